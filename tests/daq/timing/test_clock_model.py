@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -13,11 +11,7 @@ from daq.protocols.block import BlockFlag
 from daq.recording.file_format import BLOCK_DTYPE
 from daq.timing.arrival_times import ArrivalTimes
 from daq.timing.clock_model import (
-    ClockSource,
-    ClockState,
     MeasuredDelays,
-    OffsetSource,
-    RelativeTime,
 )
 from daq.timing.kalman import Observations, smooth
 from daq.timing.lower_envelope import supporting_line
@@ -391,41 +385,3 @@ def test_errors_are_large_in_the_first_seconds(seconds: int, polled: bool) -> No
             late = (phase - taken) % 16e-3 + rng.exponential(5e-5, len(taken))
         ratios.append(error_over_stated(block_rows(np.maximum.accumulate(taken + late)), taken))
     assert np.mean(np.array(ratios) < 2.0) >= 0.9
-
-
-def clock(sensor: str, source: ClockSource) -> ClockState:
-    return ClockState(sensor, source, 0.0, 0.0, 0.0, 0.0, 0.0, 1)
-
-
-@pytest.mark.parametrize(
-    ("changed", "expected"),
-    [
-        ({"shared_clock": "rack"}, RelativeTime.STATED),
-        (
-            {"shared_clock": "rack", "offset_source": OffsetSource.SAMPLES},
-            RelativeTime.WHOLE_SAMPLES,
-        ),
-        ({"source": ClockSource.DEVICE_UTC}, RelativeTime.STATED),
-        ({"source": ClockSource.DEVICE_UTC, "refined": True}, RelativeTime.ALIGNED),
-        ({"source": ClockSource.DEVICE_UTC, "corrected": 1e-6}, RelativeTime.ALIGNED),
-        ({"source": ClockSource.DEVICE_UTC, "drifts": True}, RelativeTime.ALIGNED),
-        ({"source": ClockSource.NOMINAL_RATE}, RelativeTime.WHOLE_SAMPLES),
-        ({"source": ClockSource.NOMINAL_RATE, "residual": math.nan}, RelativeTime.ALIGNED),
-        ({"source": ClockSource.SAMPLE_INSTANTS}, RelativeTime.ALIGNED),
-        ({}, RelativeTime.ALIGNED),
-    ],
-)
-def test_how_times_of_two_sensors_are_known(
-    changed: dict[str, Any], expected: RelativeTime
-) -> None:
-    common = {key: changed[key] for key in ("source", "shared_clock") if key in changed}
-    one = replace(clock("a", ClockSource.ARRIVAL_TIMES), **common)
-    other = replace(clock("b", ClockSource.ARRIVAL_TIMES), **changed)
-
-    assert one.relative_time(other) is other.relative_time(one) is expected
-
-
-def test_utc_tells_nothing_of_a_sensor_without_it() -> None:
-    stated = clock("a", ClockSource.DEVICE_UTC)
-
-    assert stated.relative_time(clock("b", ClockSource.ARRIVAL_TIMES)) is RelativeTime.ALIGNED

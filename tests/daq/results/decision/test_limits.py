@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from daq.bench.loading import parse
-from daq.bench.model import Limit
+from daq.estimation.snapshot_diagnostics import Synchronisation
 from daq.results.band_summary import channel_means, dimension_error, second_order_error
 from daq.results.decision.limits import MIN_AVERAGES, judge
-from daq.results.decision.mask_bands import mask_edges
 from daq.results.decision.verdict import LimitResult, Obstacle, TestVerdict, Verdict
 from estimator.diagnostics.advice import ModelMisfit
 from estimator.diagnostics.kinds import Level
@@ -22,31 +21,11 @@ from estimator.likelihood.dimension import BandDimension
 from estimator.likelihood.goodness_of_fit import BandTest
 from estimator.methods import self_noise
 from estimator.self_noise.result import Flag
+from tests.daq.results.decision.benches import bench_with, verdict_on
 from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot
-from tui.output.verdict_text import not_judged
 
 if TYPE_CHECKING:
-    from daq.bench.model import Bench
     from daq.estimation.snapshot import Snapshot
-
-MASK = """
-[[limits]]
-name = "data sheet"
-frequency = [1.0, 30.0]
-psd = [{psd}, {psd}]
-{more}
-"""
-
-
-def bench_with(psd: float, more: str = "") -> Bench:
-    text = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
-    return parse(text + MASK.format(psd=psd, more=more))
-
-
-def verdict_on(snapshot: Snapshot, psd: float, more: str = "") -> TestVerdict:
-    found = judge(bench_with(psd, more), snapshot, SETTINGS)
-    assert found is not None
-    return found
 
 
 def failing(psd: float, more: str = "", *, n_effective: float = 1000.0) -> list[str]:
@@ -105,16 +84,6 @@ def test_a_channel_just_at_its_mask_seldom_fails() -> None:
     # One test in forty, and four standard deviations: 10; channel by channel it would be 24.
     expected = n_tests / 40
     assert 0 < n_failing <= expected + 4 * math.sqrt(expected)
-
-
-def test_a_mask_outside_the_spectrum_decides_nothing() -> None:
-    text = MASK.format(psd=1e-15, more="").replace("[1.0, 30.0]", "[300.0, 400.0]")
-    base = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
-    found = judge(parse(base + text), made_snapshot(), SETTINGS)
-    assert found is not None
-    assert found.verdict is Verdict.NOT_DECIDED
-    assert found.obstacles == (Obstacle.OUTSIDE_SPECTRUM,)
-    assert found.prediction is None
 
 
 def test_without_limits_there_is_no_verdict() -> None:
@@ -198,27 +167,26 @@ def test_noise_that_may_come_from_the_clocks_does_not_fail() -> None:
     assert verdict_on(passing, 12e-12).verdict is Verdict.PASS
 
 
-def with_clocks(snapshot: Snapshot, **changed: object) -> Snapshot:
+def with_clocks(snapshot: Snapshot, found: Synchronisation) -> Snapshot:
     """Return the snapshot with other errors of its clocks."""
-    diagnostics = snapshot.diagnostics
-    found = replace(diagnostics.synchronisation, **changed)  # type: ignore[arg-type]
-    return replace(snapshot, diagnostics=replace(diagnostics, synchronisation=found))
+    return replace(snapshot, diagnostics=replace(snapshot.diagnostics, synchronisation=found))
 
 
 def test_noise_that_clocks_may_have_taken_away_does_not_pass() -> None:
     """Where two clocks err in opposite ways, the noise of a third sensor comes out too low."""
     snapshot = made_snapshot(n_effective=5000.0)
     removed = np.full_like(snapshot.results["three-sensor"].noise_psd, 4e-12)
-    found = verdict_on(with_clocks(snapshot, removed=removed), 12e-12)
+    snapshot = with_clocks(snapshot, Synchronisation(removed=removed))
+    found = verdict_on(snapshot, 12e-12)
     assert found.verdict is Verdict.NOT_DECIDED
     assert found.obstacles == (Obstacle.CLOCKS,)
-    assert verdict_on(with_clocks(snapshot, removed=removed), 14e-12).verdict is Verdict.PASS
+    assert verdict_on(snapshot, 14e-12).verdict is Verdict.PASS
 
 
 def test_clocks_that_nobody_knows_decide_nothing() -> None:
     for n_effective in (5000.0, MIN_AVERAGES - 1):
         snapshot = made_snapshot(n_effective=n_effective)
-        snapshot = with_clocks(snapshot, residual={"A": 0.0, "B": math.nan})
+        snapshot = with_clocks(snapshot, Synchronisation({"A": 0.0, "B": math.nan}))
         for psd in (1e-14, 1e-9):
             found = verdict_on(snapshot, psd)
             assert found.verdict is Verdict.NOT_DECIDED
@@ -233,36 +201,6 @@ def test_noise_that_is_negative_for_certain_does_not_pass() -> None:
     found = verdict_on(replace(snapshot, results={"three-sensor": wrong}), 12e-12)
     assert found.verdict is Verdict.NOT_DECIDED
     assert found.obstacles == (Obstacle.MODEL_MISFIT,)
-
-
-def test_a_band_is_judged_only_if_all_of_it_is_known() -> None:
-    snapshot = made_snapshot(n_effective=5000.0)
-    noise = snapshot.results["three-sensor"]
-    psd = noise.noise_psd.copy()
-    psd[25, 0] = np.nan  # 12.5 Hz
-    found = verdict_on(
-        replace(snapshot, results={"three-sensor": replace(noise, noise_psd=psd)}), 12e-12
-    )
-    assert found.verdict is Verdict.NOT_DECIDED
-    assert found.obstacles == (Obstacle.NO_ESTIMATE,)
-
-
-@pytest.mark.parametrize(
-    ("psd", "verdict"),
-    [
-        ("[12e-12, 12e-12, 4e-12, 4e-12, 12e-12, 12e-12]", Verdict.FAIL),  # noise up to 9e-12
-        ("[12e-12, 12e-12, 11e-12, 11e-12, 12e-12, 12e-12]", Verdict.PASS),
-    ],
-)
-def test_a_mask_is_judged_in_a_notch_narrower_than_a_band(psd: str, verdict: Verdict) -> None:
-    text = MASK.format(psd=0, more="").replace("[0, 0]", psd)
-    text = text.replace("[1.0, 30.0]", "[1.0, 15.9, 16.0, 17.0, 17.1, 30.0]")
-    bench = parse(resources.files("tui.resources").joinpath("bench.toml").read_text("utf-8") + text)
-    found = judge(bench, made_snapshot(n_effective=20_000.0), SETTINGS)
-    assert found is not None
-    assert found.verdict is verdict
-    if verdict is Verdict.FAIL:
-        assert all(15.9 < each.frequency < 17.1 for each in found.having(Verdict.FAIL))
 
 
 def test_the_noise_of_a_clipped_channel_is_an_upper_bound() -> None:
@@ -291,82 +229,6 @@ def test_where_the_model_fails_by_more_than_the_margin_nothing_is_decided() -> N
         assert found.prediction is None
     assert verdict_on(wrong, 5e-11).verdict is Verdict.PASS  # by more than the misfit can do
     assert verdict_on(wrong, 1e-14).verdict is Verdict.FAIL
-
-
-def test_a_mask_is_in_the_unit_of_the_bench_file() -> None:
-    snapshot = made_snapshot(n_effective=1000.0)
-    scale = 9.80665e-6**-2  # (µg)² in (m/s²)²
-    (noise,) = [snapshot.results["three-sensor"]]
-    in_micro_g = replace(
-        snapshot,
-        unit="µg",
-        channels=tuple(replace(label, unit="µg") for label in snapshot.channels),
-        results={
-            "three-sensor": replace(
-                noise,
-                noise_psd=noise.noise_psd * scale,
-                low=noise.low * scale,
-                high=noise.high * scale,
-            )
-        },
-    )
-    found = verdict_on(in_micro_g, 6.5e-12)
-    assert [each.name for each in found.having(Verdict.FAIL)] == ["C.X", "C.Y", "C.Z"]
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "judged", "words"),
-    [
-        (1.0, 30.0, (1.0, 30.0), []),
-        (1.0, 100.0, (1.0, 100.0), []),  # the spectrum goes to 100 Hz
-        (1.0, 400.0, (1.0, 99.5), ["above 99.5 Hz", "from 1 to 400 Hz"]),
-        (0.01, 30.0, (0.5, 30.0), ["below 0.5 Hz", "from 0.01 to 30 Hz"]),
-        (0.01, 400.0, (0.5, 99.5), ["below 0.5 Hz and above 99.5 Hz"]),
-    ],
-)
-def test_where_a_mask_goes_beyond_the_spectrum_the_verdict_says_so(
-    low: float, high: float, judged: tuple[float, float], words: list[str]
-) -> None:
-    text = MASK.format(psd=12e-12, more="").replace("[1.0, 30.0]", f"[{low}, {high}]")
-    bench = parse(resources.files("tui.resources").joinpath("bench.toml").read_text("utf-8") + text)
-    found = judge(bench, made_snapshot(n_effective=5000.0), SETTINGS)
-    assert found is not None
-    assert found.verdict is Verdict.PASS
-    assert {(each.covers, each.judged) for each in found.limits} == {((low, high), judged)}
-    lines = not_judged(found)
-    assert len(lines) == bool(words)
-    assert all(word in lines[0] for word in words)
-
-
-def test_unusable_high_frequencies_are_not_judged_and_said() -> None:
-    """Resampling leaves nothing to be said above some frequency."""
-    snapshot = made_snapshot(n_effective=5000.0)
-    csm, known = snapshot.csm.copy(), snapshot.frequency <= 45
-    csm[~known] = np.nan
-    blank = np.where(known[:, None], 1.0, np.nan)
-    results = {
-        name: replace(noise, noise_psd=noise.noise_psd * blank, cov=noise.cov * blank)
-        for name, noise in snapshot.results.items()
-    }
-    text = MASK.format(psd=12e-12, more="").replace("[1.0, 30.0]", "[1.0, 90.0]")
-    bench = parse(resources.files("tui.resources").joinpath("bench.toml").read_text("utf-8") + text)
-    found = judge(bench, replace(snapshot, csm=csm, results=results), SETTINGS)
-    assert found is not None
-    assert found.verdict is Verdict.PASS
-    (line,) = not_judged(found)
-    assert found.limits[0].judged == (1.0, 45.0)
-    assert "above 45 Hz" in line
-
-
-def test_a_model_is_a_limit_in_any_unit() -> None:
-    """The ground's noise models are in m/s²; the channels of this bench are, too."""
-    more = '[[limits]]\nname = "loud"\nmodel = "ahnm"\n[[limits]]\nname = "quiet"\nmodel = "nlnm"'
-    text = resources.files("tui.resources").joinpath("bench.toml").read_text("utf-8")
-    found = judge(parse(f"{text}\n{more}"), made_snapshot(n_effective=5000.0), SETTINGS)
-    assert found is not None
-    verdicts = {(each.limit, each.verdict) for each in found.limits}
-    # noise of -120 to -110 dB: below -91 dB in part, above -120 dB at 0.8 s, above the NLNM
-    assert verdicts == {("loud", Verdict.FAIL), ("quiet", Verdict.FAIL), ("loud", Verdict.PASS)}
 
 
 def with_further_dimensions(cov: float, *, accepted: bool) -> Snapshot:
@@ -459,14 +321,3 @@ def test_what_may_be_motion_does_not_fail(
     assert undecided.verdict is Verdict.NOT_DECIDED
     assert undecided.obstacles == (Obstacle.WEAK_MOTION,)
     assert undecided.prediction is None
-
-
-def test_a_smooth_mask_of_many_points_has_no_more_bands_than_one_of_two() -> None:
-    """However steep it is."""
-    snapshot = made_snapshot()
-    frequency = np.geomspace(1.0, 90.0, 300)
-    many, two = (
-        Limit(name="limit", frequency=tuple(f), psd=tuple(1e-9 * f**-4))
-        for f in (frequency, frequency[[0, -1]])
-    )
-    np.testing.assert_array_equal(mask_edges(snapshot, many), mask_edges(snapshot, two))

@@ -1,0 +1,34 @@
+"""Benches with a mask, and the verdict on a snapshot by one."""
+
+from __future__ import annotations
+
+from importlib import resources
+from typing import TYPE_CHECKING
+
+from daq.bench.loading import parse
+from daq.results.decision.limits import judge
+from tests.tui.example_snapshot import SETTINGS
+
+if TYPE_CHECKING:
+    from daq.bench.model import Bench
+    from daq.estimation.snapshot import Snapshot
+    from daq.results.decision.verdict import TestVerdict
+
+MASK = """
+[[limits]]
+name = "data sheet"
+frequency = [1.0, 30.0]
+psd = [{psd}, {psd}]
+{more}
+"""
+
+
+def bench_with(psd: float, more: str = "") -> Bench:
+    text = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
+    return parse(text + MASK.format(psd=psd, more=more))
+
+
+def verdict_on(snapshot: Snapshot, psd: float, more: str = "") -> TestVerdict:
+    found = judge(bench_with(psd, more), snapshot, SETTINGS)
+    assert found is not None
+    return found
