@@ -20,6 +20,7 @@ import signal
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from daq.acquisition.block_writer import BlockWriter, SensorProgress
@@ -38,7 +39,7 @@ from daq.recording.storage.writing_thread import WritingThread
 from daq.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from daq.acquisition.connection import Item
     from daq.bench.model import Bench
@@ -80,6 +81,7 @@ def run(
     path: str | Path,
     *,
     duration: float | None = None,
+    attributes: Mapping[str, str] = MappingProxyType({}),
     clock: HostClock | None = None,
     loop_factory: Callable[[], asyncio.AbstractEventLoop] | None = None,
     acknowledged: Callable[[RecorderStatus], None] | None = None,
@@ -95,7 +97,13 @@ def run(
             except NotImplementedError:  # Windows
                 signal.signal(number, lambda *_: loop.call_soon_threadsafe(stop.set))
         return await record(
-            bench, path, duration=duration, clock=clock, stop=stop, acknowledged=acknowledged
+            bench,
+            path,
+            duration=duration,
+            attributes=attributes,
+            clock=clock,
+            stop=stop,
+            acknowledged=acknowledged,
         )
 
     runner = asyncio.Runner(loop_factory=loop_factory)
@@ -112,6 +120,7 @@ async def record(
     path: str | Path,
     *,
     duration: float | None = None,
+    attributes: Mapping[str, str] = MappingProxyType({}),
     clock: HostClock | None = None,
     stop: asyncio.Event | None = None,
     acknowledged: Callable[[RecorderStatus], None] | None = None,
@@ -128,6 +137,9 @@ async def record(
     duration : float, optional
         Seconds to record of every sensor, counted by its samples; the run ends after this host time
         even if a sensor is lost. Without a duration, ``stop`` ends the run.
+    attributes : mapping of str to str
+        Further attributes of the recording, such as what of the live estimate ends the run
+        (``until``): the recorder only writes them.
     clock : HostClock, optional
         Source of host times; default: the system's clock, at the bench's speed.
     stop : asyncio.Event, optional
@@ -151,7 +163,9 @@ async def record(
         If no file can be written; all acknowledged samples are safe.
     """
     clock = SystemClock(bench.speed) if clock is None else clock
-    recorder = _Recorder(bench, Path(path), clock, stop or asyncio.Event(), acknowledged)
+    recorder = _Recorder(
+        bench, Path(path), clock, stop or asyncio.Event(), acknowledged, attributes=attributes
+    )
     return await recorder.run(duration, drivers)
 
 
@@ -163,8 +177,11 @@ class _Recorder:
         clock: HostClock,
         stop: asyncio.Event,
         acknowledged: Callable[[RecorderStatus], None] | None,
+        *,
+        attributes: Mapping[str, str],
     ) -> None:
         self._bench = bench
+        self._attributes = attributes
         self._path = self._file = path
         self._clock = clock
         self._stop = stop
@@ -269,6 +286,7 @@ class _Recorder:
             RecordingWriter.create, bench=self._bench, sensors=ordered, control=address
         )
         attributes: dict[str, str | float] = {} if duration is None else {"duration": duration}
+        attributes |= self._attributes
         writer = self._new_file(self._path, created=self._started, attributes=attributes)
         writer.event(Event("", EventKind.STARTED, f"{len(ordered)} sensors", self._started))
         _LOGGER.info("recording to %s", self._path, extra={"recording": str(self._path)})

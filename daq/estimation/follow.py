@@ -13,12 +13,14 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Protocol
 
 from daq.errors import HuddleError, NotConnectedError, RecordingError
 from daq.estimation.estimation import Estimation
 from daq.estimation.recording_set import is_continued
 from daq.estimation.segments.freed_memory import FreedMemory
+from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError
 from daq.estimation.throttle import Throttle
 from daq.recording.control import ask
@@ -30,7 +32,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
 
@@ -148,6 +149,7 @@ def follow(
     """
     cancelled = threading.Event() if cancelled is None else cancelled
     recording = first = Recording.open(path)
+    settings = _with_target(settings, recording)
     with Estimation(
         [recording], settings, diagnosis_share=share * of_diagnoses, live=not whole
     ) as estimation:
@@ -205,6 +207,14 @@ def follow(
             return _result(estimation, observer, cancelled)
     with Estimation([path], estimation.settings) as again:
         return _result(again, observer, cancelled)
+
+
+def _with_target(settings: Settings | None, recording: Recording) -> Settings | None:
+    """Return settings with the target c.o.v. at which the recording ends, if it does."""
+    if recording.until.cov is None:
+        return settings
+    settings = Settings.of(recording.bench) if settings is None else settings
+    return replace(settings, target_cov=recording.until.cov)
 
 
 def _check_left(path: Path, *, is_open: bool) -> None:

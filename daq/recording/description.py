@@ -29,7 +29,7 @@ CHECKSUMS = "checksums"
 _DESCRIPTION, _TABLE, _COUNTS = range(3)
 _FILE = (
     *("format", "format_version", "run_id", "created", "created_utc_ns", "created_monotonic_ns"),
-    *("software", "bench", "operator", "location", "duration", "origin"),
+    *("software", "bench", "operator", "location", "duration", "until", "estimate", "origin"),
 )
 _SENSOR = ("model", "serial_number", "driver", "port", "clock", "sampling_rate")
 _SAMPLES = ("channels", "sensitivity", "unit", "direction", "auxiliary", "response")

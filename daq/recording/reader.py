@@ -6,6 +6,7 @@ A recording consists of the rows counted in ``/committed``; later rows were neve
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 from datetime import datetime
 from functools import cached_property
@@ -15,7 +16,9 @@ from typing import TYPE_CHECKING, Any, Self
 import h5py
 import numpy as np
 
+from daq.bench.end_condition import EndCondition
 from daq.bench.loading import parse
+from daq.bench.model import estimate_settings
 from daq.errors import BenchFileError, NotARecordingError
 from daq.protocols.block import Event, EventKind, HostTime
 from daq.recording import file_format
@@ -63,6 +66,11 @@ class Recording:
         self.bench_text = text(attributes, "bench")
         self.duration = float(number(attributes, "duration")) if "duration" in attributes else None
         """Planned duration in s; None without a planned end."""
+        self.until = EndCondition.of_text(
+            text(attributes, "until") if "until" in attributes else ""
+        )
+        """What of the live estimate ends the run; the process that records obeys it."""
+        self._estimate = text(attributes, "estimate") if "estimate" in attributes else ""
         self.continues = text(attributes, CONTINUES) if CONTINUES in attributes else ""
         """The ``run_id`` of the recording that this one continues; empty for most."""
         self._committed = dataset(file, "committed", np.dtype("<i8"))
@@ -116,7 +124,11 @@ class Recording:
         if not self.bench_text:
             return None
         with contextlib.suppress(BenchFileError):
-            return parse(self.bench_text, str(self.path))
+            bench = parse(self.bench_text, str(self.path))
+            if self._estimate:
+                table = estimate_settings(json.loads(self._estimate))
+                bench = bench.model_copy(update={"estimate": table})
+            return bench
         return None
 
     @property

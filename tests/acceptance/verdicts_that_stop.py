@@ -14,8 +14,8 @@ from collections import Counter
 
 import numpy as np
 
+from daq.results.decision.end import is_surely_decided
 from daq.results.decision.verdict import Verdict
-from tui.application.plan import is_surely_decided
 from tui.studies.verdicts import (
     FARTHEST_DB,
     LONGEST,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 from textual import work
 from textual.binding import Binding, BindingType
 
+from daq.bench.end_condition import EndCondition
 from tui.application.dialogs import MarkScreen, StopScreen
 from tui.application.following import FollowingApp
 from tui.application.forms.start import StartForm
@@ -80,7 +81,8 @@ class HuddleApp(FollowingApp):
             self.post_message(RecordingOpened(self._given))
         elif self._start_at_once:
             bench = self._controls.bench
-            self._begin(TestPlan(duration=None if bench is None else bench.recording.duration))
+            duration = None if bench is None else bench.recording.duration
+            self._begin(TestPlan(end=EndCondition(duration)))
         else:
             self._find_running()
 
@@ -117,7 +119,7 @@ class HuddleApp(FollowingApp):
     def _start(self, plan: TestPlan) -> None:
         path = self._try(partial(self._controls.start, plan))
         if path is not None:
-            self.post_message(RecordingOpened(path, plan=plan))
+            self.post_message(RecordingOpened(path))
             if plan.note:
                 self._try(partial(self._controls.mark, path, plan.note))
 

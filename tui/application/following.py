@@ -103,7 +103,6 @@ class FollowingApp(App[None]):
         self._controls = controls
         self._ended = threading.Event()
         self._quitting = threading.Event()
-        self._is_stopping = False
         self._lost: frozenset[str] = frozenset()
         self._recent, self._is_moved = RecentMotion(), False
         self._bench = controls.bench
@@ -186,10 +185,7 @@ class FollowingApp(App[None]):
         own = message.settings is None
         settings = self._controls.settings if own else message.settings
         self._bench = self._controls.bench if own else message.bench
-        self.state = replace(self._state_of(message.path), plan=message.plan)
-        if message.plan is not None and message.plan.cov is not None and settings is not None:
-            settings = replace(settings, target_cov=message.plan.cov)
-        self._is_stopping = False
+        self.state = self._state_of(message.path)
         self._lost = frozenset()
         self._recent, self._is_moved = RecentMotion(), False
         self._ended.set()
@@ -201,7 +197,7 @@ class FollowingApp(App[None]):
     def _follow(
         self, path: Path, settings: Settings | None, ended: threading.Event, *, is_kept: bool
     ) -> None:
-        messenger, bench, plan = Messenger(self, ended), self._bench, self.state.plan
+        messenger, bench = Messenger(self, ended), self._bench
         with self._reading:
             if ended.is_set():  # another one was opened meanwhile
                 return
@@ -213,7 +209,6 @@ class FollowingApp(App[None]):
                     cancelled=ended,
                     growth=CURVE_GROWTH,
                     of_diagnoses=DIAGNOSES,
-                    whole=plan is not None and plan.ends_by_estimate,
                 )
             except (HuddleError, EstimatorError, OSError) as error:
                 messenger.error(error)
@@ -253,26 +248,10 @@ class FollowingApp(App[None]):
             verdict=judge(self._bench, snapshot, message.settings),
             note="",
         )
-        if not snapshot.closed:
-            self._end_if_reached(snapshot, message.settings)
-        elif before is not None and not before.closed:
+        if snapshot.closed and before is not None and not before.closed:
             word = "" if self.state.verdict is None else WORDS[self.state.verdict.verdict]
             self.announce("ended", word)
             await self._show_result()
-
-    def _end_if_reached(self, snapshot: Snapshot, settings: Settings) -> None:
-        """Stop the test if what was wanted of it is reached."""
-        plan, path = self.state.plan, self.path
-        if plan is None or path is None or self._is_stopping:
-            return
-        if plan.is_reached(snapshot, settings, self.state.verdict):
-            self._is_stopping = True
-            self.state = replace(self.state, note="reached what was wanted: stopping …")
-            self._stop(path)
-
-    @work(thread=True, group="control")
-    def _stop(self, path: Path) -> None:
-        self._try(partial(self._controls.stop, path))
 
     @work(thread=True, group="announce")
     def announce(self, event: str, text: str) -> None:

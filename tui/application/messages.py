@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
-    from tui.application.plan import TestPlan
     from tui.application.state import Reference
     from tui.runs.catalogue import Entry
 
@@ -39,8 +38,6 @@ class RecordingOpened(Message):
     """What it was recorded with; that of the application, if neither is given."""
     is_kept: bool = False
     """Whether its result is written into it, where it holds none."""
-    plan: TestPlan | None = None
-    """When the test ends by itself, if it was started here."""
 
 
 @dataclass

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
     from daq.results.decision.verdict import TestVerdict
-    from tui.application.plan import TestPlan
 
 BENCH, TEST, RESULT, RECORDINGS = VIEWS = ("bench", "test", "result", "recordings")
 TITLES: Final = {BENCH: "Bench", TEST: "Test", RESULT: "Result", RECORDINGS: "Recordings"}
@@ -58,8 +57,6 @@ class State:
         Notice in place of the progress.
     is_starting : bool
         Whether a recorder is being started.
-    plan : TestPlan or None
-        When the test ends by itself, if it was started here.
     reference : Reference or None
         What the recording is compared with.
     models : tuple of Mask
@@ -80,7 +77,6 @@ class State:
     failure: str = ""
     note: str = ""
     is_starting: bool = False
-    plan: TestPlan | None = None
     reference: Reference | None = None
     models: tuple[Mask, ...] = ()
 

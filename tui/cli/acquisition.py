@@ -73,6 +73,7 @@ def tui(
 
 @examples(
     "huddle run lab.toml --duration 3h",
+    "huddle run lab.toml --until-decided --duration 3h",
     "huddle run lab.toml --until-cov 0.05 --band 1:20",
     "huddle run lab.toml -d 20min --json result.json --report result.pdf",
 )
@@ -89,9 +90,14 @@ def run(
             min=0.001,
             max=1.0,
             metavar="COV",
-            help="Stop when the noise in the band has this coefficient of variation.",
+            help="Stop when the noise in the worst third of an octave of the band has this"
+            " coefficient of variation.",
         ),
     ] = None,
+    until_decided: Annotated[
+        bool,
+        typer.Option("--until-decided", help="Stop when all limits of the bench are decided."),
+    ] = False,
     out: OutOption = None,
     diagnostics: DiagnosticsOption = False,
     report: Annotated[
@@ -110,12 +116,12 @@ def run(
     Ctrl-C stops the recorder, and the command prints the result. Ctrl-C
     during the final estimate finishes it first; a second Ctrl-C aborts.
     """
+    from daq.bench.end_condition import EndCondition
     from tui.commands.run import run_test
 
     run_test(
         bench,
-        duration=duration,
-        until_cov=until_cov,
+        end=EndCondition(duration, until_cov, until_decided),
         out=out,
         diagnostics=diagnostics,
         report=report,
@@ -135,6 +141,17 @@ def record(
         str | None,
         typer.Option(metavar="NAME", help="Operator (default: from the bench file)."),
     ] = None,
+    until: Annotated[
+        str,
+        typer.Option(
+            "--until",
+            metavar="CONDITION",
+            help="Stop by the live estimate: 'decided' once all limits are decided, '5 %' once the"
+            " noise in the worst third of an octave of the band is known to 5 %, or both,"
+            " separated by a comma: the first of them.",
+        ),
+    ] = "",
+    estimate: Annotated[str | None, typer.Option("--estimate", hidden=True)] = None,
     until_stopped: Annotated[
         bool,
         typer.Option("--until-stopped", help="Ignore the duration of the bench file."),
@@ -143,13 +160,22 @@ def record(
     json: JsonOption = None,
 ) -> None:
     """Record without estimating, until the duration has passed or Ctrl-C."""
+    from daq.bench.end_condition import EndCondition
     from tui.commands.record import record_bench
 
     if until_stopped and duration is not None:
         raise typer.BadParameter("--duration and --until-stopped exclude each other; expected one")
+    try:
+        condition = EndCondition.of_text(until)
+    except ValueError as error:
+        raise typer.BadParameter(f"--until {error}") from None
+    if condition.duration is not None:
+        raise typer.BadParameter(f"--until {until!r}: expected a time as --duration")
     record_bench(
         bench,
         duration=duration,
+        until=condition,
+        estimate=estimate,
         until_stopped=until_stopped,
         operator=operator,
         out=out,

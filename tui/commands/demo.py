@@ -16,6 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.bench.durations import format_duration
+from daq.bench.end_condition import EndCondition
 from daq.bench.loading import dump
 from daq.drivers.bench_file import parse
 from daq.estimation.estimation import estimate
@@ -133,11 +134,11 @@ def _record(path: Path, out: Path, settings: Settings, duration: float, speed: f
         f"Recording three simulated accelerometers for {format_duration(duration)} at {speed:g} "
         f"times real time, which takes {format_duration(duration / speed)}."
     )
-    recorder = RecorderProcess(path, out, duration=duration)
+    recorder = RecorderProcess(path, out, end=EndCondition(duration))
     try:
         recorder.wait_for_file()
         with defer_interrupt(recorder.request_stop) as interruption:
-            result_of(recorder, settings, duration=duration)
+            result_of(recorder, settings, end=EndCondition(duration))
         recorder.check()
     except KeyboardInterrupt:
         recorder.stop()

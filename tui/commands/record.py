@@ -4,21 +4,27 @@ from __future__ import annotations
 
 import logging
 import math
+import subprocess
 import time
+from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING
 
 from rich.live import Live
 
 from daq.acquisition.recorder import run
+from daq.bench.end_condition import NEVER, EndCondition
 from daq.drivers.bench_file import load
+from daq.errors import WrongSettingError
 from daq.host_clock import SystemClock
+from daq.python_process import python_command
 from daq.recording.storage.names import recording_path
 from tui.output.console import notices, write_json
 from tui.output.formatting import clock_time, roughly, several
 from tui.simulation.host_time import host_time
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from daq.acquisition.recorder import RecorderStatus
@@ -32,45 +38,96 @@ def record_bench(
     path: Path,
     *,
     duration: float | None,
+    until: EndCondition = NEVER,
     until_stopped: bool = False,
     operator: str | None = None,
+    estimate: str | None = None,
     out: Path | None,
     json: str | None,
 ) -> None:
     """Record a bench until the duration has passed, or until SIGINT or SIGTERM.
 
-    The duration is that of the bench file, if none is given and `until_stopped` is false.
+    The duration is that of the bench file, if none is given and `until_stopped` is false. With a
+    condition `until` on the live estimate, a process beside the recorder makes that estimate.
+
+    Parameters
+    ----------
+    path : Path
+        Bench file.
+    duration : float, optional
+        In seconds.
+    until : EndCondition
+        Its duration is not used.
+    until_stopped : bool
+    operator : str, optional
+        In place of that of the bench file.
+    estimate : str, optional
+        Settings of the estimate in place of those of the bench file, as its table in JSON.
+    out : Path, optional
+    json : str, optional
 
     Raises
     ------
+    WrongSettingError
+        If the test is to be decided and the bench file has no limits.
     ExceptionGroup
         With a DeviceError for every sensor that cannot be used at the start.
     """
     bench = load(path)
     if operator is not None:
         bench = bench.model_copy(update={"operator": operator})
-    if duration is None and not until_stopped:
+    if until.decided and not bench.limits:
+        raise WrongSettingError(f"until decided: {path} has no limits; expected [[limits]]")
+    if duration is None and not until_stopped and not until.is_estimated:
         duration = bench.recording.duration
     if out is None:
         out = recording_path(bench, SystemClock().now())
     clock, loop_factory = host_time(bench)
-    record = partial(run, bench, out, duration=duration, clock=clock, loop_factory=loop_factory)
+    attributes = {"until": until.estimated.text, "estimate": estimate or ""}
+    record = partial(
+        run,
+        bench,
+        out,
+        duration=duration,
+        attributes={name: text for name, text in attributes.items() if text},
+        clock=clock,
+        loop_factory=loop_factory,
+    )
     screen = notices()
     gaps = GapLog()
-    if screen.is_terminal:
-        with Live(console=screen, refresh_per_second=2, transient=True) as live:
+    with _watched(out, until):
+        if screen.is_terminal:
+            with Live(console=screen, refresh_per_second=2, transient=True) as live:
 
-            def show(now: RecorderStatus) -> None:
-                gaps.look(now)
-                live.update(progress_line(now, duration))
+                def show(now: RecorderStatus) -> None:
+                    gaps.look(now)
+                    live.update(progress_line(now, duration))
 
-            status = record(acknowledged=show)
-    else:
-        status = record(acknowledged=gaps.look)
+                status = record(acknowledged=show)
+        else:
+            status = record(acknowledged=gaps.look)
     if status.closed:
         closed = {"recording": status.path}
         _LOGGER.info("%s closed: %s", status.path, progress_line(status), extra=closed)
     write_json(json, status.to_dict())
+
+
+@contextmanager
+def _watched(out: Path, until: EndCondition) -> Iterator[None]:
+    """Run the process that stops the recorder, for as long as the recorder runs."""
+    if not until.is_estimated:
+        yield
+        return
+    watching = subprocess.Popen(
+        python_command("tui.runs.end_watch", str(out)),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+    )
+    try:
+        yield
+    finally:  # it has nothing to lose
+        watching.kill()
+        watching.wait()
 
 
 class GapLog:

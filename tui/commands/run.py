@@ -12,11 +12,12 @@ import typer
 from rich.progress import BarColumn, TextColumn
 
 from daq.bench.durations import format_duration
+from daq.bench.end_condition import EndCondition
 from daq.bench.option_fit import shortest_duration
 from daq.drivers.bench_file import load
 from daq.errors import HuddleError, RecordingError
 from daq.estimation.estimation import estimate
-from daq.estimation.follow import ESTIMATE_SHARE, RecordingLeftOpenError, follow
+from daq.estimation.follow import RecordingLeftOpenError, follow
 from daq.estimation.settings import Settings
 from daq.host_clock import SystemClock
 from daq.recording.reader import Recording
@@ -56,8 +57,7 @@ STATUS_INTERVAL = 1.0
 def run_test(
     path: Path,
     *,
-    duration: float | None,
-    until_cov: float | None,
+    end: EndCondition,
     out: Path | None,
     json: str | None,
     csv: str | None,
@@ -79,21 +79,22 @@ def run_test(
     settings = chosen(Settings.of(bench), **wanted)
     check_fit(settings, bench.sensors)
     check_places(json, csv)
-    if until_cov is not None:
-        settings = replace(settings, target_cov=until_cov)
-    duration = bench.recording.duration if duration is None and until_cov is None else duration
-    refuse_hopeless(bench, settings, duration)
+    if end.cov is not None:
+        settings = replace(settings, target_cov=end.cov)
+    if end == EndCondition():
+        end = EndCondition(bench.recording.duration)
+    refuse_hopeless(bench, settings, end)
     out = recording_path(bench, SystemClock().now()) if out is None else out
     if report is not None:
         checked(report)
     elif bench.recording.report is not None:
         report = out.with_suffix(f".{bench.recording.report}")
-    recorder = RecorderProcess(path, out, duration=duration)
+    recorder = RecorderProcess(path, out, end=end, settings=settings)
     try:
         recorder.wait_for_file()
         hint("Ctrl-C stops the recording and shows the result")
         with defer_interrupt(recorder.request_stop) as interruption:
-            snapshot = result_of(recorder, settings, duration=duration, until_cov=until_cov)
+            snapshot = result_of(recorder, settings, end=end)
             # First into the recording, whatever becomes of screens and other files.
             stored = _Stored(out, snapshot, judge(bench, snapshot, settings))
             found = show_result(
@@ -147,8 +148,7 @@ def result_of(
     recorder: RecorderProcess,
     settings: Settings,
     *,
-    duration: float | None,
-    until_cov: float | None = None,
+    end: EndCondition,
 ) -> Snapshot:
     """Follow the recording of a recorder to its end, and return its result.
 
@@ -160,8 +160,8 @@ def result_of(
     HuddleError, EstimatorError
         The recorder failed, or the recording gives no result.
     """
-    with _progress(duration) as bar:
-        observer = _Run(recorder, bar, until_cov)
+    with _progress(end.duration) as bar:
+        observer = _Run(bar)
         try:
             snapshot = follow(
                 recorder.out,
@@ -169,8 +169,7 @@ def result_of(
                 observer,
                 recorder=recorder,
                 watch_sensors=False,
-                share=LINE_SHARE if until_cov is None else ESTIMATE_SHARE,
-                whole=until_cov is not None,
+                share=LINE_SHARE,
             )
         except RecordingLeftOpenError:
             snapshot = None
@@ -207,10 +206,10 @@ def _estimate_at_end(recorder: RecorderProcess, settings: Settings) -> Snapshot 
 
 
 class _Run:
-    """Shows the progress of a run, and stops its recorder when the target c.o.v. is reached."""
+    """Shows the progress of a run."""
 
-    def __init__(self, recorder: RecorderProcess, bar: _Bar, until_cov: float | None) -> None:
-        self._recorder, self._bar, self._until_cov = recorder, bar, until_cov
+    def __init__(self, bar: _Bar) -> None:
+        self._bar = bar
         self._says_why = False
 
     def status(self, status: RecordingStatus) -> None:
@@ -225,8 +224,6 @@ class _Run:
         if reason and not self._says_why:
             self._says_why = True
             _LOGGER.warning("%s", reason)
-        if self._until_cov is not None and precision(snapshot, settings).is_reached:
-            self._recorder.request_stop()
 
     def segments(self, n_segments: int, elapsed: float) -> None:
         """Show the progress of the recording."""
@@ -237,14 +234,19 @@ class _Run:
         self._bar.result(done, total)
 
 
-def refuse_hopeless(bench: Bench, settings: Settings, duration: float | None) -> None:
-    """Refuse a duration that is too short for any estimate.
+def refuse_hopeless(bench: Bench, settings: Settings, end: EndCondition) -> None:
+    """Refuse a test that cannot end as wanted: too short for any estimate, or without limits.
 
     Raises
     ------
     typer.BadParameter
-        With the minimum duration.
+        With what was expected.
     """
+    if end.decided and not bench.limits:
+        raise typer.BadParameter(
+            "--until-decided: the bench file has no limits; expected [[limits]], or --until-cov"
+        )
+    duration = end.duration
     n_segments, shortest = shortest_duration(settings, bench.sensors)
     if duration is not None and duration < shortest:
         raise typer.BadParameter(

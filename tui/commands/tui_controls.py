@@ -120,7 +120,11 @@ class BenchControls(_Controls):
         out = recording_path(self.bench, SystemClock().now())
         with self.ports:  # a preview has released them
             recorder = RecorderProcess(
-                self.path, out, duration=plan.duration, operator=plan.operator
+                self.path,
+                out,
+                end=plan.end,
+                settings=without_comparison(self.settings),
+                operator=plan.operator,
             )
         self.started.append(recorder)
         recorder.wait_for_file()
@@ -349,6 +353,12 @@ def _report(
     out = (folder or path.parent) / f"{path.stem}.html"
     write(snapshot, out, recordings=[path], settings=settings, models=models)
     return out
+
+
+def without_comparison(settings: Settings) -> Settings:
+    """Return settings without methods that are only shown, unless they were chosen alone."""
+    chosen = tuple(name for name in settings.methods if name not in COMPARISON_METHODS)
+    return replace(settings, methods=chosen or settings.methods)
 
 
 def with_comparison(settings: Settings, wanted: Mapping[str, Any]) -> Settings:

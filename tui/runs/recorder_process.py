@@ -7,6 +7,7 @@ us. The recorder logs JSON there; a thread reads it and logs each record here as
 
 from __future__ import annotations
 
+import json
 import os
 import select
 import signal
@@ -17,14 +18,19 @@ import threading
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from daq.bench.end_condition import NEVER, EndCondition
+from daq.bench.estimate_settings import to_table
 from daq.errors import HuddleError, RecordingError
 from daq.python_process import python_command
 from daq.recording.control import ask
 from tui.output.exit_codes import ExitCode
 from tui.output.logs import lines as logs
 from tui.runs.child_log import ChildLog
+
+if TYPE_CHECKING:
+    from daq.bench.estimate_settings import EstimateSettings
 
 POLL = 0.05
 LOG_POLL = 0.25
@@ -48,8 +54,10 @@ class RecorderProcess:
     bench_path : Path
     out : Path
         Recording it writes; must not exist.
-    duration : float, optional
-        In seconds; without it, until a stop is requested, whatever the bench file says.
+    end : EndCondition
+        Without a duration, until a stop is requested, whatever the bench file says.
+    settings : EstimateSettings, optional
+        Of the estimate, in place of those of the bench file.
     lock : int, optional
         Descriptor of a lock that the process holds as long as it lives (not on Windows).
     operator : str, optional
@@ -66,7 +74,8 @@ class RecorderProcess:
         bench_path: Path,
         out: Path,
         *,
-        duration: float | None = None,
+        end: EndCondition = NEVER,
+        settings: EstimateSettings | None = None,
         lock: int | None = None,
         operator: str | None = None,
     ) -> None:
@@ -75,7 +84,12 @@ class RecorderProcess:
         self.out = out
         arguments = python_command("tui", "record", str(bench_path), "--out", str(out))
         arguments += logs.arguments_for_child()
+        duration = end.duration
         arguments += ["--until-stopped"] if duration is None else ["--duration", repr(duration)]
+        if end.is_estimated:
+            arguments += ["--until", end.estimated.text]
+        if settings is not None:
+            arguments += ["--estimate", json.dumps(to_table(settings))]
         if operator is not None:
             arguments += ["--operator", operator]
         descriptor, name = tempfile.mkstemp(prefix="huddle-recorder-", suffix=".log")

@@ -123,7 +123,7 @@ class Window:
         return self._recorded(run)
 
     def _left_over(self, run: Run) -> Recorder | None:
-        return self._steps.running(run.parts[-1], run.target_cov) if run.parts else None
+        return self._steps.running(run.parts[-1]) if run.parts else None
 
     def _rest(self, run: Run) -> float:
         end = run.window_end

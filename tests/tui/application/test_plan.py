@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING
 import pytest
 from textual.events import Key
 
+from daq.bench.end_condition import EndCondition
 from daq.bench.model import Limit
 from daq.errors import HuddleError
 from daq.recording.sensor_state import SensorState
+from daq.results.decision.end import is_reached, is_surely_decided
 from daq.results.decision.limits import judge
 from daq.results.decision.verdict import Verdict
 from tests.tui.application.screen_text import screen_text
@@ -20,13 +22,11 @@ from tests.tui.example_snapshot import (
     SETTINGS,
     ProgressCallback,
     demo_bench,
-    growing,
     made_now,
     made_snapshot,
 )
 from tui.application.app import HuddleApp
-from tui.application.messages import RecordingOpened, StatusUpdated
-from tui.application.plan import TestPlan, end_text, is_surely_decided, parse_end
+from tui.application.messages import StatusUpdated
 from tui.commands.tui_controls import announce
 
 if TYPE_CHECKING:
@@ -43,21 +43,21 @@ def told(tmp_path: Path) -> ProgressCallback:
 @pytest.mark.parametrize(
     ("text", "plan"),
     [
-        ("", TestPlan()),
-        ("3h", TestPlan(duration=10800.0)),
-        ("5 %", TestPlan(cov=0.05)),
-        ("decided, 90 min", TestPlan(until_decided=True, duration=5400.0)),
+        ("", EndCondition()),
+        ("3h", EndCondition(10800.0)),
+        ("5 %", EndCondition(cov=0.05)),
+        ("decided, 90 min", EndCondition(5400.0, decided=True)),
     ],
 )
-def test_the_end_is_read_and_written_alike(text: str, plan: TestPlan) -> None:
-    assert parse_end(text) == plan
-    assert parse_end(end_text(plan)) == plan
+def test_the_end_is_read_and_written_alike(text: str, plan: EndCondition) -> None:
+    assert EndCondition.of_text(text) == plan
+    assert EndCondition.of_text(plan.text) == plan
 
 
 @pytest.mark.parametrize("text", ["soon", "120 %", "x %", "decided or so", "-3h"])
 def test_what_is_no_end_is_refused_with_what_was_expected(text: str) -> None:
     with pytest.raises(ValueError, match="expected"):
-        parse_end(text)
+        EndCondition.of_text(text)
 
 
 async def test_the_form_takes_operator_note_and_end(told: ProgressCallback) -> None:
@@ -80,25 +80,10 @@ async def test_the_form_takes_operator_note_and_end(told: ProgressCallback) -> N
         await shown(pilot, app)
     assert told.plan is not None
     assert told.plan.note == "hot"
-    assert told.plan.cov == 0.1
+    assert told.plan.end == EndCondition(cov=0.1)
     assert told.plan.operator is not None
     assert told.plan.operator.endswith("ann")
     assert told.told == ["start", "mark run.h5 hot"]
-
-
-async def test_a_test_is_stopped_once_when_its_precision_is_reached(
-    told: ProgressCallback, tmp_path: Path
-) -> None:
-    app, path = HuddleApp(told), tmp_path / "grows.h5"
-    with growing(path):
-        async with app.run_test(size=NARROW) as pilot:
-            await shown(pilot, app, RecordingOpened(path, plan=TestPlan(cov=0.2)), *running())
-            assert told.told == []
-            for _ in range(2):
-                await shown(pilot, app, *running(n_effective=1000.0))
-            for worker in [worker for worker in app.workers if worker.group == "control"]:
-                await worker.wait()
-    assert told.told == ["stop grows.h5"]
 
 
 def test_a_test_ends_on_a_verdict_only_if_it_is_surer_than_a_verdict_must_be() -> None:
@@ -108,9 +93,9 @@ def test_a_test_ends_on_a_verdict_only_if_it_is_surer_than_a_verdict_must_be() -
     assert found is not None
     assert found.verdict is Verdict.FAIL
     assert is_surely_decided(found)
-    plan = TestPlan(until_decided=True)
-    assert plan.ends_by_estimate
-    assert plan.is_reached(snapshot, SETTINGS, found)
+    end = EndCondition(decided=True)
+    assert end.is_estimated
+    assert is_reached(end, bench, snapshot, SETTINGS)
     passed = [each for each in found.limits if each.verdict is Verdict.PASS]
     assert is_surely_decided(replace(found, verdict=Verdict.PASS, limits=tuple(passed[:3])))
     barely = replace(passed[0], limit_psd=passed[0].high * 1.001)

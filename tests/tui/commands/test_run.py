@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from daq.bench.end_condition import EndCondition
 from daq.bench.loading import dump
 from daq.drivers.bench_file import parse
 from daq.python_process import python_command
@@ -173,6 +174,40 @@ def test_until_cov_ends_the_run(bench: Path, tmp_path: Path) -> None:
     with Recording.open(out) as recording:
         assert recording.events[-1].text != "duration reached"
     assert "self-noise" in out.with_suffix(".html").read_text(encoding="utf-8")
+
+
+def test_the_recorder_ends_at_the_precision_that_its_recording_states(
+    bench: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "alone.h5"
+    table = json.dumps({"segment": "0.5s", "band": [2.0, 20.0]})
+    process = start(
+        *("record", str(bench), "--out", str(out), "--until", "60 %", "--until-stopped"),
+        *("--estimate", table),
+    )
+    code, _, err = finish(process)  # nobody asks it to stop
+    assert code == 0, err
+    with Recording.open(out) as recording:
+        assert recording.closed
+        assert recording.until == EndCondition(cov=0.6)
+        assert recording.duration is None
+        assert recording.bench is not None
+        assert recording.bench.estimate.segment == 0.5
+        assert recording.bench.estimate.band == (2.0, 20.0)
+        assert recording.events[-1].kind == "stopped"
+
+
+def test_a_test_without_limits_cannot_end_when_they_are_decided(
+    bench: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "undecided.h5"
+    refused = huddle("run", str(bench), "--until-decided", "--out", str(out), code=2)
+    assert "has no limits" in refused.stderr
+    refused = huddle("record", str(bench), "--until", "decided", "--out", str(out), code=2)
+    assert "has no limits" in refused.stderr
+    refused = huddle("record", str(bench), "--until", "soon", "--out", str(out), code=2)
+    assert "expected" in refused.stderr
+    assert not out.exists()
 
 
 def test_record_says_what_is_safe(bench: Path, tmp_path: Path) -> None:

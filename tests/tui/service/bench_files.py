@@ -126,9 +126,8 @@ class FakeSteps:
             (self.folder / part).touch()
         return FakeRecorder(self, self.folder / part, seconds if until is None else until, error)
 
-    def running(self, part: str, target_cov: float | None) -> Recorder | None:
+    def running(self, part: str) -> Recorder | None:
         """Return one that a test left running."""
-        del target_cov
         left = self.left_running.pop(part, None)
         return None if left is None else FakeRecorder(self, self.folder / part, left)
 

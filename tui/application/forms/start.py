@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from daq.bench.end_condition import EndCondition
 from tui.application.forms.form import Field, Form
-from tui.application.plan import TestPlan, end_text, parse_end
+from tui.application.plan import TestPlan
 
 if TYPE_CHECKING:
     from daq.bench.model import Bench
@@ -15,8 +15,8 @@ HINTS = {
     "operator": "Who does the test. It stands in the recording and in the report.",
     "note": "What is special about this test. Recorded as a mark at its start.",
     "end": "3h: after this time · 5 %: when the noise is known to 5 % · decided: when the limits"
-    " are · several: the first of them · empty: x stops it. Precision and limits need this"
-    " application to stay open.",
+    " are · several: the first of them · empty: x stops it. The recorder sees to it: this"
+    " application may be closed.",
 }
 
 
@@ -38,7 +38,7 @@ class StartForm(Form[TestPlan]):
         fields = (
             Field("operator", "operator", self._operator),
             Field("note", "note"),
-            Field("end", "ends", end_text(TestPlan(duration=duration)), "when x stops it"),
+            Field("end", "ends", EndCondition(duration).text, "when x stops it"),
         )
         title = f"start a test; {kept} is kept" if kept else "start a test"
         super().__init__(title, fields, does="starts")
@@ -52,10 +52,10 @@ class StartForm(Form[TestPlan]):
         if name != "end":
             return ""
         try:
-            end = parse_end(self.value("end"))
+            end = EndCondition.of_text(self.value("end"))
         except ValueError as error:
             return str(error)
-        if end.until_decided and not self._has_limits:
+        if end.decided and not self._has_limits:
             return "decided: the bench file has no limits; expected a time or a precision"
         return ""
 
@@ -63,9 +63,9 @@ class StartForm(Form[TestPlan]):
         """Start."""
         operator = self.value("operator")
         self.dismiss(
-            replace(
-                parse_end(self.value("end")),
+            TestPlan(
                 operator=operator if operator != self._operator else None,
                 note=self.value("note"),
+                end=EndCondition.of_text(self.value("end")),
             )
         )

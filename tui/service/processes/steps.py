@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from daq.bench.end_condition import EndCondition
 from daq.errors import HuddleError, RecordingError
 from daq.protocols.block import HostTime
 from daq.python_process import python_command
@@ -73,7 +73,7 @@ class Steps(Protocol):
         """Start a recorder."""
         ...
 
-    def running(self, part: str, target_cov: float | None) -> Recorder | None:
+    def running(self, part: str) -> Recorder | None:
         """Return the recorder of a recording, if one runs."""
         ...
 
@@ -123,7 +123,7 @@ class ProcessSteps:
         raise AssertionError
 
     def start(self, part: str, seconds: float, target_cov: float | None) -> Recorder:
-        """Start a recorder, and what stops it at a precision.
+        """Start a recorder, which stops at a precision if one is given.
 
         Raises
         ------
@@ -135,15 +135,20 @@ class ProcessSteps:
         if lock is None:
             raise RecordingError(f"{out}: another recorder of the service is writing it")
         try:
-            process = RecorderProcess(self._bench_path, out, duration=seconds, lock=lock.descriptor)
+            process = RecorderProcess(
+                self._bench_path,
+                out,
+                end=EndCondition(seconds, target_cov),
+                lock=lock.descriptor,
+            )
             lock.name(process.pid)
         finally:
             lock.release()
-        return _OwnRecorder(process, None if target_cov is None else _stopper(out, target_cov))
+        return _OwnRecorder(process)
 
-    def running(self, part: str, target_cov: float | None) -> Recorder | None:
+    def running(self, part: str) -> Recorder | None:
         """Return the recorder of a recording, if one runs."""
-        found = _FoundRecorder(self._folder / part, target_cov)
+        found = _FoundRecorder(self._folder / part)
         return found if found.is_running else None
 
     async def finish(self, request: Request) -> Outcome:
@@ -200,8 +205,8 @@ async def _outcome(process: Process) -> Outcome:
 class _OwnRecorder:
     """A recorder that this service has started."""
 
-    def __init__(self, process: RecorderProcess, stopper: RecorderStopper | None) -> None:
-        self._process, self._stopper = process, stopper
+    def __init__(self, process: RecorderProcess) -> None:
+        self._process = process
         self._code_error = ""
 
     async def ends_within(self, seconds: float) -> bool:
@@ -225,9 +230,6 @@ class _OwnRecorder:
         return self._code_error
 
     def _close(self) -> None:
-        if self._stopper is not None:
-            self._stopper.end()
-            self._stopper = None
         try:
             self._process.check()
         except RecorderFailedError as error:
@@ -239,24 +241,20 @@ class _OwnRecorder:
 class _FoundRecorder:
     """A recorder that a service before this one has started."""
 
-    def __init__(self, out: Path, target_cov: float | None) -> None:
-        self._out, self._target_cov = out, target_cov
-        self._stopper: RecorderStopper | None = None
+    def __init__(self, out: Path) -> None:
+        self._out = out
 
     @property
     def is_running(self) -> bool:
         return is_held(_mark(self._out)) or (self._out.exists() and is_being_written(self._out))
 
     async def ends_within(self, seconds: float) -> bool:
-        if self._stopper is None and self._target_cov is not None and self._out.exists():
-            self._stopper = _stopper(self._out, self._target_cov)
         loop = asyncio.get_running_loop()
         deadline = loop.time() + seconds
         while self.is_running:
             if loop.time() >= deadline:
                 return False
             await asyncio.sleep(min(POLL, seconds))
-        self._end()
         return True
 
     async def status(self) -> dict[str, Any] | None:
@@ -270,7 +268,6 @@ class _FoundRecorder:
 
     def kill(self) -> None:
         kill_holder(_mark(self._out))
-        self._end()
 
     def failure(self) -> str:
         try:
@@ -279,34 +276,6 @@ class _FoundRecorder:
         except (HuddleError, OSError) as error:
             return str(error)
         return "" if closed else "the recorder ended without closing its recording"
-
-    def _end(self) -> None:
-        if self._stopper is not None:
-            self._stopper.end()
-            self._stopper = None
-
-
-class RecorderStopper:
-    """The process that stops a recorder when the noise has its precision."""
-
-    def __init__(self, out: Path, target_cov: float) -> None:
-        import subprocess  # noqa: PLC0415 - seldom needed
-
-        self._process = subprocess.Popen(
-            python_command("tui.service.processes.until_cov", json.dumps([str(out), target_cov])),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-
-    def end(self) -> None:
-        """End the process, which has nothing to lose."""
-        self._process.kill()
-        self._process.wait()
-
-
-def _stopper(out: Path, target_cov: float) -> RecorderStopper:
-    return RecorderStopper(out, target_cov)
 
 
 async def _taken(mark: Path) -> Lock:
