@@ -77,14 +77,3 @@ def test_commands_compute_nothing() -> None:
         if name.parts[0] not in ARRAYS_IN and {"numpy", "scipy"} & set(imports):
             computing.add(name.as_posix())
     assert computing == ARRAYS_OF
-
-
-def test_a_folder_has_at_most_a_dozen_modules() -> None:
-    root = Path(__file__).parents[1]
-    crowded = {}
-    for package in ("daq", "estimator", "sim_devices", "tui"):
-        for folder in (root / package).rglob("__init__.py"):
-            modules = [path for path in folder.parent.glob("*.py") if path != folder]
-            if len(modules) > 12:
-                crowded[folder.parent.relative_to(root).as_posix()] = len(modules)
-    assert set(crowded) <= {"tui/commands"}, crowded  # one module a subcommand

@@ -130,7 +130,10 @@ def _off_by_default(switch: Any) -> Any:
 
 def _options(parameters: Iterable[Any], ctx: Any) -> Rows:
     for each in parameters:
-        form, text = each.get_help_record(ctx)
+        record = each.get_help_record(ctx)
+        if record is None:  # a hidden option
+            continue
+        form, text = record
         if isinstance(each, TyperArgument):
             yield "Arguments", (" ".join(each.get_usage_pieces(ctx)), text)
         else:

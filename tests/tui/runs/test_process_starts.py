@@ -110,6 +110,23 @@ def test_the_installed_command_and_all_that_it_starts_run_none(record: Path) -> 
 
 
 @pytest.mark.long
+def test_what_ends_a_recording_at_its_condition_executes_none(record: Path) -> None:
+    with simulated(parse(demo_bench()), speed=8.0) as reachable:
+        Path("bench.toml").write_text(dump(reachable), encoding="utf-8")
+        command = Path(sys.executable).with_name("huddle")
+        done = subprocess.run(
+            [command, "record", "bench.toml", "--until", "90 %", "--out", "r.h5"],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=limit(),
+        )
+    assert done.returncode == 0, done.stderr
+    assert Path("r.h5").exists()
+    assert not record.exists()
+
+
+@pytest.mark.long
 def test_processes_of_an_archive_execute_none(record: Path, tmp_path: Path) -> None:
     begin = months.START_NS
     paths = [
@@ -135,7 +152,8 @@ def test_no_process_of_python_is_started_in_any_other_way() -> None:
     interpreters = [name for name, text in sources.items() if "sys.executable" in text]
     assert interpreters == [str(Path("daq", "python_process.py"))]
     assert not [name for name, text in sources.items() if OTHER_STARTS.search(text)]
-    # Each has its own test above: simulated devices, the recorder, archives, runs of a service.
+    # Each has its own test above: simulated devices, the recorder,
+    # what ends it, archives, runs of a service.
     starts = {name for name, text in sources.items() if STARTS.search(text)}
     users = {  # run what the bench file or --on-event says
         str(Path("tui", "commands", "tui_controls.py")),
@@ -144,6 +162,7 @@ def test_no_process_of_python_is_started_in_any_other_way() -> None:
     assert starts == users | {
         str(Path("daq", "archive", "execution.py")),
         str(Path("sim_devices", "server", "launch.py")),
+        str(Path("tui", "commands", "record.py")),
         str(Path("tui", "runs", "recorder_process.py")),
         str(Path("tui", "service", "processes", "steps.py")),
     }
