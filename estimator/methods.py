@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from estimator.errors import EstimatorError, UnknownMethodError
+from estimator.levels.pooled import pooled_noise, unresolved_blocks
 from estimator.likelihood.maximum_likelihood import maximum_likelihood
-from estimator.self_noise import uncertainty
+from estimator.self_noise.coherency import coherency
 from estimator.self_noise.result import Flag, SelfNoise
 from estimator.self_noise.three_channel import three_channel
 from estimator.self_noise.three_sensor import three_sensor
@@ -18,10 +19,14 @@ from estimator.self_noise.two_channel import two_channel
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from estimator.types import BoolArray, ComplexArray
+    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 __all__ = ["METHODS", "Flag", "Method", "SelfNoise", "self_noise"]
 
+
+AT_ZERO = 0.05
+"""Share of a block's bins at which the likelihood is largest at zero noise, from which neighbours
+count."""
 
 Method: TypeAlias = "Callable[..., SelfNoise]"
 """``method(csm, *, dims, n_effective, correct, **options)``."""
@@ -44,6 +49,8 @@ def self_noise(
     n_effective: float,
     correct: bool = True,
     real: BoolArray | None = None,
+    blocks: IntArray | None = None,
+    correlation: FloatArray | None = None,
     **options: Any,  # noqa: ANN401 - each method's own
 ) -> SelfNoise:
     """Return the self-noise PSD of every channel by a named method.
@@ -64,6 +71,13 @@ def self_noise(
     real : bool, shape (n_freqs,), optional
         Whether the spectra are real-valued, with twice the variance: at 0 Hz and at the Nyquist
         frequency (`estimator.spectra.welch.WelchSettings.real`). Default: nowhere.
+    blocks : int64, shape (n_freqs,), optional
+        Block of neighbours of every frequency (`estimator.levels.pooled.blocks_of`). With it,
+        `three-sensor` and `maximum-likelihood` take the directions of the motion from neighbours
+        where single frequencies do not resolve them; flag POOLED.
+    correlation : float64, shape (n_lags,), optional
+        Of the power of neighbouring frequencies (`estimator.levels.bands.bin_correlation`);
+        default: independent.
     **options
         Options of the method.
 
@@ -81,11 +95,99 @@ def self_noise(
     if method not in METHODS:
         raise UnknownMethodError(f"method {method!r}: expected one of {', '.join(METHODS)}")
     found = METHODS[method](csm, dims=dims, n_effective=n_effective, correct=correct, **options)
-    if real is None:
-        return found
-    real = np.asarray(real)
-    if real.shape != (len(csm),) or real.dtype != np.bool_:
+    is_real = np.zeros(len(csm), np.bool_) if real is None else np.asarray(real)
+    if is_real.shape != (len(csm),) or is_real.dtype != np.bool_:
         raise EstimatorError(
-            f"real of shape {real.shape} and type {real.dtype}, expected bool of ({len(csm)},)"
+            f"real of shape {is_real.shape} and type {is_real.dtype}, expected bool of"
+            f" ({len(csm)},)"
         )
-    return uncertainty.widened(found, real)
+    if blocks is not None and method in {"three-sensor", "maximum-likelihood"}:
+        found = _with_neighbours(
+            found,
+            csm,
+            np.where(is_real, -1, blocks),
+            _dimensions(options.get("n_factors"), dims, len(csm)),
+            dims=dims,
+            n_effective=n_effective,
+            correct=correct,
+            correlation=np.ones(1) if correlation is None else correlation,
+        )
+    if not is_real.any():
+        return found
+    # half the degrees of freedom: a Fourier coefficient of a real series has no imaginary part
+    scale = np.where(is_real, np.array([[2.0], [4.0], [8.0]]), 1.0)[:, :, None]
+    return SelfNoise.of(method, found.noise_psd, scale * found.cumulants, found.flags)
+
+
+def _dimensions(n_factors: int | IntArray | None, dims: tuple[int, ...], n_freqs: int) -> IntArray:
+    wanted = _shared(dims) if n_factors is None else n_factors
+    return np.broadcast_to(np.asarray(wanted, np.int64), (n_freqs,))
+
+
+def _shared(dims: tuple[int, ...]) -> int:
+    """Return the largest number of channels that three sensors have; 0 with fewer sensors."""
+    return sorted(dims)[-3] if len(dims) > 2 else 0
+
+
+def _with_neighbours(
+    found: SelfNoise,
+    csm: ComplexArray,
+    blocks: IntArray,
+    n_dims: IntArray,
+    *,
+    dims: tuple[int, ...],
+    n_effective: float,
+    correct: bool,
+    correlation: FloatArray,
+) -> SelfNoise:
+    """Return a result whose bins take the directions of the motion from neighbours where needed.
+
+    They do in blocks whose bins do not resolve all dimensions, and where the likelihood of a
+    channel is largest at zero noise at some. `blocks` is negative at bins that have no neighbours.
+    """
+    missing = Flag.DEAD_CHANNEL | Flag.DUPLICATE | Flag.NO_COUNTERPART
+    given = coherency(csm, dims)
+    good = given.valid & (blocks >= 0)
+    if not good.any():
+        return found
+    columns = np.flatnonzero(~((found.flags[good] & missing) != 0).any(axis=0))
+    sensor = np.repeat(np.arange(len(dims)), dims)
+    left = np.bincount(sensor[columns], minlength=len(dims))
+    live = tuple(int(n) for n in left if n)
+    usual = _shared(live)
+    fits = bool(usual) and max(live) == usual
+    rows = np.flatnonzero(good & (n_dims <= usual) & fits)
+    if not len(rows):
+        return found
+    matrix = given.matrix[rows[:, None, None], columns[:, None], columns]
+    share = found.noise_psd[rows[:, None], columns] / given.psd[rows[:, None], columns]
+    scatter = found.cumulants[0][rows[:, None], columns] / given.psd[rows[:, None], columns] ** 2
+    steps = [np.diff(each[rows], prepend=-1) != 0 for each in (blocks, n_dims)]
+    number = np.cumsum(steps[0] | steps[1]) - 1
+    unresolved = unresolved_blocks(
+        matrix, number, n_dims[rows], share, scatter, dims=live, n_effective=n_effective
+    )
+    at_zero = ((found.flags[rows] & (Flag.BOUNDARY | Flag.UNRESOLVED)) != 0).any(axis=1)
+    often = np.bincount(number, at_zero) > AT_ZERO * np.bincount(number)
+    wanted = (unresolved | often)[number]
+    if not wanted.any():
+        return found
+    pooled = pooled_noise(
+        matrix[wanted],
+        number[wanted],
+        n_dims[rows][wanted],
+        dims=live,
+        n_effective=n_effective,
+        correlation=correlation,
+    )
+    known = np.isfinite(pooled.noise).all(axis=1)
+    here = rows[wanted][known]
+    at = np.ix_(here, columns)
+    gain = 1.0 if correct else (1 - n_dims[here] / n_effective)[:, None]
+    noise, cumulants, flags = found.noise_psd.copy(), found.cumulants.copy(), found.flags.copy()
+    unit = given.psd[at] * gain
+    noise[at] = pooled.noise[known] * unit
+    for m in range(3):
+        cumulants[m][at] = pooled.cumulants[m, known] * unit ** (m + 2)
+    flags[at] = np.where(noise[at] <= 0, int(Flag.POOLED | Flag.NEGATIVE), int(Flag.POOLED))
+    return SelfNoise.of(found.method, noise, cumulants, flags)

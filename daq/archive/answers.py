@@ -19,7 +19,7 @@ from daq.archive.spectra_file import SpectraFile
 from daq.errors import ArchiveError
 from daq.results.band_summary import band_within, channel_means, judged_method
 from estimator.errors import BandError
-from estimator.self_noise.band_means import CERTAIN, NORMAL_95
+from estimator.levels.interval import CERTAIN, NORMAL_95
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.bench.units import canonical
+from daq.estimation.contributions import with_contributions
 from daq.estimation.diagnosis import Findings, bias_of_clocks, diagnosis
 from daq.estimation.equalisation import Equalisation
 from daq.estimation.noise_estimates import (
@@ -23,7 +24,6 @@ from daq.estimation.snapshot import ChannelLabel, Snapshot
 from daq.estimation.snapshot_diagnostics import (
     SnapshotDiagnostics,
     Synchronisation,
-    added,
 )
 from estimator.errors import InsufficientDataError
 from estimator.spectra.multiresolution import Band
@@ -145,22 +145,10 @@ class Estimator:
                 clipped=average.clipped,
                 stood_still=average.stood_still,
             ).added_to(diagnostics)
-        too_much = added(diagnostics, estimates.results)
-        too_little = np.nan_to_num(
-            0.0 if synchronisation.removed is None else synchronisation.removed
-        )
-        results = {
-            name: replace(
-                each,
-                low=each.low - (0.0 if too_much is None else too_much),
-                high=each.high + too_little,
-            )
-            for name, each in estimates.results.items()
-        }
-        return Snapshot(
+        snapshot = Snapshot(
             frequency=band.frequencies,
             csm=band.csm,
-            results=results,
+            results=estimates.results,
             refused=estimates.refused,
             channels=tuple(ChannelLabel(s, c.name, self.unit) for s, c in self.channels),
             dims=self.dims,
@@ -177,6 +165,7 @@ class Estimator:
             left_out={reason: average.left_out[reason] for reason in Reason},
             diagnostics=diagnostics,
         )
+        return with_contributions(snapshot)
 
 
 def _aligned(residual: Mapping[str, float]) -> set[tuple[str, str]]:

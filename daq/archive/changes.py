@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.special import stdtrit
 
-from estimator.self_noise.band_means import CERTAIN
+from estimator.levels.interval import CERTAIN
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -306,7 +306,6 @@ def diagnosis(
             statistic=_over(bands, [each.model.statistic for each in found]),
             degrees=_over(bands, [each.model.degrees for each in found]),
             p_value=_over(bands, [each.model.p_value for each in found]),
-            left_in=_over(bands, [each.left_in for each in found]),
         ),
     )
     tested = any(np.isfinite(band.test.p_value) for band in whole.bands)

@@ -10,6 +10,8 @@ import numpy as np
 from daq.bench.units import conversion
 from daq.errors import WrongSettingError
 from estimator.errors import InsufficientDataError
+from estimator.levels.bands import bin_correlation
+from estimator.levels.pooled import blocks_of
 from estimator.likelihood.dimension import BandDimension, choose_dimension
 from estimator.likelihood.goodness_of_fit import neighbour_correlation
 from estimator.likelihood.gradients import Gradients, noise_by_gradients, with_gradients
@@ -179,6 +181,13 @@ def known_positions(recording: ReadableRecording, channels: Channels) -> FloatAr
     return np.array(known) if len(known) == len(positions) else None
 
 
+def _power_correlation(band: Band) -> FloatArray:
+    """Return how the power of averages k bins apart is correlated, 1 at k = 0."""
+    return bin_correlation(
+        get_window(band.settings.window, band.settings.segment_length), band.settings.hop
+    )
+
+
 def neighbours(band: Band) -> FloatArray:
     """Return how averages at neighbouring frequencies of a band are correlated."""
     window = get_window(band.settings.window, band.settings.segment_length)
@@ -232,6 +241,8 @@ def noise_estimates(
                         n_effective=band.n_effective,
                         correct=settings.correct,
                         real=band.settings.real(band.frequencies),
+                        blocks=blocks_of(band.frequencies),
+                        correlation=_power_correlation(band),
                         **option,
                     )
                     for band, option in zip(bands, options, strict=True)
@@ -297,8 +308,9 @@ def _dimensions(
 def _joined(parts: Sequence[SelfNoise]) -> SelfNoise:
     if len(parts) == 1:
         return parts[0]
-    arrays = (
-        np.concatenate([getattr(part, name) for part in parts])
-        for name in ("noise_psd", "cov", "low", "high", "flags")
+    return SelfNoise.of(
+        parts[0].method,
+        np.concatenate([part.noise_psd for part in parts]),
+        np.concatenate([part.cumulants for part in parts], axis=1),
+        np.concatenate([part.flags for part in parts]),
     )
-    return SelfNoise(parts[0].method, *arrays)

@@ -9,10 +9,7 @@ import numpy as np
 
 from daq.estimation.snapshot_diagnostics import (
     SnapshotDiagnostics,
-    added,
-    added_besides_motion,
     added_by_clocks,
-    left_in,
 )
 from daq.recording.sensor_state import STATE_AFTER
 from estimator.errors import InsufficientDataError
@@ -238,25 +235,6 @@ class Snapshot:
         an estimate.
         """
         return added_by_clocks(self.diagnostics.synchronisation, self.results)
-
-    @property
-    def added(self) -> FloatArray | None:
-        """What may be in the noise PSD at most that is no noise, of all causes together.
-
-        Clocks, the edges of segments, and motion that few averages do not show. Shape and unit as
-        of `added_by_clocks`.
-        """
-        return added(self.diagnostics, self.results)
-
-    @property
-    def added_besides_motion(self) -> FloatArray | None:
-        """The same without that motion: of means whose method leaves none in."""
-        return added_besides_motion(self.diagnostics, self.results)
-
-    @property
-    def left_in(self) -> FloatArray | None:
-        """Motion that few averages may leave in the noise PSD at most, a part of `added`."""
-        return left_in(self.diagnostics, self.results)
 
     @property
     def removed(self) -> FloatArray | None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daq.alignment.sensor_reader import main_columns
+from daq.estimation.contributions import with_contributions
 from daq.estimation.diagnosis import (
     Findings,
     aligned_pairs,
@@ -41,7 +40,7 @@ from daq.estimation.snapshot import (
     SensorTotals,
     Snapshot,
 )
-from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics, added
+from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics
 from daq.estimation.throttle import Throttle
 from estimator.spectra.segment_rejection import Reason
 
@@ -55,7 +54,6 @@ if TYPE_CHECKING:
     from daq.recording.interface import ReadableRecording
     from estimator.self_noise.result import SelfNoise
     from estimator.spectra.multiresolution import Band
-    from estimator.types import FloatArray
 
 _RECHOICE = 2.0  # growth after which the dimension is chosen again: 5 s with 15 channels
 _SEGMENTS_MISSED = 3  # complete, and none that counts: a reason is given
@@ -150,21 +148,10 @@ class SnapshotBuilder:
                 self._findings = self._diagnose(recordings, passes, raw, bands, estimates)
         if self._findings.fits(frequency):
             diagnostics = self._findings.added_to(diagnostics)
-        too_much = added(diagnostics, estimates.results)
-        too_little = diagnostics.synchronisation.removed
-        gaps = _bridged(passes, estimates.results)
-        found = diagnostics.diagnosis
-        steady = None if found is None else found.stability
-        factor = 1.0 if steady is None else math.sqrt(steady.inflation)
-        return Snapshot(
+        snapshot = Snapshot(
             frequency=frequency,
             csm=csm,
-            results={
-                name: _widened(
-                    each, factor=factor, too_much=too_much, too_little=too_little, gaps=gaps
-                )
-                for name, each in estimates.results.items()
-            },
+            results=estimates.results,
             refused=estimates.refused,
             channels=tuple(
                 ChannelLabel(sensor, channel.name, self._unit) for sensor, channel in channels
@@ -184,7 +171,7 @@ class SnapshotBuilder:
             octaves=tuple(map(Octave.of, bands)) if self._settings.octaves else (),
             diagnostics=diagnostics,
             no_segment=_no_segment(passes, self._settings.segment),
-            bridged=gaps,
+            bridged=_bridged(passes, estimates.results),
             not_estimated=left,
             quantisation_psd=(
                 quantisation_psd(frequency, channels, self._unit, _counting_rates(latest))
@@ -192,6 +179,7 @@ class SnapshotBuilder:
                 else None
             ),
         )
+        return with_contributions(snapshot)
 
     def _diagnose(
         self,
@@ -275,42 +263,6 @@ def _bridged(passes: Sequence[Pass], results: Mapping[str, SelfNoise]) -> Bridge
         lost=float(np.average([each.lost for each in leakages], weights=counts)),
         leakage=np.einsum("r,rfc->fc", counts / total, biases),
     )
-
-
-def _widened(
-    result: SelfNoise,
-    *,
-    factor: float,
-    too_much: FloatArray | None,
-    too_little: FloatArray | None,
-    gaps: Bridged | None,
-) -> SelfNoise:
-    """Return an estimate whose intervals include what its method does not know.
-
-    Parameters
-    ----------
-    result : SelfNoise
-    factor : float
-        Standard error over that for steady noise.
-    too_much, too_little : float64, shape (n_freqs, n_channels), optional
-        What the clocks may have added, and taken away, unit**2/Hz.
-    gaps : Bridged, optional
-        What segments with gaps bring in.
-    """
-    psd, low, high = result.noise_psd, result.low, result.high
-    if factor > 1:
-        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            in_log = (low > 0) & (psd > 0)
-            low = np.where(in_log, psd * (low / psd) ** factor, psd - factor * (psd - low))
-            high = np.where(in_log, psd * (high / psd) ** factor, psd + factor * (high - psd))
-    if too_much is not None:
-        low = low - too_much
-    if too_little is not None:
-        high = high + np.nan_to_num(too_little)
-    if gaps is not None:
-        low = low - np.clip(np.nan_to_num(gaps.leakage), 0.0, 1.0) * np.abs(psd)
-        high = high + np.clip(np.nan_to_num(-gaps.leakage), 0.0, 1.0) * np.abs(psd)
-    return replace(result, cov=factor * result.cov, low=low, high=high)
 
 
 def _not_estimated(recording: ReadableRecording, channels: Channels) -> tuple[str, ...]:

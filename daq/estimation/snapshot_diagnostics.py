@@ -119,8 +119,6 @@ class FrequencyDiagnosis:
     snr : float64, shape (n_freqs, n_channels)
     statistic, degrees, p_value : float64, shape (n_freqs,)
         Of the model test: `estimator.likelihood.goodness_of_fit.ModelTest`.
-    left_in : float64, shape (n_freqs, n_channels), or None
-        Motion that may be left in the noise PSD at most, in unit**2/Hz; NaN where nothing is known.
     """
 
     coherence: FloatArray
@@ -130,7 +128,6 @@ class FrequencyDiagnosis:
     statistic: FloatArray
     degrees: FloatArray
     p_value: FloatArray
-    left_in: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,40 +195,3 @@ class SnapshotDiagnostics:
     def advice(self) -> tuple[Advice, ...]:
         """Advice on the test; none before it is diagnosed."""
         return () if self.diagnosis is None else self.diagnosis.advice
-
-
-def left_in(
-    diagnostics: SnapshotDiagnostics, results: Mapping[str, SelfNoise]
-) -> FloatArray | None:
-    """Return the motion that few averages may leave in the noise PSD at most; None if not known.
-
-    Shape (n_freqs, n_channels), in unit**2/Hz: no more than the noise itself. Two-channel estimates
-    have none.
-    """
-    method, noise = next(iter(results.items()), ("two-channel", None))
-    found = None if diagnostics.diagnosis is None else diagnostics.diagnosis.per_frequency.left_in
-    if found is None or noise is None or method == "two-channel":
-        return None
-    psd = np.abs(noise.noise_psd)
-    return np.where(np.isfinite(found) & np.isfinite(psd), np.fmin(found, psd), 0.0)
-
-
-def added(diagnostics: SnapshotDiagnostics, results: Mapping[str, SelfNoise]) -> FloatArray | None:
-    """Return `Snapshot.added`."""
-    others, motion = added_besides_motion(diagnostics, results), left_in(diagnostics, results)
-    if others is None or motion is None:
-        return motion if others is None else others
-    psd = np.abs(next(iter(results.values())).noise_psd)
-    return np.minimum(others + motion, np.where(np.isfinite(psd), psd, 0.0))
-
-
-def added_besides_motion(
-    diagnostics: SnapshotDiagnostics, results: Mapping[str, SelfNoise]
-) -> FloatArray | None:
-    """Return what clocks and the edges of segments may have added at most, as `Snapshot.added`."""
-    clocks, edges = added_by_clocks(diagnostics.synchronisation, results), diagnostics.edge_leakage
-    if edges is None or not results:
-        return clocks
-    psd = np.abs(next(iter(results.values())).noise_psd)
-    known = np.where(np.isfinite(psd), psd, 0.0)
-    return np.minimum(edges.most + (0.0 if clocks is None else clocks), known)

@@ -13,7 +13,7 @@ from daq.timing.clock_model import RelativeTime
 if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
-    from estimator.self_noise.band_means import FloatArray
+    from estimator.types import FloatArray
 
 NO_EFFECT, NEGLIGIBLE_EFFECT, SMALL_EFFECT = 0.001, 0.01, 0.05
 """Share of the noise that comes from the clocks: below it nothing, negligible, small."""

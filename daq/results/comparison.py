@@ -12,7 +12,7 @@ from daq.results.band_summary import band_of, channel_means
 if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
-    from estimator.self_noise.band_means import BandMeans
+    from daq.results.band_summary import BandMeans
 
 
 @dataclass(frozen=True, slots=True)

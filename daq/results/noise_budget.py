@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.estimation.snapshot_diagnostics import CLOCK_FACTOR, SnapshotDiagnostics
-from daq.results.band_summary import channel_means, judged_method
-from daq.results.clock_effect import effect
+from daq.results.band_summary import judged_method, levels
 from daq.results.uncertainty_budget import Budget, Component
-from estimator.diagnostics.advice import ModelMisfit
-from estimator.self_noise.band_means import NORMAL_95
+from estimator.levels.bands import band_edges
+from estimator.levels.interval import NORMAL_95
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import ChannelLabel, Snapshot
+    from estimator.levels.contributions import Contribution
 
 _RECTANGULAR = math.sqrt(3.0)
 
@@ -62,40 +60,24 @@ def noise_budgets(
         return [], []
     low, high = band
     inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
-    misfit = max(
-        (
-            each.error
-            for each in snapshot.diagnostics.advice
-            if isinstance(each, ModelMisfit)
-            and (each.band is None or (each.band[0] <= high and each.band[1] >= low))
-        ),
-        default=0.0,
-    )
-    clocks = effect(snapshot, settings)
-    edges = snapshot.diagnostics.edge_leakage
-    means = channel_means(found, snapshot, settings, band)
-    # without what has lines of its own
-    scatter = SnapshotDiagnostics(dimensions=snapshot.diagnostics.dimensions)
-    plain_means = channel_means(found, replace(snapshot, diagnostics=scatter), settings, band)
+    whole = levels(found, snapshot, settings, band_edges(snapshot.frequency, band))
+    ends = whole.of_scatter.interval()
     budgets: list[Budget] = []
     unknown: list[ChannelLabel] = []
-    every = zip(snapshot.channels, means, plain_means, strict=True)
-    for column, (label, mean, plain) in enumerate(every):
+    for column, label in enumerate(snapshot.channels):
         if column not in calibrated:
             continue
         ratio, uncertainty = calibrated[column]
-        value = float(mean.mean[0])
+        value = float(whole.mean[0, column])
         if not value > 0:
             unknown.append(label)
             continue
-        # the interval includes errors that averaging over the band does not reduce
-        half = known(float(plain.high[0] - plain.low[0]) / 2 / NORMAL_95)
-        late, left = (
-            0.0 if psd is None else known(float(np.mean(psd[inside, column]))) / value
-            for psd in (snapshot.removed, snapshot.left_in)
+        half = known(float(ends[1][0, column] - ends[0][0, column]) / 2 / NORMAL_95)
+        spread = float(whole.of_scatter.spread[0, column])
+        others = tuple(
+            Component(each.source, "B", "rectangular", _half_width(each, column, value))
+            for each in whole.contributions
         )
-        late = max(known(float(clocks[column])), late / CLOCK_FACTOR)
-        leaks = 0.0 if edges is None else float(np.mean(edges.most[inside, column])) / value
         counting = 0.0
         if snapshot.quantisation_psd is not None:
             psd = snapshot.quantisation_psd[inside, column]
@@ -105,14 +87,11 @@ def noise_budgets(
                 "estimate",
                 "A",
                 "normal",
-                max(float(mean.spread[0]), half) / value,
+                max(spread, half) / value,
                 2 * max(averages, 1.0) * max(int(inside.sum()) / 2, 1.0),
             ),
             Component("sensitivity", "B", "normal", 2 * uncertainty),
-            Component("clocks", "B", "rectangular", late / _RECTANGULAR),
-            Component("motion", "B", "rectangular", left / _RECTANGULAR),
-            Component("leakage", "B", "rectangular", leaks / _RECTANGULAR),
-            Component("incoherence", "B", "rectangular", misfit / _RECTANGULAR),
+            *others,
             Component("quantisation", "B", "rectangular", counting / _RECTANGULAR),
         )
         budgets.append(
@@ -129,6 +108,12 @@ def noise_budgets(
             )
         )
     return budgets, unknown
+
+
+def _half_width(each: Contribution, column: int, value: float) -> float:
+    """Return the standard uncertainty of a contribution that is within its larger side."""
+    side = max(float(each.below[0, column]), float(each.above[0, column]))
+    return (side / value + float(each.share[0, column])) / _RECTANGULAR
 
 
 def known(value: float) -> float:

@@ -12,9 +12,9 @@ import numpy as np
 from daq.bench.units import canonical, conversion
 from daq.results.band_summary import band_of, correlation_of, judged_method
 from estimator.errors import InsufficientDataError
+from estimator.levels.bands import band_edges, band_levels
 from estimator.noise_parameters.allan import AllanDeviation, allan_deviation
 from estimator.noise_parameters.fit import NoiseParameters, fit
-from estimator.self_noise.band_means import band_edges, band_means
 
 if TYPE_CHECKING:
     from daq.bench.model import Bench, DataSheet
@@ -141,7 +141,11 @@ def noise_parameters(
                 *shares[column],
                 ()
                 if sheet is None
-                else tuple(_compared(sheet, label, frequency, (psd, cov), correlation)),
+                else tuple(
+                    _compared(
+                        sheet, label, frequency, (psd, noise.cumulants[:, :, column]), correlation
+                    )
+                ),
             )
         )
     return tuple(found)
@@ -189,7 +193,9 @@ def _compared(
 ) -> list[Comparison]:
     unit = canonical(sheet.unit or label.unit)
     with np.errstate(divide="ignore", invalid="ignore"):
-        psd = estimate[0] * np.abs(conversion(label.unit, unit, frequency)) ** 2
+        factor = np.abs(conversion(label.unit, unit, frequency)) ** 2
+        psd = estimate[0] * factor
+        scatter = (estimate[1] * np.stack([factor**k for k in (2, 3, 4)]))[:, :, None]
 
     def mean(low: float, high: float) -> tuple[float, float, float]:
         edges = np.searchsorted(frequency, (low, high), side="left")
@@ -198,8 +204,10 @@ def _compared(
             return math.nan, math.nan, math.nan
         if not np.isfinite(psd[edges[0] : edges[1]]).all():
             return math.nan, math.nan, math.nan
-        found = band_means(psd, estimate[1], edges, correlation, weights=np.gradient(frequency))
-        return float(found.mean[0]), float(found.low[0]), float(found.high[0])
+        width = np.gradient(frequency)
+        found = band_levels(psd[:, None], scatter, edges, correlation, weights=width)
+        ends = found.interval()
+        return float(found.mean[0, 0]), float(ends[0][0, 0]), float(ends[1][0, 0])
 
     rows = []
     for at, stated in sheet.noise_density:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.results.band_summary import band_of, judged_method
-from estimator.self_noise.band_means import median_of_columns
+from estimator.median import median_of_columns
 
 if TYPE_CHECKING:
     from daq.estimation.settings import Settings

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from daq.recording.reader import Recording
     from daq.results.decision.verdict import TestVerdict
-    from estimator.self_noise.band_means import FloatArray
+    from estimator.types import FloatArray
 
 
 def store_results(path: str | Path, snapshot: Snapshot, verdict: TestVerdict | None = None) -> None:

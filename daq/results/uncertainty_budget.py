@@ -16,8 +16,8 @@ class Component:
     Attributes
     ----------
     source : str
-        "estimate", "variation", "clocks", "leakage", "quantisation", "certificate",
-        "sensitivity", "incoherence" or "motion".
+        "estimate", "variation", "quantisation", "certificate", "sensitivity", or a cause of
+        `estimator.levels.contributions.Source`.
     kind : str
         "A" (from the scatter of these data) or "B" (from elsewhere).
     distribution : str

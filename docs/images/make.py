@@ -24,9 +24,9 @@ from daq.estimation.settings import Settings
 from daq.formats.importer import import_files
 from daq.python_process import python_command
 from daq.recording.reader import Recording
-from daq.results.band_summary import correlation_of
+from daq.results.band_summary import levels
 from daq.results.sources import sources
-from estimator.self_noise.band_means import band_means, log_edges
+from estimator.levels.bands import log_edges
 from tui.application.app import HuddleApp
 from tui.commands.tui_controls import RecordingControls
 from tui.report.contents import report_of
@@ -119,7 +119,7 @@ def real_recording(folder: Path) -> None:
     import_files(sorted(DATA.glob("*.mseed")), recording, response=DATA / "T-compact_Q330HR_BH_40")
     settings = Settings(segment=409.6, detrend="none", methods=METHODS, unit="m/s²")
     snapshot = estimate([recording], settings)
-    frequency, correlation = snapshot.frequency, correlation_of(settings)
+    frequency = snapshot.frequency
     edges = log_edges(frequency, 220)
     edges = edges[frequency[edges] <= 16.0]
     centre = np.sqrt(frequency[edges[:-1]] * frequency[edges[1:] - 1])
@@ -133,7 +133,7 @@ def real_recording(folder: Path) -> None:
         axis.plot(centre, 10 * np.log10(data / np.diff(edges)), color="0.6", label="data")
         for method, colour in zip(METHODS, ("#0a7ea4", "#e07b39"), strict=True):
             noise = snapshot.results[method]
-            mean = band_means(noise.noise_psd[:, column], noise.cov[:, column], edges, correlation)
+            mean = levels(noise, snapshot, settings, edges).of_channel(column)
             with np.errstate(invalid="ignore", divide="ignore"):
                 level, low, high = (10 * np.log10(v) for v in (mean.mean, mean.low, mean.high))
             axis.fill_between(centre, low, high, color=colour, alpha=0.25, lw=0)

@@ -248,28 +248,6 @@ class WeakMotion(Advice):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MotionLeftIn(Advice):
-    """The averages are too few to remove weak motion from the estimate.
-
-    Attributes
-    ----------
-    share : float
-        Maximum motion left in three-sensor and three-channel estimates, as a fraction of the
-        noise; of `channels`, as a fraction of the estimate.
-    n_effective : float
-        Number of independent averages.
-    channels : tuple of int
-        Channels of which more may be left in than among sensors of like noise; empty where it is
-        about all channels.
-    """
-
-    kind: ClassVar[AdviceKind] = AdviceKind.MOTION_LEFT_IN
-    share: float
-    n_effective: float
-    channels: tuple[int, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SwappedChannels(Advice):
     """Two channels of the second of `sensors` are swapped.
 

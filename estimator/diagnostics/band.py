@@ -35,9 +35,6 @@ class BandDiagnosis:
         Share of the motion that two sensors have in common, from
         `estimator.diagnostics.shared_motion`; NaN for sensors without signal.
     n_frequencies : int
-    left_in : float64, shape (n_channels,)
-        Motion that may be left in the noise of quiet sensors' channels at most, as a share of the
-        estimate; zero for the others.
     """
 
     low: float
@@ -50,4 +47,3 @@ class BandDiagnosis:
     test: BandTest
     shared: FloatArray
     n_frequencies: int
-    left_in: FloatArray

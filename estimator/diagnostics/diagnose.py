@@ -41,7 +41,7 @@ from estimator.likelihood.goodness_of_fit import (
     pool,
 )
 from estimator.likelihood.maximum_likelihood import standard_error
-from estimator.self_noise.band_means import median_of_columns
+from estimator.median import median_of_columns
 from estimator.self_noise.coherency import (
     check_averages,
     check_dims,
@@ -50,7 +50,6 @@ from estimator.self_noise.coherency import (
     testable,
 )
 from estimator.self_noise.live_channels import Presence, presence
-from estimator.self_noise.motion_left_in import motion_left_in, share_of, unpredicted
 
 if TYPE_CHECKING:
     from estimator.diagnostics.advice import Advice
@@ -95,9 +94,6 @@ class Diagnostics:
         Relative responses of the comparable pairs: sensors with all their channels.
     advice : tuple of Advice
         Most severe first.
-    left_in : float64, shape (n_freqs, n_channels)
-        Motion that may be left in the noise estimate at most, in unit**2/Hz:
-        `estimator.self_noise.motion_left_in`.
     stability : Stability or None
         None without segments, or with too few.
     """
@@ -114,7 +110,6 @@ class Diagnostics:
     bands: tuple[BandDiagnosis, ...]
     responses: tuple[RelativeResponse, ...]
     advice: tuple[Advice, ...]
-    left_in: FloatArray
     stability: Stability | None = None
 
 
@@ -189,9 +184,6 @@ def diagnose(
     tested = fit if q == d else _fit(matrix, there, q, n_effective)
     model, untested = _test(tested, there, n_effective, len(csm))
     snr, lost = np.full((2, len(csm), sum(dims)), np.nan)
-    rest = there.spread(unpredicted(part.matrix, n_effective), sum(dims)) * given.psd
-    third = np.where(frequency > 0, bands(frequency), -1)
-    left_in = motion_left_in(given, third, dims=dims, n_effective=n_effective)
     if isinstance(fit, Maximum):
         error = standard_error(fit, n_effective=n_effective)
         snr = there.spread(np.where(error < fit.psi, 1 / fit.psi - 1, np.nan), sum(dims))
@@ -213,7 +205,6 @@ def diagnose(
             test=pool(model, inside, neighbours=neighbours),
             shared=_shared(canonical, there, len(dims), inside=inside, n_effective=n_effective),
             n_frequencies=int(inside.sum()),
-            left_in=share_of(left_in[inside], rest[inside], dims=dims),
         )
         for inside in insides
     )
@@ -271,7 +262,6 @@ def diagnose(
                 else tuple(changes(steady, course.times, np.repeat(np.arange(len(dims)), dims)))
             ),
         ),
-        left_in=left_in,
         stability=steady,
     )
 

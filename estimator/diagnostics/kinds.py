@@ -47,7 +47,6 @@ class AdviceKind(enum.StrEnum):
     """The cross-spectral matrix between two sensors is nearly singular."""
     WEAK_MOTION = "weak-motion"
     """The motion is weaker than the noise in every channel."""
-    MOTION_LEFT_IN = "motion-left-in"
     """The averages are too few to remove weak motion from the estimate."""
     SWAPPED_CHANNELS = "swapped-channels"
     """Two channels of a sensor are swapped."""

@@ -25,7 +25,6 @@ from estimator.diagnostics.advice import (
     MissingDimension,
     ModelMisfit,
     MotionAcross,
-    MotionLeftIn,
     NearlySingular,
     NoSharedMotion,
     NoSignal,
@@ -39,7 +38,6 @@ from estimator.diagnostics.orientation import orientation
 from estimator.diagnostics.shared_motion import outsiders
 from estimator.likelihood.goodness_of_fit import less, rejected_below
 from estimator.self_noise.live_channels import presence
-from estimator.self_noise.motion_left_in import among_like_sensors
 from estimator.self_noise.result import Flag
 
 if TYPE_CHECKING:
@@ -49,16 +47,13 @@ if TYPE_CHECKING:
     from estimator.diagnostics.relative_response import RelativeResponse
     from estimator.diagnostics.shared_noise import SharedPairs
     from estimator.self_noise.coherency import Coherency
-    from estimator.types import BoolArray, FloatArray
+    from estimator.types import FloatArray
 
 TYPICAL = 10.0
 CROSSING = 20.0
 CROSSING_THREE = 100.0
 LARGE_ERROR = 0.5
 """Error, as a fraction of the noise, from which an estimate is wrong."""
-QUIET_ERROR = 0.25
-"""Share of motion in a channel's estimate from which it is advised: more than few averages leave
-in the noise of like sensors."""
 SMALL_ERROR = 0.05
 """Error, as a fraction of the noise, below which it is harmless."""
 
@@ -117,7 +112,6 @@ def advise(
         *_sensor_space(bands, dims),
         *_dimensions(bands, alive, n_effective),
         *_weak_motion(bands),
-        *_left_in(bands, dims, n_effective),
     ]
     found = [
         *_absent(given, dims),
@@ -186,13 +180,8 @@ def _span(run: list[BandDiagnosis]) -> tuple[float, float]:
 def _is_weak(band: BandDiagnosis) -> bool:
     """Return whether the motion is weaker than the noise in every channel."""
     known = band.snr[~np.isnan(band.snr)]
-    is_known = len(known) > 0 and not band.noise_lost.any() and not _may_have_motion(band).any()
+    is_known = len(known) > 0 and not band.noise_lost.any()
     return is_known and bool(known.max() < 1)
-
-
-def _may_have_motion(band: BandDiagnosis) -> BoolArray:
-    """Return of which channels' noise a large part may be motion, shape (n_channels,)."""
-    return np.asarray(band.left_in >= QUIET_ERROR)
 
 
 def _absent(given: Coherency, dims: tuple[int, ...]) -> Iterator[Advice]:
@@ -348,7 +337,7 @@ def _dimensions(
     full = min(sorted(dims)[-2:])
 
     def is_missing(band: BandDiagnosis) -> bool:
-        hidden = _is_weak(band) or _may_have_motion(band).any()
+        hidden = _is_weak(band)
         return band.dimension < full and not hidden
 
     for run in _runs(bands, is_missing):
@@ -370,29 +359,3 @@ def _weak_motion(bands: tuple[BandDiagnosis, ...]) -> Iterator[Advice]:
     for run in _runs(bands, _is_weak):
         snr = float(np.nanmax([b.snr for b in run]))
         yield WeakMotion(level=Level.NOTE, band=_span(run), snr=snr)
-
-
-def _left_in(
-    bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...], n_effective: float
-) -> Iterator[Advice]:
-    """Yield advice on motion in quiet sensors' noise, and on weak motion (with wild SNRs)."""
-    share = among_like_sensors(max(dims), n_effective)
-    most = max(share, QUIET_ERROR)
-    sensor_of = np.repeat(np.arange(len(dims)), dims)
-    for run in _runs(bands, lambda band: bool((band.left_in > most).any())):
-        largest = np.max([band.left_in for band in run], axis=0)
-        channels = np.flatnonzero(largest > most)
-        yield MotionLeftIn(
-            level=Level.WARNING,
-            sensors=tuple(np.unique(sensor_of[channels]).tolist()),
-            band=_span(run),
-            share=float(largest.max()),
-            n_effective=float(n_effective),
-            channels=tuple(channels.tolist()),
-        )
-    if share < SMALL_ERROR:
-        return
-    for run in _runs(bands, lambda b: bool((b.snr < 1).sum() > np.isfinite(b.snr).sum() / 2)):
-        yield MotionLeftIn(
-            level=Level.NOTE, band=_span(run), share=share, n_effective=float(n_effective)
-        )

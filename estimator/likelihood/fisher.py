@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.errors import InvalidMatrixError
-from estimator.self_noise.coherency import check_averages
+from estimator.self_noise.coherency import blocks, check_averages
 
 if TYPE_CHECKING:
     from estimator.likelihood.factor_analysis import Maximum
@@ -137,37 +137,40 @@ def efficiency(cov: FloatArray, bound: FloatArray) -> FloatArray:
     return np.asarray((bound / cov) ** 2)
 
 
-def interval(
-    noise_psd: FloatArray, standard_error: FloatArray, *, level: float = 0.95
-) -> tuple[FloatArray, FloatArray]:
-    """Return the confidence interval of a noise PSD, symmetric in its logarithm.
+def cumulants(maximum: Maximum, *, n_effective: float) -> FloatArray:
+    """Return the cumulants of psi, for `estimator.levels.interval.interval`.
 
     Parameters
     ----------
-    noise_psd : float64
-        Unbiased estimate, not negative, unit**2/Hz.
-    standard_error : float64, same shape
-        unit**2/Hz.
-    level : float
-        Probability that the interval contains the true value.
+    maximum : Maximum
+    n_effective : float
+        Number of independent averages.
 
     Returns
     -------
-    low, high : float64, same shape
-        ``noise_psd * exp(-/+ z c)`` with ``c = standard_error / noise_psd``. Above c = 1 / z the
-        lower end is 0: the estimate may be nothing but the scatter of other sensors. Above c = 1
-        the upper end is linear instead of exponential in c, so that it is finite for an estimate
-        of zero.
-    """
-    from scipy import special  # noqa: PLC0415 - takes a quarter of a second to import
+    float64, shape (3, n_freqs, n_channels)
+        In the powers of the unit of psi; NaN where the noise cannot be identified.
 
-    z = float(special.ndtri((1 + level) / 2))
-    positive = np.where(noise_psd > 0, noise_psd, 1.0)
-    c = np.where(noise_psd > 0, standard_error / positive, np.inf)
-    low = np.where(z * c < 1, noise_psd * np.exp(-z * c), 0.0)
-    high = np.maximum(noise_psd, standard_error) * np.exp(z * np.minimum(c, 1.0))
-    unknown = ~np.isfinite(standard_error)
-    return np.where(unknown, np.nan, low), np.where(unknown, np.nan, high)
+    Notes
+    -----
+    psi_i is, to first order, ``tr(K_i W)`` of the residual matrix W, a Wishart matrix of unit
+    covariance with n - q averages: ``K_i = sum_j inv(J)_ij b_j b_j*``, where b_j is channel j in
+    the basis of the space without motion. Without a penalty ``tr(K_i**2) = inv(J)_ii``.
+    """
+    found = np.empty((3, *maximum.psi.shape))
+    for some in blocks(*maximum.psi.shape):
+        free = maximum.eigenvectors[some, :, maximum.n_factors :]
+        inverse = covariance(information(free) + maximum.penalty)
+        n, p, m = free.shape
+        outer = free.conj()[:, :, :, None] * free[:, :, None, :]
+        K = (inverse @ outer.reshape(n, p, m * m)).reshape(n, p, m, m)
+        K2 = K @ K
+        found[0, some] = np.einsum("nimm->ni", K2).real
+        found[1, some] = np.einsum("niml,nilm->ni", K, K2).real
+        found[2, some] = np.einsum("niml,nilm->ni", K2, K2).real
+    averages = n_effective - maximum.n_factors
+    powers = [maximum.psi ** (m + 2) / averages ** (m + 1) for m in range(3)]
+    return np.asarray(found * np.stack(powers))
 
 
 def spiked_eigenvalues(sample: FloatArray, n_residual: int, n_effective: float) -> FloatArray:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.likelihood import fisher
+from estimator.levels.interval import like_psd
 from estimator.likelihood.dimension import (
     MAX_BINS,
     MIN_BINS,
@@ -213,14 +213,12 @@ def noise_by_gradients(
         csm[used], gradients.loadings[used], expected, kind=kind, n_effective=n_effective
     )
     error = np.hypot(fit.standard_error(n_effective), gradients.misfit[used, None] * fit.psi)
-    noise_psd, cov, low, high = (
-        each.copy() for each in (found.noise_psd, found.cov, found.low, found.high)
-    )
+    noise_psd, scatter = found.noise_psd.copy(), found.cumulants.copy()
     flags = found.flags.copy()
-    noise_psd[used], cov[used] = fit.psi, error / fit.psi
-    low[used], high[used] = fisher.interval(fit.psi, error)
+    noise_psd[used] = fit.psi
+    scatter[:, used] = like_psd(fit.psi, error)
     flags[used] = np.where(fit.converged, 0, Flag.NOT_CONVERGED)[:, None]
-    return SelfNoise(found.method, noise_psd, cov, low, high, flags)
+    return SelfNoise.of(found.method, noise_psd, scatter, flags)
 
 
 def _is_usual(choice: BandDimension) -> bool:

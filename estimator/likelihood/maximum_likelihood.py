@@ -63,9 +63,9 @@ def maximum_likelihood(
     -------
     SelfNoise
         ``cov`` is the Cramér-Rao bound at the estimate, for ``n_effective - n_factors`` averages,
-        plus the effect of an uncertain number of factors; the interval is symmetric in the
-        logarithm (`fisher.interval`). A channel whose likelihood increases towards zero noise has
-        the estimate 0, no c.o.v., an upper end of the interval, and the flag BOUNDARY.
+        plus the effect of an uncertain number of factors. A channel whose likelihood increases
+        towards zero noise has the estimate 0, an infinite c.o.v., an interval, and the flag
+        BOUNDARY.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def maximum_likelihood(
     lone &= given.flags == 0
     shared = factors - lone.sum(axis=1)  # without dimensions that only one channel measures
     kind = kinds(given, dims)
-    noise_psd, cov, low, high = (np.full((n_freqs, p), np.nan) for _ in range(4))
+    noise_psd, scatter = np.full((n_freqs, p), np.nan), np.full((3, n_freqs, p), np.nan)
     flags = given.flags.copy()
     flags[few] |= np.where(absent[few], 0, Flag.NO_COUNTERPART)
     for q in np.unique(factors[~few]):  # ascending: usual fits come first, and give the prior
@@ -134,11 +134,11 @@ def maximum_likelihood(
         for some, fit, error in fits:
             here = rows[some]
             good = given.flags[here] == 0
-            psi = np.where(fit.boundary, 0.0, fit.psi)
-            cov[here] = np.where(fit.boundary, np.nan, error / fit.psi)
-            gain = small_sample_correction(fit, n_effective=n_effective) if correct else 1.0
-            noise_psd[here] = psi * gain
-            low[here], high[here] = fisher.interval(noise_psd[here], error * gain)
+            gain = np.ones(fit.psi.shape)
+            if correct:
+                gain = small_sample_correction(fit, n_effective=n_effective)
+            noise_psd[here] = np.where(fit.boundary, 0.0, fit.psi) * gain
+            scatter[:, here] = _cumulants(fit, error, gain, n_effective=n_effective)
             flags[here] |= np.where(fit.boundary, Flag.BOUNDARY, 0)
             missed = good & (fit.n_factors < shared[here, None])
             flags[here] |= np.where(missed, Flag.UNRESOLVED, 0)
@@ -148,11 +148,10 @@ def maximum_likelihood(
             flags[here] |= np.where(lost, Flag.NOT_CONVERGED, 0)[:, None]
     flags[lone] = Flag.NO_COUNTERPART
     unknown = (given.flags | (flags & (Flag.SINGULAR | Flag.NO_COUNTERPART))) != 0
-    for result in (noise_psd, cov, low, high):
-        result[unknown] = np.nan
-    return SelfNoise(
-        "maximum-likelihood", noise_psd * given.psd, cov, low * given.psd, high * given.psd, flags
-    )
+    noise_psd[unknown] = np.nan
+    scatter[:, unknown] = np.nan
+    powers = np.stack([given.psd**m for m in (2, 3, 4)])
+    return SelfNoise.of("maximum-likelihood", noise_psd * given.psd, scatter * powers, flags)
 
 
 def _usual(
@@ -199,6 +198,15 @@ def _expecting(
         fit,
         np.hypot(np.maximum(error, beyond), fit.psi - wider.psi),
     )
+
+
+def _cumulants(
+    fit: Maximum, error: FloatArray, gain: FloatArray, *, n_effective: float
+) -> FloatArray:
+    """Return the cumulants of ``gain * psi`` with the standard error that includes all factors."""
+    found = fisher.cumulants(fit, n_effective=n_effective)
+    found[0] = error**2
+    return np.asarray(found * np.stack([gain**m for m in (2, 3, 4)]))
 
 
 def _without_dead_and_copies(given: Coherency) -> tuple[ComplexArray, BoolArray]:

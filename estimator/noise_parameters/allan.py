@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimator.levels.interval import CERTAIN, NORMAL_95
 from estimator.noise_parameters.fit import resolution, scatter, terms_at, usable
-from estimator.self_noise.band_means import CERTAIN, NORMAL_95
 
 if TYPE_CHECKING:
     from estimator.noise_parameters.fit import NoiseParameters

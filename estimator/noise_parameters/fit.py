@@ -145,7 +145,7 @@ def fit(
         (`estimator.self_noise.result.SelfNoise`); NaN if unknown.
     correlation : float64, shape (n_lags,)
         Correlation of neighbouring frequencies, from
-        `estimator.self_noise.band_means.bin_correlation`.
+        `estimator.levels.bands.bin_correlation`.
     band : tuple of float, optional
         Hz. Default: from four times the resolution, below which the window smears the terms, up to
         the highest frequency, excluded.

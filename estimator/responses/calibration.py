@@ -252,7 +252,7 @@ def calibrate_sensor(
         Hz.
     correlation : float64, shape (n_lags,)
         Correlation of neighbouring frequencies, from
-        `estimator.self_noise.band_means.bin_correlation`.
+        `estimator.levels.bands.bin_correlation`.
 
     Raises
     ------

@@ -208,7 +208,7 @@ def testable(given: Coherency, frequency: FloatArray) -> ComplexArray:
 
 
 def from_parts(
-    method: str, given: Coherency, parts: tuple[FloatArray, ...], flags: IntArray
+    method: str, given: Coherency, noise: FloatArray, cumulants: FloatArray, flags: IntArray
 ) -> SelfNoise:
     """Return a method's result for the coherency matrix in physical units.
 
@@ -216,17 +216,20 @@ def from_parts(
     ----------
     method : str
     given : Coherency
-    parts : tuple of float64, shape (n_freqs, n_channels)
-        Noise, its standard deviation, and both ends of its interval, as fractions of the PSD.
+    noise : float64, shape (n_freqs, n_channels)
+        As a fraction of the PSD.
+    cumulants : float64, shape (3, n_freqs, n_channels)
+        Of this fraction.
     flags : int64, shape (n_freqs, n_channels)
         All flags except NEGATIVE. Flagged values become NaN.
     """
     unknown = flags != 0
-    noise, deviation, low, high = (np.where(unknown, np.nan, given.psd * part) for part in parts)
-    with np.errstate(divide="ignore", invalid="ignore"):  # noise may be zero
-        cov = deviation / np.abs(noise)
+    noise = np.where(unknown, np.nan, given.psd * noise)
+    powers = np.stack([given.psd**m for m in (2, 3, 4)])
     negative = np.where(noise <= 0, int(Flag.NEGATIVE), 0)
-    return SelfNoise(method, noise, cov, low, high, flags | negative)
+    return SelfNoise.of(
+        method, noise, np.where(unknown, np.nan, powers * cumulants), flags | negative
+    )
 
 
 def inverse(matrices: ComplexArray) -> tuple[ComplexArray, BoolArray]:

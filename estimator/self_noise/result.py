@@ -6,6 +6,10 @@ import enum
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from estimator.levels.interval import interval
+
 if TYPE_CHECKING:
     from estimator.types import FloatArray, IntArray
 
@@ -34,6 +38,8 @@ class Flag(enum.IntFlag):
     noise: at most about one standard deviation of the estimate."""
     INVALID = 512
     """Not a cross-spectral matrix: not Hermitian, a negative PSD or coherence above 1."""
+    POOLED = 1024
+    """The bin alone does not resolve the motion: its directions are those of neighbouring bins."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +57,8 @@ class SelfNoise:
         Coefficient of variation: predicted standard deviation over ``abs(noise_psd)``.
     low, high : float64, shape (n_freqs, n_channels)
         95 % confidence interval, in unit**2/Hz.
+    cumulants : float64, shape (3, n_freqs, n_channels)
+        Of the estimate, for `estimator.levels.interval.interval`.
     flags : int64, shape (n_freqs, n_channels)
         Sum of `Flag` values; 0 without remarks.
     """
@@ -61,3 +69,15 @@ class SelfNoise:
     low: FloatArray
     high: FloatArray
     flags: IntArray
+    cumulants: FloatArray
+
+    @classmethod
+    def of(
+        cls, method: str, noise_psd: FloatArray, cumulants: FloatArray, flags: IntArray
+    ) -> SelfNoise:
+        """Return a result with the c.o.v. and the interval that follow from its cumulants."""
+        with np.errstate(divide="ignore", invalid="ignore"):  # noise may be zero
+            cov = np.sqrt(np.maximum(cumulants[0], 0.0)) / np.abs(noise_psd)
+            cov = np.where(noise_psd == 0, np.nan, cov)
+            low, high = interval(noise_psd, cumulants)
+        return cls(method, noise_psd, cov, low, high, flags, cumulants)

@@ -62,7 +62,7 @@ def three_channel(
     compared = [part for part in parts if len(part) >= 3]
     if not compared:
         raise InsufficientDataError(f"sensors of {dims} channels: no three of them share a channel")
-    values = np.full((4, *given.psd.shape), np.nan)
+    values = np.full((4, *given.psd.shape), np.nan)  # noise, and its cumulants
     flags = given.flags | Flag.NO_COUNTERPART
     for part in compared:
         result = estimate(
@@ -72,7 +72,6 @@ def three_channel(
             correct=correct,
             weighted=False,
         )
-        values[:, :, part] = result.noise_psd, result.cov, result.low, result.high
+        values[:, :, part] = result.noise_psd, *result.cumulants
         flags[:, part] = result.flags
-    noise_psd, cov, low, high = values
-    return SelfNoise("three-channel", noise_psd, cov, low, high, flags)
+    return SelfNoise.of("three-channel", values[0], values[1:], flags)

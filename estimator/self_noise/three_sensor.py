@@ -32,7 +32,7 @@ from estimator.self_noise.coherency import (
 )
 from estimator.self_noise.pair_weights import PairWeights, log_variance, predictors
 from estimator.self_noise.result import Flag
-from estimator.self_noise.uncertainty import moments, score_interval
+from estimator.self_noise.uncertainty import cumulants, moments
 from estimator.spectra.welch import THREADS
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def estimate(
     size = min(_at_a_time(group) for group in groups)
     blocks = range(0, len(given.psd), size)
 
-    def of_block(low: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray]:
+    def of_block(low: int) -> tuple[FloatArray, FloatArray, IntArray]:
         block = given.block(slice(low, low + size))
         parts = [
             _mean_of_pairs(block, group, weight, low)
@@ -150,10 +150,14 @@ def estimate(
         with ThreadPoolExecutor(THREADS) as pool:
             of_shares = pool.map(lambda part: [of_block(low) for low in part], shares)
             found = list(itertools.chain.from_iterable(of_shares))
-    noise, deviation, low, high, flags = (
-        np.concatenate(parts) for parts in zip(*found, strict=True)
+    noise, scatter, flags = zip(*found, strict=True)
+    return from_parts(
+        "three-sensor",
+        given,
+        np.concatenate(noise),
+        np.concatenate(scatter, axis=1),
+        np.concatenate(flags),
     )
-    return from_parts("three-sensor", given, (noise, deviation, low, high), flags)
 
 
 def _groups(dims: tuple[int, ...]) -> list[_Group]:
@@ -199,9 +203,10 @@ def _estimate(
     *,
     n_effective: float,
     correct: bool,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray]:
-    """Return noise, deviation and interval as fractions of the channel's PSD, and flags."""
-    noise, deviation, low, high = (np.full(given.psd.shape, np.nan) for _ in range(4))
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Return noise and its cumulants as fractions of the channel's PSD, and flags."""
+    shape = given.psd.shape
+    noise, scatter = np.full(shape, np.nan), np.full((3, *shape), np.nan)
     flags = given.flags.copy()
     covered = np.zeros(sum(dims), dtype=np.bool_)
     for group, (part, traces, possible) in zip(groups, parts, strict=True):
@@ -214,11 +219,9 @@ def _estimate(
             (1 / (1 - d / n_effective), n_effective - d) if correct else (1, n_effective)
         )
         noise[:, rows] = part * gain
-        scaled = traces * gain ** np.arange(2, 5)[:, None, None]
-        deviation[:, rows] = np.sqrt(np.maximum(scaled[0], 0) / averages)
-        low[:, rows], high[:, rows] = score_interval(part * gain, scaled, averages=averages)
+        scatter[:, :, rows] = cumulants(traces, averages, gain)
     flags[:, ~covered] |= Flag.NO_COUNTERPART
-    return noise, deviation, low, high, flags
+    return noise, scatter, flags
 
 
 def _shared(dims: tuple[int, ...], i: int) -> int:

@@ -9,7 +9,7 @@ import numpy as np
 from estimator.errors import EstimatorError
 from estimator.self_noise.coherency import check_averages, check_dims, coherency, from_parts
 from estimator.self_noise.result import Flag
-from estimator.self_noise.uncertainty import moments, score_interval
+from estimator.self_noise.uncertainty import cumulants, moments
 
 if TYPE_CHECKING:
     from estimator.self_noise.result import SelfNoise
@@ -72,7 +72,7 @@ def two_channel(
     given = coherency(csm, dims)
     gain = _gain(response, given.psd.shape) / np.sqrt(given.psd)
     shape = n_freqs, n_channels = given.psd.shape
-    noise, deviation, low, high = (np.full(shape, np.nan) for _ in range(4))
+    noise, scatter = np.full(shape, np.nan), np.full((3, *shape), np.nan)
     flags = given.flags.copy()
     sensor = np.repeat(np.arange(len(dims)), dims)
     row = np.concatenate([np.arange(d) for d in dims])
@@ -87,11 +87,9 @@ def two_channel(
         W[:, :, p] = 1
         W[:, 1, others] -= weights * gain[:, p, None] / gain[:, others]
         G = W @ given.matrix @ W.conj().swapaxes(1, 2)
-        traces = moments(G, omega)
         noise[:, p] = G[:, 0, 1].real
-        deviation[:, p] = np.sqrt(np.maximum(traces[0], 0) / n_effective)
-        low[:, p], high[:, p] = score_interval(noise[:, p], traces, averages=n_effective)
-    return from_parts("two-channel", given, (noise, deviation, low, high), flags)
+        scatter[:, :, p] = cumulants(moments(G, omega), n_effective)
+    return from_parts("two-channel", given, noise, scatter, flags)
 
 
 def _gain(response: ComplexArray | None, shape: tuple[int, ...]) -> ComplexArray:

@@ -21,8 +21,9 @@ from daq.bench.loading import dump
 from daq.drivers.bench_file import parse
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
-from daq.results.band_summary import band_of, channel_means, data_means, mean_in_bands
-from estimator.self_noise.band_means import band_edges
+from daq.results.band_summary import band_of, data_means, levels
+from estimator.levels.bands import band_edges
+from estimator.levels.contributions import Source
 from tui.commands.run import result_of
 from tui.output.console import check_places, for_people, notices, write_json
 from tui.output.exit_codes import ExitCode
@@ -154,15 +155,14 @@ def compare(snapshot: Snapshot, settings: Settings, scenario: Scenario) -> list[
     edges = band_edges(snapshot.frequency, band)
     inside = snapshot.frequency[slice(*edges)]
     compared = []
-    added = snapshot.added_by_clocks
     for method, noise in snapshot.results.items():
-        means = channel_means(noise, snapshot, settings, band, quantile=SIMULTANEOUS_95)
+        found = levels(noise, snapshot, settings, edges)
+        clocks = [each.below[0] for each in found.contributions if each.source is Source.CLOCKS]
+        means = [found.of_channel(n, SIMULTANEOUS_95) for n in range(len(snapshot.channels))]
         places: dict[str, int] = {}
         for column, (label, mean) in enumerate(zip(snapshot.channels, means, strict=True)):
             place = places.get(label.sensor, 0)
             places[label.sensor] = place + 1
-            psd = None if added is None else added[:, column]
-            clocks = mean_in_bands(psd, noise.noise_psd[:, column], edges, snapshot.frequency)
             compared.append(
                 NoiseComparison(
                     sensor=label.sensor,
@@ -172,7 +172,7 @@ def compare(snapshot: Snapshot, settings: Settings, scenario: Scenario) -> list[
                     noise_psd=float(mean.mean[0]),
                     low=float(mean.low[0]),
                     high=float(mean.high[0]),
-                    clocks=float(clocks[0]),
+                    clocks=float(sum(each[column] for each in clocks)),
                 )
             )
     return compared

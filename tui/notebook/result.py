@@ -10,7 +10,7 @@ import numpy as np
 from daq.bench.units import levels_db
 from daq.errors import WrongSettingError
 from daq.results.band_summary import band_of, channel_means
-from estimator.self_noise.band_means import band_edges
+from estimator.levels.bands import band_edges
 from tui.notebook import text
 
 if TYPE_CHECKING:

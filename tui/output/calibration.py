@@ -34,17 +34,23 @@ _SHORT = {
     "quantisation": "quant.",
     "certificate": "cert.",
     "sensitivity": "sens.",
-    "incoherence": "incoh.",
-    "motion": "motion",
+    "edges": "edges",
+    "gaps": "gaps",
+    "misfit": "misfit",
+    "shared-noise": "shared",
+    "dimensions": "dim.",
+    "axes": "axes",
+    "faulty": "faulty",
 }
 LEGEND = (
     "Budgets are relative standard uncertainties. A: from the scatter of these data; B: from other "
     "sources. est.: finite averages. var.: scatter over the frequencies beyond that, by "
     "incoherence or by responses that vary. clocks: error of the alignment of the clocks. leak.: "
     "leakage by the width and the edges of segments. quant.: quantisation. cert.: certificate of "
-    "the reference. sens.: twice the uncertainty of the sensitivity. incoh.: motion or noise that "
-    "the model does not explain. motion: motion that few averages may leave in. u: combined "
-    "standard uncertainty. U: expanded uncertainty, k u. "
+    "the reference. sens.: twice the uncertainty of the sensitivity. edges, gaps: leakage at the "
+    "edges of segments and by gaps. misfit: motion that the model does not explain. shared: noise "
+    "that channels share. dim.: doubtful number of dimensions of the motion. axes: motion outside "
+    "the sensors' axes. u: combined standard uncertainty. U: expanded uncertainty, k u. "
     "1–2: angle between the first and the second channel, less 90°."
 )
 

@@ -16,6 +16,8 @@ ONE_SIDED = 1.1
 """Lower half of an interval over its upper half, from which on both are shown."""
 ONE_SIDED_DB = 0.02
 """Halves that differ by less are shown as one, the larger."""
+NOT_KNOWN = "not known"
+"""Said of a level whose interval has no upper end."""
 _PREFIXES = {0: "", -3: "m", -6: "µ", -9: "n"}
 _PREFIXED = {"m/s²", "m/s", "m", "g", "Gal", "V", "rad"}
 """Units that take a prefix."""
@@ -64,11 +66,13 @@ def level_with_error(psd: float, high: float, low: float = math.nan) -> str:
     """Return a PSD in dB with half the width of its 95 % interval.
 
     With both halves where the lower one is larger, as by what the clocks may have added. The
-    upper end alone where the estimate or the lower end is at or below zero.
+    upper end alone where the lower end is at or below zero, or the estimate outside its interval.
     """
-    if math.isnan(psd) or not high > max(psd, 0):
+    if math.isnan(psd) or math.isnan(high) or high <= 0:
         return level(psd)
-    if psd <= 0 or low <= 0:
+    if math.isinf(high):
+        return NOT_KNOWN
+    if psd <= 0 or low <= 0 or psd > high:
         return f"below {level(high)}"
     up = decibels(high) - decibels(psd)
     down = up if math.isnan(low) else decibels(psd) - decibels(low)
@@ -81,10 +85,10 @@ def level_with_error(psd: float, high: float, low: float = math.nan) -> str:
 
 def interval(low: float, high: float) -> str:
     """Return an interval of PSD in dB."""
-    if math.isnan(high):
+    if math.isnan(high) or high <= 0:
         return ""
-    if high <= 0:
-        return ""
+    if math.isinf(high):
+        return NOT_KNOWN
     return f"… {level(high)}" if low <= 0 else f"{level(low)} … {level(high)}"
 
 

@@ -306,20 +306,18 @@ def flagged(snapshot: Snapshot, method: str, *, besides: Flag = _NONE) -> list[s
 
 
 def unresolved(snapshot: Snapshot, method: str) -> list[str]:
-    """Return where the averages are too few to resolve weak motion, and the effect."""
-    noise = snapshot.results[method]
-    here = (noise.flags[1:-1] & Flag.UNRESOLVED) != 0
-    left_in = noise.cov[1:-1][here & np.isfinite(noise.cov[1:-1])]
-    if not left_in.size:
+    """Return where the directions of the motion are those of neighbouring frequencies."""
+    where = ((snapshot.results[method].flags[1:-1] & Flag.POOLED) != 0).any(axis=1)
+    if not where.any():
         return []
-    where = here.any(axis=1)
     frequency = snapshot.frequency[1:-1][where]
-    line = (
-        f"{method}: too few averages for the weak motion at {where.sum()} of {len(where)} "
-        f"frequencies ({frequency[0]:.3g} to {frequency[-1]:.3g} Hz): the noise may include "
-        f"motion, up to about {100 * float(np.median(left_in)):.2g} %. Record longer to remove it"
-    )
-    return [line]
+    return [
+        (
+            f"{method}: single frequencies do not resolve the motion at {where.sum()} of"
+            f" {len(where)} ({frequency[0]:.3g} to {frequency[-1]:.3g} Hz); its directions are"
+            " taken from neighbouring frequencies there"
+        )
+    ]
 
 
 def _not_a_formula(text: str) -> str:

@@ -48,9 +48,6 @@ OBSTACLES: Mapping[Obstacle, str] = {
     Obstacle.MODEL_MISFIT: "{channels}: one common motion does not explain what the sensors have "
     "in common, and the noise estimate may be wrong by more than the margin. Follow the advice and "
     "record again.",
-    Obstacle.WEAK_MOTION: "{channels}: what is above the limit may be motion, which is too weak "
-    "beside the noise of the other sensors to be found. Record longer or where the motion is "
-    "stronger, or compare with quieter sensors.",
     Obstacle.CLOCKS: "{channels}: errors of the clocks are too large to decide, or not known. Give "
     "the sensors one clock, or record longer for their rates to be known (with --clocks nominal "
     "they never are).",

@@ -79,6 +79,9 @@ FLAG_WORDS: Mapping[Flag, FlagWords] = {
     Flag.NOT_CONVERGED: FlagWords("not converged", "the iteration did not reach the maximum"),
     Flag.NEGATIVE: FlagWords("below 0", "the estimate is at or below zero"),
     Flag.BOUNDARY: FlagWords("at zero", "the likelihood is largest at zero noise"),
+    Flag.POOLED: FlagWords(
+        "pooled", "the directions of the motion are those of neighbouring frequencies"
+    ),
     Flag.UNRESOLVED: FlagWords(
         "unresolved", "too few averages for the weak motion, which the noise may include"
     ),

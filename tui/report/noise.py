@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from daq.results.band_summary import BandMeans
     from daq.results.decision.verdict import TestVerdict
-    from estimator.self_noise.band_means import BandMeans
     from tui.report.parts import Tone
 
 MAX_BANDS = 7

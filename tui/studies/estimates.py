@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from estimator.levels.bands import band_levels
 from estimator.likelihood.fisher import cramer_rao_cov
 from estimator.methods import self_noise
 from estimator.noise_parameters.fit import fit, terms_at
-from estimator.self_noise.quiet_sensor import quiet_sensor_noise
 from tui.studies.draws import averaged, bench
 from tui.studies.study import Panel, Point, Series, Study
 
@@ -163,15 +163,22 @@ def quiet(progress: ProgressCallback, length: float) -> Study:
         for _ in range(n_draws):
             true = bench(rng, snr=snr * ratio, noise_psd=noise_psd)
             csm = averaged(np.broadcast_to(true, (n_freqs, 9, 9)), n, rng)
-            found.append(
-                quiet_sensor_noise(
-                    csm, dims=(3, 3, 3), sensor=0, n_effective=n, correlation=INDEPENDENT
-                )
+            noise = self_noise(
+                "three-sensor",
+                csm,
+                dims=(3, 3, 3),
+                n_effective=n,
+                blocks=np.zeros(n_freqs, np.int64),
+                correlation=INDEPENDENT,
             )
-        noise, low, high = np.array(found).swapaxes(0, 1)
+            band = band_levels(
+                noise.noise_psd, noise.cumulants, np.array([0, n_freqs]), INDEPENDENT
+            )
+            found.append([each[0, :3] for each in (band.mean, *band.interval())])
+        means, low, high = np.array(found).swapaxes(0, 1)
         covers = float(((low < 1) & (high > 1)).mean())
         points.append(share(snr, covers, 3 * n_draws, NOMINAL, COVERAGE_TOLERANCE))
-        below = float((noise < 1).mean())
+        below = float((means < 1).mean())
         biases.append(share(snr, below, 3 * n_draws, 0.5, 0.0))
     return Study(
         "quiet",

@@ -14,9 +14,9 @@ from daq.bench.model import PolesZeros
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
+from estimator.levels.bands import bin_correlation
 from estimator.responses.calibration import calibrate_sensor
 from estimator.responses.derived_quantities import derived
-from estimator.self_noise.band_means import bin_correlation
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window
 from tui.studies.study import Panel, Point, Series, Study

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.results.decision.verdict import Prediction
-from estimator.self_noise.band_means import interval_of_cov
+from estimator.levels.interval import interval
 
 if TYPE_CHECKING:
     from estimator.types import BoolArray, FloatArray
@@ -50,8 +50,8 @@ class Margins:
     ----------
     margin : float64
         Natural logarithm of limit over noise.
-    cov : float64
-        Of the noise.
+    cumulants : float64, shape (3, n)
+        Of the noise, in powers of the noise itself: their first is the squared c.o.v.
     added, removed : float64
         By how much more the noise must be above the limit, or below it, for what is no noise and
         what is missing in the estimate: a natural logarithm.
@@ -60,10 +60,20 @@ class Margins:
     """
 
     margin: FloatArray
-    cov: FloatArray
+    cumulants: FloatArray
     added: FloatArray
     removed: FloatArray
     can_fail: BoolArray
+
+    @property
+    def cov(self) -> FloatArray:
+        """Coefficient of variation of the noise."""
+        return np.asarray(np.sqrt(self.cumulants[0]))
+
+    def ends(self, share: float, quantile: float) -> tuple[FloatArray, FloatArray]:
+        """Return the interval over the noise, where `share` of the averages are those of now."""
+        scale = np.array([[share], [share**2], [share**3]])
+        return interval(np.ones(len(self.margin)), scale * self.cumulants, quantile)
 
 
 def predict(
@@ -95,7 +105,6 @@ def predict(
             margins,
             share,
             quantile=quantile,
-            averages=averages / share,
             mean=mean + nodes * error,
             variance=variance,
         )
@@ -103,11 +112,7 @@ def predict(
             likely = seconds
             break
     closest = int(np.argmin(np.abs(margins.margin)))
-    low, high = interval_of_cov(
-        margins.cov[[closest]] * math.sqrt(elapsed / longest),
-        quantile,
-        np.array([averages * longest / elapsed]),
-    )
+    low, high = (end[[closest]] for end in margins.ends(elapsed / longest, quantile))
     return Prediction(
         seconds=likely,
         longest=longest,
@@ -133,7 +138,6 @@ def _chances(
     share: float,
     *,
     quantile: float,
-    averages: float,
     mean: FloatArray,
     variance: float,
 ) -> FloatArray:
@@ -146,9 +150,7 @@ def _chances(
     truth = trust * estimate + (1 - trust) * mean[:, None]
     then = share * estimate + (1 - share) * truth
     deviation = np.sqrt((1 - share) ** 2 * trust * scatter + share * (1 - share) * scatter)
-    low, high = interval_of_cov(
-        margins.cov * math.sqrt(share), quantile, np.full(estimate.shape, averages)
-    )
+    low, high = margins.ends(share, quantile)
     with np.errstate(divide="ignore", invalid="ignore"):
         passes = _normal_cdf((then - np.log(high) - margins.removed) / deviation)
         short = np.where(low > 0, np.log(low), -np.inf) - margins.added

@@ -6,10 +6,10 @@ passes where the whole interval of its band means is below the mask in every ban
 the whole interval of one band is above it. The intervals hold for all channels, masks and bands
 together (Bonferroni): of tests with all channels just at the mask, one in forty fails.
 
-What the clocks may have added to the noise or taken from it, and what the estimate may be off by
-where one common motion does not explain the averages, widens the interval. Noise that is below zero
-for certain is wrong, so it decides nothing. Of a channel that is clipped, or was dead
-for a while, the estimate is an upper bound.
+The ends are those of every table (`daq.results.band_summary.levels`) at another quantile: with all
+that widens them, and below the bound that needs no model. Noise that is below zero for certain is
+wrong, so it decides nothing. Of a channel that is clipped, or was dead for a while, the estimate is
+an upper bound.
 """
 
 from __future__ import annotations
@@ -21,16 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.results.band_summary import (
-    averages_at,
-    correlation_of,
-    deviation_at_bound,
-    dimension_error,
-    judged_method,
-    mean_in_bands,
-    second_order_error,
-    taken_by_bound,
-)
+from daq.results.band_summary import averages_at, judged_method, levels
 from daq.results.decision.decision_time import Margins, predict
 from daq.results.decision.mask_bands import judged_range, mask_edges, mean_mask
 from daq.results.decision.verdict import (
@@ -41,10 +32,7 @@ from daq.results.decision.verdict import (
     Verdict,
 )
 from daq.results.partners import without_partners
-from estimator.diagnostics.advice import ModelMisfit, TooFewDimensions
-from estimator.diagnostics.kinds import Level
-from estimator.diagnostics.misfit import SharedNoise
-from estimator.self_noise.band_means import NORMAL_95, band_means, decision_interval
+from estimator.levels.contributions import Source
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -54,15 +42,12 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench, Limit
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import ChannelLabel, Snapshot
+    from daq.results.band_summary import Levels
     from daq.results.decision.verdict import Prediction
-    from estimator.self_noise.band_means import FloatArray
-    from estimator.self_noise.result import SelfNoise
+    from estimator.types import FloatArray
 
 MIN_AVERAGES = 20.0
 """Averages below which the far tails of the interval have not been verified by simulation."""
-
-LARGE_SHARE = 0.25
-"""Share of motion in the estimate, at most, from which it is named as an obstacle."""
 
 
 def judge(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> TestVerdict | None:
@@ -79,9 +64,20 @@ def judge(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> TestVe
     edges = {limit.name: mask_edges(snapshot, limit) for limit in bench.limits}
     n_bands = sum(max(0, edges[limit.name].size - 1) for limit, _ in pairs)
     quantile = NormalDist().inv_cdf(1 - 0.025 / max(1, n_bands))
+    noise = snapshot.results.get(method)
+    of_limit = {
+        name: None if noise is None or each.size < 2 else levels(noise, snapshot, settings, each)
+        for name, each in edges.items()
+    }
     found = [
         _compare(
-            bench, limit, column, snapshot, settings, edges=edges[limit.name], quantile=quantile
+            bench,
+            limit,
+            column,
+            snapshot,
+            of_limit[limit.name],
+            edges=edges[limit.name],
+            quantile=quantile,
         )
         for limit, column in pairs
     ]
@@ -113,7 +109,8 @@ class _Comparison:
     """One channel beside one mask in all bands of it; arrays of shape (n_bands,).
 
     `outer_low` and `outer_high` are the ends of the interval with all that widens it; `low` and
-    `high` those by the scatter of the estimate alone. NaN in bands without an estimate.
+    `high` those by the scatter of the estimate alone, `no_clocks` the ends without what the clocks
+    do. NaN in bands without an estimate.
     """
 
     limit: Limit
@@ -123,27 +120,16 @@ class _Comparison:
     centre: FloatArray
     mask: FloatArray
     mean: FloatArray
-    spread: FloatArray
+    cumulants: FloatArray
     low: FloatArray
     high: FloatArray
-    added: FloatArray
-    removed: FloatArray
-    by_clocks: FloatArray
-    left_in: FloatArray
-    error: FloatArray
+    outer_low: FloatArray
+    outer_high: FloatArray
+    no_clocks: tuple[FloatArray, FloatArray]
     averages: FloatArray
     is_alone: NDArray[np.bool_]
+    is_withdrawn: NDArray[np.bool_]
     is_faulty: bool
-
-    @property
-    def outer_low(self) -> FloatArray:
-        low = (self.low - self.added) * np.where(self.low > self.added, 1 - self.error, 1.0)
-        return np.full_like(low, -math.inf) if self.is_faulty else low
-
-    @property
-    def outer_high(self) -> FloatArray:
-        high = self.high + self.removed
-        return np.asarray(high * np.where(high > 0, 1 + self.error, 1.0))
 
     def result(self, method: str) -> LimitResult:
         """Return the verdict, with the numbers of the band where the channel does worst."""
@@ -186,35 +172,37 @@ class _Comparison:
         """Return what keeps the limit from being decided."""
         would_fail = bool((self.low > self.mask).any())  # by scatter alone
         would_pass = bool((self.high <= self.mask).all())
-        without = self.low - self.left_in <= self.mask
-        is_large = (self.left_in >= LARGE_SHARE * np.abs(self.mean)) & (self.mean > self.mask)
-        by_motion = bool(((is_large | (self.low > self.mask)) & without).any())
-        by_clocks = would_fail and not bool((self.low - self.by_clocks > self.mask).any())
-        by_clocks |= would_pass and not bool((self.high + self.removed <= self.mask).all())
-        by_clocks |= bool(np.isinf(self.removed).any())  # nothing is known of them
+        low, high = self.no_clocks
+        by_clocks = bool(((low > self.mask) & (self.outer_low <= self.mask)).any())
+        by_clocks |= bool((high <= self.mask).all() and (self.outer_high > self.mask).any())
         reads_high = self.is_faulty and (would_fail or bool((self.mean > self.mask).any()))
         reasons = (
             (Obstacle.NO_ESTIMATE, not known.all()),
             (Obstacle.NO_SHARED_MOTION, bool(self.is_alone.any())),
             (Obstacle.TOO_FEW_AVERAGES, not trusted.all()),
             (Obstacle.FAULTY_CHANNEL, reads_high),
-            (Obstacle.WEAK_MOTION, by_motion),
             (Obstacle.CLOCKS, by_clocks),
-            (Obstacle.MODEL_MISFIT, would_fail or would_pass),
+            (Obstacle.MODEL_MISFIT, would_fail or would_pass or bool(self.is_withdrawn.any())),
         )
         return next((reason for reason, holds in reasons if holds), Obstacle.SPANS_LIMIT)
 
     def margins(self) -> Margins:
         """Return the margins for a prediction; where the mean is not positive, from its spread."""
+        spread = np.sqrt(np.maximum(self.cumulants[0], 0.0))
         positive = self.mean > 0
+        unit = np.where(positive, self.mean, spread)
         with np.errstate(invalid="ignore", divide="ignore"):
             in_log = np.log(self.mask / self.mean)
-            in_linear = (self.mask - self.mean) / self.spread
+            in_linear = (self.mask - self.mean) / spread
+        added, removed = (
+            np.where(np.isfinite(part), np.maximum(part, 0.0), math.inf)
+            for part in (self.low - self.outer_low, self.outer_high - self.high)
+        )
         return Margins(
             margin=np.where(positive, in_log, in_linear),
-            cov=np.where(positive, self.spread / np.abs(self.mean), 1.0),
-            added=np.log1p(self.added / self.mask),
-            removed=np.log1p(self.removed / self.mask),
+            cumulants=self.cumulants / np.stack([unit**k for k in (2, 3, 4)]),
+            added=np.log1p(added / self.mask),
+            removed=np.log1p(removed / self.mask),
             can_fail=np.full(self.mean.shape, not self.is_faulty),
         )
 
@@ -224,41 +212,35 @@ def _compare(
     limit: Limit,
     column: int,
     snapshot: Snapshot,
-    settings: Settings,
+    found: Levels | None,
     *,
     edges: NDArray[np.int64],
     quantile: float,
 ) -> _Comparison:
     label, frequency = snapshot.channels[column], snapshot.frequency
-    noise = snapshot.results.get(judged_method(snapshot, settings))
     if edges.size < 2:
         centre = mask = np.empty(0)
     else:
         centre = np.sqrt(frequency[edges[:-1]] * frequency[edges[1:] - 1])
         mask = mean_mask(bench, limit, label, frequency, edges)
-
-    def in_bands(psd: FloatArray | None) -> FloatArray:
-        if psd is None or noise is None or not centre.size:
-            return np.zeros(centre.shape)
-        return mean_in_bands(psd[:, column], noise.noise_psd[:, column], edges, frequency)
-
-    averages = averages_at(snapshot, centre)
-    mean = spread = low = high = np.full(centre.shape, np.nan)
-    if noise is not None and centre.size:
-        means = band_means(
-            noise.noise_psd[:, column],
-            noise.cov[:, column],
-            edges,
-            correlation_of(settings),
-            weights=np.gradient(frequency),
-            deviation=deviation_at_bound(noise, column),
+    nothing = np.full(centre.shape, np.nan)
+    mean, cumulants = nothing, np.full((3, *centre.shape), np.nan)
+    scatter = outer = no_clocks = (nothing, nothing)
+    withdrawn = np.zeros(centre.shape, np.bool_)
+    if found is not None and centre.size:
+        complete = found.of_scatter.complete[:, column]
+        mean = np.where(complete, found.mean[:, column], np.nan)
+        cumulants = found.of_scatter.cumulants[:, :, column]
+        scatter, outer, no_clocks = (
+            (ends[0][:, column], ends[1][:, column])
+            for ends in (
+                found.of_scatter.interval(quantile),
+                found.ends(quantile),
+                found.ends(quantile, without={Source.CLOCKS}),
+            )
         )
-        mean, spread = means.mean, means.spread
-        low, high = decision_interval(means, quantile, averages)
-        high = high + in_bands(taken_by_bound(noise, snapshot.dims))
-        mean = np.where(_is_complete(noise, column, edges), mean, np.nan)
+        withdrawn = found.withdrawn(quantile)[:, column]
     diagnostics = snapshot.diagnostics
-    unknown = 0.0 if diagnostics.synchronisation.is_known else math.inf
     return _Comparison(
         limit=limit,
         label=label,
@@ -267,59 +249,19 @@ def _compare(
         centre=centre,
         mask=mask,
         mean=mean,
-        spread=spread,
-        low=low,
-        high=high,
-        added=in_bands(snapshot.added) + unknown,
-        removed=in_bands(snapshot.removed) + unknown,
-        by_clocks=in_bands(snapshot.added_by_clocks),
-        left_in=in_bands(snapshot.left_in),
-        error=_errors(snapshot, edges, judged_method(snapshot, settings), column),
-        averages=averages,
+        cumulants=cumulants,
+        low=scatter[0],
+        high=scatter[1],
+        outer_low=outer[0],
+        outer_high=outer[1],
+        no_clocks=no_clocks,
+        averages=averages_at(snapshot, centre),
         is_alone=np.array(
             [column in without_partners(snapshot, (f, f)) for f in centre.tolist()], dtype=bool
         ),
+        is_withdrawn=withdrawn,
         is_faulty=column in diagnostics.clipped or column in diagnostics.stood_still,
     )
-
-
-def _is_complete(noise: SelfNoise, column: int, edges: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return whether the noise is known at every frequency of each band."""
-    certain = np.isfinite(noise.cov[:, column]) | np.isfinite(deviation_at_bound(noise, column))
-    known = (np.isfinite(noise.noise_psd[:, column]) & certain)[edges[0] : edges[-1]]
-    return np.asarray(np.logical_and.reduceat(known, edges[:-1] - edges[0]))
-
-
-def _errors(snapshot: Snapshot, edges: NDArray[np.int64], method: str, column: int) -> FloatArray:
-    """Return what the estimate may be off by in each band, as a share of the noise."""
-    if edges.size < 2:
-        return np.empty(0)
-    low, high = snapshot.frequency[edges[:-1]], snapshot.frequency[edges[1:] - 1]
-    centre = np.sqrt(low * high)
-    share = dimension_error(snapshot, method)[: edges[-1]]
-    noise = snapshot.results.get(method)
-    if noise is not None:
-        weak = second_order_error(noise, snapshot.frequency)[: edges[-1], column]
-        share = np.hypot(share, weak)
-    error = NORMAL_95 * np.maximum.reduceat(share, edges[:-1])
-    explained = np.zeros(centre.shape, np.bool_)
-    for choice in snapshot.diagnostics.dimensions if method == "maximum-likelihood" else ():
-        here = (high >= choice.low) & (low <= choice.high)
-        explained |= here
-        if choice.is_biased or choice.is_undetermined:
-            error = np.where(here, np.inf, error)
-    for advice in snapshot.diagnostics.advice:
-        if advice.band is None or advice.level is Level.NOTE:
-            continue
-        here = (high >= advice.band[0]) & (low <= advice.band[1])
-        if isinstance(advice, ModelMisfit):
-            here &= ~explained
-            error = np.where(here, np.maximum(error, advice.error), error)
-        elif isinstance(advice, SharedNoise):
-            error = np.where(here, np.maximum(error, advice.harm), error)
-        elif isinstance(advice, TooFewDimensions):
-            error = np.where(here & ~explained, np.inf, error)
-    return error
 
 
 def _general_obstacles(snapshot: Snapshot) -> set[Obstacle]:
@@ -341,7 +283,7 @@ def _prediction(
     return predict(
         Margins(
             margin=np.concatenate([part.margin for part in parts]),
-            cov=np.concatenate([part.cov for part in parts]),
+            cumulants=np.concatenate([part.cumulants for part in parts], axis=1),
             added=np.concatenate([part.added for part in parts]),
             removed=np.concatenate([part.removed for part in parts]),
             can_fail=np.concatenate([part.can_fail for part in parts]),

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from daq.bench.masks.mask import Mask
     from daq.bench.model import Bench, Limit
     from daq.estimation.snapshot import ChannelLabel, Snapshot
-    from estimator.self_noise.band_means import FloatArray
+    from estimator.types import FloatArray
 
 BANDS_PER_OCTAVE = 3
 BENT = 2.0

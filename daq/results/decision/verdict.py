@@ -37,8 +37,6 @@ class Obstacle(enum.StrEnum):
     """The channel is clipped or was dead for a while: its noise is lower than the estimate."""
     MODEL_MISFIT = "model-misfit"
     """One common motion does not explain the averages: the estimate may be too far off."""
-    WEAK_MOTION = "weak-motion"
-    """What is above the limit may be motion that few averages do not show."""
     CLOCKS = "clocks"
     """The clocks may have added what is above the limit, or taken it away, or are not known."""
     TOO_FEW_AVERAGES = "too-few-averages"

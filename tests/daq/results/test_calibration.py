@@ -18,7 +18,7 @@ from daq.errors import WrongSettingError
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
-from daq.results.band_summary import channel_means, judged_method
+from daq.results.band_summary import judged_method
 from daq.results.calibration import calibrate
 from daq.results.uncertainty_budget import Budget, Component, student_quantile
 from daq.timing.clock_model import RelativeTime
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.estimation.snapshot import Snapshot
-    from estimator.self_noise.band_means import BandMeans
-    from estimator.self_noise.result import SelfNoise
 
 GAINS = {"a": 1.0, "b": 1.03, "c": 0.98}
 SETTINGS = Settings(segment=2.0, band=(1.0, 20.0))
@@ -327,20 +325,15 @@ def test_the_delay_of_a_third_sensor_is_in_the_budget_of_the_others() -> None:
     assert abs(budget.value - 1) < budget.expanded
 
 
-def test_an_error_common_to_the_band_is_in_the_budget_of_the_noise(
-    snapshot: Snapshot, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def widened(
-        noise: SelfNoise, snapshot: Snapshot, settings: Settings, band: tuple[float, float]
-    ) -> tuple[BandMeans, ...]:
-        return tuple(
-            replace(mean, low=0.8 * mean.mean, high=1.2 * mean.mean)
-            for mean in channel_means(noise, snapshot, settings, band)
-        )
-
-    monkeypatch.setattr("daq.results.noise_budget.channel_means", widened)
-    for budget in calibrate(snapshot, SETTINGS, None).whole_band("noise"):
-        assert budget.components[0].relative == pytest.approx(0.2 / 1.96, rel=1e-3)
+def test_what_widens_the_interval_is_in_the_budget_of_the_noise(snapshot: Snapshot) -> None:
+    faulty = replace(snapshot.diagnostics, edge_leakage=None)
+    assert snapshot.added_by_clocks is not None
+    for budget in calibrate(replace(snapshot, diagnostics=faulty), SETTINGS, None).whole_band(
+        "noise"
+    ):
+        sources = [part.source for part in budget.components]
+        assert "edges" not in sources
+        assert "clocks" in sources
 
 
 def test_the_command_says_it_all(recording: Path) -> None:

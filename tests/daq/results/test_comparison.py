@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from daq.results.band_summary import BandMeans
 from daq.results.comparison import compare, difference
-from estimator.self_noise.band_means import BandMeans
+from estimator.self_noise.result import SelfNoise
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
 
 
@@ -38,8 +39,9 @@ def test_the_interval_covers_the_true_difference(errors: tuple[float, float]) ->
 def test_like_channels_are_compared_in_the_common_band() -> None:
     snapshot = made_snapshot(n_effective=2000.0)
     noise = snapshot.results["three-sensor"]
-    doubled = replace(noise, noise_psd=noise.noise_psd * 2, low=noise.low * 2, high=noise.high * 2)
-    louder = replace(snapshot, results=dict(snapshot.results) | {"three-sensor": doubled})
+    scale = np.array([4.0, 8.0, 16.0])[:, None, None]
+    doubled = SelfNoise.of(noise.method, 2 * noise.noise_psd, scale * noise.cumulants, noise.flags)
+    louder = replace(snapshot, csm=2 * snapshot.csm, results={"three-sensor": doubled})
     other = replace(SETTINGS, band=(2.0, 30.0))
     found = compare(louder, SETTINGS, snapshot, other)
     assert len(found) == 9

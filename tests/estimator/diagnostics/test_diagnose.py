@@ -14,7 +14,6 @@ from estimator.diagnostics.advice import (
     Gain,
     MissingDimension,
     ModelMisfit,
-    MotionLeftIn,
     NoSharedMotion,
     NotOrthogonal,
     ReversedPolarity,
@@ -27,7 +26,6 @@ from estimator.diagnostics.diagnose import Diagnostics, diagnose
 from estimator.diagnostics.kinds import AdviceKind, Level, Untested
 from estimator.errors import InsufficientDataError, InvalidMatrixError
 from estimator.likelihood.factor_analysis import maximise
-from estimator.self_noise.three_sensor import three_sensor
 from tests.estimator.csm_models import pentagon, plane_waves, random_bench, wishart
 
 if TYPE_CHECKING:
@@ -100,7 +98,7 @@ def test_a_sensor_on_another_floor_is_named(n_sensors: int, n: int) -> None:
         assert advice.share_of_partners > 0.9
         assert advice.band == (1.0, 20.0)
         kinds = {each.kind for each in found.advice}
-        assert not kinds & {AdviceKind.MOTION_LEFT_IN, AdviceKind.WEAK_MOTION}
+        assert AdviceKind.WEAK_MOTION not in kinds
 
 
 def test_weakly_coherent_sensors_are_not_reported_without_common_motion() -> None:
@@ -228,26 +226,6 @@ def test_noise_without_motion_is_reported() -> None:
     found = of(averages(csm))
     assert all(advice.snr < 1 for advice in advice_of(WeakMotion, found))
     assert advice_of(WeakMotion, found)
-    assert not advice_of(MotionLeftIn, found)  # too many averages
-
-
-@pytest.mark.parametrize("snr", [0.1, 0.3])
-@pytest.mark.parametrize("d", [1, 2, 3])
-def test_motion_left_in_by_few_averages_is_no_silent_bias(d: int, snr: float) -> None:
-    """What is said of twenty averages holds, and is no more than twice as much at its worst."""
-    rng = np.random.default_rng(d)
-    csm = random_bench(rng, dims=(d,) * 3, snr=snr, noise_psd=np.ones(3 * d))
-    found = of(averages(csm, n=20), dims=(d,) * 3, n=20)
-    said = advice_of(MotionLeftIn, found)
-    covered = sum(a.band[0] <= f <= a.band[1] for a in said if a.band for f in FREQUENCY)
-    assert covered > 0.8 * len(FREQUENCY)
-    assert said[0].n_effective == 20
-    draws = wishart(csm, 20, rng, n_draws=8000)
-    noise = three_sensor(draws, dims=(d,) * 3, n_effective=20).noise_psd
-    bias = noise.mean() - 1
-    error = noise.mean(axis=1).std() / np.sqrt(len(draws))
-    assert bias > 5 * error
-    assert bias - 3 * error < said[0].share < 2 * bias
 
 
 def test_a_lagging_sensor_is_reported_with_its_delay() -> None:

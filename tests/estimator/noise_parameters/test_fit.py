@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from estimator.errors import EstimatorError, InsufficientDataError
+from estimator.levels.bands import N_LAGS, bin_correlation
 from estimator.methods import self_noise
 from estimator.noise_parameters.allan import allan_deviation, averaging_times
 from estimator.noise_parameters.fit import NoiseParameters, Term, fit, terms_at
-from estimator.self_noise.band_means import N_LAGS, bin_correlation
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window
 

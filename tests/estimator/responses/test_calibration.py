@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from estimator.errors import InsufficientDataError
+from estimator.levels.bands import bin_correlation
 from estimator.responses.calibration import calibrate_sensor, response_curve
-from estimator.self_noise.band_means import bin_correlation
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
 import pytest
 from textual.widgets import Static
 
 from daq.recording.sensor_state import SensorState
 from daq.timing.clock_model import ClockSource
+from estimator.self_noise.result import SelfNoise
 from tests.tui.application.screen_text import assert_looks_as_before, resized, screen_text
 from tests.tui.example_snapshot import (
     SETTINGS,
@@ -251,9 +251,10 @@ async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]
 async def test_negative_estimates_are_marked_not_hidden(told: ProgressCallback) -> None:
     snapshot = made_snapshot()
     noise = snapshot.results["three-sensor"]
-    psd, high = noise.noise_psd.copy(), noise.high.copy()
+    psd, cumulants = noise.noise_psd.copy(), noise.cumulants.copy()
     psd[20:60, 0] = -1e-13
-    changed = replace(noise, noise_psd=psd, high=high, cov=np.abs(noise.cov))
+    cumulants[0, 20:60, 0] = 1e-24
+    changed = SelfNoise.of(noise.method, psd, cumulants, noise.flags)
     snapshot = replace(snapshot, results={"three-sensor": changed})
     app = HuddleApp(told)
     async with app.run_test(size=WIDE) as pilot:

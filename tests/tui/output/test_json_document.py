@@ -35,7 +35,7 @@ def test_advice_has_its_kind_its_numbers_and_its_words() -> None:
     assert diagnostics["untested"] is None
     assert diagnostics["pairs"] == [["A", "B"], ["A", "C"], ["B", "C"]]
     assert set(diagnostics["per_frequency"]) == {
-        "coherence", "condition", "dimension", "snr", "statistic", "degrees", "p_value", "left_in",
+        "coherence", "condition", "dimension", "snr", "statistic", "degrees", "p_value",
     }  # fmt: skip
     assert len(diagnostics["per_frequency"]["coherence"][0]) == 3
     assert set(diagnostics["bands"][0]["test"]) == {

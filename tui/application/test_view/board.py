@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from textual.app import ComposeResult
     from textual.events import Resize
 
-    from estimator.self_noise.band_means import BandMeans
+    from daq.results.band_summary import BandMeans
     from tui.application.state import State
     from tui.application.test_view.curves import Curve
 

@@ -20,7 +20,7 @@ from tui.output.vocabulary import PARTNER_WORDS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from estimator.self_noise.band_means import BandMeans
+    from daq.results.band_summary import BandMeans
     from tui.application.state import State
     from tui.application.test_view.plotted import Choice
 

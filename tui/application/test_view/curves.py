@@ -8,22 +8,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.bench.units import levels_db
-from estimator.self_noise.band_means import band_means, log_edges
+from estimator.levels.bands import log_edges
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from estimator.self_noise.band_means import FloatArray
+    from daq.results.band_summary import BandMeans
+    from estimator.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True)
 class Curve:
     """One curve, one point per band of frequencies; shape (n_points,).
 
-    ``level_db`` is 10 log10 of the mean PSD, NaN where the mean is not positive; ``negative`` says
-    where it is known not to be. ``low_db`` and ``high_db`` bound the 95 % interval, NaN where a
+    ``level_db`` is 10 log10 of the mean PSD, NaN where only its upper bound is known; ``negative``
+    says where that is so. ``low_db`` and ``high_db`` bound the 95 % interval, NaN where a
     bound is not positive, and throughout for a curve without one. ``marker`` is drawn on the
     curve at intervals, to identify it without colour; empty for none.
     """
@@ -82,30 +83,25 @@ def data_curve(frequency: FloatArray, psd: FloatArray, *, n_points: int, style: 
 
 def noise_curve(
     frequency: FloatArray,
-    psd: FloatArray,
-    cov: FloatArray,
+    means: BandMeans,
     *,
-    correlation: FloatArray,
-    n_points: int,
+    edges: NDArray[np.int64],
     label: str,
     style: str,
     band_style: str,
     marker: str,
-    added: FloatArray | None = None,
 ) -> Curve:
-    """Return a self-noise estimate as a curve with the 95 % interval of each of its points."""
-    edges = log_edges(frequency, n_points)
-    means = band_means(psd, cov, edges, correlation, added=added)
+    """Return the levels of a channel as a curve with the 95 % interval of each of its points."""
     return Curve(
         label=label,
         style=style,
         band_style=band_style,
         marker=marker,
         log_frequency=_centres(frequency, edges),
-        level_db=levels_db(means.mean),
-        low_db=levels_db(means.low),
+        level_db=levels_db(np.where(means.outside, np.nan, means.mean)),
+        low_db=levels_db(np.where(np.isinf(means.low), np.nan, means.low)),
         high_db=levels_db(means.high),
-        negative=means.mean <= 0,
+        negative=means.outside,
     )
 
 

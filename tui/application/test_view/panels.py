@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus, SensorStatus
+    from daq.results.band_summary import BandMeans
     from daq.results.decision.verdict import TestVerdict
     from daq.results.partners import WithoutPartner
     from daq.results.precision import Precision
-    from estimator.self_noise.band_means import BandMeans
     from tui.application.test_view.plotted import Choice
 
 MUTED = "#9aa5b8"

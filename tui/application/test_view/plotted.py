@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.results.band_summary import correlation_of
+from daq.results.band_summary import levels
 from daq.results.decision.limits import concerns
 from daq.results.decision.mask_bands import mask_psd
+from estimator.levels.bands import log_edges
 from tui.application.test_view.clocks import COLOURS
 from tui.application.test_view.curves import data_curve, mask_curve, noise_curve
 from tui.application.test_view.units import units_of
@@ -210,18 +211,16 @@ def _noise(
     style: tuple[str, str, str],
     n_points: int,
 ) -> Curve:
-    noise, added = snapshot.results[method], snapshot.added
+    edges = log_edges(snapshot.frequency, n_points)
+    found = levels(snapshot.results[method], snapshot, settings, edges)
     return noise_curve(
         snapshot.frequency,
-        noise.noise_psd[:, column],
-        noise.cov[:, column],
-        correlation=correlation_of(settings),
-        n_points=n_points,
+        found.of_channel(column),
+        edges=edges,
         label=label,
         style=style[0],
         band_style=style[1],
         marker=style[2],
-        added=None if added is None else added[:, column],
     )
 
 

@@ -14,7 +14,6 @@ from estimator.diagnostics.advice import (
     MissingDimension,
     ModelMisfit,
     MotionAcross,
-    MotionLeftIn,
     NearlySingular,
     NoSharedMotion,
     NoSignal,
@@ -303,25 +302,6 @@ def _weak_motion(advice: WeakMotion, names: Names) -> Explanation:
         f"most {ratio(advice.snr)}). If they stand side by side, the rest is noise, and alignment "
         "and method have little effect. If not, the estimates include motion.",
         "Check that every sensor stands beside the others and is connected.",
-    )
-
-
-@explain.register(MotionLeftIn)
-def _motion_left_in(advice: MotionLeftIn, names: Names) -> Explanation:
-    if advice.channels:
-        quiet = listed([names.channels[channel] for channel in advice.channels])
-        return Explanation(
-            f"{quiet}: at {where(advice)} the motion is too weak beside the noise of the other "
-            f"sensors to be found in {advice.n_effective:.0f} averages: up to about "
-            f"{percent(advice.share)} of the noise estimate may be motion. The lower end of its "
-            "interval includes this.",
-            "Record longer or where the motion is stronger, or compare with quieter sensors.",
-        )
-    return Explanation(
-        f"At {where(advice)} the motion is too weak to be found in {advice.n_effective:.0f} "
-        "averages: three-sensor and three-channel estimates may include motion and be too high by "
-        f"up to about {percent(advice.share)}; maximum likelihood by less.",
-        "Record longer to remove it.",
     )
 
 

@@ -11,10 +11,10 @@ import numpy as np
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
 from daq.bench.units import levels_db
-from daq.results.band_summary import correlation_of
+from daq.results.band_summary import levels
 from daq.results.decision.limits import concerns
 from daq.results.decision.mask_bands import mask_psd
-from estimator.self_noise.band_means import band_means, log_edges
+from estimator.levels.bands import log_edges
 from tui.report.figures import drawing
 from tui.report.parts import Plot
 from tui.report.wording import power_of_ten
@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
-    from estimator.self_noise.band_means import BandMeans, FloatArray
+    from daq.results.band_summary import BandMeans
+    from estimator.types import FloatArray
 
     BoolArray = NDArray[np.bool_]
 
@@ -231,21 +232,10 @@ def _curves(
     edges = log_edges(frequency, POINTS)
     centre = centres(frequency, edges)
     width = np.gradient(frequency)
-    correlation = correlation_of(settings)
-    added = snapshot.added
+    found = levels(noise, snapshot, settings, edges)
     curves = []
     for column, label in enumerate(snapshot.channels):
-        means = band_means(
-            noise.noise_psd[:, column],
-            noise.cov[:, column],
-            edges,
-            correlation,
-            weights=width,
-            added=None if added is None else added[:, column],
-        )
-        single = np.diff(edges) == 1  # has an interval of its own, better at few averages
-        means.low[single] = noise.low[edges[:-1][single], column]
-        means.high[single] = noise.high[edges[:-1][single], column]
+        means = found.of_channel(column)
         limits = [] if bench is None else [lim for lim in bench.limits if concerns(lim, label)]
         masks = []
         for limit in limits:

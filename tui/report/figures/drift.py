@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from daq.estimation.snapshot import Snapshot
-    from estimator.self_noise.band_means import FloatArray
+    from estimator.types import FloatArray
 
 POINTS = 400
 HEIGHT = 1.5

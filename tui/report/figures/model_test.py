@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from scipy import special
 
+from estimator.levels.bands import log_edges
 from estimator.likelihood.goodness_of_fit import REJECT, neighbour_correlation
-from estimator.self_noise.band_means import log_edges
 from estimator.spectra.windows import get_window
 from tui.report.figures import drawing
 from tui.report.figures.curves import centres, logarithmic
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
-    from estimator.self_noise.band_means import FloatArray
+    from estimator.types import FloatArray
 
 TEST_POINTS = 90
 TEST_HEIGHT = 1.25

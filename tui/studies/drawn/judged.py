@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.results.band_summary import channel_means
-from estimator.self_noise.band_means import band_edges
+from estimator.levels.bands import band_edges
 from tui.studies.study import Panel, Point, Series, Study
 
 if TYPE_CHECKING:

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimator.levels.bands import bin_correlation
 from estimator.likelihood.dimension import choose_dimension
 from estimator.methods import self_noise
-from estimator.self_noise.band_means import bin_correlation
 from estimator.self_noise.bias import three_channel_bias, three_sensor_bias
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window

@@ -12,8 +12,14 @@ from daq.results.decision.decision_time import LIKELY, Margins, predict
 
 if TYPE_CHECKING:
     from daq.results.decision.verdict import Prediction
+    from estimator.types import FloatArray
 
 QUANTILE = 3.5
+
+
+def like_psd(cov: float, n: int) -> FloatArray:
+    """Return the cumulants of n estimates that scatter like a PSD."""
+    return np.repeat([[cov**2], [cov**4], [cov**6]], n, axis=1)
 
 
 def prediction(
@@ -21,7 +27,7 @@ def prediction(
 ) -> Prediction:
     """Return the prediction for channels that are all as far from the limit."""
     margins = Margins(
-        np.full(n, margin), np.full(n, cov), np.full(n, clocks), np.zeros(n), np.full(n, can_fail)
+        np.full(n, margin), like_psd(cov, n), np.full(n, clocks), np.zeros(n), np.full(n, can_fail)
     )
     return predict(margins, quantile=QUANTILE, elapsed=100.0, averages=100.0, least=20.0)
 
@@ -53,7 +59,7 @@ def test_what_clocks_may_have_added_does_not_fail_with_time() -> None:
 
 def test_too_few_averages_take_as_long_as_it_takes_to_have_enough() -> None:
     margins = Margins(
-        np.full(9, 5.0), np.full(9, 0.3), np.zeros(9), np.zeros(9), np.ones(9, dtype=bool)
+        np.full(9, 5.0), like_psd(0.3, 9), np.zeros(9), np.zeros(9), np.ones(9, dtype=bool)
     )
     found = predict(margins, quantile=QUANTILE, elapsed=10.0, averages=10.0, least=20.0)
     assert found.seconds is not None
@@ -68,7 +74,7 @@ def test_it_decides_as_often_as_it_says() -> None:
     for _ in range(150):
         truth = rng.normal(0.5, 0.15, n)
         now = truth + cov * rng.standard_normal(n)
-        margins = Margins(now, np.full(n, cov), np.zeros(n), np.zeros(n), np.ones(n, dtype=bool))
+        margins = Margins(now, like_psd(cov, n), np.zeros(n), np.zeros(n), np.ones(n, dtype=bool))
         found = predict(margins, quantile=QUANTILE, elapsed=100.0, averages=1e4, least=20.0)
         if found.seconds is None:
             continue

@@ -13,6 +13,7 @@ from daq.bench.model import Limit
 from daq.results.decision.limits import judge
 from daq.results.decision.mask_bands import mask_edges
 from daq.results.decision.verdict import Obstacle, Verdict
+from estimator.self_noise.result import SelfNoise
 from tests.daq.results.decision.benches import MASK, verdict_on
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
 from tui.output.verdict_text import not_judged
@@ -65,13 +66,14 @@ def test_a_mask_is_in_the_unit_of_the_bench_file() -> None:
     in_micro_g = replace(
         snapshot,
         unit="µg",
+        csm=snapshot.csm * scale,
         channels=tuple(replace(label, unit="µg") for label in snapshot.channels),
         results={
-            "three-sensor": replace(
-                noise,
-                noise_psd=noise.noise_psd * scale,
-                low=noise.low * scale,
-                high=noise.high * scale,
+            "three-sensor": SelfNoise.of(
+                noise.method,
+                noise.noise_psd * scale,
+                noise.cumulants * np.array([scale**k for k in (2, 3, 4)])[:, None, None],
+                noise.flags,
             )
         },
     )

@@ -13,7 +13,6 @@ from estimator.diagnostics.advice import (
     MissingDimension,
     ModelMisfit,
     MotionAcross,
-    MotionLeftIn,
     NearlySingular,
     NoSharedMotion,
     NoSignal,
@@ -262,24 +261,6 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
     (
         WeakMotion(level=Level.NOTE, band=BAND, snr=0.3),
         ("At 2–8 Hz the motion that the sensors share is weaker than the rest (SNR at most 0.3)",),
-    ),
-    (
-        MotionLeftIn(level=Level.NOTE, band=BAND, share=0.085, n_effective=20.0),
-        ("too weak to be found in 20 averages", "up to about 8.5 %", "Record longer"),
-    ),
-    (
-        MotionLeftIn(
-            level=Level.WARNING,
-            sensors=(0,),
-            band=BAND,
-            share=0.6,
-            n_effective=190.0,
-            channels=(0, 1),
-        ),
-        (
-            "a.x and a.y: at 2–8 Hz",
-            "190 averages: up to about 60 % of the noise estimate",
-        ),
     ),
     (
         SwappedChannels(level=Level.WARNING, sensors=(0, 1), band=BAND, channels=((3, 1), (4, 0))),

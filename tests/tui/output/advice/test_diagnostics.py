@@ -137,17 +137,15 @@ def test_octaves_say_what_each_has_left_out() -> None:
     assert not any("octaves below" in line or "above 20.1 Hz" in line for line in alone)
 
 
-def test_where_averages_are_too_few_for_weak_motion_is_said_with_what_may_be_left_in() -> None:
+def test_where_directions_of_motion_come_from_neighbouring_frequencies_is_said() -> None:
     snapshot = diagnosed()
     noise = snapshot.results["three-sensor"]
-    flags, cov = noise.flags.copy(), noise.cov.copy()
-    flags[20:41] |= Flag.UNRESOLVED
-    cov[20:41] = 0.13
-    results = {"three-sensor": replace(noise, flags=flags, cov=cov)}
-    (line,) = [x for x in remarks(replace(snapshot, results=results)) if "too few averages" in x]
-    assert "at 21 of 199 frequencies (10 to 20 Hz)" in line
-    assert "up to about 13 %" in line
-    assert not any("too few averages" in x for x in remarks(snapshot))
+    flags = noise.flags.copy()
+    flags[20:41] |= Flag.POOLED
+    results = {"three-sensor": replace(noise, flags=flags)}
+    (line,) = [x for x in remarks(replace(snapshot, results=results)) if "do not resolve" in x]
+    assert "at 21 of 199 (10 to 20 Hz)" in line
+    assert not any("do not resolve" in x for x in remarks(snapshot))
 
 
 def test_what_is_not_searched_for_among_many_channels_is_said() -> None:

@@ -8,14 +8,9 @@ import numpy as np
 import pytest
 
 from daq.results.band_summary import band_of
-from estimator.self_noise.band_means import (
-    NORMAL_95,
-    band_edges,
-    band_means,
-    bin_correlation,
-    log_edges,
-    median_of_columns,
-)
+from estimator.levels.bands import band_edges, band_levels, bin_correlation, log_edges
+from estimator.levels.interval import like_psd
+from estimator.median import median_of_columns
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
 from tui.output.results import result_table, result_title
 
@@ -33,11 +28,16 @@ def test_cov_of_a_band_mean_agrees_with_simulated_periodograms(name: str, overla
     truth = psd[:, 4:28].mean(axis=1)
     cov_of_bin = psd[:, 4:28].std(axis=0).mean() / truth.mean()
 
-    found = band_means(psd[0], np.full(33, cov_of_bin), edges, bin_correlation(window, hop))
+    scatter = like_psd(psd[0], cov_of_bin * psd[0])[:, :, None]
+    found = band_levels(psd[0][:, None], scatter, edges, bin_correlation(window, hop))
 
     # The standard deviation of n_runs draws is known to 1 / sqrt(2 n_runs) = 1.8 %.
-    assert found.spread[0] / found.mean[0] == pytest.approx(truth.std() / truth.mean(), rel=0.08)
-    assert found.mean[0] == pytest.approx(truth[0])
+    cov = found.spread[0, 0] / found.mean[0, 0]
+    assert cov == pytest.approx(truth.std() / truth.mean(), rel=0.08)
+    assert found.mean[0, 0] == pytest.approx(truth[0])
+    # Gamma variables: as skew as the mean of so many independent bins
+    skewness = 2 * found.cumulants[1] / found.spread**3
+    assert skewness[0, 0] == pytest.approx(2 * cov, rel=0.15)
 
 
 def test_hann_bins_are_correlated_as_in_theory() -> None:
@@ -48,15 +48,17 @@ def test_hann_bins_are_correlated_as_in_theory() -> None:
 
 
 def test_bins_with_nan_are_ignored_and_negative_means_remain_negative() -> None:
-    psd = np.array([1.0, np.nan, 3.0, -2.0, -4.0, np.nan])
-    cov = np.where(np.isfinite(psd), 0.1, np.nan)
-    uncorrelated = np.array([1.0, 0.0])
-    found = band_means(psd, cov, np.array([0, 3, 5, 6]), uncorrelated)
-    np.testing.assert_allclose(found.mean, [2.0, -3.0, np.nan])
+    psd = np.array([1.0, np.nan, 3.0, -2.0, -4.0, np.nan])[:, None]
+    scatter = like_psd(np.abs(psd), 0.1 * np.abs(psd))
+    found = band_levels(psd, scatter, np.array([0, 3, 5, 6]), np.array([1.0, 0.0]))
+    np.testing.assert_allclose(found.mean[:, 0], [2.0, -3.0, np.nan])
     spread = np.array([np.hypot(0.1, 0.3), np.hypot(0.2, 0.4)]) / 2
-    np.testing.assert_allclose(found.high[0], 2 * np.exp(NORMAL_95 * spread[0] / 2))
-    np.testing.assert_allclose(found.low[1], -3 - NORMAL_95 * spread[1])
-    assert np.isnan(found.high[2])
+    np.testing.assert_allclose(found.spread[:2, 0], spread)
+    assert found.complete[:, 0].tolist() == [False, True, False]
+    low, high = found.interval()
+    assert 1.96 * spread[0] < high[0, 0] - 2 < 1.2 * 1.96 * spread[0]  # asymmetric
+    assert low[1, 0] < -3
+    assert np.isnan(high[2, 0])
 
 
 def test_bands_exclude_zero_frequency_and_nyquist() -> None:

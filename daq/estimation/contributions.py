@@ -1,0 +1,124 @@
+"""What widens the intervals of one estimate: made here, once, from what its snapshot knows."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.diagnostics.advice import ModelMisfit, TooFewDimensions
+from estimator.diagnostics.kinds import Level
+from estimator.diagnostics.misfit import SharedNoise
+from estimator.levels.contributions import Contribution, Source, contribution, widened
+from estimator.levels.interval import NORMAL_95
+from estimator.likelihood.gradients import misfit
+from estimator.self_noise.result import SelfNoise
+
+if TYPE_CHECKING:
+    from daq.estimation.snapshot import Snapshot
+    from estimator.types import BoolArray, FloatArray
+
+SECOND_ORDER = 2.5
+"""Bias by further dimensions over the squared c.o.v. of one frequency, one standard deviation
+(docs/validation/gradients.md)."""
+NOTHING_USEFUL = 1.0
+"""Share of the noise by which a model that fails may be off, from which nothing is known."""
+
+
+def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
+    """Return what widens the intervals of a method's noise at every frequency."""
+    noise = snapshot.results[method]
+    shape = (len(snapshot.frequency), len(snapshot.channels))
+    psd = np.nan_to_num(np.abs(noise.noise_psd))
+    diagnostics = snapshot.diagnostics
+    found = []
+    clocks, missing = snapshot.added_by_clocks, snapshot.removed
+    if clocks is not None or missing is not None:
+        below, above = (0.0 if each is None else each for each in (clocks, missing))
+        found.append(contribution(Source.CLOCKS, shape, below=below, above=above))
+    if diagnostics.edge_leakage is not None:
+        most = np.minimum(diagnostics.edge_leakage.most, psd)
+        found.append(contribution(Source.EDGES, shape, below=most))
+    if snapshot.bridged is not None:
+        leakage = np.nan_to_num(snapshot.bridged.leakage)
+        below, above = (np.clip(part, 0.0, 1.0) * psd for part in (leakage, -leakage))
+        found.append(contribution(Source.GAPS, shape, below=below, above=above))
+    dimensions, explained = _dimensions(snapshot, method)
+    if dimensions.any():
+        found.append(contribution(Source.DIMENSIONS, shape, share=dimensions[:, None]))
+    for source, share in _misfits(snapshot, explained).items():
+        if share.any():
+            found.append(contribution(source, shape, share=share[:, None]))
+    faulty = [*diagnostics.clipped, *diagnostics.stood_still]
+    if faulty:
+        below = np.zeros(shape)
+        below[:, faulty] = math.inf
+        found.append(contribution(Source.FAULTY, shape, below=below))
+    return tuple(found)
+
+
+def with_contributions(snapshot: Snapshot) -> Snapshot:
+    """Return a snapshot whose intervals include what its methods do not know.
+
+    Of noise that changes, estimates scatter more than their cumulants say.
+    """
+    found = snapshot.diagnostics.diagnosis
+    steady = None if found is None else found.stability
+    inflation = max(1.0, 1.0 if steady is None else steady.inflation)
+    scale = np.array([inflation, inflation**2, inflation**3])[:, None, None]
+    results = {}
+    for name, each in snapshot.results.items():
+        result = each
+        if inflation > 1:
+            result = SelfNoise.of(name, each.noise_psd, scale * each.cumulants, each.flags)
+        low, high = widened(result.low, result.high, contributions(snapshot, name))
+        results[name] = replace(result, low=low, high=high)
+    return replace(snapshot, results=results)
+
+
+def _dimensions(snapshot: Snapshot, method: str) -> tuple[FloatArray, BoolArray]:
+    """Return the doubt of the chosen dimensions as a share, and where dimensions were chosen.
+
+    Both of shape (n_freqs,). The doubt is common to the frequencies of a band: what gradients of
+    the motion leave unexplained, and the bias of many free factors, of second order in the c.o.v.
+    """
+    frequency = snapshot.frequency
+    share, explained = np.zeros(len(frequency)), np.zeros(len(frequency), np.bool_)
+    if method != "maximum-likelihood":
+        return share, explained
+    for choice in snapshot.diagnostics.dimensions:
+        inside = (frequency >= choice.low) & (frequency <= choice.high)
+        explained |= inside
+        if choice.is_biased or choice.is_undetermined:
+            share[inside] = math.inf
+        elif choice.n_factors > choice.usual and math.isfinite(choice.cov):
+            error = (
+                misfit(choice.test, sum(snapshot.dims), snapshot.n_effective)
+                if choice.gradients
+                else SECOND_ORDER * choice.cov**2
+            )
+            share[inside] = NORMAL_95 * error
+    return share, explained
+
+
+def _misfits(snapshot: Snapshot, explained: BoolArray) -> dict[Source, FloatArray]:
+    """Return what failed tests of the model allow, as shares, shape (n_freqs,) each."""
+    frequency = snapshot.frequency
+    found = {source: np.zeros(len(frequency)) for source in (Source.MISFIT, Source.SHARED_NOISE)}
+    for advice in snapshot.diagnostics.advice:
+        if advice.band is None or advice.level is Level.NOTE:
+            continue
+        here = (frequency >= advice.band[0]) & (frequency <= advice.band[1])
+        source, error = Source.MISFIT, 0.0
+        if isinstance(advice, ModelMisfit):
+            here &= ~explained
+            error = advice.error if advice.error < NOTHING_USEFUL else math.inf
+        elif isinstance(advice, SharedNoise):
+            source, error = Source.SHARED_NOISE, advice.harm
+        elif isinstance(advice, TooFewDimensions):
+            here &= ~explained
+            error = math.inf
+        found[source][here] = np.maximum(found[source][here], error)
+    return found

@@ -1,0 +1,121 @@
+"""What widens the interval of a level beyond the scatter of the estimate, by name.
+
+Every cause enters once, here: table, plot, report, JSON, budget and verdict have the same two ends.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable
+
+    from numpy.typing import NDArray
+
+    from estimator.types import FloatArray
+
+
+class Source(enum.StrEnum):
+    """Causes of a wider interval."""
+
+    CLOCKS = "clocks"
+    """The residual between the clocks adds noise, or takes it away."""
+    EDGES = "edges"
+    """Unequal responses leak at the edges of segments."""
+    GAPS = "gaps"
+    """The windows of segments with gaps leak from other frequencies."""
+    MISFIT = "misfit"
+    """One common motion does not explain the averages."""
+    SHARED_NOISE = "shared-noise"
+    """Two channels share noise."""
+    DIMENSIONS = "dimensions"
+    """The number of dimensions of the motion is in doubt."""
+    FAULTY = "faulty"
+    """The channel is clipped, or was dead for a while: its noise is lower than the estimate."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contribution:
+    """What one cause adds to an interval; arrays of shape (n, n_channels), n bins or bands.
+
+    Attributes
+    ----------
+    source : Source
+    below, above : float64
+        By how much the lower end is lower, the upper end higher, in unit**2/Hz.
+    share : float64
+        Part of the level by which both ends are farther; infinite where nothing is known.
+    """
+
+    source: Source
+    below: FloatArray
+    above: FloatArray
+    share: FloatArray
+
+    def in_bands(self, edges: NDArray[np.int64], weight: FloatArray) -> Contribution:
+        """Return the contribution to the means of bands.
+
+        Offsets are averaged with weights, shape (n_freqs, n_channels), 0 where the noise is not
+        known; of shares the largest counts: a band is concerned if a part of it is.
+        """
+        first, last, starts = int(edges[0]), int(edges[-1]), edges[:-1] - edges[0]
+        inside = weight[first:last]
+        total = np.add.reduceat(inside, starts, axis=0)
+        total = np.where(total > 0, total, 1.0)
+
+        def mean(psd: FloatArray) -> FloatArray:
+            part = np.where(inside > 0, psd[first:last], 0.0)
+            summed = np.add.reduceat(np.where(inside > 0, part * inside, 0.0), starts, axis=0)
+            return np.asarray(summed / total)
+
+        return Contribution(
+            self.source,
+            mean(self.below),
+            mean(self.above),
+            np.maximum.reduceat(self.share[first:last], starts, axis=0),
+        )
+
+
+def contribution(
+    source: Source,
+    shape: tuple[int, int],
+    *,
+    below: FloatArray | float = 0.0,
+    above: FloatArray | float = 0.0,
+    share: FloatArray | float = 0.0,
+) -> Contribution:
+    """Return a contribution; what is not given is zero."""
+    arrays = (
+        np.broadcast_to(np.asarray(part, np.float64), shape) for part in (below, above, share)
+    )
+    return Contribution(source, *arrays)
+
+
+def widened(
+    low: FloatArray,
+    high: FloatArray,
+    contributions: Iterable[Contribution],
+    *,
+    without: Collection[Source] = (),
+) -> tuple[FloatArray, FloatArray]:
+    """Return the ends of an interval with all contributions but some.
+
+    Offsets are bounds, so they add. A share moves the upper end up, and a positive lower end down
+    to zero at most, unless nothing is known.
+    """
+    share = np.zeros(low.shape)
+    for each in contributions:
+        if each.source in without:
+            continue
+        low = low - each.below
+        high = high + each.above
+        share = share + each.share
+    with np.errstate(invalid="ignore"):
+        lower = np.where(low > 0, low * np.maximum(1 - share, 0.0), low)
+        upper = np.where(high > 0, high * (1 + share), high)
+    unknown = np.isinf(share) & ~np.isnan(low)
+    return np.where(unknown, -np.inf, lower), np.where(unknown, np.inf, upper)

@@ -1,0 +1,136 @@
+"""The interval of a level: one function for a bin, a band, an octave, a mask, by every method.
+
+An estimate that scales with the cross-spectral matrix S is, to first order, a linear function
+``tr(M S)`` of it, with a Hermitian differential M. For a complex Wishart matrix of n averages its
+cumulants are those of ``tr(M S)`` with M fixed. With ``t_k = tr((M S)**k)`` and
+
+    ``T_k = t_k / n**(k - 1)``,   k = 2, 3, 4,
+
+its variance is T_2 and its third cumulant ``2 T_3``. T_k of a sum of independent estimates is the
+sum of theirs, with the k-th power of their weights.
+
+An interval needs the variance at *other* values of the noise than the estimate. Along the least
+favourable direction, ``S + delta S M S / t_2``, in which the noise changes by delta with the
+smallest effect on the data, the variance is
+
+    ``T_2 + 2 (T_3 / T_2) delta + (T_4 / T_2**2) delta**2``:
+
+proportional to the square of the noise for a PSD, and constant if leaking motion dominates.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from estimator.types import FloatArray
+
+NORMAL_95 = 1.959963984540054
+"""Standard normal quantile of 97.5 %."""
+
+
+CERTAIN = 4.0
+"""Standard deviations above zero from which a level counts as certainly positive."""
+
+
+def interval(
+    level: FloatArray, cumulants: FloatArray, quantile: float | FloatArray = NORMAL_95
+) -> tuple[FloatArray, FloatArray]:
+    """Return the interval of an estimate whose variance depends on the true value.
+
+    Parameters
+    ----------
+    level : float64, shape (...)
+        The estimate.
+    cumulants : float64, shape (3, ...)
+        T_2, T_3, T_4, in the square, cube and fourth power of the unit of `level`.
+    quantile : float
+        Standard deviations to either end, z: of a normal variable with the wanted probability.
+
+    Returns
+    -------
+    low, high : float64, shape (...)
+        The values within z of *their own* standard deviations of the estimate (Wilson's
+        construction), where z is corrected for skewness (Cornish and Fisher) and for the scatter of
+        the deviation. The interval is asymmetric: the chi-squared interval if the estimate is a
+        single PSD, and also valid for negative estimates. `high` is infinite if the averages are
+        too few to bound it.
+
+    Notes
+    -----
+    ``T_2`` has the variance ``4 T_4``, of which its dependence on the true value, above, explains
+    ``4 T_3**2 / T_2``. The rest is that of a chi-square variable with
+    ``nu = 1 / (2 (T_4 / T_2**2 - T_3**2 / T_2**3))`` degrees of freedom, so that z becomes the
+    quantile of Student's t, ``z + (z**3 + z) / (4 nu)``. For a single PSD nu is infinite.
+    """
+    t2, t3, t4 = cumulants
+    certain = t2 <= 0
+    t2 = np.where(certain, 1.0, t2)
+    slope, curvature = t3 / t2, t4 / t2**2
+    skewness = 2 * t3 / np.sqrt(t2**3)
+    unexplained = np.maximum(curvature - slope**2 / t2, 0.0)
+    student = quantile * (1 + (np.square(quantile) + 1) * unexplained / 2)
+    ends = []
+    for side in (-1, 1):
+        kappa = (student - side * skewness * (np.square(quantile) - 1) / 6) ** 2
+        # delta**2 = kappa (T2 + 2 slope delta + curvature delta**2), solved without cancellation
+        square = 1 - kappa * curvature
+        root = np.sqrt(np.maximum((kappa * slope) ** 2 + square * kappa * t2, 0.0))
+        reach = root - side * kappa * slope
+        # with one average or less the expansion for skewness is invalid
+        bounded = (reach > 0) & ((side < 0) | ((square > 0) & (curvature < 1)))
+        distance = np.full_like(reach, np.inf)
+        np.divide(kappa * t2, reach, out=distance, where=bounded)
+        ends.append(level + side * np.where(certain, 0.0, distance))
+    return ends[0], ends[1]
+
+
+def like_psd(level: FloatArray, deviation: FloatArray) -> FloatArray:
+    """Return the cumulants of an estimate that scatters like a PSD of as many averages.
+
+    Parameters
+    ----------
+    level, deviation : float64, shape (...)
+        Positive estimate, and its standard deviation.
+    """
+    share = np.square(deviation / level)  # one over the averages
+    return np.stack([level**k * share ** (k - 1) for k in (2, 3, 4)])
+
+
+def moved(cumulants: FloatArray, change: FloatArray) -> FloatArray:
+    """Return cumulants at another value of the noise than the one at which they are known.
+
+    Parameters
+    ----------
+    cumulants : float64, shape (3, ...)
+    change : float64, shape (...)
+        The other value less the one at which `cumulants` are known.
+
+    Notes
+    -----
+    T_2 as in the module's docstring, limited to 1e-6 of itself; T_3 and T_4 with its powers of 3/2
+    and 2, as those of a PSD.
+    """
+    t2, t3, t4 = cumulants
+    known = t2 > 0
+    unit = np.where(known, t2, 1.0)
+    ratio = 1 + (2 * (t3 / unit) * change + (t4 / unit**2) * change**2) / unit
+    ratio = np.where(known, np.maximum(ratio, 1e-6), 1.0)
+    return np.stack([t2 * ratio, t3 * ratio**1.5, t4 * ratio**2])
+
+
+def worth(most: int, correlation: FloatArray) -> FloatArray:
+    """Return how many independent bins 0, 1, … `most` neighbouring ones are worth.
+
+    Parameters
+    ----------
+    most : int
+    correlation : float64, shape (n_lags,)
+        Of the power of bins k apart, 1 at k = 0.
+    """
+    count = np.arange(1, most + 1)
+    lag = np.arange(1, len(correlation))
+    pairs = np.maximum(1 - lag[None, :] / count[:, None], 0.0) @ correlation[1:]
+    return np.concatenate([[0.0], count / (1 + 2 * pairs)])

@@ -1,0 +1,151 @@
+"""Noise from directions that neighbouring bins share: unbiased, and covered by its interval."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from estimator.levels.bands import band_levels
+from estimator.levels.interval import worth
+from estimator.levels.pooled import pooled_noise, unresolved_blocks
+from estimator.methods import Flag, self_noise
+from estimator.self_noise.three_sensor import three_sensor
+from tests.estimator.csm_models import wishart
+
+if TYPE_CHECKING:
+    from estimator.types import ComplexArray, FloatArray
+
+N_BINS = 61
+ONE = np.ones(1)
+EDGES = np.array([0, N_BINS])
+
+
+def scene(
+    rng: np.random.Generator, snr: tuple[float, ...], noise: FloatArray, *, sensors: int = 3
+) -> ComplexArray:
+    """Return the true matrix of each bin; responses vary by 10 % and 6 degrees over the band."""
+    d = len(snr)
+    turned = [np.linalg.qr(rng.standard_normal((d, d)))[0] for _ in range(sensors)]
+    loadings = np.concatenate(turned) * np.sqrt(snr)
+    f = np.linspace(-1, 1, N_BINS)[:, None]
+    size = 1 + 0.1 * rng.uniform(-1, 1, len(noise)) * f
+    phase = np.exp(1j * np.deg2rad(6) * rng.uniform(-1, 1, len(noise)) * f)
+    A = (size * phase)[:, :, None] * loadings
+    return np.asarray(A @ A.conj().swapaxes(1, 2) + np.diag(noise))
+
+
+def drawn(rng: np.random.Generator, csm: ComplexArray, n: int) -> ComplexArray:
+    return np.asarray(wishart(csm, n, rng)[0], np.complex128)
+
+
+def coverage(
+    snr: tuple[float, ...], noise: FloatArray, *, n: int, draws: int, sensors: int = 3
+) -> tuple[float, float, float]:
+    """Return coverage of bands and of bins, and the mean over the truth."""
+    d = len(snr)
+    bands, bins, means = [], [], []
+    for seed in range(draws):
+        rng = np.random.default_rng([n, seed, sensors])
+        sample = drawn(rng, scene(rng, snr, noise, sensors=sensors), n)
+        found = self_noise(
+            "three-sensor",
+            sample,
+            dims=(d,) * sensors,
+            n_effective=n,
+            blocks=np.zeros(N_BINS, np.int64),
+        )
+        level = band_levels(found.noise_psd, found.cumulants, EDGES, ONE)
+        low, high = level.interval()
+        bands.append((low[0] <= noise) & (noise <= high[0]))
+        bins.append((found.low <= noise) & (noise <= found.high))
+        means.append(level.mean[0] / noise)
+    return float(np.mean(bands)), float(np.mean(bins)), float(np.mean(means))
+
+
+@pytest.mark.parametrize(
+    "snr",
+    [(0.1, 0.1, 0.1), (1.0, 1.0, 1.0), (1e3, 1.0, 1.0), (1e5, 1.0, 0.5)],
+    ids=["weak", "equal to the noise", "one strong axis", "one very strong axis"],
+)
+def test_levels_of_bands_and_bins_are_covered(snr: tuple[float, ...]) -> None:
+    noise = np.ones(9)
+    bands, bins, mean = coverage(snr, noise, n=189, draws=12)
+    # 108 levels of correlated channels: 95 % less four standard errors
+    assert bands > 0.95 - 4 * np.sqrt(0.05 * 0.95 / 108)
+    assert 0.93 < bins < 0.97
+    assert mean == pytest.approx(1, abs=0.015)
+
+
+def test_few_averages_are_covered() -> None:
+    bands, bins, _ = coverage((0.3, 0.3), np.ones(6), n=12, draws=20)
+    assert bands > 0.95 - 4 * np.sqrt(0.05 * 0.95 / 120)
+    assert 0.93 < bins < 0.985
+
+
+def test_a_quiet_sensor_is_known_to_a_few_times_its_noise() -> None:
+    """30 dB below the others, SNR 0.3 in them: single bins know it to 60 times its noise."""
+    noise = np.array([1e-3] * 3 + [1.0] * 6)
+    reach = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        sample = drawn(rng, scene(rng, (0.3,) * 3, noise), 189)
+        found = self_noise(
+            "three-sensor",
+            sample,
+            dims=(3,) * 3,
+            n_effective=189,
+            blocks=np.zeros(N_BINS, np.int64),
+        )
+        _, high = band_levels(found.noise_psd, found.cumulants, EDGES, ONE).interval()
+        reach.append(high[0, :3] / noise[:3])
+    assert np.median(reach) < 20
+
+
+def test_where_bins_resolve_the_motion_the_paper_s_formula_stays() -> None:
+    rng = np.random.default_rng(1)
+    sample = drawn(rng, scene(rng, (1e4,) * 3, np.ones(9)), 189)
+    kept = self_noise(
+        "three-sensor", sample, dims=(3,) * 3, n_effective=189, blocks=np.zeros(N_BINS, np.int64)
+    )
+    plain = three_sensor(sample, dims=(3,) * 3, n_effective=189)
+    np.testing.assert_array_equal(kept.noise_psd, plain.noise_psd)
+    assert not (kept.flags & Flag.POOLED).any()
+
+
+def test_a_quiet_sensor_does_not_vouch_for_its_own_motion() -> None:
+    noise = np.array([1e-3] * 2 + [1.0] * 4)
+    rng = np.random.default_rng(2)
+    sample = drawn(rng, scene(rng, (0.05, 0.05), noise), 100)
+    unresolved = unresolved_blocks(
+        sample,
+        np.zeros(N_BINS, np.int64),
+        np.full(N_BINS, 2),
+        np.broadcast_to(noise, (N_BINS, 6)),
+        np.full((N_BINS, 6), 1e-4) * noise**2,
+        dims=(2, 2, 2),
+        n_effective=100,
+    )
+    assert unresolved.tolist() == [True]
+
+
+def test_too_few_averages_for_a_block_give_nothing() -> None:
+    found = pooled_noise(
+        np.broadcast_to(np.eye(9, dtype=np.complex128), (2, 9, 9)),
+        np.zeros(2, np.int64),
+        np.full(2, 3),
+        dims=(3, 3, 3),
+        n_effective=4,
+        correlation=ONE,
+    )
+    assert np.isnan(found.noise).all()
+
+
+def test_correlated_neighbours_are_worth_fewer_bins() -> None:
+    hann = np.array([1.0, 4 / 9, 1 / 36])
+    table = worth(100, hann)
+    assert table[1] == 1
+    assert table[2] == pytest.approx(2 / (1 + 4 / 9))
+    assert table[100] == pytest.approx(100 / (1 + 2 * (4 / 9 * 0.99 + 1 / 36 * 0.98)))
+    np.testing.assert_allclose(worth(9, ONE), np.arange(10))
