@@ -157,7 +157,7 @@ def answer(
     channels = known[0].described.channels
     every = Estimator(plan, settings, channels)
     # Days and stretches go by the method that judges.
-    first = settings.methods[:1] if settings.methods[:1] != ("all",) else ("three-sensor",)
+    first = settings.methods[:1] if settings.methods[:1] != ("all",) else ("auto",)
     one = Estimator(plan, replace(settings, methods=first), channels)
     usable = min(entry.described.usable for entry in known)
     bands = _bands(one, usable)

@@ -67,8 +67,11 @@ class EstimateSettings:
     methods: Annotated[
         tuple[str, ...],
         Option(
-            "Method: two-channel, three-channel, three-sensor, maximum-likelihood; all: every"
-            " method that applies; several: separated by commas.",
+            "Method: auto; two-channel, three-channel, three-sensor, maximum-likelihood; all: every"
+            " method that applies; several: separated by commas. auto is maximum likelihood with as"
+            " many dimensions of the motion as the data show, where the sensors leave room for"
+            " them (four with two or three channels, six with one; up to 96 channels), else"
+            " three-sensor.",
             check=values.methods,
             flags=("--method", "-m"),
             metavar="METHOD",
@@ -77,7 +80,7 @@ class EstimateSettings:
             text=",".join,
             key="method",
         ),
-    ] = ("three-sensor",)
+    ] = ("auto",)
     segment: Annotated[
         float,
         Option(
@@ -179,8 +182,8 @@ class EstimateSettings:
         Option(
             "Dimensions of the common motion for maximum likelihood: a number, or auto for as many"
             " as the model test of each band requires; with four or more sensors, auto uses"
-            " gradients of the motion where they explain it. Default: as many as a sensor has"
-            " channels.",
+            " gradients of the motion where they explain it. Default: auto with method auto, else"
+            " as many as a sensor has channels.",
             check=values.dimension,
             flags=("--dimension",),
             metavar="N|auto",

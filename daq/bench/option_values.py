@@ -9,7 +9,7 @@ import difflib
 import math
 from collections.abc import Mapping, Sequence
 
-METHODS = ("two-channel", "three-channel", "three-sensor", "maximum-likelihood", "all")
+METHODS = ("auto", "two-channel", "three-channel", "three-sensor", "maximum-likelihood", "all")
 CLOCKS = ("refined", "arrivals", "nominal")
 EQUALISATIONS = ("auto", "known", "estimated", "off")
 TRENDS = ("none", "constant", "linear")

@@ -19,7 +19,7 @@ from daq.estimation.snapshot_diagnostics import (
     Synchronisation,
 )
 from daq.timing.clock_model import RelativeTime
-from estimator.diagnostics.advice import Advice, Gain
+from estimator.diagnostics.advice import Advice, Gain, ModelMisfit
 from estimator.diagnostics.diagnose import Diagnostics, diagnose
 from estimator.diagnostics.kinds import Level, Untested
 from estimator.errors import InsufficientDataError
@@ -295,7 +295,9 @@ def diagnosis(
             advice
             for each in found
             for advice in each.advice
-            if (each is clearest or not advice.sensors) and not _is_explained(advice, faulty)
+            if (each is clearest or not advice.sensors)
+            and not _is_explained(advice, faulty)
+            and not _is_fitted(advice, dimensions)
         ),
         stability=found[0].stability if len(found) == 1 else None,
         per_frequency=FrequencyDiagnosis(
@@ -315,6 +317,15 @@ def diagnosis(
 def _is_explained(advice: Advice, faulty: Collection[int]) -> bool:
     """Whether a gain is off because a channel is faulty."""
     return isinstance(advice, Gain) and (advice.channel in faulty or advice.counterpart in faulty)
+
+
+def _is_fitted(advice: Advice, dimensions: Dimensions | None) -> bool:
+    """Whether the dimensions chosen by the motion explain what the usual ones do not."""
+    if dimensions is None or not isinstance(advice, ModelMisfit) or advice.band is None:
+        return False
+    low, high = advice.band
+    concerned = [each for each in dimensions.chosen if each.low <= high and each.high >= low]
+    return bool(concerned) and all(each.accepted for each in concerned)
 
 
 def _n_known(band: Band) -> int:

@@ -220,7 +220,7 @@ def noise_estimates(
     known : mapping of str to sequence of SelfNoise, optional
         What some methods give for each band, where that is estimated already.
     """
-    known = known or {}
+    known, settings = known or {}, settings.for_sensors(dims)
     results: dict[str, SelfNoise] = {}
     refused: dict[str, str] = {}
     wanted = ALL_METHODS if "all" in settings.methods else settings.methods

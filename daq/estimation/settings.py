@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from daq.recording.interface import ReadableSensor
 
 _LONG_WINDOW = 4096  # samples, in which every window with a parameter that has one is possible
+ROOM, ROOM_OF_ONE_CHANNEL = 4, 6
+"""Sensors from which ``auto`` looks for more dimensions of motion than a sensor has channels."""
+MAX_CHANNELS = 96
+"""Channels up to which ``auto`` is maximum likelihood, to limit its cost."""
 _NEEDED = {"dimension": "maximum-likelihood", "gains": "two-channel"}
 """Options that are for one method."""
 
@@ -42,6 +46,20 @@ class Settings(EstimateSettings):
     start: datetime | None = None
     end: datetime | None = None
     sampling_rate: float | None = None
+
+    def for_sensors(self, dims: tuple[int, ...]) -> Settings:
+        """Return settings with a method in place of ``auto``, by the channels of each sensor.
+
+        Maximum likelihood needs room for more dimensions than a sensor has channels.
+        """
+        if "auto" not in self.methods:
+            return self
+        least = ROOM_OF_ONE_CHANNEL if 1 in dims else ROOM
+        roomy = len(dims) >= least and len(set(dims)) == 1 and sum(dims) <= MAX_CHANNELS
+        chosen = "maximum-likelihood" if roomy else "three-sensor"
+        methods = (chosen if name == "auto" else name for name in self.methods)
+        dimension = "auto" if roomy and self.dimension is None else self.dimension
+        return replace(self, methods=tuple(dict.fromkeys(methods)), dimension=dimension)
 
     @classmethod
     def of(cls, bench: Bench | None) -> Settings:

@@ -157,7 +157,10 @@ def levels(
     bound = band_levels(rest, scatter, edges - edges[0], correlation, weights=width[inside])
     return Levels(
         found,
-        tuple(each.in_bands(edges, weight) for each in contributions(snapshot, noise.method)),
+        tuple(
+            each.in_bands(edges, weight, noise.noise_psd)
+            for each in contributions(snapshot, noise.method)
+        ),
         bound,
     )
 
@@ -187,7 +190,7 @@ def judged_method(snapshot: Snapshot, settings: Settings) -> str:
 
     It is the first of the settings, also where it gives no result: never one that is only shown.
     """
-    wanted = next(iter(settings.methods), "all")
+    wanted = next(iter(settings.for_sensors(snapshot.dims).methods), "all")
     return wanted if wanted != "all" else next(iter(snapshot.results), ALL_METHODS[0])
 
 

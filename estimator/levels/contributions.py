@@ -56,27 +56,34 @@ class Contribution:
     above: FloatArray
     share: FloatArray
 
-    def in_bands(self, edges: NDArray[np.int64], weight: FloatArray) -> Contribution:
+    def in_bands(
+        self, edges: NDArray[np.int64], weight: FloatArray, psd: FloatArray
+    ) -> Contribution:
         """Return the contribution to the means of bands.
 
-        Offsets are averaged with weights, shape (n_freqs, n_channels), 0 where the noise is not
-        known; of shares the largest counts: a band is concerned if a part of it is.
+        Bins err together, so that offsets are averaged with weights, and shares with these and the
+        noise; of arrays of shape (n_freqs, n_channels). The weight is 0 where the noise is not
+        known. Where nothing is known of a part of a band, nothing is known of the band.
         """
         first, last, starts = int(edges[0]), int(edges[-1]), edges[:-1] - edges[0]
-        inside = weight[first:last]
-        total = np.add.reduceat(inside, starts, axis=0)
-        total = np.where(total > 0, total, 1.0)
 
-        def mean(psd: FloatArray) -> FloatArray:
-            part = np.where(inside > 0, psd[first:last], 0.0)
-            summed = np.add.reduceat(np.where(inside > 0, part * inside, 0.0), starts, axis=0)
-            return np.asarray(summed / total)
+        def mean(part: FloatArray, by: FloatArray) -> FloatArray:
+            used = by[first:last] > 0
+            amount = np.where(used, part[first:last], 0.0)
+            weights = np.where(used, by[first:last], 0.0)
+            with np.errstate(invalid="ignore"):
+                product = np.where(weights > 0, amount * weights, 0.0)
+            total = np.add.reduceat(weights, starts, axis=0)
+            summed = np.add.reduceat(product, starts, axis=0)
+            return np.asarray(summed / np.where(total > 0, total, 1.0))
 
+        share = mean(self.share, weight * np.nan_to_num(np.abs(psd)))
+        unknown = np.logical_or.reduceat(np.isinf(self.share[first:last]), starts, axis=0)
         return Contribution(
             self.source,
-            mean(self.below),
-            mean(self.above),
-            np.maximum.reduceat(self.share[first:last], starts, axis=0),
+            mean(self.below, weight),
+            mean(self.above, weight),
+            np.where(unknown, np.inf, share),
         )
 
 

@@ -59,9 +59,14 @@ class NoiseComparison:
     """Largest effect of the clocks; the lower limit allows for it."""
 
     @property
+    def withdrawn(self) -> bool:
+        """Whether the estimate is above what the other sensors leave unpredicted."""
+        return self.noise_psd > self.high
+
+    @property
     def covers(self) -> bool:
-        """Whether the truth lies in the interval."""
-        return self.low <= self.true_psd <= self.high
+        """Whether the truth lies in the interval of an estimate that is not withdrawn."""
+        return not self.withdrawn and self.low <= self.true_psd <= self.high
 
 
 def run_demo(
@@ -208,7 +213,11 @@ def comparison_table(
         for method in METHODS:
             entry = found[method]
             colour, mark = ("green", "✓") if entry.covers else ("red", "✗")
-            estimate = level_with_error(entry.noise_psd, entry.high)
+            estimate = (
+                f"{level(entry.noise_psd)} withdrawn"
+                if entry.withdrawn
+                else level_with_error(entry.noise_psd, entry.high)
+            )
             row.append(Text(f"{estimate} {mark}", colour))
         table.add_row(*row)
     return table
@@ -220,18 +229,25 @@ def verdict(compared: list[NoiseComparison]) -> list[str]:
     for method in METHODS:
         entries = [entry for entry in compared if entry.method == method]
         covered = sum(entry.covers for entry in entries)
+        withdrawn = sum(entry.withdrawn for entry in entries)
         above = sum(entry.low > entry.true_psd for entry in entries)
         below = sum(entry.high < entry.true_psd for entry in entries)
         lines.append(
             f"{method}: the 95 % interval covers the truth in "
             f"{covered} of {len(entries)} channels"
             + (f"; {above} too high, {below} too low" if covered < len(entries) else "")
+            + (f", {withdrawn} withdrawn" if withdrawn else "")
             + "."
         )
     lines.append(
         "The sensors point in different directions, so motion leaks into the three-channel "
         "estimate, which is too high or below zero. The three-sensor estimate needs no alignment."
     )
+    if any(entry.withdrawn for entry in compared):
+        lines.append(
+            "An estimate is withdrawn where it is above what the other sensors do not predict of "
+            "the channel. The noise is below that, whatever the motion."
+        )
     return lines
 
 
@@ -250,6 +266,7 @@ def _document(compared: list[NoiseComparison], snapshot: Snapshot) -> dict[str, 
                 "noise_psd_high": entry.high,
                 "added_by_clocks": entry.clocks,
                 "covers": entry.covers,
+                "withdrawn": entry.withdrawn,
             }
             for entry in compared
         ],

@@ -117,8 +117,10 @@ def estimate(
     Other Parameters
     ----------------
     method : str or sequence of str
-        ``"three-sensor"`` (default), ``"two-channel"``, ``"three-channel"``,
-        ``"maximum-likelihood"``, or ``"all"`` that apply.
+        ``"auto"`` (default), ``"three-sensor"``, ``"two-channel"``, ``"three-channel"``,
+        ``"maximum-likelihood"``, or ``"all"`` that apply. ``"auto"`` is maximum likelihood with as
+        many dimensions of the motion as the data show where the sensors leave room for them (four
+        with two or three channels, six with one), else three-sensor.
     segment : str or float
         Length of a segment in seconds, or as in ``"10s"`` (default) or ``"2min"``. It sets the
         frequency resolution.
@@ -214,10 +216,11 @@ def _check_sensors(sensors: Sequence[ReadableSensor], settings: Settings) -> Non
     least = min(_MIN_SENSORS.get(method, 3) for method in settings.methods)
     if len(sensors) < least:
         names = ", ".join(sensor.name for sensor in sensors)
+        method = settings.for_sensors((1,) * len(sensors)).methods[0]
         way_out = ", or method='two-channel' where they are alike" if len(sensors) == 2 else ""
         raise ArrayError(
             f"{len(sensors)} sensor{'s' if len(sensors) > 1 else ''} ({names}):"
-            f" {settings.methods[0]} takes at least {least}; expected more sensors{way_out}"
+            f" {method} takes at least {least}; expected more sensors{way_out}"
         )
     longest = min(sensor.n_samples / sensor.sampling_rate for sensor in sensors)
     if settings.segment > longest:

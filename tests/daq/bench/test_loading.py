@@ -184,7 +184,7 @@ psd = [[1, 2], [3, 4]]
         ),
         (
             "[estimate]\ngains = {b = 1.1}\n",
-            'expected with method = "two-channel" or "all" only, not "three-sensor"',
+            'expected with method = "two-channel" or "all" only, not "auto"',
         ),
         (
             '[estimate]\nmethod = "two-channel"\ngains = {b = 0}\n',
@@ -274,9 +274,7 @@ def test_each_fault_names_file_key_value_and_what_was_expected(text: str, expect
 
 def test_too_few_sensors_are_refused() -> None:
     found = faults(HEAD + sensor_text("a") + sensor_text("b"))
-    assert found == [
-        'bench.toml: sensors = "2 sensors": expected at least 3 for method three-sensor'
-    ]
+    assert found == ['bench.toml: sensors = "2 sensors": expected at least 3 for method auto']
     method = '[estimate]\nmethod = "two-channel"\n'
     assert len(read(HEAD + sensor_text("a") + sensor_text("b") + method).sensors) == 2
 

@@ -65,7 +65,16 @@ def test_a_contribution_concerns_every_band_that_it_overlaps() -> None:
     share[2] = 0.3
     below = np.arange(6.0)[:, None]
     found = contribution(Source.MISFIT, (6, 1), below=below, share=share).in_bands(
-        np.array([0, 3, 6]), np.ones((6, 1))
+        np.array([0, 3, 6]), np.ones((6, 1)), np.full((6, 1), 2.0)
     )
-    np.testing.assert_allclose(found.share[:, 0], [0.3, 0.0])
+    np.testing.assert_allclose(found.share[:, 0], [0.1, 0.0])
     np.testing.assert_allclose(found.below[:, 0], [1.0, 4.0])
+
+
+def test_nothing_is_known_of_a_band_of_a_part_of_which_nothing_is() -> None:
+    share = np.full((6, 1), 0.2)
+    share[4] = np.inf
+    found = contribution(Source.MISFIT, (6, 1), share=share).in_bands(
+        np.array([0, 3, 6]), np.ones((6, 1)), np.ones((6, 1))
+    )
+    np.testing.assert_allclose(found.share[:, 0], [0.2, np.inf])

@@ -293,7 +293,7 @@ def test_unresolved_motion_causes_a_bias_of_a_few_percent(
     mean = found.noise_psd.mean(axis=1)
     assert abs(mean.mean() - 1) < 0.05 + 4 * mean.std() / np.sqrt(n_draws)
     covered = (found.low < 1) & (found.high > 1)
-    assert 0.93 < covered.mean() < 0.995
+    assert 0.92 < covered.mean() < 0.995  # of single frequencies, without their neighbours
     unresolved = (found.flags & Flag.UNRESOLVED) != 0
     assert np.all(unresolved.any(axis=1) == unresolved.all(axis=1))
     assert unresolved.mean() > (0.5 if snr == 0.1 else -1)

@@ -247,7 +247,7 @@ def test_options_of_an_import_hold_for_what_is_estimated_from_it(tmp_path: Path)
     assert set(watched["noise"]) == {"three-channel"}
     assert watched["segments"] == estimated["segments"]
     watched = huddle("watch", out, "--method", "all", "--segment", "1s", "--start", "20s")
-    assert set(watched["noise"]) == {*METHODS} - {"all"}
+    assert set(watched["noise"]) == {*METHODS} - {"all", "auto"}
     later = huddle("estimate", out, "--method", "all", "--segment", "1s", "--start", "20s")
     assert watched["segments"] == later["results"][0]["segments"] < estimated["segments"] / 2
     refused = CliRunner().invoke(

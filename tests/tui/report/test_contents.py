@@ -160,7 +160,10 @@ def test_the_report_and_json_say_that_shared_noise_was_not_searched_for(
     reported: Reported, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     snapshot = estimate([reported.recording])
-    plain, searched = advice_section(snapshot), result_document(snapshot, "three-sensor")
+    plain, searched = (
+        advice_section(snapshot),
+        result_document(snapshot, next(iter(snapshot.results))),
+    )
     for module in ("results", "json_document"):
         monkeypatch.setattr(f"tui.output.{module}.MAX_CHANNELS", 2)
     words = "noise that two channels share is not searched for among more than 2 channels"
@@ -168,5 +171,8 @@ def test_the_report_and_json_say_that_shared_noise_was_not_searched_for(
     assert words not in str(plain)
     assert searched["diagnostics"]["shared_noise_searched"] is True
     assert (
-        result_document(snapshot, "three-sensor")["diagnostics"]["shared_noise_searched"] is False
+        result_document(snapshot, next(iter(snapshot.results)))["diagnostics"][
+            "shared_noise_searched"
+        ]
+        is False
     )

@@ -215,7 +215,8 @@ def fitting(choice: Choice, state: State) -> Choice:
     channel = min(choice.channel, len(snapshot.channels) - 1)
     methods = choice.methods
     if not methods:
-        names = tuple(name for name in settings.methods if name != "all")
+        wanted = settings.for_sensors(snapshot.dims).methods
+        names = tuple(name for name in wanted if name != "all")
         names = names or tuple(snapshot.results)
         methods = names if len(names) < 3 else names[:1]
     picked = frozenset(each for each in choice.picked if each < len(snapshot.channels))

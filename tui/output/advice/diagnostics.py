@@ -57,7 +57,8 @@ def summary(snapshot: Snapshot) -> list[str]:
             isinstance(a, ModelMisfit | NoSharedMotion | TooFewDimensions) for a in found.advice
         )
         if diagnostics.untested is None:
-            if not failing:
+            more = any(each.n_factors > each.usual for each in diagnostics.dimensions)
+            if not failing and not more:  # what more dimensions explain is said below
                 lines.append(
                     f"The model test passes in all bands: {model(found.n_factors, snapshot.dims)} "
                     "explains what the sensors have in common."

@@ -45,17 +45,23 @@ class Names:
         Each with its sensor.
     dims : tuple of int
         Channels of each sensor.
+    in_use : frozenset of str
+        Settings that no advice need recommend: ``auto`` if the dimension is chosen from the data,
+        and the methods of the results.
     """
 
     sensors: tuple[str, ...]
     channels: tuple[str, ...]
     dims: tuple[int, ...]
+    in_use: frozenset[str] = frozenset()
 
     @classmethod
     def of(cls, snapshot: Snapshot) -> Names:
         """Return the names of a snapshot."""
         channels = tuple(label.name for label in snapshot.channels)
-        return cls(snapshot.sensor_names, channels, snapshot.dims)
+        chosen = ("auto",) if snapshot.diagnostics.dimensions else ()
+        in_use = frozenset((*snapshot.results, *chosen))
+        return cls(snapshot.sensor_names, channels, snapshot.dims, in_use)
 
     def list_sensors(self, sensors: Sequence[int]) -> str:
         """Return sensors as a list."""
@@ -186,7 +192,9 @@ def _missing_channels(advice: MissingChannels, names: Names) -> Explanation:
         f"Channels of {names.list_sensors(advice.sensors)} are missing: there is no three-sensor "
         f"estimate for {whole}, because each sensor needs two others with all their channels. The "
         "orientations of all sensors cannot be compared.",
-        "Maximum likelihood uses the remaining channels (--method maximum-likelihood).",
+        ""
+        if "maximum-likelihood" in names.in_use
+        else "Maximum likelihood uses the remaining channels (--method maximum-likelihood).",
     )
 
 
@@ -244,7 +252,7 @@ def _remedy_of_misfit(names: Names) -> str:
             f" If the motion has more than {_dimensions(d)}, sensors of {_channels(d)} must point "
             "exactly the same way: align them, or use triaxial data."
         )
-    if n_sensors > 3:
+    if n_sensors > 3 and "auto" not in names.in_use:
         remedy += f" {n_sensors} sensors allow more dimensions (--dimension auto)."
     return remedy
 
@@ -274,13 +282,17 @@ def _motion_across(advice: MotionAcross, names: Names) -> Explanation:
 
 @explain.register(MissingDimension)
 def _missing_dimension(advice: MissingDimension, names: Names) -> Explanation:
-    del names
+    choose = (
+        ""
+        if "auto" in names.in_use
+        else "Choose the dimension from the data (--dimension auto), or "
+    )
+    remedy = f"{choose}excite the floor in all directions."
     return Explanation(
         f"At {where(advice)} motion is significant in only {advice.n_dimensions:.0f} of "
         f"{advice.n_channels} dimensions; in the others it is absent or too weak to detect. The "
         "three-sensor estimate stays unbiased but scatters more.",
-        "Choose the dimension from the data (--dimension auto), or excite the floor in all "
-        "directions.",
+        remedy[0].upper() + remedy[1:],
     )
 
 

@@ -22,6 +22,7 @@ from estimator.levels.contributions import Source
 from estimator.likelihood.dimension import BandDimension
 from estimator.likelihood.goodness_of_fit import BandTest
 from estimator.methods import self_noise
+from estimator.self_noise.result import SelfNoise
 from tests.daq.results.decision.benches import bench_with, verdict_on
 from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot
 
@@ -74,11 +75,14 @@ def test_a_channel_just_at_its_mask_seldom_fails() -> None:
     snapshot, settings = made_snapshot(), replace(SETTINGS, window="rectangular", overlap=0.0)
     snapshot = replace(snapshot, n_effective=1e6)  # the c.o.v. is known here
     noise, bench = snapshot.results["three-sensor"], bench_with(4e-12)
-    cov = np.full_like(noise.cov, 0.05)
+    shape, level = noise.noise_psd.shape, 4e-12
+    cumulants = np.broadcast_to(
+        (level ** np.array([2, 3, 4]) / 400.0 ** np.array([1, 2, 3]))[:, None, None], (3, *shape)
+    )
     n_tests, n_failing = 120, 0
     for _ in range(n_tests):
-        drawn = 4e-12 * (1 + cov * rng.normal(size=cov.shape))
-        results = {"three-sensor": replace(noise, noise_psd=drawn, cov=cov)}
+        drawn = level * (1 + 0.05 * rng.normal(size=shape))
+        results = {"three-sensor": SelfNoise.of("three-sensor", drawn, cumulants, noise.flags)}
         found = judge(bench, replace(snapshot, results=results), settings)
         assert found is not None
         n_failing += found.verdict is Verdict.FAIL
