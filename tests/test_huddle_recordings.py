@@ -96,6 +96,12 @@ def test_a_plan_is_that_of_the_command(tmp_path: Path) -> None:
         assert entry.duration == document["duration"]
         assert entry.bias.tolist() == document["bias"]
     assert repr(found).split() == command("plan", str(bench), *arguments).split()
+    single = huddle.plan(snr=250, fs=200, segment="10s", channels=1)
+    assert single.axes is not None
+    assert single.axes.n_sensors == 6
+    assert single.axes.share == pytest.approx(250 * (2.3 * np.radians(1)) ** 2)
+    assert any("6 sensors determine this motion" in line for line in single.remarks)
+    assert huddle.plan(snr=250, fs=200, segment="10s", sensors=7, channels=1).axes is None
     aligned = huddle.plan(snr=250, fs=200, segment="10s")
     assert "or use six sensors: five on a circle of 12 cm" in aligned.remarks[-1]
     four = huddle.plan(snr=250, fs=200, segment="10s", sensors=4)

@@ -124,6 +124,8 @@ class Estimator:
             synchronisation=synchronisation,
             dimensions=() if estimates.dimensions is None else estimates.dimensions.chosen,
         )
+        names = list(dict.fromkeys(sensor for sensor, _ in self.channels))
+        axes = self.settings.axis_tolerances(names, self.dims)
         edges = None
         if not curves_only:
             edges = self._equalisation.leakage((raw,), self.channels, self.unit)
@@ -135,6 +137,7 @@ class Estimator:
                 self.channels,
                 dimensions=estimates.dimensions,
                 faulty={*average.clipped, *average.stood_still},
+                axes=axes,
                 aligned=_aligned(average.residual),
             )
             diagnostics = Findings.of(
@@ -164,6 +167,7 @@ class Estimator:
             closed=average.closed,
             left_out={reason: average.left_out[reason] for reason in Reason},
             diagnostics=diagnostics,
+            axis_tolerances=axes,
         )
         return with_contributions(snapshot)
 

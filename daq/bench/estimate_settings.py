@@ -204,6 +204,23 @@ class EstimateSettings:
             repeated=True,
         ),
     ] = field(default_factory=dict)
+    axis_tolerance: Annotated[
+        Mapping[str, float],
+        Option(
+            "Angle in degrees, rms, by which axes of sensors with one or two channels may be off:"
+            " of all of them (0.2), or of a sensor (B=0.2; may be repeated). Motion across an axis"
+            " widens the intervals. Default: 1.",
+            check=values.axis_tolerance,
+            flags=("--axis-tolerance",),
+            metavar="DEGREES",
+            read=values.to_axis_tolerance,
+            show=values.number_or_table,
+            text=lambda angles: [
+                f"{n}={angle!r}" if n else repr(angle) for n, angle in angles.items()
+            ],
+            repeated=True,
+        ),
+    ] = field(default_factory=dict)
     unit: Annotated[
         str | None,
         Option(

@@ -42,6 +42,7 @@ PARAMETRIC_WINDOWS = (
 )
 """Of one parameter each, as in ``kaiser,8``."""
 _MAX_DIMENSION = 999
+_LARGEST_ANGLE = 45.0
 
 
 def number(value: object) -> float:
@@ -199,3 +200,23 @@ def to_gains(texts: Sequence[str]) -> dict[str, float]:
         except ValueError:
             raise ValueError("expected a sensor and a number as in B=1.02") from None
     return found
+
+
+def axis_tolerance(value: object) -> dict[str, float]:
+    """Return angles in degrees by sensor; the empty name is for all others."""
+    given = value if isinstance(value, Mapping) else {"": value}
+    for angle in given.values():
+        if not 0 <= number(angle) <= _LARGEST_ANGLE:
+            raise ValueError("expected an angle from 0 to 45 degrees, or angles by sensor")
+    return {str(name): number(angle) for name, angle in given.items()}
+
+
+def to_axis_tolerance(texts: Sequence[str]) -> dict[str, float]:
+    """Return the angles in texts such as 0.2 or A=0.2."""
+    found = to_gains([text if "=" in text else f"*={text}" for text in texts])
+    return {"" if name == "*" else name: angle for name, angle in found.items()}
+
+
+def number_or_table(angles: Mapping[str, float]) -> object:
+    """Return one angle if it is that of all sensors, or angles by sensor."""
+    return angles[""] if set(angles) == {""} else dict(angles)

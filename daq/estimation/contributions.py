@@ -8,11 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.estimation.settings import DIMENSIONS
 from estimator.diagnostics.advice import ModelMisfit, TooFewDimensions
 from estimator.diagnostics.kinds import Level
 from estimator.diagnostics.misfit import SharedNoise
+from estimator.levels.axes import across
 from estimator.levels.contributions import Contribution, Source, contribution, widened
 from estimator.levels.interval import NORMAL_95
+from estimator.likelihood.dimension import most_testable
 from estimator.likelihood.gradients import misfit
 from estimator.self_noise.result import SelfNoise
 
@@ -46,6 +49,12 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
         below, above = (np.clip(part, 0.0, 1.0) * psd for part in (leakage, -leakage))
         found.append(contribution(Source.GAPS, shape, below=below, above=above))
     dimensions, explained = _dimensions(snapshot, method)
+    if any(snapshot.axis_tolerances):
+        motion = np.maximum(np.nan_to_num(snapshot.data_psd) - psd, 0.0)
+        share = np.repeat(across(snapshot.axis_tolerances), snapshot.dims)
+        fitted = _all_dimensions(snapshot, method)
+        most = np.where(fitted[:, None], 0.0, share * motion)
+        found.append(contribution(Source.AXES, shape, below=most, above=most))
     if dimensions.any():
         found.append(contribution(Source.DIMENSIONS, shape, share=dimensions[:, None]))
     for source, share in _misfits(snapshot, explained).items():
@@ -101,6 +110,16 @@ def _dimensions(snapshot: Snapshot, method: str) -> tuple[FloatArray, BoolArray]
             )
             share[inside] = NORMAL_95 * error
     return share, explained
+
+
+def _all_dimensions(snapshot: Snapshot, method: str) -> BoolArray:
+    """Return where the fitted model has room for all dimensions of motion, shape (n_freqs,)."""
+    fitted = np.zeros(len(snapshot.frequency), np.bool_)
+    if method == "maximum-likelihood":
+        for choice in snapshot.diagnostics.dimensions:
+            if choice.accepted and most_testable(snapshot.dims) >= DIMENSIONS:
+                fitted |= (snapshot.frequency >= choice.low) & (snapshot.frequency <= choice.high)
+    return fitted
 
 
 def _misfits(snapshot: Snapshot, explained: BoolArray) -> dict[Source, FloatArray]:

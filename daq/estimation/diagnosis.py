@@ -22,7 +22,9 @@ from daq.timing.clock_model import RelativeTime
 from estimator.diagnostics.advice import Advice, Gain, ModelMisfit
 from estimator.diagnostics.diagnose import Diagnostics, diagnose
 from estimator.diagnostics.kinds import Level, Untested
+from estimator.diagnostics.misfit import SharedNoise
 from estimator.errors import InsufficientDataError
+from estimator.levels.axes import across
 from estimator.responses.equalisation import leakage_advice
 
 if TYPE_CHECKING:
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
     from daq.estimation.noise_estimates import Dimensions
     from daq.estimation.segments.segment_pass import Pass
     from daq.timing.clock_model import ClockState
+    from estimator.diagnostics.band import BandDiagnosis
     from estimator.diagnostics.stability import SegmentCourse
     from estimator.self_noise.result import SelfNoise
     from estimator.spectra.multiresolution import Band
@@ -230,6 +233,7 @@ def diagnosis(
     *,
     dimensions: Dimensions | None = None,
     faulty: Collection[int] = (),
+    axes: tuple[float, ...] = (),
     aligned: Collection[tuple[str, str]] = (),
     course: SegmentCourse | None = None,
 ) -> tuple[Diagnosis | None, Untested | None]:
@@ -238,6 +242,8 @@ def diagnosis(
     The tested model has the dimensions of the settings; where `dimensions` were chosen by the
     motion, as many as the largest sensor has channels. `faulty` channels, by column, are clipped or
     were dead for a while: their sensitivities are not reported as wrong.
+    Noise that channels seem to share is motion across `axes` that are off by these angles (radians,
+    of each sensor), if it is no more than that.
     Delays between sensors that are `aligned` by their motion or by arrival times are not known.
     `course` is that of the segments of the only band.
 
@@ -298,6 +304,7 @@ def diagnosis(
             if (each is clearest or not advice.sensors)
             and not _is_explained(advice, faulty)
             and not _is_fitted(advice, dimensions)
+            and not _is_across(advice, each.bands, dims, axes)
         ),
         stability=found[0].stability if len(found) == 1 else None,
         per_frequency=FrequencyDiagnosis(
@@ -326,6 +333,21 @@ def _is_fitted(advice: Advice, dimensions: Dimensions | None) -> bool:
     low, high = advice.band
     concerned = [each for each in dimensions.chosen if each.low <= high and each.high >= low]
     return bool(concerned) and all(each.accepted for each in concerned)
+
+
+def _is_across(
+    advice: Advice, bands: Sequence[BandDiagnosis], dims: tuple[int, ...], axes: tuple[float, ...]
+) -> bool:
+    """Whether motion across axes explains noise that channels seem to share."""
+    if not isinstance(advice, SharedNoise) or advice.band is None or not any(axes):
+        return False
+    low, high = advice.band
+    snr = np.nanmax([b.snr for b in bands if b.low <= high and b.high >= low], axis=0)
+    most = snr * np.repeat(across(axes), dims)
+    return all(
+        abs(amount) <= max(most[one], most[other])
+        for (one, other), amount in zip(advice.channels, advice.amounts, strict=True)
+    )
 
 
 def _n_known(band: Band) -> int:

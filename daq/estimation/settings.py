@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING
@@ -22,6 +23,10 @@ if TYPE_CHECKING:
 _LONG_WINDOW = 4096  # samples, in which every window with a parameter that has one is possible
 ROOM, ROOM_OF_ONE_CHANNEL = 4, 6
 """Sensors from which ``auto`` looks for more dimensions of motion than a sensor has channels."""
+DIMENSIONS = 3
+"""Of the motion of a floor."""
+AXIS_TOLERANCE = 1.0
+"""Degrees, rms, if nothing else is given."""
 MAX_CHANNELS = 96
 """Channels up to which ``auto`` is maximum likelihood, to limit its cost."""
 _NEEDED = {"dimension": "maximum-likelihood", "gains": "two-channel"}
@@ -60,6 +65,20 @@ class Settings(EstimateSettings):
         methods = (chosen if name == "auto" else name for name in self.methods)
         dimension = "auto" if roomy and self.dimension is None else self.dimension
         return replace(self, methods=tuple(dict.fromkeys(methods)), dimension=dimension)
+
+    def axis_tolerances(self, sensors: Sequence[str], dims: tuple[int, ...]) -> tuple[float, ...]:
+        """Return the angle by which axes of each sensor may be off, rms, in radians.
+
+        Zero for sensors whose partners sense all three dimensions of motion.
+        """
+        usual = self.axis_tolerance.get("", AXIS_TOLERANCE)
+        found = []
+        for number, name in enumerate(sensors):
+            others = sorted((*dims[:number], *dims[number + 1 :]), reverse=True)[:2]
+            seen = min(others, default=DIMENSIONS) >= DIMENSIONS
+            angle = self.axis_tolerance.get(name, usual)
+            found.append(0.0 if seen else math.radians(angle))
+        return tuple(found)
 
     @classmethod
     def of(cls, bench: Bench | None) -> Settings:

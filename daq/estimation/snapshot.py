@@ -196,6 +196,8 @@ class Snapshot:
         None where no segment with gaps counts.
     not_estimated : tuple of str
         Sensors that a live estimate leaves out, because all would take too much memory.
+    axis_tolerances : tuple of float
+        Angle by which axes of each sensor may be off, rms, in radians; empty: not at all.
     """
 
     frequency: FloatArray
@@ -221,6 +223,7 @@ class Snapshot:
     quantisation_psd: FloatArray | None = None
     bridged: Bridged | None = None
     not_estimated: tuple[str, ...] = ()
+    axis_tolerances: tuple[float, ...] = ()
 
     @property
     def sensor_names(self) -> tuple[str, ...]:

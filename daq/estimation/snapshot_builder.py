@@ -95,6 +95,8 @@ class SnapshotBuilder:
     ) -> None:
         self._settings, self._unit, self._equalisation = settings, unit, equalisation
         self._gains = known_gains(settings, channels)
+        counts = Counter(sensor for sensor, _ in channels)
+        self._axes = settings.axis_tolerances(list(counts), tuple(counts.values()))
         self._dimensions: Dimensions | None = None
         self._findings = Findings()
         self._diagnoses = Throttle(diagnosis_share)
@@ -173,6 +175,7 @@ class SnapshotBuilder:
             no_segment=_no_segment(passes, self._settings.segment),
             bridged=_bridged(passes, estimates.results),
             not_estimated=left,
+            axis_tolerances=self._axes,
             quantisation_psd=(
                 quantisation_psd(frequency, channels, self._unit, _counting_rates(latest))
                 if final
@@ -199,6 +202,7 @@ class SnapshotBuilder:
             channels,
             dimensions=estimates.dimensions,
             faulty={*clipped, *stood_still},
+            axes=self._axes,
             aligned=aligned_pairs(clock_states(passes)),
             course=segment_course(passes, channels, self._unit, self._equalisation),
         )

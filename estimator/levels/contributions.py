@@ -32,6 +32,8 @@ class Source(enum.StrEnum):
     """One common motion does not explain the averages."""
     SHARED_NOISE = "shared-noise"
     """Two channels share noise."""
+    AXES = "axes"
+    """Sensors of one or two channels lean, and feel motion across their axes."""
     DIMENSIONS = "dimensions"
     """The number of dimensions of the motion is in doubt."""
     FAULTY = "faulty"

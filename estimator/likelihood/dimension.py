@@ -256,6 +256,11 @@ def choose_dimension(
     return np.array([chosen[int(b)] for b in number]), choices
 
 
+def most_testable(dims: tuple[int, ...]) -> int:
+    """Return the largest dimension that sensors of so many channels can tell from noise."""
+    return _most_testable(sum(dims), max(dims))
+
+
 def _most_testable(n_channels: int, usual: int) -> int:
     """Return the maximum number of factors that the test can tell from noise.
 

@@ -31,6 +31,7 @@ frequency = [1.0, 30.0]
 psd = [{psd}, {psd}]
 [estimate]
 segment = "1s"
+axis_tolerance = 0.0
 target_cov = 0.1
 band = [2.0, 20.0]
 [schedule]

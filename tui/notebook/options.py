@@ -38,6 +38,7 @@ class EstimateOptions(TypedDict, total=False):
     octaves: bool
     dimension: int | str
     gains: Mapping[str, float]
+    axis_tolerance: float | Mapping[str, float]
     unit: str
     band: tuple[float, float]
     target_cov: float

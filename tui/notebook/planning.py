@@ -15,8 +15,9 @@ from daq.bench.durations import format_duration
 from daq.drivers.bench_file import load
 from daq.errors import WrongSettingError
 from daq.estimation.noise_estimates import responses
-from daq.estimation.settings import Settings
+from daq.estimation.settings import ROOM, ROOM_OF_ONE_CHANNEL, Settings
 from estimator import planning
+from estimator.levels.axes import across
 from estimator.responses.edge_leakage import slope_factor
 from estimator.responses.equalisation import THRESHOLD
 from estimator.spectra.welch import WelchSettings
@@ -99,6 +100,25 @@ class Leakage:
     segment: float
 
 
+@dataclass(frozen=True, slots=True)
+class Axes:
+    """What motion across the axes of sensors with one or two channels leaves in doubt.
+
+    Attributes
+    ----------
+    degrees : float
+        By which axes may be off, rms.
+    share : float
+        Of the noise.
+    n_sensors : int
+        Sensors of as many channels that determine the motion in all dimensions.
+    """
+
+    degrees: float
+    share: float
+    n_sensors: int
+
+
 class RecordingPlan(Mapping[str, MethodPlan]):
     """What every method needs, as `huddle.plan` returns it: a `MethodPlan` by name of the method.
 
@@ -110,6 +130,8 @@ class RecordingPlan(Mapping[str, MethodPlan]):
         What waves across triaxial sensors do; None for others.
     leakage : Leakage or None
         What responses of the bench file that differ leak into the noise; None if they do not.
+    axes : Axes or None
+        What axes that are off leave in doubt; None where the sensors determine all dimensions.
     """
 
     def __init__(
@@ -121,9 +143,10 @@ class RecordingPlan(Mapping[str, MethodPlan]):
         settings: WelchSettings,
         waves: Waves | None = None,
         leakage: Leakage | None = None,
+        axes: Axes | None = None,
     ) -> None:
         self.snr, self.cov, self.settings = snr, cov, settings
-        self.waves, self.leakage = waves, leakage
+        self.waves, self.leakage, self.axes = waves, leakage, axes
         self._plans = dict(plans)
 
     def __getitem__(self, method: str) -> MethodPlan:
@@ -182,6 +205,14 @@ class RecordingPlan(Mapping[str, MethodPlan]):
                 f" otherwise motion leaks at the edges of segments: {percent(found.share)} of the"
                 f" noise of {found.channel} at {found.frequency:.3g} Hz, 1 % with segments of"
                 f" {format_duration(math.ceil(found.segment))}."
+            )
+        if self.axes is not None:
+            axes = self.axes
+            lines.append(
+                f"Sensors of one or two channels feel motion across their axes. Axes that are"
+                f" {axes.degrees:g}° off (rms) leave {percent(axes.share)} of the noise in"
+                f" doubt. {axes.n_sensors} sensors determine this motion (--method auto);"
+                " triaxial sensors do too. State axes that are better (--axis-tolerance)."
             )
         return lines
 
@@ -335,7 +366,19 @@ def _planned(
         settings=welch,
         waves=waves_across(directions, dims, positions, snr=snr),
         leakage=leakage,
+        axes=_axes(dims, settings, snr),
     )
+
+
+def _axes(dims: tuple[int, ...], settings: Settings, snr: float) -> Axes | None:
+    """Return what axes that are off leave in doubt; None below 1 % of the noise."""
+    tolerances = settings.axis_tolerances([""] * len(dims), dims)
+    share = snr * float(across(tolerances).max(initial=0.0))
+    if share < THRESHOLD or settings.for_sensors(dims).dimension == "auto":
+        return None
+    each = min(dims)
+    enough = ROOM_OF_ONE_CHANNEL if each == 1 else ROOM
+    return Axes(math.degrees(max(tolerances)), share, enough)
 
 
 def _directions(bench: Bench) -> FloatArray:

@@ -16,7 +16,13 @@ from tui.report.contents import report_of
 @pytest.fixture(scope="session")
 def reported(tmp_path_factory: pytest.TempPathFactory) -> Reported:
     recording = record(tmp_path_factory.mktemp("report") / "night.h5")
-    settings = Settings(segment=1.0, methods=("three-sensor",), band=(2.0, 20.0), target_cov=0.1)
+    settings = Settings(
+        segment=1.0,
+        methods=("three-sensor",),
+        band=(2.0, 20.0),
+        target_cov=0.1,
+        axis_tolerance={"": 0.0},
+    )
     snapshot = estimate([recording], settings)
     report = report_of(snapshot, settings, sources([recording]))
     return Reported(recording, snapshot, settings, report)

@@ -1,0 +1,84 @@
+"""Axes off plumb before motion in three dimensions: no interval excludes the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from daq.bench.estimate_settings import from_text, to_table
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.formats.arrays import recording_of_arrays
+from daq.results.band_summary import channel_means
+from estimator.diagnostics.misfit import SharedNoise
+from estimator.levels.axes import across
+
+RATE, SNR = 100.0, 5e4
+BANDS = ((2.0, 10.0), (10.0, 30.0), (5.0, 6.0))
+
+
+def leaning(n_sensors: int, degrees: float, seed: int) -> dict[str, np.ndarray]:
+    """Return samples of vertical sensors of unit noise whose axes are off by so much, rms."""
+    rng = np.random.default_rng(seed)
+    motion = np.sqrt(SNR) * rng.standard_normal((30_000, 3))
+    lean = np.radians(degrees) / np.sqrt(2) * rng.standard_normal((n_sensors, 2))
+    axis = np.c_[np.ones(n_sensors), lean] * (1 + 0.01 * rng.standard_normal((n_sensors, 1)))
+    noise = rng.standard_normal((30_000, n_sensors))
+    return {f"s{n:02}": (motion @ axis[n] + noise[:, n])[:, None] for n in range(n_sensors)}
+
+
+def covered(samples: dict[str, np.ndarray], settings: Settings) -> tuple[float, float]:
+    """Return the share of intervals that hold the truth, and the median upper end over it."""
+    snapshot = estimate([recording_of_arrays(samples, RATE)], settings)
+    assert not any(isinstance(each, SharedNoise) for each in snapshot.diagnostics.advice)
+    (noise,) = snapshot.results.values()
+    truth = 2 / RATE
+    ends = np.array(
+        [
+            (float(mean.low[0]) / truth, float(mean.high[0]) / truth)
+            for band in BANDS
+            for mean in channel_means(noise, snapshot, settings, band)
+        ]
+    )
+    held = (ends[:, 0] <= 1) & (ends[:, 1] >= 1)
+    return float(held.mean()), float(np.median(ends[:, 1]))
+
+
+@pytest.mark.parametrize("n_sensors", [3, 5, 12])
+def test_no_interval_excludes_the_truth_of_sensors_off_plumb(n_sensors: int) -> None:
+    shares, ends = zip(
+        *(covered(leaning(n_sensors, 1.0, seed), Settings(segment=2.0)) for seed in range(3)),
+        strict=True,
+    )
+    assert np.mean(shares) >= 0.95
+    if n_sensors == 12:  # as many as determine motion in all dimensions
+        assert np.median(ends) < 10**0.08
+
+
+def test_a_stated_tolerance_replaces_the_usual_one() -> None:
+    samples = leaning(3, 0.0, 1)
+    usual, exact = (
+        covered(samples, Settings(segment=2.0, axis_tolerance=each))[1] for each in ({}, {"": 0.0})
+    )
+    assert exact < 1.1
+    assert usual > 1.4  # the bound ends it; motion across the axes would allow 60
+
+
+def test_tolerances_are_by_sensor_and_nothing_to_triaxial_ones() -> None:
+    settings = Settings(axis_tolerance={"B": 0.5})
+    found = np.degrees(settings.axis_tolerances("ABC", (1, 1, 1)))
+    np.testing.assert_allclose(found, [1.0, 0.5, 1.0])
+    assert settings.axis_tolerances("ABC", (3, 3, 3)) == (0.0, 0.0, 0.0)
+    # a single channel beside two triaxial sensors is known, whatever its axis
+    np.testing.assert_allclose(np.degrees(settings.axis_tolerances("ABC", (3, 3, 1))), [1, 0.5, 0])
+    np.testing.assert_allclose(across([0.1, 0.1, 0.1]), 0.0529)
+    assert across([0.0, 0.1, 0.1])[0] == 0.0
+
+
+def test_tolerances_as_text_and_in_the_bench_file() -> None:
+    assert from_text("axis_tolerance", ["0.2", "B=0.05"]) == {"": 0.2, "B": 0.05}
+    assert to_table(Settings(axis_tolerance={"": 0.2}))["axis_tolerance"] == 0.2
+    table = to_table(Settings(axis_tolerance={"": 0.2, "B": 0.05}))["axis_tolerance"]
+    assert table == {"": 0.2, "B": 0.05}
+    with pytest.raises(ValueError, match="from 0 to 45 degrees"):
+        from_text("axis_tolerance", ["-1"])
