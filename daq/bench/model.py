@@ -4,84 +4,33 @@ from __future__ import annotations
 
 import datetime as dt
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
-import numpy as np
 from pydantic import (
     AfterValidator,
     BeforeValidator,
     Field,
+    GetCoreSchemaHandler,
     InstanceOf,
     PlainSerializer,
     PrivateAttr,
     create_model,
     model_validator,
 )
+from pydantic_core import core_schema
 
 from daq.bench.estimate_settings import OPTIONS, EstimateSettings, table_keys, to_table
 from daq.bench.masks.mask import NOISE_MODELS, Mask, check_points
+from daq.bench.response import PolesZeros, Response
 from daq.bench.tables.fields import Duration, Name, Number, PositiveNumber, Table
 from daq.bench.tables.toml_text import to_toml
 from daq.bench.tables.unattended import History, Hooks, Metrics, Schedule, Storage
 from daq.bench.units import DensityUnit
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-
-def _pair_to_complex(value: object) -> object:
-    if isinstance(value, (list, tuple)) and len(value) == 2:
-        real, imaginary = value
-        if all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in value):
-            return complex(real, imaginary)
-    if isinstance(value, (int, float, complex)) and not isinstance(value, bool):
-        return complex(value)
-    raise ValueError("expected a number or [real, imaginary], in rad/s")
-
-
 Day: TypeAlias = dt.date
-ComplexNumber = Annotated[complex, BeforeValidator(_pair_to_complex)]
-
-
-class PolesZeros(Table):
-    """Frequency response as poles and zeros of the Laplace transform.
-
-    ``H(s) = normalization * prod(s - zeros) / prod(s - poles)``, to be multiplied by the channel's
-    sensitivity. Without ``normalization``, ``|H| = 1`` at ``frequency``.
-    """
-
-    zeros: tuple[ComplexNumber, ...] = Field((), description="zeros in rad/s")
-    poles: tuple[ComplexNumber, ...] = Field((), description="poles in rad/s")
-    normalization: Number | None = None
-    frequency: PositiveNumber = 1.0
-    """Frequency in Hz at which the sensitivity holds."""
-
-    def at(self, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Return the response, without sensitivity.
-
-        Parameters
-        ----------
-        frequency : float64, any shape
-            In Hz.
-        """
-
-        def shape(s: NDArray[np.complexfloating[Any]]) -> NDArray[np.complex128]:
-            value = np.ones_like(s, dtype=np.complex128)
-            # Factor by factor in turn, so that high orders neither overflow nor underflow.
-            for index in range(max(len(self.zeros), len(self.poles))):
-                if index < len(self.zeros):
-                    value = value * (s - self.zeros[index])
-                if index < len(self.poles):
-                    value = value / (s - self.poles[index])
-            return value
-
-        value = shape(2j * np.pi * np.asarray(frequency, dtype=np.float64))
-        if self.normalization is not None:
-            return value * self.normalization
-        return value / np.abs(shape(np.array(2j * np.pi * self.frequency)))
 
 
 class Certificate(Table):
@@ -104,6 +53,28 @@ class Certificate(Table):
         return table
 
 
+class _PolesZerosInText:
+    """A whole response is taken as it is, and left out of text: it is kept with the samples.
+
+    Its hundreds of coefficients are nothing for people to read.
+    """
+
+    def __get_pydantic_core_schema__(
+        self, source: object, handler: GetCoreSchemaHandler
+    ) -> core_schema.CoreSchema:
+        def checked(value: Any, check: Callable[[Any], Any]) -> Any:  # noqa: ANN401 - pydantic's
+            return value if isinstance(value, Response) else check(value)
+
+        def shown(value: Any, show: Callable[[Any], Any]) -> Any:  # noqa: ANN401 - pydantic's
+            return None if isinstance(value, Response) else show(value)
+
+        return core_schema.no_info_wrap_validator_function(
+            checked,
+            handler.generate_schema(PolesZeros | None),
+            serialization=core_schema.wrap_serializer_function_ser_schema(shown),
+        )
+
+
 class Channel(Table):
     """One digitised input."""
 
@@ -111,7 +82,8 @@ class Channel(Table):
     sensitivity: Number = Field(description="counts per unit, not zero")
     unit: str = "m/s²"
     direction: str | None = None
-    response: PolesZeros | None = None
+    response: Annotated[PolesZeros | Response | None, _PolesZerosInText()] = None
+    """Poles and zeros, as the bench file has them, or the whole response of an imported file."""
     certificate: Certificate | None = None
     """A sensor with one for each channel is the reference of ``huddle calibrate``."""
     auxiliary: bool = False

@@ -118,8 +118,8 @@ class Equalisation:
             return None
         length, rate = self._welch.segment_length, self._welch.sampling_rate
         grid = np.arange(_FINE * length // 2 + 1) * rate / (_FINE * length // 2 * 2)
-        response = responses(
-            np.where(grid > 0, grid, 1e-3 * grid[1]), channels, channels[0][1].unit
+        response = _held(
+            responses(np.where(grid > 0, grid, 1e-3 * grid[1]), channels, channels[0][1].unit)
         )
         snr = np.full((len(grid), 1), _ASSUMED_SNR)
         best: tuple[float, ComplexArray] | None = None
@@ -302,6 +302,22 @@ def _noise_of_prediction(band: Band, factor: float) -> float:
     """
     length = band.settings.segment_length / band.settings.sampling_rate
     return _PREDICTION * max(factor * 3 * length**2 - 1, 0.0) / max(band.n_effective, 1.0)
+
+
+def _held(response: ComplexArray) -> ComplexArray:
+    """Return responses with the nearest known value where nothing is known, or they are 0.
+
+    A list of measured values says nothing beyond its ends, and a digital filter may have zeros.
+    """
+    held = response.copy()
+    for column in range(response.shape[1]):
+        values = response[:, column]
+        known = np.flatnonzero(np.isfinite(values) & (values != 0))
+        if 0 < len(known) < len(values):
+            middles = (known[1:] + known[:-1]) / 2
+            nearest = known[np.searchsorted(middles, np.arange(len(values)))]
+            held[:, column] = values[nearest]
+    return held
 
 
 def _unseen(band: Band) -> FloatArray:

@@ -125,11 +125,15 @@ def responses(frequency: FloatArray, channels: Channels, unit: str) -> ComplexAr
     Shape (n_freqs, n_channels).
     """
     response = np.ones((len(frequency), len(channels)), dtype=np.complex128)
+    known: dict[tuple[str, object], ComplexArray] = {}  # most sensors of a bench are alike
     for column, (_, channel) in enumerate(channels):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            response[:, column] = 1 / conversion(channel.unit, unit, frequency)
-        if channel.response is not None:
-            response[:, column] *= channel.response.at(frequency)
+        alike = channel.unit, channel.response
+        if alike not in known:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                known[alike] = 1 / conversion(channel.unit, unit, frequency)
+            if channel.response is not None:
+                known[alike] = known[alike] * channel.response.at(frequency)
+        response[:, column] = known[alike]
     return response
 
 

@@ -58,9 +58,12 @@ def segment_course(
     filters = equalisation.response(first.welch.frequencies[bins])
     if filters is not None:
         response = response * filters
+    response = np.where(response == 0, np.nan, response)  # as `scale` has it
+    joined = spectra[0] if len(spectra) == 1 else np.concatenate(spectra)
+    with np.errstate(invalid="ignore"):  # where a response is not known
+        joined = joined / response.astype(np.complex64)
     return SegmentCourse(
-        spectra=(spectra[0] if len(spectra) == 1 else np.concatenate(spectra))
-        / response.astype(np.complex64),
+        spectra=joined,
         bins=bins,
         times=np.concatenate(times),
         runs=np.concatenate(runs),

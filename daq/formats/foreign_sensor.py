@@ -75,10 +75,40 @@ class Stretch:
 
 
 @dataclass(frozen=True, slots=True)
+class Calibration:
+    """What a file says of one of its channels.
+
+    Attributes
+    ----------
+    sensitivity : float
+        In counts per `unit`; the samples stay counts.
+    unit : str
+    origin : str
+        Where in the file it is, for people: ``scale factor of K-NET``.
+    model, serial_number : str
+        Of the instrument, as far as the file says.
+    """
+
+    sensitivity: float
+    unit: str
+    origin: str
+    model: str = ""
+    serial_number: str = ""
+
+    @classmethod
+    def of_count(cls, size: float, unit: str, origin: str, **rest: str) -> Calibration | None:
+        """Return the calibration by which a count is `size` units; None if that is no number."""
+        if not math.isfinite(size) or size == 0 or not math.isfinite(1 / size):
+            return None
+        return cls(1 / size, unit, origin, **rest)
+
+
+@dataclass(frozen=True, slots=True)
 class ForeignSensor:
     """One sensor as a foreign file has it; between its stretches lie gaps.
 
-    ``units`` holds one unit per channel, or is empty where the format does not say.
+    ``units`` holds one unit per channel, in which its samples are, or is empty where the format
+    does not say. ``calibrations`` holds one for each channel whose samples are counts, or is empty.
     """
 
     name: str
@@ -87,6 +117,7 @@ class ForeignSensor:
     stretches: tuple[Stretch, ...]
     source: str
     units: tuple[str, ...] = ()
+    calibrations: tuple[Calibration | None, ...] = ()
 
     def check(self) -> None:
         """Refuse what no recording can hold.

@@ -6,9 +6,10 @@ Each contiguous stretch is written as blocks that state the UTC of their first s
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from heapq import merge
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -26,7 +27,6 @@ from daq.recording.file_format import SensorLayout
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
-    from pathlib import Path
 
     from daq.bench.estimate_settings import EstimateSettings
     from daq.formats.foreign_sensor import ForeignSensor, Stretch
@@ -65,11 +65,38 @@ class ImportResult:
         One sentence for each file or channel that could not be used.
     left_aside : dict of str to str
         Channels that were not imported, with the reason.
+    calibrations : tuple of Taken
+        What every channel's counts are taken to be.
     """
 
     sensors: tuple[Imported, ...]
     problems: tuple[str, ...] = ()
     left_aside: dict[str, str] = field(default_factory=dict)
+    calibrations: tuple[Taken, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """The calibration of one channel that was taken.
+
+    Attributes
+    ----------
+    channel : str
+        ``sensor.channel``.
+    origin : {"response", "bench", "file", "none"}
+        The first of these that says something counts.
+    sensitivity : float
+        In counts per `unit`.
+    unit : str
+    notes : tuple of str
+        From where, which stages, and what in the file contradicts them.
+    """
+
+    channel: str
+    origin: Literal["response", "bench", "file", "none"]
+    sensitivity: float
+    unit: str
+    notes: tuple[str, ...] = ()
 
 
 def import_files(
@@ -77,7 +104,8 @@ def import_files(
     out: Path,
     *,
     bench: Bench | None = None,
-    response: Path | None = None,
+    response: Path | Sequence[Path] = (),
+    response_for: Sequence[tuple[str, Path]] = (),
     sampling_rate: float | None = None,
     estimate: EstimateSettings | None = None,
     selection: Selection | None = None,
@@ -96,8 +124,11 @@ def import_files(
     bench : Bench, optional
         Gives sensitivities, units, order and settings; its sensors are found by name, their
         channels by name or, where no name fits, by order.
-    response : Path, optional
-        RESP or StationXML, used for every channel; overrules the bench.
+    response : Path or sequence of Path, optional
+        RESP or StationXML files, or folders of them. Each channel takes that of its code and
+        dates, in place of what the bench and the file say.
+    response_for : sequence of (str, Path), optional
+        Patterns of channels, and the file whose response they take whatever its code is.
     sampling_rate : float, optional
         In Hz, where a file does not say.
     estimate : EstimateSettings, optional
@@ -120,11 +151,15 @@ def import_files(
     if bench is not None:
         found = _ordered(found, bench)
     responses = None
-    if response is not None:
-        from daq.formats.response import read_responses  # noqa: PLC0415 - ObsPy is an extra
+    files = [response] if isinstance(response, Path) else list(response)
+    if files or response_for:
+        from daq.formats.response import Responses  # noqa: PLC0415 - ObsPy is an extra
 
-        responses = read_responses(response)
-    described = {name: _described(sensor, bench, responses) for name, sensor in found.items()}
+        responses = Responses(files, response_for)
+    taken: list[Taken] = []
+    described = {
+        name: _described(sensor, bench, responses, taken) for name, sensor in found.items()
+    }
     written = _bench(out, bench, tuple(described.values()), estimate)
     start = min(sensor.stretches[0].start_utc_ns for sensor in found.values())
     with ArrayWriter(
@@ -137,7 +172,10 @@ def import_files(
     ) as writer:
         _write(writer, tuple(found.values()))
     return ImportResult(
-        tuple(_imported(sensor) for sensor in found.values()), opened.problems, opened.left_aside
+        tuple(_imported(sensor) for sensor in found.values()),
+        opened.problems,
+        opened.left_aside,
+        tuple(taken),
     )
 
 
@@ -157,15 +195,27 @@ def _ordered(found: dict[str, ForeignSensor], bench: Bench) -> dict[str, Foreign
     return {name: found[name] for name in names}
 
 
-def _described(foreign: ForeignSensor, bench: Bench | None, responses: Responses | None) -> Sensor:
-    """Return a sensor as the recording's bench names it."""
+def _described(
+    foreign: ForeignSensor, bench: Bench | None, responses: Responses | None, taken: list[Taken]
+) -> Sensor:
+    """Return a sensor as the recording's bench names it; what was taken is added to `taken`."""
     units = [canonical(unit) for unit in foreign.units] or ["counts"] * len(foreign.channels)
-    channels = [
-        Channel(name=name, sensitivity=1.0, unit=unit)
-        for name, unit in zip(foreign.channels, units, strict=True)
-    ]
+    calibrations = foreign.calibrations or (None,) * len(foreign.channels)
+    model = next((each.model for each in calibrations if each and each.model), "")
+    serial = next((each.serial_number for each in calibrations if each and each.serial_number), "")
+    channels, found = [], []
+    for name, unit, own in zip(foreign.channels, units, calibrations, strict=True):
+        channel = Channel(name=name, sensitivity=1.0, unit=unit)
+        said = Taken(name, "none" if unit == "counts" else "file", 1.0, unit)
+        if own is not None:
+            channel = Channel(name=name, sensitivity=own.sensitivity, unit=canonical(own.unit))
+            said = Taken(name, "file", own.sensitivity, channel.unit, (own.origin,))
+        channels.append(channel)
+        found.append(said)
     sensor = Sensor(
         name=foreign.name,
+        model=model,
+        serial_number=serial,
         driver="import",
         port=foreign.source[-200:],
         sampling_rate=foreign.sampling_rate,
@@ -175,17 +225,31 @@ def _described(foreign: ForeignSensor, bench: Bench | None, responses: Responses
         listed = bench.sensor(foreign.name)
         channels = list(_matched(foreign, listed))
         _refuse_scaling_twice(foreign, channels)
+        found = [Taken(each.name, "bench", each.sensitivity, each.unit) for each in channels]
         sensor = listed.model_copy(update={"sampling_rate": foreign.sampling_rate})
-    if responses is not None:
-        for number, name in enumerate(foreign.channels):
-            known = responses.of(foreign.name, name, foreign.dated_spans_ns())
-            channels[number] = channels[number].model_copy(
-                update={
-                    "sensitivity": known.sensitivity,
-                    "unit": known.unit,
-                    "response": known.shape,
-                }
-            )
+    for number, name in enumerate(foreign.channels):
+        known = responses and responses.of(foreign.name, name, foreign.dated_spans_ns())
+        if not known:
+            continue
+        changes = {"sensitivity": known.sensitivity, "unit": known.unit, "response": known.shape}
+        if known.azimuth is not None and known.dip is not None and not channels[number].direction:
+            direction = f"azimuth {known.azimuth:g}°, dip {known.dip:g}°"
+            changes["direction"] = direction
+        channels[number] = channels[number].model_copy(update=changes)
+        found[number] = Taken(
+            channels[number].name,
+            "response",
+            known.sensitivity,
+            known.unit,
+            (*([known.model] if known.model else []), *known.notes, f"from {known.source}"),
+        )
+        sensor = sensor.model_copy(
+            update={
+                "model": sensor.model or known.model,
+                "serial_number": sensor.serial_number or known.serial_number,
+            }
+        )
+    taken += [replace(each, channel=f"{foreign.name}.{each.channel}") for each in found]
     return sensor.model_copy(update={"channels": tuple(channels)})
 
 

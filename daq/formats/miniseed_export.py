@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daq.bench.response import AnalogPolesZeros, Fir, Gain, Iir, Measured, Response
 from daq.errors import RecordingError
 from daq.formats.foreign_sensor import NS_PER_S
 from daq.formats.readers.waveforms import load_obspy
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.model import Channel
+    from daq.bench.response import Stage
     from daq.recording.reader import Recording
     from daq.recording.sensor_record import SensorRecord
 
@@ -322,7 +324,7 @@ def _inventory(
                     end_date=obspy.UTCDateTime(ns=end),
                     sensor=equipment,
                     description=f"{sensor.name}.{channel.name}; coordinates are not recorded",
-                    response=_response(parts, channel),
+                    response=_response(parts, channel, sensor.sampling_rate),
                 )
             )
     return parts.Inventory(
@@ -340,14 +342,26 @@ def _inventory(
     )
 
 
-def _response(parts: Any, channel: Channel) -> Any:  # noqa: ANN401 - ObsPy has no types
-    """Return the response of a channel; None if its samples are no motion."""
+def _response(parts: Any, channel: Channel, rate: float) -> Any:  # noqa: ANN401 - see above
+    """Return the response of a channel with all stages; None if its samples are no motion."""
     if channel.unit not in _SI:
         return None
     shape = channel.response
-    gain, frequency, factor = channel.sensitivity, 1.0, 1.0
+    frequency = 1.0 if shape is None else shape.frequency
+    units = {"input_units": _SI[channel.unit], "output_units": "COUNTS"}
+    if isinstance(shape, Response):
+        stages = _stages(parts, shape, channel.sensitivity / shape.sensitivity, rate)
+        for number, stage in enumerate(stages, start=1):
+            stage.stage_sequence_number = number
+            stage.input_units = _SI[channel.unit] if number == 1 else "COUNTS"
+            stage.output_units = "COUNTS"
+            stage.stage_gain_frequency = frequency
+        stated = parts.InstrumentSensitivity(
+            channel.sensitivity, frequency, units["input_units"], units["output_units"]
+        )
+        return parts.Response(instrument_sensitivity=stated, response_stages=stages)
+    gain, factor = channel.sensitivity, 1.0
     if shape is not None:
-        frequency = shape.frequency
         at = float(np.abs(shape.at(np.array([frequency])))[0])
         bare = shape.model_copy(update={"normalization": 1.0})
         plain = float(np.abs(bare.at(np.array([frequency])))[0])
@@ -364,6 +378,76 @@ def _response(parts: Any, channel: Channel) -> Any:  # noqa: ANN401 - ObsPy has 
         stage_gain_frequency=frequency,
         normalization_frequency=frequency,
         normalization_factor=factor,
-        input_units=_SI[channel.unit],
-        output_units="COUNTS",
+        **units,
+    )
+
+
+def _stages(parts: Any, response: Response, scale: float, rate: float) -> list[Any]:  # noqa: ANN401 - see above
+    """Return the stages of a response; all gains hold at the frequency of the sensitivity."""
+    rates = [each.sampling_rate for each in response.filters] + [rate]
+    return [
+        _file_stage(
+            parts,
+            stage,
+            stage.factor * (scale if number == 0 else 1.0),
+            at=response.frequency,
+            next_rate=rates[sum(each in response.filters for each in response.stages[: number + 1])]
+            if stage in response.filters
+            else rate,
+        )
+        for number, stage in enumerate(response.stages)
+    ]
+
+
+def _file_stage(
+    parts: Any,  # noqa: ANN401 - ObsPy has no types
+    stage: Stage,
+    factor: float,
+    *,
+    at: float,
+    next_rate: float,
+) -> Any:  # noqa: ANN401 - see above
+    module = parts.response
+    about: dict[str, Any] = {"stage_sequence_number": 0, "stage_gain": factor} | dict.fromkeys(
+        ("stage_gain_frequency", "input_units", "output_units")
+    )
+    if isinstance(stage, Gain):
+        return module.ResponseStage(**about)
+    if isinstance(stage, Measured):
+        values = zip(stage.frequencies, stage.amplitudes, np.degrees(stage.phases), strict=True)
+        elements = [module.ResponseListElement(f, a, float(p)) for f, a, p in values]
+        return module.ResponseListResponseStage(response_list_elements=elements, **about)
+    if not isinstance(stage, AnalogPolesZeros):
+        ratio = max(1, round(stage.sampling_rate / next_rate))
+        correction = stage.correction if isinstance(stage, Fir) else 0.0
+        about |= {
+            "decimation_input_sample_rate": stage.sampling_rate,
+            "decimation_factor": ratio,
+            "decimation_offset": 0,
+            "decimation_delay": correction,
+            "decimation_correction": correction,
+        }
+    if isinstance(stage, Fir):
+        return module.FIRResponseStage(
+            coefficients=list(stage.coefficients), symmetry=stage.symmetry.upper(), **about
+        )
+    if isinstance(stage, Iir):
+        return module.CoefficientsTypeResponseStage(
+            cf_transfer_function_type="DIGITAL",
+            numerator=list(stage.numerator),
+            denominator=list(stage.denominator),
+            **about,
+        )
+    size = float(np.abs(stage.shape(np.array([at])))[0])
+    about["stage_gain"] = factor * size
+    is_analog = isinstance(stage, AnalogPolesZeros)
+    return module.PolesZerosResponseStage(
+        pz_transfer_function_type=(
+            "LAPLACE (RADIANS/SECOND)" if is_analog else "DIGITAL (Z-TRANSFORM)"
+        ),
+        normalization_frequency=at,
+        normalization_factor=1 / size,
+        zeros=list(stage.zeros),
+        poles=list(stage.poles),
+        **about,
     )

@@ -1,26 +1,33 @@
-"""Instrument responses from RESP and StationXML, read by ObsPy.
+"""Instrument responses from RESP and StationXML, read by ObsPy, with all their stages.
 
-Only what an estimate needs is taken: the product of all analog poles-and-zeros stages and the
-product of all gains. Digital filters are left out: they are flat where noise is estimated, and
-their delay is already taken out of the times that digitizers write.
-
-A file may hold several epochs of a channel, in any order. Samples get the response of the epoch in
-which they were taken.
+Each stage is scaled so that its size is its stated gain at the frequency of that gain. The rules
+are those of evalresp, see :func:`whole_response`; a file whose factor A0 evalresp would take
+against a stated gain that is more than 1 dB away is refused. A file may hold many channels and
+epochs, in any order. Samples get the response of the epoch in which they were taken, and only the
+responses of imported channels are built: what is wrong with another channel does not matter.
 """
 
 from __future__ import annotations
 
-import logging
 import math
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daq.bench.model import PolesZeros
-from daq.bench.units import is_motion
+from daq.bench.response import (
+    AnalogPolesZeros,
+    DigitalPolesZeros,
+    Fir,
+    Gain,
+    Iir,
+    Measured,
+    Response,
+)
+from daq.bench.units import canonical, is_motion
 from daq.errors import ImportFormatError
 from daq.formats.readers.waveforms import load_obspy
 
@@ -28,50 +35,133 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
-_LOGGER = logging.getLogger(__name__)
-_UNITS = {"m": "m", "m/s": "m/s", "m/s**2": "m/s²", "m/s/s": "m/s²", "m/(s**2)": "m/s²"}
-_SAME_UNIT = {"count": "counts", "digits": "counts", "volt": "v", "volts": "v"}
+    from daq.bench.response import Stage
+
+_SAME_UNIT = {
+    "count": "counts",
+    "digits": "counts",
+    "bit": "counts",
+    "volt": "v",
+    "volts": "v",
+    "m/sec": "m/s",
+    "m/s/s": "m/s**2",
+    "m/(s**2)": "m/s**2",
+    "m/sec**2": "m/s**2",
+    "m/(sec**2)": "m/s**2",
+    "m/s^2": "m/s**2",
+}
+_SMALL = {"cm": 1e2, "mm": 1e3, "um": 1e6, "nm": 1e9}
+"""How many of a length are in a metre: responses are kept in metres."""
 _TOLERANCE = 0.01
-"""Share by which the sensitivity of a file may miss the product of its stages."""
+"""Share by which numbers of a file that mean the same may differ unsaid."""
+_CONTRADICTION = 1.122
+"""Of A0 and the gain of a stage, beyond which a file is refused: 1 dB."""
+_SUM_TOLERANCE = 0.02
+"""Of the sum of a filter's coefficients from 1, beyond which they are divided by it (evalresp)."""
 _END_OF_TIME_NS = 2**63 - 1
 _FAR_NS = 4 * 10**18
 """Ends beyond the year 2096 are written for "not yet"."""
 _EDGE_NS = 10**9
 """By which data may begin before their epoch, or end after it: dates are often whole seconds."""
+_USED = 0.4
+"""Of the sampling rate: up to where the ripple of digital filters is stated."""
+_NAMED = 8
+_HEAD = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelResponse:
     """How one channel turns motion into counts: ``counts = sensitivity · H(f) · motion``.
 
-    ``sensitivity`` is in counts per ``unit``; ``shape`` is H, normalised as its file says.
+    Attributes
+    ----------
+    sensitivity : float
+        In counts per `unit`, at the frequency of `shape`.
+    unit : str
+    shape : Response
+        H, of size 1 at its frequency.
+    source : str
+        Names of the files that it is from.
+    model, serial_number : str
+        Of the sensor, as far as the file says; empty otherwise.
+    azimuth, dip : float, optional
+        In degrees, clockwise from north and down from the horizontal.
+    notes : tuple of str
+        What a person should know: what was taken, and what in the file contradicts it.
     """
 
     sensitivity: float
     unit: str
-    shape: PolesZeros
+    shape: Response
+    source: str = field(compare=False)
+    model: str = field(default="", compare=False)
+    serial_number: str = field(default="", compare=False)
+    azimuth: float | None = field(default=None, compare=False)
+    dip: float | None = field(default=None, compare=False)
+    notes: tuple[str, ...] = field(default=(), compare=False)
 
 
-@dataclass(frozen=True, slots=True)
-class Epoch:
-    """The response of a channel from one instant to another, in ns since 1970."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Epoch:
+    """A channel of a file from one instant to another, in ns since 1970; its stages unbuilt."""
 
+    path: Path
+    sensor: str
+    channel: str
     start_ns: int
     end_ns: int
-    response: ChannelResponse
+    raw: Any
+
+    @property
+    def name(self) -> str:
+        return f"{self.sensor}.{self.channel}"
+
+    @property
+    def _units(self) -> tuple[str, str]:
+        response = self.raw.response
+        stages, stated = response.response_stages, response.instrument_sensitivity
+        ordered = sorted(stages, key=lambda each: each.stage_sequence_number)
+        first = ordered[0].input_units or (stated and stated.input_units)
+        last = ordered[-1].output_units or (stated and stated.output_units)
+        return _unit(first), _unit(last)
+
+    @property
+    def is_sensor_alone(self) -> bool:
+        """Whether it ends in volts: the response of a sensor without its digitizer."""
+        return self._units[1] == "v" and self._units[0] != "v"
+
+    @property
+    def is_digitizer_alone(self) -> bool:
+        """Whether it begins in volts and ends in counts."""
+        return self._units[0] == "v" and self._units[1] in {"counts", ""}
 
 
 class Responses:
-    """The responses a file holds, by sensor (``network.station.location``) and channel code."""
+    """The responses that files hold, found by code and date.
 
-    def __init__(self, path: Path, by_channel: dict[tuple[str, str], tuple[Epoch, ...]]) -> None:
-        self.path = path
-        self.by_channel = by_channel
+    Parameters
+    ----------
+    files : sequence of Path
+        RESP or StationXML, and folders of them; each channel takes the response of its own code.
+    assigned : sequence of (str, Path)
+        Patterns of ``network.station.location.channel``, of a sensor or of a channel code, each
+        with a file whose response those channels take whatever its code is. A sensor and a
+        digitizer in two files are joined.
+
+    Raises
+    ------
+    ImportFormatError
+        ObsPy is absent, or a file holds no response that it understands.
+    """
+
+    def __init__(self, files: Sequence[Path], assigned: Sequence[tuple[str, Path]] = ()) -> None:
+        self._epochs = _read_all(files)
+        self._assigned = [(pattern, _read_all([path])) for pattern, path in assigned]
 
     def of(
         self, sensor: str, channel: str, stretches: Sequence[tuple[int, int]] = ()
-    ) -> ChannelResponse:
-        """Return the response of a channel; the only one in the file serves all channels.
+    ) -> ChannelResponse | None:
+        """Return the response of a channel; None if only assigned files were given, for others.
 
         Parameters
         ----------
@@ -83,114 +173,126 @@ class Responses:
         Raises
         ------
         ImportFormatError
-            If the file has no response for this channel at these times, or several.
+            If there is no response for this channel at these times, or several, or one that is
+            not understood.
         """
-        epochs = self._epochs(sensor, channel)
-        where = f"{self.path}: the response of {sensor}.{channel}"
-        if not stretches:
-            if len({epoch.response for epoch in epochs}) > 1:
-                raise ImportFormatError(
-                    f"{where} changes on {', '.join(_date(e.start_ns) for e in epochs[1:])}, and"
-                    " the data have no date; expected a response of one epoch, or data with times"
-                )
-            return epochs[0].response
-        found: list[Epoch] = []
-        for begin, last in stretches:
-            edge = min(_EDGE_NS, (last - begin) // 2)
-            start, end = begin + edge, last - edge
-            met = [epoch for epoch in epochs if epoch.start_ns <= end and start < epoch.end_ns]
-            if not met or met[0].start_ns > start or max(e.end_ns for e in met) < end:
-                known = ", ".join(f"{_date(e.start_ns)} to {_date(e.end_ns)}" for e in epochs)
-                raise ImportFormatError(
-                    f"{where} is known for {known}; expected one for the data, from"
-                    f" {_date(begin)} to {_date(last)}"
-                )
-            found += met
-        for epoch in found:
-            if epoch.response != found[0].response:
-                raise ImportFormatError(
-                    f"{where} changes on {_date(epoch.start_ns)}, within the data; import what was"
-                    " recorded before and after that date into two recordings"
-                )
-        return found[0].response
+        name = f"{sensor}.{channel}"
+        files = [
+            epochs
+            for pattern, epochs in self._assigned
+            if any(fnmatchcase(each, pattern) for each in (name, sensor, channel))
+        ]
+        if files:
+            found = [each for epochs in files for each in _assigned_epochs(name, channel, epochs)]
+            is_assigned = True
+        elif self._epochs:
+            found = [
+                each for each in self._epochs if (each.sensor, each.channel) == (sensor, channel)
+            ]
+            is_assigned = False
+            if not found:
+                raise ImportFormatError(self._nothing_for(name))
+        else:
+            return None
+        whole = [each for each in found if not (each.is_sensor_alone or each.is_digitizer_alone)]
+        if whole:
+            return _in_time(name, whole, stretches, is_assigned=is_assigned)
+        return _joined_halves(name, found, stretches, is_assigned=is_assigned)
 
-    def _epochs(self, sensor: str, channel: str) -> tuple[Epoch, ...]:
-        if len(self.by_channel) == 1:
-            return next(iter(self.by_channel.values()))
-        try:
-            return self.by_channel[sensor, channel]
-        except KeyError:
-            known = ", ".join(".".join(key) for key in sorted(self.by_channel))
-            raise ImportFormatError(
-                f"{self.path}: no response for {sensor}.{channel}; it holds {known}"
-            ) from None
+    def _nothing_for(self, name: str) -> str:
+        names = list(dict.fromkeys(each.name for each in self._epochs))
+        known = ", ".join(names[:_NAMED])
+        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        path = self._epochs[0].path
+        return (
+            f"no response for {name}; --response gives {known}{more}. If one of its files is for"
+            f" this channel, say so: --response-for '{name}={path}'"
+        )
 
 
-def read_responses(path: Path) -> Responses:
-    """Read a RESP or StationXML file, with all its epochs.
+def _read_all(paths: Sequence[Path]) -> list[_Epoch]:
+    """Return the channel epochs of files, and of those in folders that hold responses."""
+    found: list[_Epoch] = []
+    for path in paths:
+        if path.is_dir():
+            inside = (each for each in sorted(path.rglob("*")) if each.is_file())
+            epochs = [
+                epoch for each in inside if _format_of(each) is not None for epoch in _read(each)
+            ]
+        else:
+            epochs = _read(path)
+        if not epochs:
+            raise ImportFormatError(f"{path}: expected at least one channel with a response")
+        found += epochs
+    return found
 
-    A sensitivity that misses the product of its stages by one per cent or more is logged.
 
-    Raises
-    ------
-    ImportFormatError
-        ObsPy is absent, or the file holds no response that it understands.
-    """
+def _read(path: Path) -> list[_Epoch]:
+    """Return the channel epochs of a file that have stages, those of a channel in order."""
     obspy = load_obspy()
+    if not path.is_file():
+        raise ImportFormatError(f"{path}: no such file; expected RESP or StationXML")
+    kind = _format_of(path)
+    if kind is None:
+        raise ImportFormatError(
+            f"{path}: expected a RESP or StationXML file; it has neither the element"
+            " FDSNStationXML nor the field B050F03"
+        )
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            inventory = obspy.read_inventory(str(path), format=_format(path))
+            inventory = obspy.read_inventory(str(path), format=kind)
     except Exception as error:
         raise ImportFormatError(
             f"{path}: expected a RESP or StationXML file; ObsPy cannot read it: {error}"
         ) from error
-    by_channel: dict[tuple[str, str], list[Epoch]] = {}
+    by_channel: dict[tuple[str, str], list[_Epoch]] = {}
     for network in inventory:
         for station in network:
-            for channel in station:
-                if channel.response is None or not channel.response.response_stages:
+            for raw in station:
+                if raw.response is None or not raw.response.response_stages:
                     continue
-                name = _joined(network.code, station.code, channel.location_code)
-                start = _ns(channel.start_date, 0)
-                where = f"{path}: {name}.{channel.code} from {_date(start)}"
-                by_channel.setdefault((name, channel.code), []).append(
-                    Epoch(
-                        start,
-                        _ns(channel.end_date, _END_OF_TIME_NS),
-                        _channel(where, channel.response),
+                codes = (network.code, station.code, raw.location_code)
+                sensor = ".".join(code for code in codes if code and code.strip("-? "))
+                by_channel.setdefault((sensor, raw.code), []).append(
+                    _Epoch(
+                        path,
+                        sensor,
+                        raw.code,
+                        _ns(raw.start_date, 0),
+                        _ns(raw.end_date, _END_OF_TIME_NS),
+                        raw,
                     )
                 )
-    if not by_channel:
-        raise ImportFormatError(f"{path}: expected at least one channel with a response")
-    return Responses(path, {key: _in_order(epochs) for key, epochs in by_channel.items()})
+    return [epoch for epochs in by_channel.values() for epoch in _in_order(epochs)]
 
 
-def _format(path: Path) -> str:
+def _format_of(path: Path) -> str | None:
     """Return the name that ObsPy has for this file: what it tries by itself is not limited."""
     with path.open("rb") as file:
-        head = file.read(1 << 16)
-    if b"<!DOCTYPE" in head or b"<!ENTITY" in head:
-        raise ImportFormatError("it declares entities, which StationXML does not need")
+        head = file.read(_HEAD)
     if b"FDSNStationXML" in head:
+        if b"<!DOCTYPE" in head or b"<!ENTITY" in head:
+            raise ImportFormatError(f"{path}: it declares entities, which StationXML does not need")
         return "STATIONXML"
-    if b"B050F03" in head:
-        return "RESP"
-    raise ImportFormatError("it has neither the element FDSNStationXML nor the field B050F03")
+    return "RESP" if b"B050F03" in head else None
 
 
-def _in_order(epochs: Iterable[Epoch]) -> tuple[Epoch, ...]:
+def _in_order(epochs: Iterable[_Epoch]) -> list[_Epoch]:
     """Return epochs by their start; one without an end lasts until the next begins."""
     ordered = sorted(epochs, key=lambda epoch: epoch.start_ns)
     nexts = [epoch.start_ns for epoch in ordered[1:]] + [_END_OF_TIME_NS]
-    return tuple(
-        Epoch(e.start_ns, min(following, e.end_ns) if _is_open(e) else e.end_ns, e.response)
+    return [
+        _Epoch(
+            e.path,
+            e.sensor,
+            e.channel,
+            e.start_ns,
+            min(following, e.end_ns) if e.end_ns > _FAR_NS else e.end_ns,
+            e.raw,
+        )
         for e, following in zip(ordered, nexts, strict=True)
-    )
-
-
-def _is_open(epoch: Epoch) -> bool:
-    return epoch.end_ns > _FAR_NS
+    ]
 
 
 def _ns(instant: Any, otherwise: int) -> int:  # noqa: ANN401 - ObsPy has no types
@@ -206,75 +308,406 @@ def _date(instant_ns: int) -> str:
     return text.removesuffix("+00:00").removesuffix("T00:00:00")
 
 
-def _joined(*codes: str) -> str:
-    return ".".join(code for code in codes if code)
-
-
-def _channel(where: str, response: Any) -> ChannelResponse:  # noqa: ANN401 - ObsPy has no types
-    zeros: list[complex] = []
-    poles: list[complex] = []
-    normalization, frequency = 1.0, 1.0
-    _check_units(where, response)
-    gains = [stage.stage_gain for stage in response.response_stages]
-    for stage in response.response_stages:
-        kind = getattr(stage, "pz_transfer_function_type", "")
-        if not kind.startswith("LAPLACE"):
-            continue
-        to_radians = 2 * math.pi if "HERTZ" in kind else 1.0
-        stage_zeros = tuple(complex(zero) * to_radians for zero in stage.zeros)
-        stage_poles = tuple(complex(pole) * to_radians for pole in stage.poles)
-        zeros += stage_zeros
-        poles += stage_poles
-        frequency = float(stage.normalization_frequency) or frequency
-        factor = stage.normalization_factor * to_radians ** (len(stage_poles) - len(stage_zeros))
-        normalization *= _at_gain_frequency(stage, stage_zeros, stage_poles, factor)
-    stated = response.instrument_sensitivity
-    value = None if stated is None or not stated.value else float(stated.value)
-    if gains and all(gain is not None for gain in gains):
-        sensitivity = math.prod(float(gain) for gain in gains)
-        if value is not None and abs(value - sensitivity) >= _TOLERANCE * abs(sensitivity):
-            _LOGGER.warning(
-                "%s: its sensitivity is %g, the product of its stages %g counts per %s; the stages"
-                " are used",
-                *(where, value, sensitivity, stated.input_units),
-            )
-    elif value is not None:
-        sensitivity = value
-    else:
-        raise ImportFormatError(f"{where}: expected a gain for every stage, or a sensitivity")
-    motion = response.response_stages[0].input_units or (stated and stated.input_units)
-    unit = str(motion or "").lower()
-    unit = _UNITS.get(unit, unit)
-    if not is_motion(unit):
-        _LOGGER.warning(
-            "%s: its input is in %r; expected a unit of motion, such as M/S or M/S**2. The channel"
-            " keeps this unit; if it is a mistake, import again with the right response",
-            *(where, motion),
-        )
-    return ChannelResponse(
-        sensitivity=sensitivity,
-        unit=unit,
-        shape=PolesZeros(
-            zeros=tuple(zeros), poles=tuple(poles), normalization=normalization, frequency=frequency
-        ),
+def _assigned_epochs(name: str, channel: str, epochs: Sequence[_Epoch]) -> list[_Epoch]:
+    """Return the epochs of a file that a channel takes: of its code, its channel, or the only."""
+    for fits in (
+        lambda each: each.name == name,
+        lambda each: each.channel == channel,
+        lambda _: True,
+    ):
+        found = [each for each in epochs if fits(each)]
+        if len({each.name for each in found}) == 1:
+            return found
+    listed = ", ".join(dict.fromkeys(each.name for each in epochs))
+    raise ImportFormatError(
+        f"{epochs[0].path}: several responses ({listed}), none with the code of {name}; expected a"
+        " file with one, or with this channel code"
     )
 
 
-def _at_gain_frequency(
-    stage: Any,  # noqa: ANN401 - ObsPy has no types
-    zeros: tuple[complex, ...],
-    poles: tuple[complex, ...],
-    factor: float,
-) -> float:
-    """Return the factor that makes a stage 1 at the frequency for which its gain is stated."""
-    at = stage.stage_gain_frequency
-    if not at or float(at) == float(stage.normalization_frequency):
-        return factor
-    value = np.abs(PolesZeros(zeros=zeros, poles=poles, normalization=1.0).at(np.array(float(at))))
-    return factor if not np.isfinite(value) or value == 0 else 1.0 / float(value)
+def _in_time(
+    name: str,
+    epochs: Sequence[_Epoch],
+    stretches: Sequence[tuple[int, int]],
+    *,
+    is_assigned: bool,
+) -> ChannelResponse:
+    """Return the response of a channel, the same in all epochs that its data touch."""
+    paths = " and ".join(dict.fromkeys(str(each.path) for each in epochs))
+    where = f"{paths}: the response of {name}"
+    found = list(epochs)
+    if stretches and not (is_assigned and len(epochs) == 1):  # assigned files are for any time
+        found = []
+        for begin, last in stretches:
+            edge = min(_EDGE_NS, (last - begin) // 2)
+            start, end = begin + edge, last - edge
+            met = [each for each in epochs if each.start_ns <= end and start < each.end_ns]
+            if not _covers(met, start, end):
+                known = ", ".join(f"{_date(e.start_ns)} to {_date(e.end_ns)}" for e in epochs)
+                raise ImportFormatError(
+                    f"{where} is known for {known}; expected one for the data, from"
+                    f" {_date(begin)} to {_date(last)}"
+                )
+            found += met
+    built = [(each, whole_response([each])) for each in dict.fromkeys(found)]
+    for each, response in built:
+        if response != built[0][1]:
+            if each.start_ns == built[0][0].start_ns or each.path != built[0][0].path:
+                raise ImportFormatError(
+                    f"{where}: several that differ for one time; expected one of these files"
+                )
+            if not stretches:
+                starts = ", ".join(_date(e.start_ns) for e in epochs[1:])
+                raise ImportFormatError(
+                    f"{where} changes on {starts}, and the data have no date; expected a response"
+                    " of one epoch, or data with times"
+                )
+            raise ImportFormatError(
+                f"{where} changes on {_date(each.start_ns)}, within the data; import what was"
+                " recorded before and after that date into two recordings"
+            )
+    return built[0][1]
 
 
-def _check_units(where: str, response: Any) -> None:  # noqa: ANN401 - ObsPy has no types
+def _covers(epochs: Iterable[_Epoch], start: int, end: int) -> bool:
+    """Whether epochs leave no part of a span of time without a response."""
+    reached = start
+    for each in sorted(epochs, key=lambda epoch: epoch.start_ns):
+        if each.start_ns > reached + _EDGE_NS:
+            return False
+        reached = max(reached, each.end_ns)
+    return reached >= end
+
+
+def _joined_halves(
+    name: str,
+    epochs: Sequence[_Epoch],
+    stretches: Sequence[tuple[int, int]],
+    *,
+    is_assigned: bool,
+) -> ChannelResponse:
+    """Return the response of a sensor and a digitizer whose responses are in two files."""
+    halves: list[_Epoch] = []
+    meant = epochs
+    if stretches and not is_assigned:
+        begin, last = stretches[0][0], stretches[-1][1]
+        meant = [each for each in epochs if each.start_ns <= last and begin < each.end_ns]
+    for kind, own in (
+        ("sensor", [each for each in meant if each.is_sensor_alone]),
+        ("digitizer", [each for each in meant if each.is_digitizer_alone]),
+    ):
+        if len(own) != 1:
+            had = ", ".join(dict.fromkeys(str(each.path) for each in epochs))
+            what = f"{len(own)} responses of a {kind}" if own else f"no response of a {kind}"
+            raise ImportFormatError(
+                f"{name}: {what} in {had}; expected one response from motion to counts, or one of a"
+                " sensor (to V) and one of a digitizer (from V to counts), each by --response-for"
+            )
+        halves += own
+    return whole_response(halves)
+
+
+def whole_response(epochs: Sequence[_Epoch]) -> ChannelResponse:
+    """Return a response from all its stages; of a sensor and a digitizer one after the other.
+
+    The size of a stage is its gain at the frequency of its gain. The rest follows evalresp: where
+    that frequency is the one of the sensitivity, coefficients of filters are taken as they are, and
+    poles and zeros with their A0, which must then agree with the gain; coefficients of filters
+    without symmetry are divided by their sum where it is more than 2 % off 1; filters whose
+    coefficients are symmetric have no phase.
+
+    Raises
+    ------
+    ImportFormatError
+        With the stage that is not understood.
+    """
+    first = epochs[0]
+    where = f"{' and '.join(str(each.path) for each in epochs)}: {first.name}"
+    where += f" from {_date(first.start_ns)}" if first.start_ns > 0 else ""
+    raws = [raw for each in epochs for raw in _ordered(where, each.raw.response)]
+    _check_units(where, raws)
+    notes: list[str] = []
+    stated = [each.raw.response.instrument_sensitivity for each in epochs]
+    frequency = _sensitivity_frequency(stated[0], raws)
+    stages: list[Stage] = []
+    rate: float | None = None
+    for number, raw in enumerate(raws, start=1):
+        rate = float(raw.decimation_input_sample_rate or 0) or rate
+        try:
+            stages.append(_stage(raw, rate, frequency, notes))
+        except (ValueError, TypeError, ZeroDivisionError) as error:
+            raise ImportFormatError(f"{where}: stage {number}: {error}") from error
+        if rate and raw.decimation_factor:
+            rate /= float(raw.decimation_factor)
+    if all(raw.stage_gain is None for raw in raws):
+        if len(stated) > 1 or stated[0] is None or not stated[0].value:
+            raise ImportFormatError(f"{where}: expected a gain for every stage, or a sensitivity")
+        stages.append(Gain(float(stated[0].value)))
+        notes.append("no stage has a gain; its stated sensitivity is used")
+    shape = _normalised(where, stages, frequency, raws)
+    sensitivity = shape.sensitivity
+    motion = raws[0].input_units or (stated[0] and stated[0].input_units)
+    unit, scale = _motion_unit(str(motion or ""))
+    if not is_motion(unit):
+        notes.append(f"its input is in {motion!r}, which is no unit of motion")
+    value = None if stated[0] is None or len(stated) > 1 else stated[0].value
+    if value and shape.frequency == frequency:
+        off = abs(float(value)) / sensitivity
+        if abs(off - 1) >= _TOLERANCE:
+            notes.append(
+                f"the file's sensitivity, {float(value):g}, misses its stages by"
+                f" {abs(off - 1):.0%}; the stages are used"
+            )
+    return ChannelResponse(
+        sensitivity=sensitivity * scale,
+        unit=unit,
+        shape=shape,
+        source=" and ".join(dict.fromkeys(each.path.name for each in epochs)),
+        model=_equipment(first.raw, "model", "type", "description"),
+        serial_number=_equipment(first.raw, "serial_number"),
+        azimuth=_degrees(first.raw.azimuth),
+        dip=_degrees(first.raw.dip),
+        notes=(*_summary(shape, float(first.raw.sample_rate or 0) or rate), *notes),
+    )
+
+
+def _ordered(where: str, response: Any) -> list[Any]:  # noqa: ANN401 - ObsPy has no types
+    numbers = [stage.stage_sequence_number for stage in response.response_stages]
+    if len(set(numbers)) != len(numbers):
+        twice = next(number for number in numbers if numbers.count(number) > 1)
+        raise ImportFormatError(f"{where}: stage {twice} is given twice; expected each stage once")
+    return sorted(response.response_stages, key=lambda each: each.stage_sequence_number)
+
+
+def _sensitivity_frequency(stated: Any, raws: Sequence[Any]) -> float:  # noqa: ANN401 - see above
+    """Return the frequency of the stated sensitivity, or else of the last stage that has one."""
+    if stated is not None and stated.value:
+        return float(stated.frequency or 0.0)
+    found = [float(raw.stage_gain_frequency or 0.0) for raw in raws]
+    return next((each for each in reversed(found) if each), 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class _Given:
+    """What a file says of any stage.
+
+    Attributes
+    ----------
+    gain, at : float
+        Its gain, and the frequency in Hz of that.
+    rate : float, optional
+        Sampling rate of its input in Hz.
+    frequency : float
+        Of the sensitivity of the whole response, in Hz.
+    """
+
+    gain: float
+    at: float
+    rate: float | None
+    frequency: float
+
+    @property
+    def known_rate(self) -> float:
+        if not self.rate or not 0 < self.rate < math.inf:
+            raise ValueError("a digital filter without the rate of its input; expected one")
+        return self.rate
+
+    def factor(self, shape: Fir | Iir) -> float:
+        """Return the factor of a digital filter: its gain, where that holds at `at`."""
+        if self.at == self.frequency:
+            return self.gain
+        size = _size(shape, self.at)
+        if size == 0 or not np.isfinite(size):
+            raise ValueError(f"its gain is stated at {self.at:g} Hz, where the filter is {size:g}")
+        return self.gain / size
+
+
+def _stage(
+    raw: Any,  # noqa: ANN401 - ObsPy has no types
+    rate: float | None,
+    frequency: float,
+    notes: list[str],
+) -> Stage:
+    """Return a stage of a file; raise ValueError if it is not understood."""
+    kind = type(raw).__name__
+    gain = 1.0 if raw.stage_gain is None else float(raw.stage_gain)
+    given = _Given(gain, float(raw.stage_gain_frequency or 0.0), rate, frequency)
+    if gain == 0:
+        raise ValueError("a gain of 0; expected another")
+    if kind == "PolesZerosResponseStage":
+        stage: Stage = _poles_zeros(raw, given, notes)
+    elif kind == "ResponseListResponseStage":
+        stage = _measured(raw, gain)
+    elif kind == "PolynomialResponseStage":
+        stage = Gain(gain / _slope([float(each) for each in raw.coefficients]))
+    elif kind == "FIRResponseStage":
+        coefficients = [float(each) for each in raw.coefficients]
+        stage = _fir(raw, coefficients, str(raw.symmetry).lower(), given)
+    elif kind == "CoefficientsTypeResponseStage":
+        stage = _coefficients(raw, given)
+    elif kind == "ResponseStage":
+        stage = Gain(gain)
+    else:
+        raise ValueError(f"a {kind.removesuffix('ResponseStage')} stage, which is not understood")
+    return stage
+
+
+def _slope(coefficients: Sequence[float]) -> float:
+    if len(coefficients) > 2:
+        raise ValueError(
+            f"a polynomial of {len(coefficients)} coefficients; expected a straight line, as noise"
+            " is estimated of linear channels"
+        )
+    return coefficients[1] if len(coefficients) == 2 else 1.0
+
+
+def _poles_zeros(raw: Any, given: _Given, notes: list[str]) -> Stage:  # noqa: ANN401 - see above
+    kind = str(raw.pz_transfer_function_type)
+    zeros = tuple(complex(each) for each in raw.zeros)
+    poles = tuple(complex(each) for each in raw.poles)
+    a0 = float(raw.normalization_factor or 1.0)
+    shape: AnalogPolesZeros | DigitalPolesZeros
+    if kind.startswith("LAPLACE"):
+        to_radians = 2 * math.pi if "HERTZ" in kind else 1.0
+        a0 *= to_radians ** (len(poles) - len(zeros))
+        shape = AnalogPolesZeros(
+            1.0, tuple(z * to_radians for z in zeros), tuple(p * to_radians for p in poles)
+        )
+    elif kind.startswith("DIGITAL"):
+        shape = DigitalPolesZeros(1.0, zeros, poles, given.rate or 1.0)
+    else:
+        raise ValueError(f"poles and zeros of kind {kind!r}; expected LAPLACE or DIGITAL")
+    stated = float(raw.normalization_frequency or 0.0)
+    size, at_stated = _size(shape, given.at), _size(shape, stated) * abs(a0)
+    differs = abs(at_stated - 1) if np.isfinite(at_stated) else math.inf
+    if not np.isfinite(size) or size == 0:
+        notes.append(f"A0 of the file is used: at {given.at:g} Hz, where its gain holds, it is 0")
+        factor = given.gain * a0
+    elif given.at == stated == given.frequency:
+        both = (
+            f"gain at {given.at:g} Hz is {given.gain:g}, but by A0 with its poles and zeros it is"
+            f" {given.gain * at_stated:g}"
+        )
+        if not 1 / _CONTRADICTION <= at_stated <= _CONTRADICTION:
+            raise ValueError(f"its {both}; expected one value: correct A0 or the gain in the file")
+        if differs >= _TOLERANCE:
+            notes.append(f"its {both}; A0 is used, as evalresp does")
+        factor = given.gain * a0
+    else:
+        if at_stated > 0 and differs >= _TOLERANCE:
+            notes.append(f"A0 differs from the file by {abs(1 / at_stated - 1):.0%}")
+        factor = given.gain / size
+    return replace(shape, factor=factor)
+
+
+def _coefficients(raw: Any, given: _Given) -> Stage:  # noqa: ANN401 - see above
+    above = [float(each) for each in raw.numerator]
+    below = [float(each) for each in raw.denominator]
+    is_digital = str(raw.cf_transfer_function_type or "DIGITAL").upper() == "DIGITAL"
+    if not is_digital and (len(above) > 1 or below):
+        raise ValueError("analog coefficients; expected poles and zeros, or a digital filter")
+    if not below:
+        return _fir(raw, above, "none", given)
+    shape = Iir(1.0, tuple(above), tuple(below), given.known_rate)
+    return replace(shape, factor=given.factor(shape))
+
+
+def _fir(
+    raw: Any,  # noqa: ANN401 - see above
+    stated: list[float],
+    symmetry: str,
+    given: _Given,
+) -> Stage:
+    if not stated:
+        return Gain(given.gain)
+    if symmetry not in {"none", "odd", "even"}:
+        raise ValueError(f"a filter of symmetry {symmetry!r}; expected NONE, ODD or EVEN")
+    coefficients = np.array(stated)
+    if symmetry == "none":
+        total = float(coefficients.sum())
+        if total == 0:
+            raise ValueError("filter coefficients that sum to 0; expected a low pass")
+        if abs(total - 1) > _SUM_TOLERANCE:
+            coefficients = coefficients / total
+        if np.array_equal(coefficients, coefficients[::-1]):
+            symmetry = "odd" if len(coefficients) % 2 else "even"
+            coefficients = coefficients[: (len(coefficients) + 1) // 2]
+    if len(coefficients) == 1 and symmetry == "odd":
+        is_scaled = given.at != given.frequency
+        return Gain(given.gain * (1.0 if is_scaled else float(coefficients[0])))
+    correction = float(raw.decimation_correction or 0.0) if symmetry == "none" else 0.0
+    known: Any = symmetry
+    shape = Fir(1.0, tuple(coefficients.tolist()), known, given.known_rate, correction)
+    return replace(shape, factor=given.factor(shape))
+
+
+def _measured(raw: Any, gain: float) -> Stage:  # noqa: ANN401 - see above
+    rows = sorted(
+        (float(each.frequency), float(each.amplitude), float(each.phase))
+        for each in raw.response_list_elements
+    )
+    if len({row[0] for row in rows}) < max(2, len(rows)):
+        raise ValueError("a list of measured values with fewer than two, or two of one frequency")
+    frequencies, amplitudes, phases = np.array(rows).T
+    unwrapped = np.unwrap(np.radians(phases))
+    return Measured(
+        gain, tuple(frequencies.tolist()), tuple(amplitudes.tolist()), tuple(unwrapped.tolist())
+    )
+
+
+def _size(shape: Any, at: float) -> float:  # noqa: ANN401 - a stage
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return float(np.abs(shape.shape(np.array([at])))[0])
+
+
+def _normalised(
+    where: str, stages: Sequence[Stage], frequency: float, raws: Sequence[Any]
+) -> Response:
+    """Return stages with the frequency of the sensitivity, or another where it has a size."""
+    others = [float(raw.stage_gain_frequency or 0.0) for raw in raws]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for each in (frequency, *others, 1.0):
+            response = Response(tuple(stages), each)
+            if each > 0 and np.isfinite(response.sensitivity) and response.sensitivity > 0:
+                return response
+    raise ImportFormatError(
+        f"{where}: its response is 0 or not known at {frequency:g} Hz, where its sensitivity is"
+        " stated; expected a frequency in its pass band"
+    )
+
+
+def _motion_unit(text: str) -> tuple[str, float]:
+    """Return a unit of motion, and how many of the file's are in one of it."""
+    unit = _unit(text)
+    if unit[:2] in _SMALL and (metres := _unit(unit[1:])) in {"m", "m/s", "m/s**2"}:
+        return canonical(metres), _SMALL[unit[:2]]
+    return canonical(unit), 1.0
+
+
+def _summary(shape: Response, rate: float | None) -> list[str]:
+    """Return what a person wants to know of the stages that were taken."""
+    found = [shape.described]
+    if shape.filters and rate:
+        at = np.linspace(0, _USED * rate, 801)[1:]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            size = np.abs(np.prod([each.shape(at) for each in shape.filters], axis=0))
+            db = 20 * np.log10(size)
+        if np.isfinite(db).all():
+            found.append(f"ripple {np.ptp(db):.2f} dB up to {_USED * rate:g} Hz")
+    return found
+
+
+def _equipment(raw: Any, *names: str) -> str:  # noqa: ANN401 - see above
+    """Return the first of these attributes of the sensor that says something."""
+    texts = [str(getattr(raw.sensor, name, None) or "").strip() for name in names]
+    return next((text for text in texts if text.strip("?* ") and text.isprintable()), "")
+
+
+def _degrees(value: Any) -> float | None:  # noqa: ANN401 - see above
+    return None if value is None else float(value)
+
+
+def _check_units(where: str, stages: Sequence[Any]) -> None:
     """Check that each stage takes what the one before gives, and that the last gives counts.
 
     Raises
@@ -282,7 +715,6 @@ def _check_units(where: str, response: Any) -> None:  # noqa: ANN401 - ObsPy has
     ImportFormatError
         With the stage that does not fit.
     """
-    stages = response.response_stages
     given = ""
     for number, stage in enumerate(stages, start=1):
         taken = _unit(stage.input_units)

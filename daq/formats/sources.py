@@ -7,7 +7,7 @@ hold the state of the instrument, and those that were not asked for, are left as
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from daq.formats.channel_runs import Overlap
-    from daq.formats.foreign_sensor import ForeignSensor
+    from daq.formats.foreign_sensor import Calibration, ForeignSensor
     from daq.formats.traces import Part, Piece, Trace
 
     Progress: TypeAlias = Callable[[str], None]
@@ -167,6 +167,7 @@ class _Index:
         self._selection = selection
         self._pieces: dict[str, dict[str, list[Piece]]] = {}
         self._units: dict[tuple[str, str], str] = {}
+        self._calibrations: dict[tuple[str, str], Calibration | None] = {}
         self._coded: set[str] = set()
         self.left_aside: dict[str, str] = {}
 
@@ -204,6 +205,13 @@ class _Index:
                     f" {self._units[key] or 'counts'}; expected one unit"
                 )
                 continue
+            known = self._calibrations.setdefault(key, trace.calibration)
+            if trace.calibration != known:
+                problems.append(
+                    f"{part.source}: {name} has {_calibrated(trace.calibration)}, in another file"
+                    f" {_calibrated(known)}; expected one: import what has the same together"
+                )
+                continue
             if trace.fdsn:
                 self._coded.add(trace.sensor)
             self._pieces.setdefault(trace.sensor, {}).setdefault(trace.channel, []).append(cut)
@@ -235,7 +243,9 @@ class _Index:
     ) -> ForeignSensor:
         units = [self._units[name, channel] for channel in channels]
         known = [unit or "counts" for unit in units] if any(units) else []
-        return assembled(name, channels, known, self._selection.overlap, cache)
+        found = assembled(name, channels, known, self._selection.overlap, cache)
+        calibrations = tuple(self._calibrations[name, channel] for channel in channels)
+        return replace(found, calibrations=calibrations) if any(calibrations) else found
 
     def _reason_against(self, trace: Trace) -> str:
         code = trace.channel
@@ -264,6 +274,12 @@ class _Index:
         if first >= last:
             return None
         return piece if last - first == piece.n_samples else piece.cut(first, last)
+
+
+def _calibrated(calibration: Calibration | None) -> str:
+    if calibration is None:
+        return "no calibration"
+    return f"{calibration.sensitivity:g} counts per {calibration.unit}"
 
 
 def sensors_of_parts(parts: Iterable[Part]) -> tuple[ForeignSensor, ...]:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daq.formats.foreign_sensor import ForeignSensor
+    from daq.formats.foreign_sensor import Calibration, ForeignSensor
 
     Samples: TypeAlias = NDArray[Any]
 
@@ -47,11 +47,13 @@ class Trace:
         In Hz, as the file states it.
     samples : ndarray, shape (n_samples,)
     unit : str
-        Empty where the format does not say.
+        Of the samples; empty where they are counts, or the format does not say.
     end_ns : int, optional
         UTC of the last sample, if the file states that too; its clock may run off its rate.
     fdsn : bool
         Whether the channel has a code of the FDSN, which tells what it measures.
+    calibration : Calibration, optional
+        What the file says a count is.
     """
 
     sensor: str
@@ -62,6 +64,7 @@ class Trace:
     unit: str = ""
     end_ns: int | None = None
     fdsn: bool = False
+    calibration: Calibration | None = None
 
 
 class Part(Protocol):
@@ -127,6 +130,7 @@ def traces_of(sensors: Iterable[ForeignSensor]) -> list[Trace]:
     for sensor in sensors:
         sensor.check()
         units = sensor.units or ("",) * len(sensor.channels)
+        calibrations = sensor.calibrations or (None,) * len(sensor.channels)
         found += [
             Trace(
                 sensor.name,
@@ -135,9 +139,12 @@ def traces_of(sensors: Iterable[ForeignSensor]) -> list[Trace]:
                 sensor.sampling_rate,
                 stretch.counts[:, number],
                 unit,
+                calibration=calibration,
             )
             for stretch in sensor.stretches
-            for number, (channel, unit) in enumerate(zip(sensor.channels, units, strict=True))
+            for number, (channel, unit, calibration) in enumerate(
+                zip(sensor.channels, units, calibrations, strict=True)
+            )
         ]
     return found
 

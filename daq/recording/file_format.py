@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import zlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daq.bench.model import Channel, PolesZeros, Sensor
+from daq.bench.model import Channel, Sensor
+from daq.bench.response import response_from_json, response_to_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -112,7 +112,10 @@ def channel_attributes(channels: Sequence[Channel]) -> dict[str, Any]:
         "unit": [channel.unit for channel in channels],
         "direction": [channel.direction or "" for channel in channels],
         "auxiliary": np.array([channel.auxiliary for channel in channels], dtype=np.int8),
-        "response": [_response_text(channel.response) for channel in channels],
+        "response": [
+            "" if channel.response is None else response_to_json(channel.response)
+            for channel in channels
+        ],
     }
 
 
@@ -130,22 +133,9 @@ def channels_of(attributes: Any) -> tuple[Channel, ...]:  # noqa: ANN401  (h5py 
             unit=unit,
             direction=direction or None,
             auxiliary=bool(auxiliary),
-            response=PolesZeros.model_validate_json(response) if response else None,
+            response=response_from_json(response) if response else None,
         )
         for name, sensitivity, unit, direction, auxiliary, response in columns
-    )
-
-
-def _response_text(response: PolesZeros | None) -> str:
-    if response is None:
-        return ""
-    return json.dumps(
-        {
-            "zeros": [[z.real, z.imag] for z in response.zeros],
-            "poles": [[p.real, p.imag] for p in response.poles],
-            "normalization": response.normalization,
-            "frequency": response.frequency,
-        }
     )
 
 

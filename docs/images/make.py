@@ -116,7 +116,11 @@ def application(folder: Path) -> None:
 def real_recording(folder: Path) -> None:
     """Draw the noise of the sensors of the real recording."""
     recording = folder / "tst.h5"
-    import_files(sorted(DATA.glob("*.mseed")), recording, response=DATA / "T-compact_Q330HR_BH_40")
+    import_files(
+        sorted(DATA.glob("*.mseed")),
+        recording,
+        response_for=[("*", DATA / "T-compact_Q330HR_BH_40")],
+    )
     settings = Settings(segment=409.6, detrend="none", methods=METHODS, unit="m/s²")
     snapshot = estimate([recording], settings)
     frequency = snapshot.frequency

@@ -220,11 +220,21 @@ def import_(
         ),
     ] = None,
     response: Annotated[
-        Path | None,
+        list[Path] | None,
         typer.Option(
             "--response",
             metavar="FILE",
-            help="Instrument response, RESP or StationXML. A single one applies to all channels.",
+            help="Instrument responses: RESP or StationXML files, or folders of them; repeatable. "
+            "Each channel takes the response of its code and date.",
+        ),
+    ] = None,
+    response_for: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--response-for",
+            metavar="PATTERN=FILE",
+            help="Response for channels of another code, as in 'XX.ABC.*=FILE'; repeatable. "
+            "A sensor and its digitizer may be in two files.",
         ),
     ] = None,
     sampling_rate: Annotated[
@@ -295,7 +305,8 @@ def import_(
         sources,
         out=out,
         bench=bench,
-        response=response,
+        response=response or [],
+        response_for=response_for or [],
         sampling_rate=sampling_rate,
         selection=selected(
             channels=channels or [],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import typer
@@ -20,7 +21,6 @@ from tui.runs.estimate_settings import chosen
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     from daq.formats.importer import ImportResult
 
@@ -74,7 +74,8 @@ def import_recording(
     *,
     out: Path,
     bench: Path | None,
-    response: Path | None,
+    response: Sequence[Path] = (),
+    response_for: Sequence[str] = (),
     sampling_rate: float | None,
     selection: Selection | None = None,
     json: str | None,
@@ -98,6 +99,7 @@ def import_recording(
         bench=described,
         estimate=settings,
         response=response,
+        response_for=[_assigned(text) for text in response_for],
         sampling_rate=sampling_rate,
         selection=selection,
     )
@@ -105,6 +107,46 @@ def import_recording(
     write_json(json, {"recording": str(out), **asdict(result)})
     if result.problems:
         raise typer.Exit(ExitCode.TROUBLE)
+
+
+def _assigned(text: str) -> tuple[str, Path]:
+    """Return pattern and file of ``PATTERN=FILE``."""
+    pattern, equals, path = text.partition("=")
+    if not pattern or not equals or not path:
+        raise typer.BadParameter(
+            f"--response-for {text}: expected PATTERN=FILE, as in 'XX.ABC.*=RESP.file'"
+        )
+    return pattern, Path(path)
+
+
+_ORIGINS = {
+    "response": "response",
+    "bench": "bench file",
+    "file": "the file's own",
+    "none": "no calibration: counts",
+}
+
+
+def _calibrations(result: ImportResult) -> list[str]:
+    """Return a line for each kind of calibration that was taken, with the channels it is of."""
+    alike: dict[str, list[str]] = {}
+    for each in result.calibrations:
+        text = _ORIGINS[each.origin]
+        if each.origin != "none":
+            text += f", {each.sensitivity:.6g} counts per {each.unit}"
+        alike.setdefault("; ".join([text, *each.notes]), []).append(each.channel)
+    if len(alike) == 1:
+        return [f"all channels: {text}" for text in alike]
+    return [f"{_by_sensor(names)}: {text}" for text, names in alike.items()]
+
+
+def _by_sensor(names: Sequence[str]) -> str:
+    """Return names of channels with that of their sensor once: ``XX.ABC.00 HHZ HHN``."""
+    found: dict[str, list[str]] = {}
+    for name in names:
+        sensor, _, channel = name.rpartition(".")
+        found.setdefault(sensor, []).append(channel)
+    return ", ".join(f"{sensor} {' '.join(channels)}" for sensor, channels in found.items())
 
 
 def _show(result: ImportResult, out: Path, json: str | None) -> None:
@@ -128,6 +170,8 @@ def _show(result: ImportResult, out: Path, json: str | None) -> None:
                 f"{entry.sensor}: resampled to the instants of {entry.channels[0]}:"
                 f" {' '.join(entry.resampled)}"
             )
+    for line in _calibrations(result):
+        screen.print(line, soft_wrap=True)
     for reason in sorted(set(result.left_aside.values())):
         names = [name for name, why in result.left_aside.items() if why == reason]
         screen.print(f"left aside ({reason}): {' '.join(sorted(names))}")

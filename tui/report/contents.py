@@ -184,10 +184,7 @@ def _response(channel: Channel) -> str:
     if channel.response is None:
         return "flat"
     response = channel.response
-    return (
-        f"{len(response.poles)} poles, {len(response.zeros)} zeros; "
-        f"sensitivity at {response.frequency:g} Hz"
-    )
+    return f"{response.described}; sensitivity at {response.frequency:g} Hz"
 
 
 def _settings_section(snapshot: Snapshot, settings: Settings) -> Section:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from daq.bench.model import PolesZeros
+from daq.bench.response import Fir, Measured, PolesZeros, Response
 from daq.estimation import equalisation, noise_estimates
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.settings import Settings
@@ -212,3 +212,30 @@ def test_segments_around_a_gap_are_left_out_as_far_as_filters_reach(tmp_path: Pa
     snapshot = estimate([write(tmp_path / "r.h5", sensors)], replace(OFF, equalise="known"))
     assert 2 <= snapshot.n_dropped <= 7  # 4 s, and filters of as much to either side at most
     assert abs(excess(snapshot, 1, 8, known=True)).max() < 0.08
+
+
+def test_a_measured_response_counts_as_far_as_it_was_measured(tmp_path: Path) -> None:
+    measured = np.geomspace(0.01, 12.0, 60)
+    values = LOW_PASS.at(measured)
+    as_list = Response(
+        (
+            Measured(
+                1.0, tuple(measured), tuple(np.abs(values)), tuple(np.unwrap(np.angle(values)))
+            ),
+            Fir(0.5, (1.0, 1.0), "none", RATE, 0.5 / RATE),  # 0 at half the sampling rate
+        ),
+        0.01,
+    )
+    sensors = recorded()
+    for name in "abc":
+        own = as_list if name == "b" else Response(as_list.stages[1:], 0.01)
+        sensors[name] = replace(sensors[name], channel={"response": own})
+    write(tmp_path / "a.h5", sensors)
+    snapshot = estimate([tmp_path / "a.h5"], replace(OFF, equalise="known"))
+    noise = snapshot.results["three-sensor"].noise_psd
+    high = (snapshot.frequency > 12.5) & (snapshot.frequency < 20)
+    assert np.isnan(noise[high][:, 3:6]).all()
+    inside = (snapshot.frequency > 1) & (snapshot.frequency < 6)
+    boxcar = np.abs(np.cos(np.pi * snapshot.frequency / RATE)) ** 2
+    flat = noise[inside][:, :3] * boxcar[inside, None] / NOISE
+    assert abs(np.mean(flat) - 1) < 0.15  # of which the errors are 0.05; without filters 100

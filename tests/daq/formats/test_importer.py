@@ -86,10 +86,12 @@ def test_a_gap_stays_a_gap_of_its_length(tmp_path: Path) -> None:
         np.testing.assert_array_equal(samples[317:, 0], np.arange(317, 1000))
 
 
-def test_one_response_serves_all_channels(tmp_path: Path, usgs_recording: Path) -> None:
+def test_a_response_assigned_to_all_channels(tmp_path: Path, usgs_recording: Path) -> None:
     write_npz(tmp_path / "a.npz", 100)
     response = usgs_recording / "T-compact_Q330HR_BH_40"
-    import_files([tmp_path / "a.npz"], tmp_path / "a.h5", response=response)
+    with pytest.raises(ImportFormatError, match=r"--response-for 'A\.1=.*T-compact"):
+        import_files([tmp_path / "a.npz"], tmp_path / "a.h5", response=response)
+    result = import_files([tmp_path / "a.npz"], tmp_path / "a.h5", response_for=[("*", response)])
     with Recording.open(tmp_path / "a.h5") as recording:
         channels = [channel for sensor in recording.sensors for channel in sensor.channels]
     assert len(channels) == 4
@@ -98,7 +100,9 @@ def test_one_response_serves_all_channels(tmp_path: Path, usgs_recording: Path) 
         assert channel.unit == "m/s"
         assert channel.response is not None
         assert np.abs(channel.response.at(np.array([1.0]))) == pytest.approx(1.0, abs=1e-6)
-        assert (len(channel.response.zeros), len(channel.response.poles)) == (6, 11)
+        assert channel.response.described == "11 poles, 6 zeros"
+    assert {each.origin for each in result.calibrations} == {"response"}
+    assert "11 poles, 6 zeros" in result.calibrations[0].notes
 
 
 def test_stationxml_gives_each_channel_its_own(tmp_path: Path) -> None:
@@ -110,6 +114,7 @@ def test_stationxml_gives_each_channel_its_own(tmp_path: Path) -> None:
             zeros=[0.0],
             poles=[-1.0 + 1.0j, -1.0 - 1.0j],
             stage_gain=100.0 * number,
+            normalization_factor=abs(2j * np.pi + 1 + 1j) * abs(2j * np.pi + 1 - 1j) / (2 * np.pi),
             input_units="M/S**2",
             output_units="COUNTS",
         )
@@ -132,7 +137,7 @@ def test_stationxml_gives_each_channel_its_own(tmp_path: Path) -> None:
 
     (tmp_path / "b.csv").write_text(f"other.X,other.Y\n{samples}\n")
     with pytest.raises(
-        ImportFormatError, match=r"no response for other\.X; it holds XX\.ABC\.00\.X"
+        ImportFormatError, match=r"no response for other\.X; --response gives XX\.ABC\.00\.X"
     ):
         import_files([tmp_path / "b.csv"], tmp_path / "b.h5", response=path, sampling_rate=50.0)
     assert not (tmp_path / "b.h5").exists()

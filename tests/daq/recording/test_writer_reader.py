@@ -13,7 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daq.bench.model import Channel, PolesZeros
+from daq.bench.model import Channel
+from daq.bench.response import PolesZeros
 from daq.errors import NotARecordingError, RecordingError
 from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
 from daq.recording.file_format import SensorLayout

@@ -176,7 +176,7 @@ def test_public_recording_through_import_and_export(tmp_path: Path, usgs_recordi
     obspy = load_obspy()
     sources = sorted(usgs_recording.glob("TST5_*_BH0.mseed"))
     resp = usgs_recording / "T-compact_Q330HR_BH_40"
-    import_files(sources, tmp_path / "a.h5", response=resp)
+    import_files(sources, tmp_path / "a.h5", response_for=[("*", resp)])
     assert run(tmp_path / "a.h5", "--format", "mseed").exit_code == ExitCode.DONE
     ours = obspy.read(str(tmp_path / "a.mseed"), format="MSEED").merge(method=-1)
     theirs = obspy.Stream()
@@ -186,7 +186,7 @@ def test_public_recording_through_import_and_export(tmp_path: Path, usgs_recordi
         (our,) = ours.select(id=their.id)
         assert our.stats.starttime == their.stats.starttime
         np.testing.assert_array_equal(our.data, their.data)
-    frequency = np.geomspace(0.005, 8.0, 60)
+    frequency = np.geomspace(0.005, 16.0, 60)
     our_xml = obspy.read_inventory(str(tmp_path / "a.xml"), format="STATIONXML")
     exported = our_xml.get_response(ours[0].id, ours[0].stats.starttime)
     original = obspy.read_inventory(str(resp), format="RESP")[0][0][0].response

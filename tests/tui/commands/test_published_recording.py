@@ -52,7 +52,7 @@ def tst(usgs_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("usgs") / "tst.h5"
     sources = sorted(str(path) for path in usgs_recording.glob("*.mseed"))
     response = str(usgs_recording / "T-compact_Q330HR_BH_40")
-    huddle("import", *sources, "--response", response, "--out", str(out))
+    huddle("import", *sources, "--response-for", f"*={response}", "--out", str(out))
     return out
 
 
