@@ -119,6 +119,7 @@ class SeedLinkSession:
             received, at = await self._stream.read()
             for item in self.decoder.receive(received, at):
                 yield item
+            self.decoder.check()
 
 
 class SeedLinkDriver:

@@ -28,12 +28,19 @@ from daq.drivers.guralp.links import open_link
 from daq.drivers.guralp.settings import GuralpSettings
 from daq.drivers.interface import DeviceInformation
 from daq.drivers.port_rules import port_label, require_address, require_alike
-from daq.errors import ABSENT, BenchFileError, FileFault, NoAnswerError, WrongDeviceError
+from daq.errors import (
+    ABSENT,
+    BenchFileError,
+    DeviceError,
+    FileFault,
+    NoAnswerError,
+    WrongDeviceError,
+)
 from daq.protocols.block import Block, Event, EventKind
 from daq.protocols.guralp.gcf import component, serial_number
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Sequence
+    from collections.abc import AsyncGenerator, AsyncIterator, Callable, Sequence
 
     from daq.bench.model import Sensor
     from daq.drivers.guralp.links import Link
@@ -67,16 +74,29 @@ class GuralpSession:
 
     async def read(self) -> AsyncIterator[Block | Event]:
         """Yield blocks and events."""
-        found, self._buffered = self._buffered, []
-        while True:
-            for item in found:
+        async with contextlib.aclosing(self._received()) as received:
+            async for item in received:
                 if isinstance(item, Block):
                     if item.sensor in self._absent:
                         yield self._identified(item)
                     if item.sensor in self._refused:
                         continue
                 yield item
-            found = await self._link.receive()
+
+    async def _received(self) -> AsyncGenerator[Block | Event]:
+        buffered, self._buffered = self._buffered, []
+        for item in buffered:
+            yield item
+        try:
+            while True:
+                for item in await self._link.receive():
+                    yield item
+                for item in await self._link.respond():
+                    yield item
+        except DeviceError:  # blocks behind a hole need not wait for lost ones any longer
+            for item in self._link.streams.release():
+                yield item
+            raise
 
     def _identified(self, first: Block) -> Event:
         """Identify a sensor whose streams were missing at the start; exclude a wrong device."""
@@ -168,7 +188,7 @@ async def _discover(
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(settings.patience):
             while True:
-                found = await link.receive()
+                found = [*await link.receive(), *await link.respond()]
                 buffered += [
                     replace(item, sensor=sensor.name) for item in found if isinstance(item, Event)
                 ]
@@ -209,6 +229,7 @@ async def _listen(
         async with asyncio.timeout(settings.patience):
             while link.streams.silent:
                 buffered += await link.receive()
+                buffered += await link.respond()
     information = []
     for sensor in sensors:
         silent = set(link.streams.stream_ids(sensor.name)).intersection(link.streams.silent)

@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 from typing import TYPE_CHECKING, Protocol
 
+from daq.errors import NotConnectedError
 from daq.protocols.block import Block, Event, EventKind
 from daq.protocols.guralp import scream
 from daq.protocols.guralp.decoders import ScreamDecoder, SerialDecoder
@@ -44,7 +45,15 @@ class Link(Protocol):
         ...
 
     async def receive(self) -> list[Block | Event]:
-        """Wait for the next bytes, decode them, and reply to the other end."""
+        """Wait for the next bytes and decode them."""
+        ...
+
+    async def respond(self) -> list[Block | Event]:
+        """Send what the other end needs, once the received blocks are handed on.
+
+        Return the blocks that this recovers. A port that is lost meanwhile raises no error here:
+        the next :meth:`receive` returns what had arrived, and then raises.
+        """
         ...
 
 
@@ -61,11 +70,14 @@ class _SerialLink:
 
     async def receive(self) -> list[Block | Event]:
         received, at = await self._stream.read()
-        found = self._decoder.receive(received, at)
+        return self._decoder.receive(received, at)
+
+    async def respond(self) -> list[Block | Event]:
         replies = self._decoder.take_replies()
         if replies:
-            await self._stream.write(replies)
-        return found
+            with contextlib.suppress(NotConnectedError):
+                await self._stream.write(replies)
+        return []
 
 
 class _TcpLink:
@@ -81,6 +93,10 @@ class _TcpLink:
         received, at = await self._stream.read()
         return self._decoder.receive(received, at)
 
+    async def respond(self) -> list[Block | Event]:
+        """Send nothing."""
+        return []
+
 
 class _UdpLink:
     def __init__(
@@ -95,6 +111,8 @@ class _UdpLink:
         self._recovery = recovery
         self._delay = FIRST_RETRY
         self._retry_ns: int | None = None  # time of the next recovery, after a failed one
+        self._at: HostTime | None = None  # arrival of the last datagram
+        self._recovered: list[Block | Event] = []  # not yet handed on
         self._name = next(iter(ids)) if len(ids) == 1 else ""
         self._decoder = ScreamDecoder(ids)
 
@@ -104,15 +122,21 @@ class _UdpLink:
 
     async def receive(self) -> list[Block | Event]:
         received, at = await self._stream.read()
-        found = self._decoder.receive_datagram(received, at)
-        due = self._retry_ns is None or at.monotonic_ns >= self._retry_ns
-        if self._decoder.missing and self._recovery is not None and due:
-            found += await self._recover(self._recovery, at)
-        return found
+        self._at = at
+        return self._decoder.receive_datagram(received, at)
 
-    async def _recover(self, where: tuple[str, int], at: HostTime) -> list[Block | Event]:
+    async def respond(self) -> list[Block | Event]:
         """Request missing packets over TCP; after a failure, wait before the next request."""
-        found: list[Block | Event] = []
+        at, where = self._at, self._recovery
+        due = self._retry_ns is None or (at is not None and at.monotonic_ns >= self._retry_ns)
+        if at is not None and where is not None and self._decoder.missing and due:
+            await self._recover(where, at)
+        recovered, self._recovered = self._recovered, []
+        return recovered
+
+    async def _recover(self, where: tuple[str, int], at: HostTime) -> None:
+        """Add the blocks of missing packets to ``_recovered``."""
+        found = self._recovered
         try:
             async with asyncio.timeout(RECOVERY_TIMEOUT):
                 reader, writer = await asyncio.open_connection(*where)
@@ -132,12 +156,12 @@ class _UdpLink:
             text = f"no recovery of lost packets over TCP, next in {self._delay:g} s: {why}"
             self._retry_ns = at.monotonic_ns + round(self._delay * 1e9)
             self._delay = min(2 * self._delay, MAX_RETRY)
-            return [*found, Event(self._name, EventKind.STATUS, text[:200], at)]
+            found.append(Event(self._name, EventKind.STATUS, text[:200], at))
+            return
         if self._retry_ns is not None:
             text = "lost packets are recovered over TCP again"
             found.append(Event(self._name, EventKind.STATUS, text, at))
         self._retry_ns, self._delay = None, FIRST_RETRY
-        return found
 
 
 async def _packet(reader: asyncio.StreamReader) -> bytes | None:

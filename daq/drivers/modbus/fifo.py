@@ -22,14 +22,14 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
 
 from daq.drivers.interface import DEFAULT_PATIENCE, DeviceInformation
 from daq.drivers.port_rules import only
-from daq.errors import BenchFileError, FileFault, NoAnswerError, WrongDeviceError
+from daq.errors import BenchFileError, DeviceError, FileFault, NoAnswerError, WrongDeviceError
 from daq.protocols.modbus import rtu
 from daq.protocols.modbus.fifo import MAX_WORDS, RATE_REGISTER, READ_OVERHEAD, FifoDecoder
 from daq.protocols.modbus.rtu import ReplyFinder
 from daq.transport.ports import open_port
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Sequence
+    from collections.abc import AsyncGenerator, AsyncIterator, Sequence
 
     from daq.bench.model import Sensor
     from daq.host_clock import HostClock
@@ -91,6 +91,16 @@ class FifoSession:
 
     async def read(self) -> AsyncIterator[Block | Event]:
         """Read the FIFO and yield its blocks."""
+        async with contextlib.aclosing(self._received()) as received:
+            try:
+                async for item in received:
+                    yield item
+            except DeviceError:
+                for item in self._decoder.flush():
+                    yield item
+                raise
+
+    async def _received(self) -> AsyncGenerator[Block | Event]:
         loop = asyncio.get_running_loop()
         fed = loop.time()
         least, lessened = math.inf, loop.time()

@@ -21,7 +21,14 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
 from daq.drivers.interface import DeviceInformation
 from daq.drivers.modbus.bus import DamagedReplyError, ModbusBus, RefusedError, Reply, open_bus
 from daq.drivers.port_rules import port_label, require_address, require_alike
-from daq.errors import ABSENT, BenchFileError, FileFault, NoAnswerError, WrongDeviceError
+from daq.errors import (
+    ABSENT,
+    BenchFileError,
+    DeviceError,
+    FileFault,
+    NoAnswerError,
+    WrongDeviceError,
+)
 from daq.protocols.block import Block, Event, EventKind
 from daq.protocols.errors import DeviceSettingError, RemoteProtocolError
 from daq.protocols.modbus import registers as protocol
@@ -227,6 +234,10 @@ class _Poller:
         self._schedule()
         return found
 
+    def flush(self) -> list[Block | Event]:
+        """Return the collected readings."""
+        return self._decoder.flush()
+
     async def _retry(self, bus: ModbusBus) -> list[Block | Event]:
         """Configure a lost device if it replies: it may have lost its settings."""
         try:
@@ -295,7 +306,13 @@ class RegisterSession:
             wait = (poller.due_ns - self._clock.now().monotonic_ns) * 1e-9 / self._clock.speed
             if wait > 0:
                 await asyncio.sleep(wait)
-            for item in await poller.poll(self._bus):
+            try:
+                found = await poller.poll(self._bus)
+            except DeviceError:
+                for item in (item for one in pollers for item in one.flush()):
+                    yield item
+                raise
+            for item in found:
                 yield item
             if all(one.is_gone for one in pollers):
                 names = ", ".join(repr(one.sensor) for one in pollers)

@@ -47,6 +47,7 @@ class Streams:
         self._searching = not all(ids.values())
         self._name = only(ids)
         self._lost = "block missing"
+        self._at: HostTime | None = None  # of the last block
 
     @property
     def silent(self) -> tuple[str, ...]:
@@ -87,6 +88,7 @@ class Streams:
 
         ``awaiting`` is whether missing blocks may still arrive.
         """
+        self._at = at
         if isinstance(block, StatusBlock):
             yield from self._status(block, at)
         elif block.stream_id in self._owner:
@@ -101,6 +103,12 @@ class Streams:
                 yield self._nobodys(block.stream_id, at)
         for sensor in self._sensors.values():
             yield from sensor.take(at, awaiting=awaiting, reason=self._lost)
+
+    def release(self) -> Iterator[Block]:
+        """Yield the blocks that wait for missing ones: the connection ended, nothing comes."""
+        if self._at is not None:
+            for sensor in self._sensors.values():
+                yield from sensor.take(self._at, awaiting=False, reason=self._lost)
 
     def assign(self, sensor: str, stream_ids: Iterable[str]) -> Iterator[Block | Event]:
         """Assign streams to a sensor; yield the blocks received of them, up to the first hole."""

@@ -160,13 +160,16 @@ class AduFinder:
         Raises
         ------
         RemoteProtocolError
-            If the bytes are not Modbus TCP, or declare a message above the maximum length.
+            If the bytes are not Modbus TCP, or declare a message above the maximum length. The
+            messages before these bytes are returned first: then the next call raises.
         """
         self._buffer += data
         found: list[Adu] = []
         while len(self._buffer) >= _MBAP.size:
             transaction, protocol, length, unit = _MBAP.unpack_from(self._buffer)
             if protocol or not 2 <= length <= _MAX_PDU + 1:
+                if found:
+                    return found
                 self._buffer.clear()
                 raise RemoteProtocolError(
                     f"not Modbus TCP: protocol {protocol}, length {length}; expected 0 and 2 to"

@@ -132,9 +132,12 @@ class FifoDecoder:
         self._doubtful += self._n_requested
         self._n_unanswered += 1
         text = f"no reply to a read: {other or 'nothing received'} ({self._n_unanswered} so far)"
-        return [
-            Event(self._sensor, EventKind.RESYNCHRONISED if other else EventKind.STATUS, text, at)
-        ]
+        kind = EventKind.RESYNCHRONISED if other else EventKind.STATUS
+        return [*self.flush(), Event(self._sensor, kind, text, at)]
+
+    def flush(self) -> list[Block | Event]:
+        """Return the collected samples; they arrived with the last reply."""
+        return [] if self._last is None else self._hand_over(self._last)
 
     def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
         """Decode bytes of the line, cut anywhere."""

@@ -227,6 +227,13 @@ class SeedLinkDecoder:
             found += self._packet(packet, at)
         return found
 
+    def check(self) -> None:
+        """Raise RemoteProtocolError if the bytes behind the last packet are no packet.
+
+        Called when the items of :meth:`receive` are handed on.
+        """
+        self._finder.receive(b"")
+
     def _packet(self, packet: Packet, at: HostTime) -> Iterator[Block | Event]:
         if packet.sequence is None or not packet.is_miniseed:
             return

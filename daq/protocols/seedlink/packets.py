@@ -131,12 +131,18 @@ class PacketFinder:
         Raises
         ------
         RemoteProtocolError
-            If the bytes are no packet. TCP loses no bytes, so the connection is then unusable.
+            If the bytes are no packet. TCP loses no bytes, so the connection is then unusable. The
+            packets before these bytes are returned first: then the next call raises.
         """
         self._buffer += data
         found: list[Packet] = []
         while True:
-            packet = self._next_4() if self._version == 4 else self._next_3()
+            try:
+                packet = self._next_4() if self._version == 4 else self._next_3()
+            except RemoteProtocolError:
+                if found:
+                    return found
+                raise
             if packet is None:
                 return found
             found.append(packet)
@@ -172,7 +178,6 @@ class PacketFinder:
         return Packet(sequence if is_miniseed else None, payload, name, is_miniseed)
 
     def _refuse(self, head: bytes) -> None:
-        self._buffer.clear()
         text = head.decode("ascii", "replace")
         expected = "SE" if self._version == 4 else "SL and a sequence number"
         raise RemoteProtocolError(f"no SeedLink packet: {text!r}; expected {expected}")
