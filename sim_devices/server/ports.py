@@ -52,8 +52,11 @@ class DevicePort(Protocol):
     async def open(self) -> None:
         """Make the line; it can be opened from elsewhere after this."""
 
-    def send(self, units: Iterable[bytes]) -> None:
-        """Send each unit, or lose it whole."""
+    def send(self, units: Iterable[bytes]) -> list[bytes]:
+        """Send each unit, or lose it whole; return those that were sent."""
+
+    def n_unsent(self) -> int:
+        """Return the number of bytes that wait in this process; a hang-up loses them."""
 
     def hang_up(self) -> None:
         """Hang up on the reader; the line cannot be opened until :meth:`restore`."""
@@ -126,16 +129,23 @@ class PseudoTerminal:
         self._loop.remove_writer(self._master)
         self._listener.disconnected()
 
-    def send(self, units: Iterable[bytes]) -> None:
-        """Send each unit, or lose it whole."""
+    def send(self, units: Iterable[bytes]) -> list[bytes]:
+        """Send each unit, or lose it whole; return those that were sent."""
+        sent: list[bytes] = []
         if not self._open:
-            return
+            return sent
         was_waiting = bool(self._waiting)
         for unit in units:
             if len(self._waiting) + len(unit) <= MAX_UNREAD:
                 self._waiting += unit
+                sent.append(unit)
         if self._waiting and not was_waiting:
             self._write()
+        return sent
+
+    def n_unsent(self) -> int:
+        """Return the number of bytes that wait in this process."""
+        return len(self._waiting)
 
     def _write(self) -> None:
         try:
@@ -221,17 +231,23 @@ class TcpPort:
             self._listener.disconnected()
             writer.transport.abort()
 
-    def send(self, units: Iterable[bytes]) -> None:
-        """Send each unit, or lose it whole."""
+    def send(self, units: Iterable[bytes]) -> list[bytes]:
+        """Send each unit, or lose it whole; return those that were sent."""
+        sent: list[bytes] = []
         if self._writer is None or self._writer.is_closing():
-            return
-        room = MAX_UNREAD - self._writer.transport.get_write_buffer_size()
-        kept = bytearray()
+            return sent
+        room = MAX_UNREAD - self.n_unsent()
         for unit in units:
-            if len(kept) + len(unit) <= room:
-                kept += unit
-        if kept:
-            self._writer.write(bytes(kept))
+            if len(unit) <= room:
+                room -= len(unit)
+                sent.append(unit)
+        if sent:
+            self._writer.write(b"".join(sent))
+        return sent
+
+    def n_unsent(self) -> int:
+        """Return the number of bytes that wait in this process."""
+        return 0 if self._writer is None else self._writer.transport.get_write_buffer_size()
 
     def hang_up(self) -> None:
         """Reset the connection, and every new one."""
@@ -270,11 +286,18 @@ class UdpPort:
         self._socket.setblocking(False)
         self._listener.connected()
 
-    def send(self, units: Iterable[bytes]) -> None:
-        """Send each unit as a datagram, with or without a receiver."""
+    def send(self, units: Iterable[bytes]) -> list[bytes]:
+        """Send each unit as a datagram; return those that somebody could have received."""
+        sent: list[bytes] = []
         for unit in () if self._down else units:
             with contextlib.suppress(OSError):
                 self._socket.sendto(unit, self._to)
+                sent.append(unit)
+        return sent
+
+    def n_unsent(self) -> int:
+        """Return 0: a datagram does not wait."""
+        return 0
 
     def hang_up(self) -> None:
         """Send nothing."""
@@ -317,11 +340,18 @@ class UdpServer(asyncio.DatagramProtocol):
         self._to = addr
         self._listener.received(data)
 
-    def send(self, units: Iterable[bytes]) -> None:
+    def send(self, units: Iterable[bytes]) -> list[bytes]:
         """Send each unit as a datagram to the last client, which may be closed."""
-        if self._transport is not None and self._to is not None:
-            for unit in units:
-                self._transport.sendto(unit, self._to)
+        if self._transport is None or self._to is None:
+            return []
+        sent = list(units)
+        for unit in sent:
+            self._transport.sendto(unit, self._to)
+        return sent
+
+    def n_unsent(self) -> int:
+        """Return 0: a datagram does not wait."""
+        return 0
 
     def hang_up(self) -> None:
         """Ignore datagrams, and forget the last client."""

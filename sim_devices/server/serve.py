@@ -8,7 +8,7 @@ The specification is one JSON object::
      "scenario": {...},            see sim_devices.world.scenario
      "faults": [...],              see sim_devices.faults
      "fault_log": "FILE",          log of faults, one JSON object per line
-     "sent_log": "FILE",           log of units sent on an open line, in hexadecimal
+     "sent_log": "FILE",           log of units that a reader could have read, in hexadecimal
      "devices": [
        {"sensors": ["A"],          sensors of this device, as named in the scenario
         "driver": "epson",         its protocol, a key of FAMILIES
@@ -39,6 +39,7 @@ import asyncio
 import json
 import math
 import signal
+from collections import deque
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -74,6 +75,10 @@ FAMILIES = {
 }
 """Driver name → ``module:function`` that creates its simulated device."""
 
+HANG_UP_DELAY = 0.05
+"""Seconds between the last unit and a hang-up, so that a reader can have read the unit: a system
+discards the bytes of a terminal that were not read. Longer than the lead of the clock over a reader
+(:mod:`sim_devices.server.paced_clock`)."""
 MIN_INTERVAL = 0.004
 """Minimum time between two sends of one line, s: units due in between are sent together.
 
@@ -99,20 +104,21 @@ class Served:
     ) -> None:
         self.line = line
         self._faults = faults
-        self._tell = tell
+        self._tell_fault = tell
         self._tell_sent = tell_sent
-        self._is_open = False
+        self._unsent: deque[tuple[float, bytes]] = deque()
+        """Time and bytes of units accepted by the port, of which some wait in this process."""
         self._endpoint: Endpoint = line.endpoint
         self._clock = clock
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._last = -math.inf
-        self._down = False
+        self._down = self._muted = False
+        self._pending_hang_up: asyncio.TimerHandle | None = None
         self.port: DevicePort = make_port(line.kind, self, scheme=line.scheme, number=number)
 
     def connected(self) -> None:
         """Handle a reader that opened the line."""
-        self._is_open = True
         self._send(self._endpoint.connected(self._clock.now()))
         self._schedule()
 
@@ -124,12 +130,14 @@ class Served:
 
     def disconnected(self) -> None:
         """Handle the last reader that closed the line."""
-        self._is_open = False
+        self._unsent.clear()
         self._endpoint.disconnected(self._clock.now())
         self._schedule()
 
     async def close(self) -> None:
         """Remove the line."""
+        if self._pending_hang_up is not None:
+            self._pending_hang_up.cancel()
         await self.port.close()
         if self._timer is not None:
             self._timer.cancel()
@@ -139,27 +147,52 @@ class Served:
             self._put(self._faults.send(units, self._clock.now()))
 
     def _put(self, units: Sequence[bytes]) -> None:
-        self.port.send(units)
-        if self._tell_sent is not None and self._is_open:
-            for unit in units:
-                self._tell_sent(self._clock.now(), unit)
+        if self._muted:
+            return
+        sent = self.port.send(units)
+        if self._tell_sent is not None:
+            self._unsent += [(self._clock.now(), unit) for unit in sent]
+            self._tell()
+
+    def _tell(self) -> None:
+        """Log the units that have left this process whole: a reader can read them."""
+        n_waiting = self.port.n_unsent()
+        n_logged = sum(len(unit) for _, unit in self._unsent) - n_waiting
+        while self._tell_sent is not None and self._unsent:
+            at, unit = self._unsent[0]
+            if len(unit) > n_logged:
+                return
+            n_logged -= len(unit)
+            self._unsent.popleft()
+            self._tell_sent(at, unit)
+
+    def _hang_up(self) -> None:
+        self._pending_hang_up = None
+        self._muted = False
+        if self._tell_sent is not None:
+            self._tell()
+        self._unsent.clear()
+        self.port.hang_up()
 
     def _strike(self) -> None:
         """Start and end the faults that are due."""
         now = self._clock.now()
         if self._down and now >= self._faults.down_until:
             self._down = False
+            if self._pending_hang_up is not None:  # unplugged for less than the delay
+                self._pending_hang_up.cancel()
+                self._hang_up()
             self.port.restore()
         faults, units = self._faults.act(now)
         self._put(units)
         for fault in faults:
             if fault.kind == "disconnect" and not self._down:
-                self._down = True
-                self.port.hang_up()
+                self._down = self._muted = True
+                self._pending_hang_up = self._loop.call_later(HANG_UP_DELAY, self._hang_up)
             elif isinstance(self._endpoint, Faulty):
                 self._send(self._endpoint.fault(fault.kind, now, fault.duration))
         for at, fault in self._faults.struck:
-            self._tell(at, fault)
+            self._tell_fault(at, fault)
         self._faults.struck.clear()
 
     def _schedule(self) -> None:

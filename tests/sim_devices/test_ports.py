@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import os
 import sys
+import time
+from typing import TYPE_CHECKING
 
 import pytest
 
+from sim_devices.devices.interface import NEVER, Line
+from sim_devices.faults import LineFaults, parse
 from sim_devices.server.ports import PseudoTerminal
+from sim_devices.server.serve import Served
+from sim_devices.server.world_clock import WorldClock
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals")
 
@@ -47,3 +58,62 @@ async def test_the_address_is_removed_before_the_terminal(monkeypatch: pytest.Mo
         patched.setattr("sim_devices.server.ports.os.close", watched)
         await line.close()
     assert not any(there)
+
+
+class _Flood:
+    """Sends without end while somebody is connected."""
+
+    def __init__(self) -> None:
+        self._is_on = False
+        self.ended = asyncio.Event()
+
+    def connected(self, now: float) -> Sequence[bytes]:
+        """Begin."""
+        del now
+        self._is_on = True
+        return ()
+
+    def receive(self, received: bytes, now: float) -> Sequence[bytes]:
+        """Ignore it."""
+        del received, now
+        return ()
+
+    def disconnected(self, now: float) -> None:
+        """End."""
+        del now
+        self._is_on = False
+        self.ended.set()
+
+    def due(self, now: float) -> Sequence[bytes]:
+        """Return what is sent."""
+        del now
+        return (b"x" * 65536,) if self._is_on else ()
+
+    def next_due(self) -> float:
+        """Return the time of the next unit."""
+        return 0.0 if self._is_on else NEVER
+
+
+async def test_only_what_a_reader_could_have_read_counts_as_sent() -> None:
+    """A reader pauses until the cable is pulled: what waits in the device never arrives."""
+    sent: list[bytes] = []
+    flood = _Flood()
+    pulled = parse([{"kind": "disconnect", "at": 0.2, "duration": 60.0}])
+    served = Served(
+        Line(flood, "tcp"),
+        WorldClock(time.monotonic_ns()),
+        LineFaults(pulled, "A"),
+        lambda *_: None,
+        lambda _, unit: sent.append(unit),
+    )
+    await served.port.open()
+    number = int(served.port.address.rpartition(":")[2])
+    reader, writer = await asyncio.open_connection("127.0.0.1", number, limit=1024)
+    await flood.ended.wait()
+    received = 0
+    with contextlib.suppress(ConnectionError):
+        while piece := await reader.read(1 << 20):
+            received += len(piece)
+    writer.close()
+    await served.close()
+    assert 0 < sum(map(len, sent)) <= received < sum(map(len, sent)) + 65536
