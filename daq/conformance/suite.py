@@ -8,18 +8,23 @@ A package subclasses :class:`DriverConformance` in one of its test modules::
         @contextlib.asynccontextmanager
         async def serve(self):
             server = ...
-            yield Served([Sensor(...)], vanish=server.close)
+            yield Served([Sensor(...)], vanish=server.close, truth=server.sent)
 
 The tests run in real time, each for some seconds. Where the sensors' port is ``socket://``, the
 suite also puts itself between driver and device and lets the connection pause.
+
+Only with ``truth`` can the suite see whether samples, times and rates are right: a driver that
+drops one sample in fifty or swaps two channels yields blocks in perfect order.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import threading
+import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 import pytest
@@ -37,16 +42,50 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Sequence
     from contextlib import AbstractAsyncContextManager
 
+    from numpy.typing import NDArray
+
     from daq.bench.model import Sensor
     from daq.drivers.interface import DriverType
+    from daq.protocols.block import HostTime
 
 LIMIT = 60.0
 """Seconds that any test may take."""
 PAUSE = 2.0
 """Seconds for which a connection pauses."""
+LATENCY = 0.3
+"""Seconds by which the host time of a block may be later than its last sample."""
+EARLY = 0.02
+"""Seconds by which it may be earlier: clocks of simulators are read before or after sampling."""
+RATE_ERROR = 0.005
+"""Relative difference between the rate of the device and that of the bench file."""
+MAX_DRIFT = 0.06
+"""Seconds by which the delay of host times may change from the first half of a session to the
+second."""
+MIN_HALF = 5
+"""Number of blocks in half of a session from which this is tested."""
+MAX_BLOCKED = 0.05
+"""Seconds for which a driver may keep the event loop busy."""
+TICK = 0.005
+"""Interval at which the event loop is observed, in s."""
 NORMAL_EVENTS = {EventKind.CONNECTED, EventKind.STATUS}
 """Kinds of events of a device that nothing is wrong with."""
 SOCKET = "socket://"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sent:
+    """What a simulated device has sent of one sensor.
+
+    Attributes
+    ----------
+    counts : ndarray, shape (n_samples, n_channels)
+        Every sample since the device started, those lost on the wire included.
+    due : ndarray, shape (n_samples,)
+        When each sample was taken or left the device, in s of ``time.monotonic``.
+    """
+
+    counts: NDArray[Any]
+    due: NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,10 +98,21 @@ class Served:
         All sensors of its port, as a bench file would connect to them.
     vanish : callable or None
         Ends the device at once, as a pulled cable does.
+    truth : callable or None
+        Takes the name of a sensor and returns what the device has sent of it so far. Samples must
+        differ from one another.
+    drop : callable or None
+        Lets the wire lose some samples, which the device counts.
+    pause : callable or None
+        Lets the wire hold everything for some seconds and then deliver it. Not needed where the
+        port is ``socket://``.
     """
 
     sensors: Sequence[Sensor]
     vanish: Callable[[], object] | None = None
+    truth: Callable[[str], Sent] | None = None
+    drop: Callable[[], object] | None = None
+    pause: Callable[[], object] | None = None
 
 
 class DriverConformance:
@@ -106,12 +156,82 @@ class DriverConformance:
         async def run() -> None:
             async with self.serve() as served:
                 port = served.sensors[0].port
+                if served.pause is not None:
+                    found = await self._read(served.sensors, pauses=served.pause)
+                    check_blocks(self.driver, served.sensors, found)
+                    return
                 if not port.startswith(SOCKET):
-                    pytest.skip(f"the suite pauses socket:// ports, not {port}")
+                    pytest.skip(f"the suite pauses socket:// ports; Served(pause=…) for {port}")
                 async with _Proxy(*host_and_port(port)) as proxy:
                     sensors = [s.model_copy(update={"port": proxy.port}) for s in served.sensors]
                     found = await self._read(sensors, pauses=proxy.pause)
                     check_blocks(self.driver, sensors, found)
+
+        _run(run())
+
+    # --- whether it is true ------------------------------------------------------------------
+
+    def test_rows_times_and_rate_are_those_of_the_device(self) -> None:
+        """Every row in its place, received when it was due, at the rate of the bench file."""
+
+        async def run() -> None:
+            async with self.serve() as served:
+                truth = _truth(served)
+                found = await self._read(served.sensors)
+                check_counters(found)
+                for sensor in served.sensors:
+                    check_truth(sensor, found, truth(sensor.name))
+
+        _run(run())
+
+    def test_the_event_loop_is_not_blocked(self) -> None:
+        """Other devices share the loop: no call may keep it for longer than ``MAX_BLOCKED``."""
+
+        async def run() -> None:
+            async with self.serve() as served, watching_the_loop() as blocked:
+                await self._read(served.sensors)
+            assert not blocked, f"the event loop was blocked for {max(blocked):.3f} s"
+
+        _run(run())
+
+    def test_lost_samples_become_a_gap(self) -> None:
+        """The wire loses samples: all later rows keep their places."""
+
+        async def run() -> None:
+            async with self.serve() as served:
+                truth = _truth(served)
+                if served.drop is None:
+                    pytest.skip("the simulated device drops nothing")
+                found = await self._read(served.sensors, first=served.drop)
+                for sensor in served.sensors:
+                    check_truth(sensor, found, truth(sensor.name), gaps=True)
+
+        _run(run())
+
+    def test_a_hang_up_after_an_arrival_loses_nothing_that_arrived(self) -> None:
+        """The line ends between a read and whatever the driver sends next."""
+
+        async def run() -> None:
+            async with self.serve() as served:
+                truth, vanish = _truth(served), served.vanish
+                if vanish is None:
+                    pytest.skip("the simulated device cannot vanish")
+                n_sent: dict[str, int] = {}
+
+                def cut() -> None:
+                    n_sent.update({s.name: len(truth(s.name).due) for s in served.sensors})
+                    vanish()
+
+                clock = _CuttingClock(cut)
+                found: list[Block | Event] = []
+                with pytest.raises((NotConnectedError, NoAnswerError)):
+                    await self._read(
+                        served.sensors, first=clock.arm, seconds=1e6, clock=clock, into=found
+                    )
+                for sensor in served.sensors:
+                    end = check_truth(sensor, found, truth(sensor.name))
+                    lost = n_sent[sensor.name] - end
+                    assert lost <= 0, f"{lost} samples had arrived and were not handed on"
 
         _run(run())
 
@@ -162,14 +282,18 @@ class DriverConformance:
         pauses: Callable[[], object] | None = None,
         first: Callable[[], object] | None = None,
         seconds: float | None = None,
+        clock: SystemClock | None = None,
+        into: list[Block | Event] | None = None,
     ) -> list[Block | Event]:
         """Read until every sensor has enough; ``first`` and ``pauses`` are called once, early."""
         wanted = {s.name: (seconds or self.seconds) * s.sampling_rate for s in sensors}
-        found: list[Block | Event] = []
+        found: list[Block | Event] = [] if into is None else into
         ends = dict.fromkeys(wanted, 0)
         validator = BlockValidator(self.driver, sensors)
-        async with self.driver.open(sensors, SystemClock()) as session:
+        async with self.driver.open(sensors, clock or SystemClock()) as session:
             assert [one.sensor for one in session.information] == list(wanted)
+            for one, sensor in zip(session.information, sensors, strict=True):
+                check_rate(sensor, one.sampling_rate)
             patience = patience_of(session)
             assert patience > 0
             items = cast("AsyncGenerator[Block | Event]", session.read())
@@ -213,6 +337,155 @@ def check_blocks(
             assert block.received.monotonic_ns >= at
             assert block.instants_ns is None or np.all(np.diff(block.instants_ns) > 0)
             end, at = block.end_sample, block.received.monotonic_ns
+
+
+def check_counters(found: Sequence[Block | Event]) -> None:
+    """See that the device's counter of each sensor grows with the index of the samples."""
+    counted = [b for b in found if isinstance(b, Block) and b.device_counter is not None]
+    for name in {block.sensor for block in counted}:
+        blocks = [block for block in counted if block.sensor == name]
+        counters = np.array([block.device_counter for block in blocks], np.int64)
+        index = np.array([block.first_sample for block in blocks], np.int64)
+        assert np.all(np.diff(counters) > 0), f"device_counter of {name} does not grow"
+        if len(blocks) > 2:
+            slope = np.diff(counters) / np.diff(index)
+            assert np.ptp(slope) <= 0.01 * slope.mean(), f"device_counter of {name} is uneven"
+
+
+def check_rate(sensor: Sensor, rate: float | None, *, source: str = "stated") -> None:
+    """See that a rate, if one is known, is that of the bench file."""
+    off = rate / sensor.sampling_rate - 1 if rate is not None else 0.0
+    assert abs(off) <= RATE_ERROR, (
+        f"{sensor.name}: {source} rate {rate:.5g} Hz, {off:+.1%} off the bench file's"
+    )
+
+
+def check_truth(
+    sensor: Sensor,
+    found: Sequence[Block | Event],
+    sent: Sent,
+    *,
+    gaps: bool = False,
+    latency: float = LATENCY,
+) -> int:
+    """See that rows, host times and rate of a session are those of the device.
+
+    Parameters
+    ----------
+    gaps
+        Whether samples may, and must, be missing.
+    latency
+        Seconds by which host time may be later than the last sample of a block.
+
+    Returns
+    -------
+    int
+        The number of samples sent up to the last row.
+    """
+    name = sensor.name
+    blocks = [b for b in found if isinstance(b, Block) and b.sensor == name]
+    index = np.concatenate([np.arange(b.first_sample, b.end_sample) for b in blocks])
+    counts = np.concatenate([block.counts for block in blocks])
+    starts = np.flatnonzero(_same(sent.counts, counts[0]))
+    n_first = min(blocks[0].n_samples, 8)
+    start = next(
+        (s for s in starts if _same(sent.counts[s : s + n_first], counts[:n_first]).all()), None
+    )
+    assert start is not None, f"{name}: no row sent is {counts[0]}: channels or scale are wrong"
+    place = index + (start - index[0])
+    assert place[-1] < len(sent.counts), f"{name}: rows were numbered that were not sent"
+    wrong = ~_same(sent.counts[place], counts)
+    assert not wrong.any(), (
+        f"{name}: {wrong.sum()} of {len(wrong)} rows are not those of their numbers, the first is"
+        f" {index[wrong.argmax()]}"
+    )
+    n_gaps = np.count_nonzero(np.diff(index) > 1)
+    assert bool(n_gaps) == gaps, f"{name}: {n_gaps} gaps"
+    last = place[np.cumsum([block.n_samples for block in blocks]) - 1]
+    received = np.array([block.received.monotonic_ns * 1e-9 for block in blocks])
+    late = received - sent.due[last]
+    assert late.min() >= -EARLY, f"{name}: received {-late.min():.3f} s before it was sampled"
+    usual = np.median(late)
+    assert usual <= latency, f"{name}: received {usual:.3f} s after the last sample"
+    if len(late) >= 2 * MIN_HALF:  # the least of a half: others may have been held up
+        halves = np.split(late, [len(late) // 2])
+        drift = halves[1].min() - halves[0].min()
+        assert abs(drift) <= MAX_DRIFT, f"{name}: host time runs away by {drift:.3f} s"
+    elapsed = sent.due[place[-1]] - sent.due[place[0]]
+    if elapsed > 0:
+        check_rate(sensor, (place[-1] - place[0]) / elapsed, source="measured")
+    return int(place[-1]) + 1
+
+
+def _same(sent: NDArray[Any], counts: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return which rows are equal; what was sent may be given before it was rounded."""
+    most = 0.5 + 1e-8 * np.abs(sent)
+    same: NDArray[np.bool_] = (np.abs(sent - counts.astype(np.float64)) <= most).all(axis=1)
+    return same
+
+
+def _truth(served: Served) -> Callable[[str], Sent]:
+    if served.truth is None:
+        pytest.skip("the simulated device does not tell what it sent: Served(truth=…)")
+    return served.truth
+
+
+class _CuttingClock(SystemClock):
+    """Cuts the line at an arrival: when bytes were read, before anything can be sent."""
+
+    def __init__(self, cut: Callable[[], None]) -> None:
+        super().__init__()
+        self._cut = cut
+        self._is_armed = False
+
+    def arm(self) -> None:
+        """Cut at the next reading of the clock."""
+        self._is_armed = True
+
+    def now(self) -> HostTime:
+        """Return the time."""
+        if self._is_armed:
+            self._is_armed = False
+            self._cut()
+        return super().now()
+
+
+@contextlib.asynccontextmanager
+async def watching_the_loop() -> AsyncIterator[list[float]]:
+    """Yield a list that collects how long the event loop was blocked, in s.
+
+    A busy computer holds up every thread; only what holds up this one counts.
+    """
+    blocked: list[float] = []
+    beats: list[float] = []
+    ended = threading.Event()
+
+    def beat() -> None:
+        while not ended.wait(TICK):
+            beats.append(time.monotonic())
+
+    async def look() -> None:
+        before = time.monotonic()
+        while True:
+            await asyncio.sleep(TICK)
+            now = time.monotonic()
+            running = np.diff([before, *(b for b in beats if before < b < now), now])
+            held_up = running[running > 2 * TICK].sum()
+            if now - before - held_up > MAX_BLOCKED:
+                blocked.append(now - before)
+            beats.clear()
+            before = time.monotonic()
+
+    thread = threading.Thread(target=beat, name="beats beside the event loop")
+    thread.start()
+    looking = asyncio.create_task(look())
+    try:
+        yield blocked
+    finally:
+        looking.cancel()
+        ended.set()
+        thread.join()
+        await asyncio.gather(looking, return_exceptions=True)
 
 
 def _run(coroutine: Coroutine[object, object, None]) -> None:

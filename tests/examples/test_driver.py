@@ -75,10 +75,10 @@ async def test_huddle_checks_and_runs_the_example(
     installed: Path, example: Callable[[str], Any], tmp_path: Path
 ) -> None:
     simulator = example("simulator")
-    servers = await simulator.serve_tcp(3, 0)
+    ports = await simulator.serve_tcp(3, 0)
     bench = (EXAMPLE / "bench.toml").read_text(encoding="utf-8")
-    for number, server in enumerate(servers):
-        port = server.sockets[0].getsockname()[1]
+    for number, one in enumerate(ports):
+        port = one.server.sockets[0].getsockname()[1]
         bench = bench.replace(f"127.0.0.1:{4001 + number}", f"127.0.0.1:{port}")
     # The recorder runs by the clock of this test's loop, in which the simulators run.
     bench += f"\n[simulation]\nclock = {json.dumps(str(paced_clock().path))}\n"
@@ -100,8 +100,8 @@ async def test_huddle_checks_and_runs_the_example(
         "run", "bench.toml", "--duration", "6s", "--out", "run.h5", "--json", "result.json"
     )
     now = int(asyncio.get_running_loop().time() * RATE)
-    for server in servers:
-        server.close()
+    for one in ports:
+        one.close()
     result = json.loads((tmp_path / "result.json").read_text(encoding="utf-8"))
     assert len(result["channels"]) == 9
     assert all(np.isfinite(channel["noise_psd"][5]) for channel in result["channels"])

@@ -54,22 +54,28 @@ def _chunk(number: int, rate: float, chunk: int) -> NDArray[np.int32]:
 
 
 class Simulator:
-    """One AX3: takes received bytes, sends with `send`.
+    """One AX3: takes received bytes, sends to the reader that is plugged in.
 
     Parameters
     ----------
     number : int
         0 for the first device; its serial number is 1001.
-    send : callable
-        Takes the bytes to send.
     """
 
-    def __init__(self, number: int, send: Callable[[bytes], object]) -> None:
-        self._number = number
-        self._send = send
+    def __init__(self, number: int) -> None:
+        self.number = number
+        self.rate = 100.0
+        self.began = self.sent = 0
+        """Numbers of the first sample since START, and of the next one."""
+        self._send: Callable[[bytes], object] = lambda _: None
         self._line = b""
-        self._rate = 100.0
+        self._n_to_lose = 0
         self._streaming: asyncio.Task[None] | None = None
+
+    def plug(self, send: Callable[[bytes], object]) -> None:
+        """Connect a reader; ``send`` takes the bytes for it."""
+        self.stop()
+        self._send, self._line = send, b""
 
     def receive(self, received: bytes) -> None:
         """Answer every complete line."""
@@ -83,15 +89,25 @@ class Simulator:
             self._streaming.cancel()
             self._streaming = None
 
+    def lose(self, n_samples: int) -> None:
+        """Let the line lose the next samples: they are counted and not sent."""
+        self._n_to_lose = n_samples
+
+    def truth(self) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+        """Return all samples since START, and the time of each by the clock of the event loop."""
+        n_samples = self.sent - self.began
+        index = np.arange(self.began, self.sent)
+        return samples(self.number, self.rate, self.began, n_samples), index / self.rate
+
     def _answer(self, words: Sequence[str]) -> None:
         match words:
             case ["STOP"]:
                 self.stop()
                 self._send(b"STOPPED\r\n")
             case ["ID"]:
-                self._send(f"ID AX3 {1001 + self._number} 1.0\r\n".encode("ascii"))
+                self._send(f"ID AX3 {1001 + self.number} 1.0\r\n".encode("ascii"))
             case ["RATE", rate] if rate in map(str, RATES):
-                self._rate = float(rate)
+                self.rate = float(rate)
                 self._send(f"RATE {rate}\r\n".encode("ascii"))
             case ["START"]:
                 self._send(b"STARTED\r\n")
@@ -102,30 +118,53 @@ class Simulator:
     async def _stream(self) -> None:
         # All devices sample at the same instants: sample n is taken at n / rate of the clock.
         now = asyncio.get_running_loop().time
-        sent = int(now() * self._rate)
+        self.began = self.sent = int(now() * self.rate)
         while True:
             await asyncio.sleep(SEND_INTERVAL)
-            due = int(now() * self._rate) - sent
-            if due > 0:
-                self._send(encode(sent, samples(self._number, self._rate, sent, due)))
-                sent += due
+            lost, self._n_to_lose = self._n_to_lose, 0
+            due = int(now() * self.rate) + 1 - self.sent
+            first, n_samples = self.sent + lost, due - lost
+            self.sent += max(due, lost)
+            if n_samples > 0:
+                self._send(encode(first, samples(self.number, self.rate, first, n_samples)))
 
 
-async def serve_tcp(n_devices: int, port: int) -> list[asyncio.Server]:
-    """Serve devices on consecutive TCP ports, or each on a free port if ``port`` is 0."""
+class TcpPort:
+    """A TCP port on which one simulated device answers."""
 
-    async def serve(number: int) -> asyncio.Server:
-        async def connected(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            device = Simulator(number, writer.write)
-            with contextlib.suppress(ConnectionError):
-                while received := await reader.read(4096):
-                    device.receive(received)
-            device.stop()
+    def __init__(self, number: int) -> None:
+        self.device = Simulator(number)
+        self.server: asyncio.Server
+        self._readers: list[asyncio.StreamWriter] = []
+
+    async def open(self, port: int) -> None:
+        """Listen at a port; 0 for a free one."""
+        self.server = await asyncio.start_server(self._connected, "127.0.0.1", port)
+
+    def close(self) -> None:
+        """Hang up on every reader and stop listening, as an unplugged device does."""
+        self.device.stop()
+        self.server.close()
+        for writer in self._readers:
             writer.close()
 
-        return await asyncio.start_server(connected, "127.0.0.1", port and port + number)
+    async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._readers.append(writer)
+        self.device.plug(writer.write)
+        with contextlib.suppress(ConnectionError):
+            while received := await reader.read(4096):
+                self.device.receive(received)
+        self.device.stop()
+        self._readers.remove(writer)
+        writer.close()
 
-    return [await serve(number) for number in range(n_devices)]
+
+async def serve_tcp(n_devices: int, port: int) -> list[TcpPort]:
+    """Serve devices on consecutive TCP ports, or each on a free port if ``port`` is 0."""
+    ports = [TcpPort(number) for number in range(n_devices)]
+    for number, one in enumerate(ports):
+        await one.open(port and port + number)
+    return ports
 
 
 async def serve_terminal() -> None:
@@ -135,7 +174,8 @@ async def serve_terminal() -> None:
     master, slave = os.openpty()
     tty.setraw(slave)
     print(os.ttyname(slave), flush=True)
-    device = Simulator(0, lambda octets: os.write(master, octets))
+    device = Simulator(0)
+    device.plug(lambda octets: os.write(master, octets))
     loop = asyncio.get_running_loop()
     loop.add_reader(master, lambda: device.receive(os.read(master, 4096)))
     await asyncio.Event().wait()
@@ -144,8 +184,8 @@ async def serve_terminal() -> None:
 async def _main(arguments: argparse.Namespace) -> None:
     if arguments.terminal:
         await serve_terminal()
-    for server in await serve_tcp(arguments.devices, arguments.port):
-        host, port = server.sockets[0].getsockname()
+    for one in await serve_tcp(arguments.devices, arguments.port):
+        host, port = one.server.sockets[0].getsockname()
         print(f"socket://{host}:{port}", flush=True)
     await asyncio.Event().wait()
 

@@ -9,7 +9,7 @@ from huddle_ax3.driver import DRIVER
 from huddle_ax3.simulator import COUNTS_PER_UNIT, serve_tcp
 
 from daq.bench.model import Channel, Sensor
-from daq.conformance.suite import DriverConformance, Served
+from daq.conformance.suite import DriverConformance, Sent, Served
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -23,8 +23,8 @@ class TestAX3(DriverConformance):
     @contextlib.asynccontextmanager
     async def serve(self) -> AsyncIterator[Served]:
         """Serve one simulated device."""
-        (server,) = await serve_tcp(1, 0)
-        number = server.sockets[0].getsockname()[1]
+        (one,) = await serve_tcp(1, 0)
+        number = one.server.sockets[0].getsockname()[1]
         sensor = Sensor(
             name="A",
             driver=DRIVER.name,
@@ -32,5 +32,10 @@ class TestAX3(DriverConformance):
             sampling_rate=100.0,
             channels=tuple(Channel(name=name, sensitivity=COUNTS_PER_UNIT) for name in "XYZ"),
         )
-        yield Served([sensor])
-        server.close()
+        yield Served(
+            [sensor],
+            vanish=one.close,
+            truth=lambda _: Sent(*one.device.truth()),
+            drop=lambda: one.device.lose(20),
+        )
+        one.close()

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial import KDTree
 
+from daq.conformance.suite import Sent
 from daq.protocols.epson import commands
 from sim_devices.devices.interface import Source
 from sim_devices.server.serve import device_spec
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.model import Sensor
+    from daq.host_clock import SystemClock
     from sim_devices.server.launch import RunningDevice
 
 RATE = 100.0
@@ -125,6 +127,15 @@ class Served:
         assert np.abs(expected - counts).max() <= 0.5 + 1e-8 * np.abs(expected).max(), mode
         return which
 
+    def sent(self, mode: str, name: str, clock: SystemClock, *, speed: float) -> Sent:
+        """Return what the device has sampled so far, due by the host clock of its reader."""
+        driver = CASES[mode]["driver"]
+        felt = np.clip(self._felt[name] + OFFSETS.get(driver, 0), *RANGES.get(driver, (None, None)))
+        world = WorldClock(self.world["epoch_ns"], self.world["speed"], paced_clock().now_ns)
+        now, host_now = world.now(), clock.now().monotonic_ns * 1e-9
+        since = (now - self._felt.times[name]) * speed / self.world["speed"]
+        return Sent(felt, host_now - since)
+
     def struck(self, mode: str) -> list[dict[str, Any]]:
         """Return the faults that struck a mode's device so far."""
         told = _lines(self.log.with_name("faults"))
@@ -147,6 +158,8 @@ class _Felt(dict[str, "NDArray[np.float64]"]):
     def __init__(self, world: dict[str, Any], told: list[dict[str, Any]]) -> None:
         super().__init__()
         self._world = world
+        self.times: dict[str, NDArray[np.float64]] = {}
+        """World times of the samples of each sensor."""
         self._utc_ns = {n: x["utc_ns"] for x in told if "utc_ns" in x for n in x["sensors"]}
 
     def __missing__(self, name: str) -> NDArray[np.float64]:
@@ -161,7 +174,9 @@ class _Felt(dict[str, "NDArray[np.float64]"]):
             WorldClock(self._world["epoch_ns"], self._world["speed"], paced_clock().now_ns).now()
             + 1.0
         )
-        self[name] = source.counts(name, 0, round(end * rate))
+        n_samples = round(end * rate)
+        self[name] = source.counts(name, 0, n_samples)
+        self.times[name] = source.times(name, 0, n_samples)
         return self[name]
 
 

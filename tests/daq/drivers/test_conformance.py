@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import pytest
 
+from daq.conformance.suite import EARLY, LATENCY, check_counters, check_truth, watching_the_loop
 from daq.drivers.registry import driver_names, driver_type
 from daq.errors import DeviceError, NoAnswerError, NotConnectedError
 from daq.protocols.block import Block, BlockFlag, Event
@@ -16,6 +17,7 @@ from daq.protocols.errors import RemoteProtocolError
 from tests.daq.drivers.driver_modes import CASES, RATE, Served, serving_all
 from tests.daq.drivers.reading import reading
 from tests.devices import host_clock
+from tests.waiting import limit
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterator, Iterator
@@ -82,7 +84,33 @@ async def test_blocks_are_in_order_and_whole(served: Served, mode: str) -> None:
         counts = np.concatenate([block.counts for block in blocks])
         assert counts.std(axis=0).min() > 0
         index = np.concatenate([np.arange(b.first_sample, b.end_sample) for b in blocks])
-        served.assert_felt(mode, name, index, counts)
+        if CASES[mode]["driver"] == "registers":
+            which = served.assert_felt(mode, name, index, counts)
+            instants = np.concatenate([b.instants_ns for b in blocks if b.instants_ns is not None])
+            late = instants * 1e-9 - served.sent(mode, name, clock, speed=SPEED).due[which]
+            assert late.min() >= -EARLY
+            assert np.median(late) <= LATENCY
+            continue
+        sent = served.sent(mode, name, clock, speed=SPEED)
+        check_counters(blocks)
+        check_truth(by_name[name], blocks, sent)
+
+
+@pytest.mark.parametrize("mode", CASES)
+def test_the_event_loop_is_not_blocked(served: Served, mode: str) -> None:
+    """In a loop that does not wait for slow processes."""
+
+    async def run() -> list[float]:
+        async with watching_the_loop() as blocked:
+            kind, found = driver_type(CASES[mode]["driver"]), 0
+            async with asyncio.timeout(limit()), reading(kind, served.sensors(mode)) as items:
+                async for item in items:
+                    found += item.n_samples if isinstance(item, Block) else 0
+                    if found >= N:
+                        break
+        return blocked
+
+    assert not asyncio.run(run())
 
 
 @pytest.mark.parametrize("mode", CASES)
