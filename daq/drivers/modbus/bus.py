@@ -1,9 +1,12 @@
 """A Modbus bus: one request at a time, with host times and named errors.
 
-On a serial bus a reply does not name its request. After a request without reply the bus therefore
-pauses for the same time again, so that a late reply is not mistaken for the reply to the next
-request. A complete reply with a wrong checksum is recognised without delay and costs only its own
-poll. Modbus TCP numbers its requests and needs no pause.
+On a serial bus a reply does not name its request, so a late reply could be mistaken for the reply
+to the next request. It is recognised by its length: after a request without reply, the bus asks the
+same device for another number of registers than any request without reply did. A device replies in
+order, so the reply to this request shows that nothing is late any more. Nothing waits for late
+replies. Modbus TCP numbers its requests and needs none of this.
+
+Timeouts follow the device: three times the 99th percentile of its recent replies.
 """
 
 from __future__ import annotations
@@ -11,7 +14,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import struct
+from collections import defaultdict, deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -26,7 +31,7 @@ from daq.transport.address import host_and_port
 from daq.transport.ports import open_port
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator, Sequence
+    from collections.abc import AsyncIterator, Collection, Iterator, Mapping, Sequence
 
     from pymodbus.pdu import ModbusPDU
 
@@ -38,11 +43,15 @@ if TYPE_CHECKING:
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
 TCP = "modbus-tcp://"
-MIN_TIMEOUT, MIN_SHORT_TIMEOUT = 0.2, 0.05
-"""Shortest timeout of a reply, s: of a device with known reply times, and of one that may be
-absent."""
-MIN_REPLIES = 5
-"""Number of replies after which a device's reply time is known."""
+MIN_TIMEOUT, MIN_TCP_TIMEOUT, MIN_SHORT_TIMEOUT = 0.03, 0.2, 0.05
+"""Shortest timeout of a reply, s: of a device with known reply times, of one over Modbus TCP, where
+the network repeats what it loses, and of one that may be absent."""
+MIN_REPLIES, MAX_REPLIES = 5, 200
+"""Number of replies after which a device's reply time is known, and of those remembered."""
+REPLY_TIMES = 3.0
+"""Timeout in units of the 99th percentile of the reply times."""
+MAX_REGISTERS = 125
+"""Of one request."""
 QUIET = 0.06
 """Silence in s that ends a message: longer than a USB adapter (16 ms) or a serial server (40 ms)
 delays bytes."""
@@ -96,9 +105,21 @@ class _Link(Protocol):
     ``ask`` raises NotConnectedError, or NoAnswerError with a description of the received bytes.
     """
 
+    numbers_requests: bool
+    """Whether a reply names its request."""
+
     async def ask(
-        self, device_id: int, function: int, address: int, value: int, patience: float
-    ) -> _Answer: ...
+        self,
+        device_id: int,
+        function: int,
+        address: int,
+        value: int,
+        patience: float,
+        *,
+        late: Mapping[int, Collection[int]],
+    ) -> _Answer:
+        """Return the reply; ``late``: see :class:`ReplyFinder`."""
+        ...
 
     async def settle(self, seconds: float) -> None:
         """Wait for a late reply and discard it."""
@@ -108,21 +129,31 @@ class _Link(Protocol):
 class _RtuLink:
     """Modbus RTU over a serial line or a serial server."""
 
+    numbers_requests = False
+
     def __init__(self, stream: ByteStream, *, echo: bool) -> None:
         self._stream = stream
         self._finder = ReplyFinder(echo=echo)
 
     async def ask(
-        self, device_id: int, function: int, address: int, value: int, patience: float
+        self,
+        device_id: int,
+        function: int,
+        address: int,
+        value: int,
+        patience: float,
+        *,
+        late: Mapping[int, Collection[int]],
     ) -> _Answer:
         stream, finder = self._stream, self._finder
         request = rtu.encode(device_id, struct.pack(">BHH", function, address, value))
         stream.discard()
-        finder.expect(request)
+        finder.expect(request, late=late)
         await stream.write(request)
         loop = asyncio.get_running_loop()
         deadline = loop.time() + patience
         quiet = False
+        n_late = 0
         try:
             while True:
                 until = min(deadline, loop.time() + QUIET) if quiet else deadline
@@ -135,6 +166,8 @@ class _RtuLink:
                     return _Answer(registers, reply.exception, at)
                 if finder.is_damaged:
                     break
+                if finder.n_late > n_late:  # the reply follows
+                    n_late, deadline = finder.n_late, loop.time() + patience
                 quiet = bool(finder.unexpected)
         except TimeoutError:
             pass
@@ -144,8 +177,6 @@ class _RtuLink:
             raise RemoteProtocolError(unexpected)
         if unexpected and other_unit is None:
             raise DamagedReplyError(unexpected)
-        if not unexpected:  # silence: a late reply must not be mistaken for the next one
-            await self.settle(patience)
         raise NoAnswerError(unexpected)
 
     async def settle(self, seconds: float) -> None:
@@ -155,6 +186,8 @@ class _RtuLink:
 class _TcpLink:
     """Modbus TCP."""
 
+    numbers_requests = True
+
     def __init__(self, client: AsyncModbusTcpClient, clock: HostClock) -> None:
         self._client = client
         self._clock = clock
@@ -162,8 +195,16 @@ class _TcpLink:
         client.ctx.trace_packet = self._trace  # otherwise pymodbus logs the packets
 
     async def ask(
-        self, device_id: int, function: int, address: int, value: int, patience: float
+        self,
+        device_id: int,
+        function: int,
+        address: int,
+        value: int,
+        patience: float,
+        *,
+        late: Mapping[int, Collection[int]],
     ) -> _Answer:
+        del late  # pymodbus compares the numbers
         client = self._client
         self._received = b""
         client.ctx.comm_params.timeout_connect = patience
@@ -208,12 +249,39 @@ class _TcpLink:
         return f"received {len(self._received)} bytes that are no reply" if self._received else ""
 
 
-@dataclass(slots=True)
-class _ReplyTime:
-    """Longest reply time of a device in s, and the number of its replies."""
+class _Device:
+    """What the bus knows of one device."""
 
-    longest: float = 0.0
-    n_replies: int = 0
+    def __init__(self) -> None:
+        self.unanswered: list[int] = []
+        """Numbers of registers of the requests since its last reply."""
+        self.factor = 1.0
+        """By which its timeout is longer, since it may have become slower."""
+        self._took: deque[float] = deque(maxlen=MAX_REPLIES)
+
+    @property
+    def is_known(self) -> bool:
+        """Whether its reply time is known."""
+        return len(self._took) >= MIN_REPLIES
+
+    @property
+    def reply_time(self) -> float | None:
+        """The 99th percentile of its recent reply times in s; None without a reply."""
+        if not self._took:
+            return None
+        ordered = sorted(self._took)
+        return ordered[math.ceil(0.99 * len(ordered)) - 1]
+
+    def replied(self, seconds: float) -> None:
+        """Note a reply."""
+        self._took.append(seconds)
+        self.factor = 1.0
+        self.unanswered.clear()
+
+    def did_not_reply(self, n_registers: int) -> None:
+        """Note a request without reply; the device may have become slower."""
+        self.unanswered.append(n_registers)
+        self.factor *= 2
 
 
 class ModbusBus:
@@ -226,7 +294,7 @@ class ModbusBus:
         self._timeout = timeout
         self._patience = timeout
         self._is_short = False
-        self._reply_times: dict[int, _ReplyTime] = {}  # by device
+        self._devices: defaultdict[int, _Device] = defaultdict(_Device)
 
     @contextlib.contextmanager
     def short_timeout(self) -> Iterator[None]:
@@ -237,15 +305,16 @@ class ModbusBus:
         finally:
             self._is_short = False
 
-    def _timeout_for(self, device_id: int) -> float:
+    def _timeout_for(self, device: _Device) -> float:
         """Return the timeout for a device in s: as short as possible, since the others wait."""
-        known = self._reply_times.get(device_id)
-        seconds = self._timeout
+        seconds, known = self._timeout, device.reply_time
         if self._is_short:
-            longest = max((other.longest for other in self._reply_times.values()), default=seconds)
-            seconds = max(MIN_SHORT_TIMEOUT, 4 * longest)
-        elif known is not None and known.n_replies >= MIN_REPLIES:
-            seconds = max(MIN_TIMEOUT, 4 * known.longest)
+            others = [one.reply_time for one in self._devices.values()]
+            slowest = max((time for time in others if time is not None), default=seconds)
+            seconds = max(MIN_SHORT_TIMEOUT, REPLY_TIMES * slowest)
+        elif known is not None and device.is_known:
+            least = MIN_TCP_TIMEOUT if self._link.numbers_requests else MIN_TIMEOUT
+            seconds = max(least, REPLY_TIMES * known) * device.factor
         return min(seconds, self._timeout)
 
     async def read(self, function: int, device_id: int, address: int, count: int) -> Reply:
@@ -264,6 +333,10 @@ class ModbusBus:
         NotConnectedError
             If the port is closed.
         """
+        await self._resynchronise(function, device_id, address, count)
+        return await self._read(function, device_id, address, count)
+
+    async def _read(self, function: int, device_id: int, address: int, count: int) -> Reply:
         sent = self._clock.now()
         answer = await self._exchange(
             device_id,
@@ -274,27 +347,47 @@ class ModbusBus:
             f" {address + count - 1}",
         )
         elapsed_ns = answer.received.monotonic_ns - sent.monotonic_ns
-        took = self._reply_times.setdefault(device_id, _ReplyTime())
-        took.longest = max(0.99 * took.longest, elapsed_ns * 1e-9 / self._clock.speed)
-        took.n_replies += 1
+        self._devices[device_id].replied(elapsed_ns * 1e-9 / self._clock.speed)
+        if len(answer.registers) != count:
+            raise RemoteProtocolError(f"{len(answer.registers)} registers; expected {count}")
         return Reply(answer.registers, sent, answer.received)
+
+    async def _resynchronise(self, function: int, device_id: int, address: int, count: int) -> None:
+        """See that no reply to an earlier request of the device is late, or will be."""
+        device = self._devices[device_id]
+        if not device.unanswered or self._link.numbers_requests:
+            return
+        used = {count, *device.unanswered}
+        other = next((n for n in range(1, MAX_REGISTERS + 1) if n not in used), None)
+        if other is not None:
+            try:
+                await self._read(function, device_id, address, other)
+            except RefusedError:  # of this request, or a late one of the requests before
+                if len(device.unanswered) > 1:
+                    await self.settle(self._timeout)
+        else:
+            await self.settle(self._timeout)
+        device.unanswered.clear()
 
     async def write(self, device_id: int, address: int, value: int) -> None:
         """Write one register by function 6; raise the errors of :meth:`read`."""
-        await self._exchange(
-            device_id,
-            rtu.WRITE_SINGLE,
-            address,
-            value,
-            f"device {device_id}, function 6, register {address} ← {value}",
-        )
+        text = f"device {device_id}, function 6, register {address} ← {value}"
+        try:
+            await self._exchange(device_id, rtu.WRITE_SINGLE, address, value, text)
+        except NoAnswerError:
+            await self.settle(self._patience)
+            raise
 
     async def _exchange(
         self, device_id: int, function: int, address: int, value: int, request: str
     ) -> _Answer:
-        self._patience = self._timeout_for(device_id)
+        device = self._devices[device_id]
+        self._patience = self._timeout_for(device)
+        late = {unit: one.unanswered for unit, one in self._devices.items() if one.unanswered}
         try:
-            answer = await self._link.ask(device_id, function, address, value, self._patience)
+            answer = await self._link.ask(
+                device_id, function, address, value, self._patience, late=late
+            )
         except NotConnectedError as error:
             raise NotConnectedError(f"{self.label}: the port closed") from error
         except DamagedReplyError as error:
@@ -302,8 +395,8 @@ class ModbusBus:
                 f"{self.label}: a damaged reply to {request}; {error}"
             ) from error
         except NoAnswerError as error:
-            if device_id in self._reply_times:  # it may have become slower
-                self._reply_times[device_id].longest *= 2
+            if function != rtu.WRITE_SINGLE:
+                device.did_not_reply(value)
             detail = f"; {error}" if str(error) else ""
             raise NoAnswerError(
                 f"{self.label}: no answer in {self._patience:.2g} s to {request}{detail}"
@@ -316,9 +409,9 @@ class ModbusBus:
             )
         return answer
 
-    async def settle(self) -> None:
-        """Wait for a late reply and discard it."""
-        await self._link.settle(self._patience)
+    async def settle(self, seconds: float | None = None) -> None:
+        """Wait for a late reply, by default for the last timeout, and discard it."""
+        await self._link.settle(self._patience if seconds is None else seconds)
 
 
 @contextlib.asynccontextmanager

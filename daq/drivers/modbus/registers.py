@@ -49,7 +49,9 @@ if TYPE_CHECKING:
     from daq.host_clock import HostClock
 
 FAILURES = 3
-"""Polls without a reply after which a device is lost."""
+"""Polls without a reply after which a device is lost, if it was silent for so long:"""
+MIN_SILENCE = 1.0
+"""Seconds, or as many of the longest timeouts: timeouts are short where replies are quick."""
 FIRST_RETRY, MAX_RETRY = 1.0, 30.0
 """Delay in s of the next request to a lost device while others on its bus reply; doubled after each
 request, because the others wait meanwhile."""
@@ -176,8 +178,6 @@ class _Polled:
         replies: list[Reply] = []
         for first, count in self.registers.reads(apart=self.apart):
             reply = await bus.read(self.registers.function, self.device_id, first, count)
-            if len(reply.registers) != count:
-                raise RemoteProtocolError(f"{len(reply.registers)} registers; expected {count}")
             held |= dict(enumerate(reply.registers, first))
             replies.append(reply)
         registers = [held[address] for address in self.registers.needed]
@@ -201,6 +201,8 @@ class _Poller:
         self._clock = clock
         self._period_ns = 1e9 / polled.sensor.sampling_rate
         self._failures = 0  # consecutive
+        self._replied_ns = self._clock.now().monotonic_ns
+        self._min_silence = min(MIN_SILENCE, FAILURES * polled.settings.timeout)
         self._n_wrong: Counter[str] = Counter()
         self._delay = FIRST_RETRY
         self._decoder = RegisterDecoder(
@@ -230,7 +232,7 @@ class _Poller:
             await bus.settle()
             found = self._event(EventKind.RESYNCHRONISED, str(error))
         else:
-            self._failures = 0
+            self._failures, self._replied_ns = 0, self._clock.now().monotonic_ns
         self._schedule()
         return found
 
@@ -253,6 +255,7 @@ class _Poller:
             return self._event(EventKind.REFUSED, str(error))
         text = f"answers again, after {self._failures} requests without a reply"
         self.is_gone, self._failures, self._delay = False, 0, FIRST_RETRY
+        self._replied_ns = self._clock.now().monotonic_ns
         self.due_ns = float(self._clock.now().monotonic_ns)
         return [Event(self.sensor, EventKind.CONNECTED, text, self._clock.now())]
 
@@ -273,10 +276,12 @@ class _Poller:
 
     def _schedule(self) -> None:
         """Schedule the next poll on the absolute grid of polls; omit missed polls."""
-        if self._failures >= FAILURES:
+        now_ns = self._clock.now().monotonic_ns
+        silent = (now_ns - self._replied_ns) * 1e-9 / self._clock.speed
+        if self._failures >= FAILURES and silent >= self._min_silence:
             self._give_up()
             return
-        late = max(0, int((self._clock.now().monotonic_ns - self.due_ns) // self._period_ns))
+        late = max(0, int((now_ns - self.due_ns) // self._period_ns))
         self.due_ns += (late + 1) * self._period_ns
 
 
@@ -317,7 +322,7 @@ class RegisterSession:
             if all(one.is_gone for one in pollers):
                 names = ", ".join(repr(one.sensor) for one in pollers)
                 raise NoAnswerError(
-                    f"{self._bus.label}: {names} did not answer {FAILURES} polls in a row"
+                    f"{self._bus.label}: {names} did not answer several polls in a row"
                 )
 
 

@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping
+
     from numpy.typing import NDArray
 
 READ_HOLDING = 3
@@ -111,20 +113,32 @@ class ReplyFinder:
         self._function = 0
         self._size = 0
         self._heard = bytearray()
+        self._late_sizes: dict[int, set[int]] = {}
+        self._is_within_late = False
+        self.n_late = 0
+        """Number of late replies since the request."""
 
-    def expect(self, request: bytes) -> None:
-        """Expect the reply to ``request``; discard the bytes received before."""
+    def expect(self, request: bytes, *, late: Mapping[int, Collection[int]] | None = None) -> None:
+        """Expect the reply to ``request``; discard the bytes received before.
+
+        ``late`` has the numbers of registers that earlier requests asked of each unit. Such
+        replies are skipped; the request of the same unit must ask for another number.
+        """
         self._buffer.clear()
         self._heard.clear()
         self._request = request
         self._unit, self._function = request[0], request[1]
+        self._late_sizes = {
+            unit: {5 + 2 * count for count in counts} for unit, counts in (late or {}).items()
+        }
+        self._is_within_late, self.n_late = False, 0
         reads = self._function in (READ_HOLDING, READ_INPUT)
         self._size = 5 + 2 * int.from_bytes(request[4:6], "big") if reads else 8
 
     @property
     def is_damaged(self) -> bool:
         """Whether as many bytes as the expected reply has were received, but not the reply."""
-        return self.waiting and len(self._heard) == self._size
+        return self.waiting and not self._is_within_late and len(self._heard) == self._size
 
     @property
     def other_unit(self) -> int | None:
@@ -155,6 +169,7 @@ class ReplyFinder:
         self._heard += received[: MAX_FRAME - len(self._heard)]
         if not self._drop_echo():
             return None
+        self._skip_late()
         buffer = bytes(self._buffer)
         head = bytes((self._unit,))
         here = 0
@@ -178,8 +193,23 @@ class ReplyFinder:
             here += 1
         else:
             here = len(buffer)
-        del self._buffer[:here]
+        if not self._is_within_late:
+            del self._buffer[:here]
         return None
+
+    def _skip_late(self) -> None:
+        """Remove replies to earlier requests, which come first: a device replies in order."""
+        buffer = self._buffer
+        self._is_within_late = False
+        while len(buffer) > 2 and buffer[1] in (READ_HOLDING, READ_INPUT):
+            size = 5 + buffer[2]
+            if size not in self._late_sizes.get(buffer[0], ()):
+                return
+            self._is_within_late = len(buffer) < size
+            if self._is_within_late or not is_whole(bytes(buffer[:size])):
+                return
+            del buffer[:size], self._heard[:size]
+            self.n_late += 1
 
     def _drop_echo(self) -> bool:
         """Remove an echo of the request; return False while the echo may be incomplete."""

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from daq.bench.model import Channel, Sensor
+from daq.drivers.modbus.bus import open_bus
 from daq.drivers.registry import driver_type
 from daq.errors import NoAnswerError
 from daq.protocols.block import Block, Event
@@ -139,3 +140,95 @@ async def test_an_echo_is_not_accepted_as_reply_to_a_write() -> None:
         with pytest.raises(NoAnswerError, match="function 6"):
             async with DRIVER.open([silent], host_clock()):
                 pass
+
+
+class SlowSlave:
+    """Answers in order, some requests late and some never; it tells when each was read.
+
+    Its first three registers have the time of the reading in units of 0.1 ms.
+    """
+
+    def __init__(self, seed: int, *, lost: float, late: float, n_registers: int = 100) -> None:
+        self._rng = np.random.default_rng(seed)
+        self._lost, self._late, self._n_registers = lost, late, n_registers
+        self.n_late = 0
+        self.n_lost = 0
+
+    @contextlib.asynccontextmanager
+    async def serve(self) -> AsyncIterator[str]:
+        """Serve; yield the port."""
+        tasks: list[asyncio.Task[None] | None] = []
+
+        async def answered(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            tasks.append(asyncio.current_task())
+            with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
+                while True:
+                    request = await reader.readexactly(8)
+                    await asyncio.sleep(0.002)
+                    writer.write(await self._reply(request))
+            writer.close()
+
+        async with await asyncio.start_server(answered, "127.0.0.1", 0) as server:
+            yield f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+        await asyncio.gather(*filter(None, tasks))
+
+    async def _reply(self, request: bytes) -> bytes:
+        count = int.from_bytes(request[4:6], "big")
+        if count > self._n_registers:
+            return rtu.encode_exception(1, 3, 2)
+        now = round(host_clock().now().monotonic_ns / 1e5)
+        values = [now >> 32 & 0xFFFF, now >> 16 & 0xFFFF, now & 0xFFFF, *range(count - 3)]
+        drawn = self._rng.uniform()
+        if drawn < self._lost:
+            self.n_lost += 1
+            return b""
+        late = drawn < self._lost + self._late
+        self.n_late += late
+        await asyncio.sleep(self._rng.uniform(0.02, 0.4) if late else 0.003)
+        return rtu.encode_registers(1, 3, np.array(values[:count], np.uint16))
+
+
+async def _polled_slow(slow: SlowSlave, n_polls: int) -> float:
+    """Return the share of missing readings."""
+    n_samples = end = 0
+    async with slow.serve() as port:
+        one = sensor(port).model_copy(update={"sampling_rate": 50.0})
+        async with DRIVER.open([one], host_clock()) as session:
+            async for item in session.read():
+                if isinstance(item, Block):
+                    n_samples += item.n_samples
+                    end = item.end_sample
+                if end >= n_polls:
+                    return 1 - n_samples / end
+    raise AssertionError("the session ended")
+
+
+@pytest.mark.parametrize("n_registers", [100, 4])
+async def test_lost_replies_cost_little_more_than_themselves(n_registers: int) -> None:
+    """2 % lost at 50 Hz: at most 8 % missing."""
+    slow = SlowSlave(1, lost=0.02, late=0.0, n_registers=n_registers)
+    assert 0.01 < await _polled_slow(slow, 3000) <= 0.08
+    assert slow.n_lost > 30
+
+
+@pytest.mark.parametrize("n_registers", [100, 4, 3])
+@pytest.mark.parametrize("seed", range(3))
+async def test_a_late_reply_is_never_the_reply_to_a_later_request(
+    seed: int, n_registers: int
+) -> None:
+    """Whether the device has further registers, which tell by their number, or not."""
+    slow = SlowSlave(seed, lost=0.02, late=0.03, n_registers=n_registers)
+    clock, n_replies = host_clock(), 0
+    async with slow.serve() as port, open_bus(port, clock, label="A") as bus:
+        for _ in range(2000):
+            with contextlib.suppress(NoAnswerError):
+                reply = await bus.read(3, 1, 0, 3)
+                read_ns = sum(
+                    word << shift for word, shift in zip(reply.registers, (32, 16, 0), strict=True)
+                )
+                assert reply.sent.monotonic_ns <= read_ns * 10**5 + 10**5
+                assert read_ns * 10**5 <= reply.received.monotonic_ns + 10**5
+                n_replies += 1
+            await asyncio.sleep(0.015)
+    assert slow.n_late > 20
+    assert n_replies > 1600
