@@ -22,8 +22,13 @@ Samples cycle through the scan list; a scan may span two packets. N is at most 5
 ===== ==================== =====================================================================
 
 If the scan list begins with CORE_TIMER and STREAM_DATA_CAPTURE_16 (its upper half), every scan
-holds the 40 MHz timer from which the scan rate is derived. Gaps are then counted by the timer, and
-blocks have it as ``device_counter``, unwrapped (it wraps every 107 s).
+holds the 40 MHz timer from which the scan rate is derived. Every step of the timer is checked. Gaps
+are counted by the timer, and blocks have it as ``device_counter``, unwrapped (it wraps every 107
+s).
+
+A scan of 0xFFFF in every column is a scan that the device did not complete, and a gap. Without the
+timer such a scan may also have been clipped. It counts as incomplete if it stands alone and has
+several columns.
 
 After a fatal status or on a new connection the stream is restarted: call
 :meth:`StreamDecoder.restart`. The timer continues, but scans start again. The number of missing
@@ -66,6 +71,8 @@ DUMMY = 0xFFFF
 REPEATED = 2
 """Maximum age in s of repeated scans against the last scan; if older, the timer was reset."""
 TIMER_ADDRESSES = (CORE_TIMER, STREAM_DATA_CAPTURE_16)
+MAX_JITTER, MIN_STEP = 0.4, 0.1
+"""Jitter of the timer from scan to scan, and its smallest step, in scans."""
 _WRAP = 1 << 32
 MAX_UNCERTAINTY = 40.0
 """Largest uncertainty of host time, in s, that still determines the timer's number of wraps."""
@@ -104,6 +111,7 @@ class StreamDecoder:
         self._timer: int | None = None  # of the last timed scan, unwrapped
         self._timer_row = 0  # index of that scan
         self._latest: HostTime | None = None
+        self._is_untimed = False  # whether the last scans had no timer, although they should
         self._begin()
 
     def _begin(self) -> None:
@@ -240,11 +248,61 @@ class StreamDecoder:
         return scans[:at], scans[at + 1 :]
 
     def _blocks(self, rows: list[NDArray[np.uint16]], at: HostTime) -> list[Block | Event]:
-        """Return one block per sensor with the scans in ``rows``, and clear ``rows``."""
+        """Return the scans in ``rows`` as blocks, one per sensor and run; clear ``rows``."""
         scans = np.concatenate(rows) if rows else np.empty((0, self._n_columns), np.uint16)
         rows.clear()
+        found: list[Block | Event] = []
         if not len(scans):
-            return []
+            return found
+        is_dummy = self._is_dummy(scans)
+        jumps = self._jumps(scans, is_dummy, at)
+        if jumps is None and not self._is_untimed:
+            text = "the core timer does not fit the scan rate: it is not used"
+            found.append(Event(self._name, EventKind.RESYNCHRONISED, text, at))
+        self._is_untimed = jumps is None
+        cuts = np.flatnonzero(np.diff(is_dummy)) + 1
+        if jumps is not None:
+            cuts = np.union1d(cuts, jumps)
+        for run in np.split(np.arange(len(scans)), cuts):
+            if is_dummy[run[0]]:
+                self._next_row += len(run)  # without a timer, each stands for itself
+                self._reason = "the device did not complete a scan (0xFFFF)"
+                continue
+            if jumps is not None and run[0] in jumps and not self._reason:
+                self._reason = "scans are missing by the core timer"
+            found += self._run(scans[run], at)
+        return found
+
+    def _is_dummy(self, scans: NDArray[np.uint16]) -> NDArray[np.bool_]:
+        """Return which scans are incomplete."""
+        dummy: NDArray[np.bool_] = (scans == DUMMY).all(axis=1)
+        if self._timed:
+            return dummy
+        if self._n_columns == 1:
+            return np.zeros_like(dummy)
+        around = np.concatenate(([False], dummy, [False]))
+        return dummy & ~around[:-2] & ~around[2:]
+
+    def _jumps(
+        self, scans: NDArray[np.uint16], is_dummy: NDArray[np.bool_], at: HostTime
+    ) -> NDArray[np.int64] | None:
+        """Return the rows before which the timer skips scans; None if it is not a timer."""
+        rows = np.flatnonzero(~is_dummy)
+        if not self._timed or len(rows) < 2:
+            return np.empty(0, np.int64)
+        timers = scans[rows, 0].astype(np.int64) | scans[rows, 1].astype(np.int64) << 16
+        steps = np.diff(timers) % _WRAP / self._ticks
+        missing = np.floor(steps + MAX_JITTER) - 1
+        elapsed = SLACK
+        if self._latest is not None:
+            elapsed += (at.monotonic_ns - self._latest.monotonic_ns) * 1e-9
+        is_timer = (steps > MIN_STEP) & (missing <= elapsed * self._rate)
+        if not is_timer.all():
+            return None
+        return np.asarray(rows[1:][missing > 0], np.int64)
+
+    def _run(self, scans: NDArray[np.uint16], at: HostTime) -> list[Block | Event]:
+        """Return one block per sensor with scans that follow one another."""
         counter = self._place(scans, at)
         first, self._next_row = self._next_row, self._next_row + len(scans)
         self._end_row = self._next_row

@@ -158,6 +158,65 @@ def test_the_timer_gives_a_gap_that_the_information_omits() -> None:
 
 
 @pytest.mark.parametrize("timed", [True, False])
+@pytest.mark.parametrize("row", [0, 7, 20, 59])
+def test_a_dummy_scan_in_a_good_packet_is_a_gap(row: int, timed: bool) -> None:
+    """Status 0: the device did not complete the scan, and says nothing else of it."""
+    rows = scans(0, 100, timed=timed)
+    rows[row] = stream.DUMMY
+    line = packets(rows, 60 * rows.shape[1])
+    receiver = decoder(timed=timed)
+    counts, blocks, _ = of("A", [x for one in line for x in receiver.receive(one, at(1))])
+    kept = [*range(row), *range(row + 1, 100)]
+    if timed and not row:  # nothing tells that there was a scan before the first
+        counts, kept = counts[: len(kept)], [i - blocks[0].first_sample for i in indices(blocks)]
+        kept = [i + 1 for i in kept]
+    np.testing.assert_array_equal(counts, scans(0, 100, timed=timed)[kept, -4:-1])
+    assert not any(BlockFlag.CLIPPED in block.flags for block in blocks)
+    if row:
+        assert indices(blocks) == kept
+        (gap,) = [b for b in blocks if b.first_sample == row + 1]
+        assert "0xFFFF" in gap.reason
+
+
+def test_several_dummy_scans_are_as_many_as_the_timer_says() -> None:
+    """One stands for five, whatever the number of dummy scans."""
+    rows = np.concatenate((scans(0, 30), np.full((2, 6), stream.DUMMY, np.uint16), scans(35, 30)))
+    _, blocks, _ = of("A", decoder().receive(packets(rows, 400)[0], at(1)))
+    assert indices(blocks) == [*range(30), *range(35, 65)]
+
+
+def test_clipped_inputs_without_timer_are_no_dummy_scans() -> None:
+    rows = scans(0, 30, timed=False)
+    rows[10:14] = stream.DUMMY
+    _, blocks, _ = of("A", decoder(timed=False).receive(packets(rows, 400)[0], at(1)))
+    assert indices(blocks) == list(range(30))
+    assert BlockFlag.CLIPPED in blocks[0].flags
+
+
+@pytest.mark.parametrize("n_missing", [1, 3, 500])
+def test_the_timer_of_each_scan_is_checked(n_missing: int) -> None:
+    """Scans are missing in the middle of a packet, and nothing else says so."""
+    rows = np.concatenate((scans(0, 13), scans(13 + n_missing, 27)))
+    line = b"".join(packets(rows, 400))
+    counts, blocks, events = of("A", decoder().receive(line, at(1)))
+    np.testing.assert_array_equal(counts, rows[:, 2:5])
+    assert indices(blocks) == [*range(13), *range(13 + n_missing, 40 + n_missing)]
+    assert [b.reason for b in blocks] == ["", "scans are missing by the core timer"]
+    assert all(b.device_counter == b.first_sample * TICKS for b in blocks)
+    assert not events
+
+
+def test_a_timer_that_contradicts_the_scan_rate_is_reported_once() -> None:
+    receiver = decoder()
+    rows = scans(0, 100)
+    rows[:, :2] = np.random.default_rng(1).integers(0, 65535, (100, 2))
+    found = [x for one in packets(rows, 120) for x in receiver.receive(one, at(1))]
+    _, blocks, events = of("A", found)
+    assert indices(blocks) == list(range(100))
+    assert ["not used" in event.text for event in events] == [True]
+
+
+@pytest.mark.parametrize("timed", [True, False])
 def test_lost_packets_are_counted_in_samples(timed: bool) -> None:
     """Three packets of 50 samples go; the scans they cut go with them, and no others."""
     rows = scans(0, 100, timed=timed)
