@@ -61,7 +61,7 @@ def segment_course(
     response = np.where(response == 0, np.nan, response)  # as `scale` has it
     joined = spectra[0] if len(spectra) == 1 else np.concatenate(spectra)
     with np.errstate(invalid="ignore"):  # where a response is not known
-        joined = joined / response.astype(np.complex64)
+        joined = np.divide(joined, response.astype(np.complex64), dtype=np.complex64)
     return SegmentCourse(
         spectra=joined,
         bins=bins,
