@@ -246,9 +246,21 @@ class EstimateSettings:
     target_cov: Annotated[
         float | None,
         Option(
-            "Target coefficient of variation of the noise in the band, such as 0.05.",
+            "Target coefficient of variation of the noise in the worst third of an octave of the"
+            " band, such as 0.05. With limits, how long a test takes is until they are decided.",
             check=values.cov,
             flags=("--target-cov",),
+            metavar="COV",
+            read=values.to_number,
+        ),
+    ] = None
+    target_cov_bin: Annotated[
+        float | None,
+        Option(
+            "Target coefficient of variation of the noise at single frequencies of the band, in"
+            " place of --target-cov.",
+            check=values.cov,
+            flags=("--target-cov-bin",),
             metavar="COV",
             read=values.to_number,
         ),

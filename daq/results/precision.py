@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.results.band_summary import band_of, judged_method
+from daq.results.band_summary import band_of, correlation_of, judged_method
+from estimator.levels.bands import band_levels, third_octaves
 from estimator.median import median_of_columns
 
 if TYPE_CHECKING:
@@ -18,12 +19,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Precision:
-    """Scatter of the noise at one frequency, beside the scatter that is wanted.
+    """Scatter of the noise, beside the scatter that is wanted.
 
     Attributes
     ----------
     cov : float
-        Median over the band, of the worst channel that has an estimate; NaN where there is none.
+        In the worst third of an octave of the band, of the worst channel that has an estimate; NaN
+        where there is none. See `channel_covs`.
     target : float or None
     seconds_left : float or None
         Until the target is reached, at the pace so far; None without a target or an estimate.
@@ -51,7 +53,7 @@ def precision(snapshot: Snapshot, settings: Settings) -> Precision:
     known = [cov for cov in channel_covs(snapshot, settings) if math.isfinite(cov)]
     if snapshot.not_estimated:
         known = []
-    cov, target = max(known, default=math.nan), settings.target_cov
+    cov, target = max(known, default=math.nan), settings.target_cov_bin or settings.target_cov
     left = total = None
     if target is not None and known:
         hop = settings.segment * (1 - settings.overlap)
@@ -62,15 +64,23 @@ def precision(snapshot: Snapshot, settings: Settings) -> Precision:
 
 
 def channel_covs(snapshot: Snapshot, settings: Settings, method: str | None = None) -> list[float]:
-    """Return the c.o.v. of every channel at one frequency, median in the band.
+    """Return the c.o.v. of every channel in the third of an octave of the band where it is largest.
 
-    By the method that judges, if none is given; NaN where there is no estimate.
+    With `Settings.target_cov_bin` it is that of single frequencies, median in the band. By the
+    method that judges, if none is given; NaN where there is no estimate.
     """
     noise = snapshot.results.get(method or judged_method(snapshot, settings))
-    if noise is None:
-        return [math.nan] * len(snapshot.channels)
     low, high = band_of(settings, snapshot)
-    inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
-    cov = noise.cov[inside]
-    medians = median_of_columns(np.where(np.isfinite(cov), cov, np.nan))
-    return [float(median) for median in medians]
+    edges = third_octaves(snapshot.frequency, low, high)
+    if noise is None or edges.size < 2:
+        return [math.nan] * len(snapshot.channels)
+    if settings.target_cov_bin is not None:
+        cov = noise.cov[edges[0] : edges[-1]]
+        medians = median_of_columns(np.where(np.isfinite(cov), cov, np.nan))
+        return [float(median) for median in medians]
+    width, correlation = np.gradient(snapshot.frequency), correlation_of(settings)
+    found = band_levels(noise.noise_psd, noise.cumulants, edges, correlation, weights=width)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        cov = np.where(np.isfinite(found.mean), found.spread / np.abs(found.mean), -np.inf)
+    worst = cov.max(axis=0)
+    return [math.nan if each < 0 else each for each in worst.tolist()]

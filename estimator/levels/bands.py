@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from estimator.types import FloatArray
 
+BANDS_PER_OCTAVE = 3
 N_LAGS = 8
 """Bins this far apart or more are independent."""
 
@@ -163,3 +164,17 @@ def log_edges(frequency: FloatArray, n_bands: int) -> NDArray[np.int64]:
     edges = np.searchsorted(frequency, targets[:-1])
     edges = np.unique(np.clip(edges, 1, frequency.size - 2))
     return np.append(edges, frequency.size - 1).astype(np.int64)
+
+
+def third_octaves(frequency: FloatArray, low: float, high: float) -> NDArray[np.int64]:
+    """Return edges of bands a third of an octave wide between two frequencies.
+
+    Every band has a bin or more; zero frequency and Nyquist are excluded. Empty without a bin.
+    """
+    low, high = max(low, float(frequency[1])), min(high, float(frequency[-2]))
+    if high < low:
+        return np.empty(0, dtype=np.int64)
+    n_bands = max(1, round(BANDS_PER_OCTAVE * np.log2(high / low)))
+    edges = np.searchsorted(frequency, np.geomspace(low, high, n_bands + 1))
+    edges[-1] += 1
+    return np.unique(edges).astype(np.int64)

@@ -161,7 +161,9 @@ def estimate(
     band : (float, float)
         Band of interest in Hz: of `Result.band`, and of the effect of clocks.
     target_cov : float
-        Wanted coefficient of variation of the noise in the band.
+        Wanted coefficient of variation of the noise in the worst third of an octave of the band.
+    target_cov_bin : float
+        The same at single frequencies, in place of `target_cov`.
 
     Returns
     -------

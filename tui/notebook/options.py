@@ -42,6 +42,7 @@ class EstimateOptions(TypedDict, total=False):
     unit: str
     band: tuple[float, float]
     target_cov: float
+    target_cov_bin: float
 
 
 def settings_of(settings: Settings, options: Mapping[str, object]) -> Settings:

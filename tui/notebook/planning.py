@@ -16,8 +16,11 @@ from daq.drivers.bench_file import load
 from daq.errors import WrongSettingError
 from daq.estimation.noise_estimates import responses
 from daq.estimation.settings import ROOM, ROOM_OF_ONE_CHANNEL, Settings
+from daq.results.band_summary import correlation_of
 from estimator import planning
 from estimator.levels.axes import across
+from estimator.levels.bands import third_octaves
+from estimator.levels.interval import worth
 from estimator.responses.edge_leakage import slope_factor
 from estimator.responses.equalisation import THRESHOLD
 from estimator.spectra.welch import WelchSettings
@@ -124,7 +127,8 @@ class RecordingPlan(Mapping[str, MethodPlan]):
 
     Attributes
     ----------
-    snr, cov : float
+    snr, cov, lowest : float
+        `lowest` is the lowest frequency of the band of interest, in Hz.
     settings : WelchSettings
     waves : Waves or None
         What waves across triaxial sensors do; None for others.
@@ -140,12 +144,13 @@ class RecordingPlan(Mapping[str, MethodPlan]):
         *,
         snr: float,
         cov: float,
+        lowest: float,
         settings: WelchSettings,
         waves: Waves | None = None,
         leakage: Leakage | None = None,
         axes: Axes | None = None,
     ) -> None:
-        self.snr, self.cov, self.settings = snr, cov, settings
+        self.snr, self.cov, self.lowest, self.settings = snr, cov, lowest, settings
         self.waves, self.leakage, self.axes = waves, leakage, axes
         self._plans = dict(plans)
 
@@ -166,8 +171,9 @@ class RecordingPlan(Mapping[str, MethodPlan]):
         """What is planned."""
         segment = self.settings.segment_length / self.settings.sampling_rate
         return (
-            f"Duration for a c.o.v. of {self.cov:g} at each frequency in every channel; motion"
-            f" {self.snr:g} × noise; {format_duration(segment)} segments, {self.settings.window}:"
+            f"Duration for a c.o.v. of {self.cov:g} in the worst third of an octave from"
+            f" {self.lowest:.3g} Hz on, in every channel; motion {self.snr:g} × noise;"
+            f" {format_duration(segment)} segments, {self.settings.window}:"
         )
 
     def table(self) -> Table:
@@ -285,6 +291,7 @@ def plan(
     segment: str | float | None = None,
     overlap: float | None = None,
     window: str | None = None,
+    band: tuple[float, float] | None = None,
 ) -> RecordingPlan:
     """Compute the duration of recording for a target precision, by every method.
 
@@ -296,12 +303,13 @@ def plan(
     snr : float
         Motion over noise, the mean over all channels.
     cov : float
-        Target coefficient of variation of the noise PSD of every channel, at each frequency.
+        Target coefficient of variation of the noise PSD of every channel, in the worst third of an
+        octave of the band.
     fs : float, optional
         Sampling rate in Hz.
     sensors, channels : int
         Number of sensors, and of channels of each.
-    segment, overlap, window : optional
+    segment, overlap, window, band : optional
         As in `estimate`.
 
     Returns
@@ -322,7 +330,7 @@ def plan(
     >>> round(plan["three-sensor"].duration / 60)
     88
     """
-    options = {"segment": segment, "overlap": overlap, "window": window}
+    options = {"segment": segment, "overlap": overlap, "window": window, "band": band}
     if bench is not None:
         given = [name for name, value in {"fs": fs, **options}.items() if value is not None]
         if given:
@@ -357,17 +365,29 @@ def _planned(
         window=settings.window,
     )
     csm, noise = planning.planned_csm(directions, snr=snr)
-    found = planning.plan(csm, noise, dims=dims, settings=welch, cov=cov)
+    low, high = settings.band or (welch.frequencies[1], 0.9 * welch.frequencies[-1])
+    of_bin = cov * math.sqrt(_worth_of_worst(welch, settings, low, high))
+    found = planning.plan(csm, noise, dims=dims, settings=welch, cov=of_bin)
     plans = map(MethodPlan.of, found)
     return RecordingPlan(
         {each.method: each for each in plans},
         snr=snr,
         cov=cov,
+        lowest=float(low),
         settings=welch,
         waves=waves_across(directions, dims, positions, snr=snr),
         leakage=leakage,
         axes=_axes(dims, settings, snr),
     )
+
+
+def _worth_of_worst(welch: WelchSettings, settings: Settings, low: float, high: float) -> float:
+    """Return how many independent frequencies the narrowest third of an octave is worth."""
+    bins = np.diff(third_octaves(welch.frequencies, low, high))
+    if not bins.size:
+        raise WrongSettingError(f"band {low:g} to {high:g} Hz: no frequency lies in it")
+    least = int(bins.min())
+    return float(worth(least, correlation_of(settings))[least])
 
 
 def _axes(dims: tuple[int, ...], settings: Settings, snr: float) -> Axes | None:

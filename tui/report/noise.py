@@ -160,7 +160,7 @@ def _band_table(snapshot: Snapshot, settings: Settings) -> Table:
         )
     header = (
         "channel", "recorded (dB)", "self-noise (dB)", "95 % interval (dB)",
-        f"({snapshot.unit})/√Hz", "c.o.v. per frequency", "c.o.v. of mean", "SNR (dB)",
+        f"({snapshot.unit})/√Hz", "c.o.v. in the worst ⅓ octave", "c.o.v. of mean", "SNR (dB)",
     )  # fmt: skip
     title = f"Mean over {span(*band)} by the {method} method, dB re 1 ({snapshot.unit})²/Hz"
     return Table(header, tuple(rows), title=title)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.results.band_summary import highest_known
+from estimator.levels.bands import third_octaves
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import ChannelLabel, Snapshot
     from estimator.types import FloatArray
 
-BANDS_PER_OCTAVE = 3
 BENT = 2.0
 """Ratio of a mask to a straight line through its band from which on its points divide the band."""
 
@@ -35,10 +35,7 @@ def mask_edges(snapshot: Snapshot, limit: Limit) -> NDArray[np.int64]:
     high = min(mask.frequency[-1], float(frequency[-2]), known)
     if high <= low:
         return np.empty(0, dtype=np.int64)
-    n_bands = max(1, round(BANDS_PER_OCTAVE * np.log2(high / low)))
-    edges = np.searchsorted(frequency, np.geomspace(low, high, n_bands + 1))
-    edges[-1] += 1
-    edges = np.unique(edges).astype(np.int64)
+    edges = third_octaves(frequency, low, high)
     bent = _is_bent(mask, snapshot.unit, frequency, edges)
     points = np.searchsorted(frequency, mask.frequency[1:-1])
     points = points[(points >= edges[0]) & (points < edges[-1])]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from daq.results.precision import channel_covs, precision
+from estimator.self_noise.result import SelfNoise
 from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot
 
 
@@ -52,15 +53,27 @@ def test_without_a_target_or_an_estimate_there_is_none() -> None:
     assert not nothing.is_reached
 
 
-def test_it_is_the_median_in_the_band_of_the_worst_channel_that_has_one() -> None:
+def test_it_is_that_of_the_worst_third_of_an_octave_of_the_worst_channel() -> None:
     snapshot = made_snapshot()
     noise = snapshot.results["three-sensor"]
-    cov = np.full_like(noise.cov, 0.1)
-    cov[:, 4], cov[:, 8] = 0.2, np.nan
-    cov[100:, 4] = 5.0  # beyond the band
-    snapshot = replace(snapshot, results={"three-sensor": replace(noise, cov=cov)})
-    assert precision(snapshot, SETTINGS).cov == pytest.approx(0.2)
-    assert math.isnan(channel_covs(snapshot, SETTINGS)[8])
+    level = np.full_like(noise.noise_psd, 2.0)
+    level[:, 8] = np.nan
+    share = np.full_like(level, 0.1)
+    share[10:, 4] = 0.2
+    share[100:, 4] = 5.0  # beyond the band, which ends at 20 Hz
+    cumulants = np.stack([level**k * share ** (2 * (k - 1)) for k in (2, 3, 4)])
+    changed = SelfNoise.of(noise.method, level, cumulants, noise.flags)
+    snapshot = replace(snapshot, results={"three-sensor": changed})
+    settings = replace(SETTINGS, window="rectangular", overlap=0.0)
+    # bins are 0.5 Hz apart: the lowest band has one, those from 5 Hz on have two or more
+    covs = channel_covs(snapshot, settings)
+    assert covs[0] == pytest.approx(0.1)
+    assert covs[4] == pytest.approx(0.2 / np.sqrt(2))
+    assert math.isnan(covs[8])
+    assert precision(snapshot, settings).cov == max(covs[:8])
+    by_bin = replace(settings, target_cov=None, target_cov_bin=0.4)
+    assert channel_covs(snapshot, by_bin)[4] == pytest.approx(0.2)
+    assert precision(snapshot, by_bin).is_reached
 
 
 def test_a_method_that_is_only_shown_is_not_the_one_that_counts() -> None:

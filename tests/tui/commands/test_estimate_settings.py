@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
 
 TEMPLATE = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
-KEYS = ("reject", "octaves", "dimension", "gains", "axis_tolerance")
+KEYS = ("reject", "octaves", "dimension", "gains", "axis_tolerance", "target_cov_bin")
 VALUES: dict[str, Any] = {
     "methods": ("maximum-likelihood", "two-channel"),
     "segment": 90.5,
@@ -57,6 +57,7 @@ VALUES: dict[str, Any] = {
     "unit": "µg",
     "band": (1 / 3, 20.0),
     "target_cov": 0.07,
+    "target_cov_bin": 0.3,
 }
 ARGUMENTS = [
     "--method=maximum-likelihood,two-channel", "--segment=90.5", "--overlap=0.75",
@@ -64,6 +65,7 @@ ARGUMENTS = [
     "--equalise=known", "--reject", "--bridge=0.25", "--octaves", "--dimension=2", "--gain=B=1.02",
     f"--gain=C.Z={0.1 + 0.2}", "--axis-tolerance=0.5", "--axis-tolerance=B=0.25",
     "--unit=µg", f"--band={1 / 3}:20", "--target-cov=0.07",
+    "--target-cov-bin=0.3",
 ]  # fmt: skip
 COMMANDS = ("estimate", "report", "run", "watch", "tui", "serve", "import")
 
