@@ -103,7 +103,7 @@ def accepted(path: Path, wanted: Mapping[str, object]) -> Bench:
                 FileFault(
                     key,
                     'is missing; expected one such as "3h", here or in'
-                    " [recording], or target_cov with longest",
+                    " [recording], or target_cov or until with longest",
                 )
             )
         elif found < shortest:

@@ -35,7 +35,7 @@ def run_of(bench: Bench, entry: ScheduledRun, due: datetime) -> Run:
         entry=entry.name,
         due=due.astimezone(UTC),
         duration=duration,
-        target_cov=entry.target_cov,
+        until=entry.end,
         queue=entry.when_busy == "queue",
     )
 

@@ -135,7 +135,7 @@ class Window:
             part = self._steps.new_part(self._clock.now())
             run = replace(run, parts=(*run.parts, part))
             self._save(run)
-            return run, self._steps.start(part, max(1.0, self._rest(run)), run.target_cov)
+            return run, self._steps.start(part, max(1.0, self._rest(run)), run.until)
         except (HuddleError, OSError) as error:
             return run.because(f"no recorder: {error}"), None
 
@@ -189,8 +189,8 @@ class Window:
         return run.to(RunState.FAILED, ended=self._clock.now())
 
     def _is_complete(self, run: Run) -> bool:
-        """Whether a recording that ends at a precision has reached it, without the service."""
-        if run.target_cov is None or STOPPED in run.reason:
+        """Whether a recording that ends by its estimate has done so, without the service."""
+        if not run.until.is_estimated or STOPPED in run.reason:
             return False
         try:
             last = with_continuations([self._folder / run.parts[-1]])[-1]

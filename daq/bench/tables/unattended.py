@@ -11,6 +11,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 from cronsim import CronSim, CronSimError
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
+from daq.bench.end_condition import EndCondition
 from daq.bench.tables.fields import Duration, Name, PositiveNumber, Table
 
 _BYTES = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "tb": 10**12}
@@ -76,11 +77,13 @@ class ScheduledRun(Table):
     """One run at this time."""
     time_zone: TimeZone | None = None
     duration: Duration | None = None
-    """In seconds; that of ``[recording]`` where neither this nor `target_cov` is given."""
+    """In seconds; that of ``[recording]`` where neither this nor `longest` is given."""
     target_cov: Annotated[float, Field(strict=True, gt=0, lt=1)] | None = None
     """Coefficient of variation at which the run ends."""
+    until: Literal["decided"] | None = None
+    """The run ends once its limits are decided."""
     longest: Duration | None = None
-    """Seconds after which a run with `target_cov` ends at the latest."""
+    """Seconds after which a run with `target_cov` or `until` ends at the latest."""
     when_busy: Literal["skip", "queue"] = "skip"
     """What becomes of a run that is due while another one records."""
 
@@ -91,11 +94,16 @@ class ScheduledRun(Table):
         is_local = self.at is None or self.at.tzinfo is None
         if is_local and self.time_zone is None:
             raise ValueError('time_zone is missing; expected one such as "UTC" or "Europe/Berlin"')
-        if self.duration is not None and self.target_cov is not None:
-            raise ValueError("expected duration, or target_cov with longest; not both")
-        if (self.target_cov is None) != (self.longest is None):
-            raise ValueError("expected target_cov and longest together")
+        if self.duration is not None and self.end.is_estimated:
+            raise ValueError("expected duration, or target_cov or until with longest; not both")
+        if self.end.is_estimated != (self.longest is not None):
+            raise ValueError('expected target_cov or until = "decided" together with longest')
         return self
+
+    @property
+    def end(self) -> EndCondition:
+        """What ends the run by its live estimate."""
+        return EndCondition(cov=self.target_cov, decided=self.until == "decided")
 
     @property
     def zone(self) -> ZoneInfo:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from daq.bench.end_condition import EndCondition
 from daq.bench.loading import dump
 from daq.bench.model import Limit
 from daq.drivers.bench_file import parse
@@ -85,7 +86,7 @@ def test_recorders_and_estimates_of_a_service_execute_none(record: Path) -> None
 
 async def one_run(steps: ProcessSteps, bench: Bench) -> tuple[Outcome, str]:
     part = steps.new_part(datetime.now(UTC))
-    recorder = steps.start(part, 12.0, 0.01)
+    recorder = steps.start(part, 12.0, EndCondition(cov=0.01))
     while not await recorder.ends_within(60):
         pass
     assert recorder.failure() == ""

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from daq.bench.end_condition import EndCondition
     from daq.bench.model import Bench
     from tui.service.processes.steps import Recorder
     from tui.service.records.run_state import Run
@@ -111,20 +112,21 @@ class FakeSteps:
     refuses: bool = False
     refuses_first: int = 0
     started: list[tuple[str, float]] = field(default_factory=list)
+    until: list[str] = field(default_factory=list)
     finished: list[Request] = field(default_factory=list)
 
     def new_part(self, at: datetime) -> str:
         """Return a name."""
         return f"lab-{at:%H%M%S}-{len(self.started)}.h5"
 
-    def start(self, part: str, seconds: float, target_cov: float | None) -> Recorder:
+    def start(self, part: str, seconds: float, until: EndCondition) -> Recorder:
         """Start one."""
-        del target_cov
         self.started.append((part, round(seconds)))
-        until, error = self.endings.pop(0) if self.endings else (None, "")
+        self.until.append(until.text)
+        ends, error = self.endings.pop(0) if self.endings else (None, "")
         if not self.refuses and len(self.started) > self.refuses_first:
             (self.folder / part).touch()
-        return FakeRecorder(self, self.folder / part, seconds if until is None else until, error)
+        return FakeRecorder(self, self.folder / part, seconds if ends is None else ends, error)
 
     def running(self, part: str) -> Recorder | None:
         """Return one that a test left running."""

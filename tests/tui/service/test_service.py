@@ -247,6 +247,35 @@ async def test_a_run_in_the_way_is_skipped_or_waited_for(
         assert runs[1].reason == "the run before was still recording"
 
 
+@pytest.mark.parametrize(
+    ("given", "until"),
+    [
+        ('until = "decided"\nlongest = "20min"', "decided"),
+        ('target_cov = 0.05\nlongest = "20min"', "5 %"),
+        ('until = "decided"\ntarget_cov = 0.05\nlongest = "20min"', "decided, 5 %"),
+        ('duration = "20min"', ""),
+    ],
+)
+async def test_a_run_ends_by_its_limits_or_its_precision(
+    tmp_path: Path, given: str, until: str
+) -> None:
+    place = Place(tmp_path, HOURLY + given + "\n")
+    await place.serve(1.5 * HOUR)
+    assert place.steps.until == [until]
+    assert place.steps.started[0][1] == 1200
+    run, *_ = place.store.runs()  # as it is read again
+    assert run.until.text == until
+    assert run.document()["until"] == (until or None)
+
+
+@pytest.mark.parametrize(
+    "given", ['until = "decided"', 'until = "decided"\nduration = "1h"', 'longest = "1h"']
+)
+def test_an_end_by_the_estimate_needs_a_longest_time(tmp_path: Path, given: str) -> None:
+    with pytest.raises(BenchFileError, match=r"longest"):
+        Place(tmp_path, HOURLY + given + "\n")
+
+
 async def test_runs_that_touch_are_all_recorded(tmp_path: Path) -> None:
     """An hour each, every hour: the end of one, and its estimate, do not miss the next."""
     place = Place(tmp_path, HOURLY + 'duration = "1h"\n')

@@ -9,10 +9,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from daq.bench.end_condition import EndCondition
 from daq.errors import HuddleError, RecordingError
 from daq.protocols.block import HostTime
 from daq.python_process import python_command
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from datetime import datetime
 
+    from daq.bench.end_condition import EndCondition
     from daq.bench.model import Bench
 
 POLL = 0.2
@@ -69,7 +70,7 @@ class Steps(Protocol):
         """Take a file name for a new recording."""
         ...
 
-    def start(self, part: str, seconds: float, target_cov: float | None) -> Recorder:
+    def start(self, part: str, seconds: float, until: EndCondition) -> Recorder:
         """Start a recorder."""
         ...
 
@@ -122,8 +123,8 @@ class ProcessSteps:
             raise RecordingError(f"{first.parent}: cannot be written: {error.strerror}") from error
         raise AssertionError
 
-    def start(self, part: str, seconds: float, target_cov: float | None) -> Recorder:
-        """Start a recorder, which stops at a precision if one is given.
+    def start(self, part: str, seconds: float, until: EndCondition) -> Recorder:
+        """Start a recorder, which stops after a time, or by its live estimate before.
 
         Raises
         ------
@@ -138,7 +139,7 @@ class ProcessSteps:
             process = RecorderProcess(
                 self._bench_path,
                 out,
-                end=EndCondition(seconds, target_cov),
+                end=replace(until, duration=seconds),
                 lock=lock.descriptor,
             )
             lock.name(process.pid)

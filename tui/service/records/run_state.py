@@ -21,6 +21,7 @@ from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from typing import Any
 
+from daq.bench.end_condition import NEVER, EndCondition
 from daq.errors import HuddleError
 
 
@@ -95,8 +96,9 @@ class Run:
     reason : str
         Why it failed, was missed, or ended early; what was done about it.
     duration : float
-        Length of its window in s; with `target_cov` the longest.
-    target_cov : float or None
+        Length of its window in s; with `until` the longest.
+    until : EndCondition
+        What ends its recording by the live estimate.
     queue : bool
         Whether it waits for a run that still records.
     started, ended : datetime or None
@@ -119,7 +121,7 @@ class Run:
     entry: str
     due: datetime
     duration: float
-    target_cov: float | None = None
+    until: EndCondition = NEVER
     queue: bool = False
     state: RunState = RunState.DUE
     reason: str = ""
@@ -182,7 +184,8 @@ class Run:
             "started": utc_text(self.started),
             "ended": utc_text(self.ended),
             "duration": self.duration,
-            "target_cov": self.target_cov,
+            "target_cov": self.until.cov,
+            "until": self.until.text or None,
             "recordings": list(self.parts),
             "pinned": self.pinned,
             "removed": utc_text(self.removed),

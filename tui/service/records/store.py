@@ -16,6 +16,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from daq.bench.end_condition import EndCondition
 from daq.errors import HuddleError
 from daq.recording.storage.names import PRIVATE
 from tui.service.records.run_state import UNFINISHED, BandNoise, Run, RunState, from_text, utc_text
@@ -204,7 +205,8 @@ def _row(run: Run) -> dict[str, Any]:
         "started": utc_text(run.started),
         "ended": utc_text(run.ended),
         "duration": run.duration,
-        "target_cov": run.target_cov,
+        # a number where it is a precision alone: earlier versions read that
+        "target_cov": run.until.text if run.until.decided else run.until.cov,
         "queue": int(run.queue),
         "parts": json.dumps(run.parts),
         "attempts": run.attempts,
@@ -220,7 +222,7 @@ def _run(row: dict[str, Any], noise: tuple[BandNoise, ...]) -> Run:
         entry=row["entry"],
         due=datetime.fromisoformat(row["due"]),
         duration=row["duration"],
-        target_cov=row["target_cov"],
+        until=_until(row["target_cov"]),
         queue=bool(row["queue"]),
         state=RunState(row["state"]),
         reason=row["reason"],
@@ -234,6 +236,10 @@ def _run(row: dict[str, Any], noise: tuple[BandNoise, ...]) -> Run:
         pending_hooks=tuple(json.loads(row["untold"])),
         noise=noise,
     )
+
+
+def _until(stored: float | str | None) -> EndCondition:
+    return EndCondition.of_text(stored) if isinstance(stored, str) else EndCondition(cov=stored)
 
 
 def _safe_name(name: str) -> str:
