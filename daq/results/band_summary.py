@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,7 +16,7 @@ from estimator.levels.interval import NORMAL_95, interval
 from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Mapping
 
     from numpy.typing import NDArray
 
@@ -35,13 +35,18 @@ class BandMeans:
     """Means of one channel's noise over bands, shape (n_bands,), in the unit of the spectrum.
 
     ``spread`` is the standard deviation of the mean by its scatter, ``low`` and ``high`` the ends
-    of its interval with all that widens it; NaN for a band without estimates.
+    of its interval with all that widens it; NaN for a band without estimates. ``scatter`` has the
+    ends by scatter alone, ``parts`` what each contribution adds below and above.
     """
 
     mean: FloatArray
     spread: FloatArray
     low: FloatArray
     high: FloatArray
+    scatter: tuple[FloatArray, FloatArray] | None = field(default=None, kw_only=True)
+    parts: Mapping[Source, tuple[FloatArray, FloatArray]] = field(
+        default_factory=dict, kw_only=True
+    )
 
     @property
     def outside(self) -> NDArray[np.bool_]:
@@ -106,7 +111,12 @@ class Levels:
         """Return the means of one channel."""
         low, high = self.ends(quantile)
         mean, spread = self.mean[:, column], self.of_scatter.spread[:, column]
-        return BandMeans(mean, spread, low[:, column], high[:, column])
+        scatter = self.of_scatter.interval(quantile)
+        return BandMeans(
+            *(mean, spread, low[:, column], high[:, column]),
+            scatter=(scatter[0][:, column], scatter[1][:, column]),
+            parts={each.source: each.adds(column, mean) for each in self.contributions},
+        )
 
     def _most(self, quantile: float) -> FloatArray:
         with np.errstate(invalid="ignore", divide="ignore"):

@@ -58,6 +58,14 @@ class Contribution:
     above: FloatArray
     share: FloatArray
 
+    def adds(self, column: int, level: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what it adds below and above a channel's level, shape (n,), in unit**2/Hz."""
+        with np.errstate(invalid="ignore"):
+            of_share = np.where(
+                self.share[:, column] > 0, self.share[:, column] * np.abs(level), 0.0
+            )
+        return self.below[:, column] + of_share, self.above[:, column] + of_share
+
     def in_bands(
         self, edges: NDArray[np.int64], weight: FloatArray, psd: FloatArray
     ) -> Contribution:

@@ -38,7 +38,7 @@ from tui.output.exit_codes import ExitCode
 from tui.output.extras import load, require
 from tui.output.formatting import several
 from tui.output.results import remarks as result_remarks
-from tui.output.results import result_table, result_title
+from tui.output.results import result_table, result_title, widened_by
 from tui.runs.estimate_settings import settings_for
 
 if TYPE_CHECKING:
@@ -109,7 +109,11 @@ def archive_recordings(
     screen = for_people(json, csv)
     screen.print(result_title(found.pooled, settings))
     screen.print(result_table(found.pooled, settings))
-    for line in (*result_remarks(found.pooled), *summary(found.pooled)):
+    for line in (
+        *result_remarks(found.pooled),
+        *widened_by(found.pooled, settings),
+        *summary(found.pooled),
+    ):
         screen.print(line)
     screen.print(course_title(found))
     screen.print(course_table(found))

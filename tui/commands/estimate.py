@@ -34,7 +34,7 @@ from tui.output.noise_parameters import (
     sheet_table,
     term_table,
 )
-from tui.output.results import curves_csv, remarks, result_table, result_title
+from tui.output.results import curves_csv, remarks, result_table, result_title, widened_by
 from tui.output.verdict_text import EXIT_CODES, STYLES, headline, limit_line, not_judged, what_to_do
 from tui.runs.estimate_settings import settings_of
 
@@ -158,7 +158,7 @@ def show_result(
     table = result_table(snapshot, settings)  # refuses a band without frequencies
     screen.print(result_title(snapshot, settings))
     screen.print(table)
-    for line in remarks(snapshot):
+    for line in (*remarks(snapshot), *widened_by(snapshot, settings)):
         screen.print(line)
     for line in quantisation_notes(snapshot.channels, quantisation_shares(snapshot, settings)):
         screen.print(line)

@@ -211,7 +211,7 @@ class Result:
     @property
     def remarks(self) -> tuple[str, ...]:
         """What the estimate rests on: segments, gaps, clocks, frequencies without an estimate."""
-        return text.remarks(self.snapshot)
+        return text.remarks(self.snapshot, self.settings)
 
     @property
     def _noise(self) -> SelfNoise:

@@ -34,8 +34,9 @@ def result(snapshot: Snapshot, settings: Settings) -> str:
             results.result_table(snapshot, settings),
         ]
     except BandError as error:
-        parts = [Text(f"Self-noise: {error}")]
-    parts += map(Text, (remarks(snapshot)[0], *results.wrong_times(snapshot)))
+        return rendered([Text(f"Self-noise: {error}"), Text(results.remarks(snapshot)[0])])
+    widened = results.widened_by(snapshot, settings)
+    parts += map(Text, (results.remarks(snapshot)[0], *results.wrong_times(snapshot), *widened))
     if advice(snapshot):
         parts.append(Text("advice on the test: print(*result.advice, sep='\\n')"))
     return rendered(parts)
@@ -71,9 +72,9 @@ def advice(snapshot: Snapshot) -> tuple[str, ...]:
     return tuple(diagnostics.summary(snapshot))
 
 
-def remarks(snapshot: Snapshot) -> tuple[str, ...]:
+def remarks(snapshot: Snapshot, settings: Settings) -> tuple[str, ...]:
     """Return the remarks below the table."""
-    return tuple(results.remarks(snapshot))
+    return (*results.remarks(snapshot), *results.widened_by(snapshot, settings))
 
 
 def rendered(parts: Sequence[RenderableType]) -> str:

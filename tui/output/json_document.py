@@ -177,6 +177,12 @@ def _band_means(snapshot: Snapshot, settings: Settings) -> list[dict[str, Any]]:
             "noise_psd": float(mean.mean[0]),
             "noise_psd_low": float(mean.low[0]),
             "noise_psd_high": float(mean.high[0]),
+            "scatter_low": None if mean.scatter is None else float(mean.scatter[0][0]),
+            "scatter_high": None if mean.scatter is None else float(mean.scatter[1][0]),
+            "contributions": [
+                {"source": source, "below": float(below[0]), "above": float(above[0])}
+                for source, (below, above) in mean.parts.items()
+            ],
         }
         for method, noise in snapshot.results.items()
         for column, (label, mean) in enumerate(

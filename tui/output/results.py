@@ -29,11 +29,21 @@ from tui.output.formatting import (
     signed,
     utc,
 )
-from tui.output.vocabulary import FLAG_WORDS, PARTNER_WORDS, REASONS, WITHOUT_ESTIMATE
+from tui.output.vocabulary import (
+    FLAG_WORDS,
+    PARTNER_WORDS,
+    REASONS,
+    SOURCE_WORDS,
+    WITHOUT_ESTIMATE,
+)
 
 if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from estimator.levels.contributions import Source
+
+LEAST_SAID = 0.01
+"""Share of the noise from which it is said what widens an interval."""
 
 
 def result_title(snapshot: Snapshot, settings: Settings) -> Text:
@@ -144,6 +154,27 @@ def remarks(snapshot: Snapshot) -> list[str]:
             of = f"{negative} of {noise.noise_psd[1:-1].size} values"
             lines.append(f"{method}: {of} {'is' if negative == 1 else 'are'} at or below zero")
     lines += [f"{method}: {reason}" for method, reason in snapshot.refused.items()]
+    return lines
+
+
+def widened_by(snapshot: Snapshot, settings: Settings) -> list[str]:
+    """Return what the intervals of the table include beyond scatter, and how much of the noise."""
+    lines = []
+    for method, noise in snapshot.results.items():
+        most: dict[Source, float] = {}
+        for mean in channel_means(noise, snapshot, settings, band_of(settings, snapshot)):
+            level = abs(float(mean.mean[0]))
+            for source, (below, above) in mean.parts.items():
+                share = max(float(below[0]), float(above[0])) / level if level else math.nan
+                if share >= LEAST_SAID:
+                    most[source] = max(most.get(source, 0.0), share)
+        if most:
+            said = [
+                SOURCE_WORDS[source]
+                + (f" (up to {percent(share)})" if math.isfinite(share) else " (without limit)")
+                for source, share in most.items()
+            ]
+            lines.append(f"{method}: beside scatter, the intervals include {listed(said)}")
     return lines
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from daq.recording.sensor_state import SensorState
 from daq.results.partners import WithoutPartner
 from daq.timing.clock_model import ClockSource
+from estimator.levels.contributions import Source
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
 
@@ -93,6 +94,18 @@ PARTNER_WORDS: Mapping[WithoutPartner, str] = {
     WithoutPartner.ONE_PARTNER: "no third sensor",
 }
 """In place of a noise level that cannot be told from motion."""
+
+SOURCE_WORDS: Mapping[Source, str] = {
+    Source.CLOCKS: "clocks",
+    Source.EDGES: "edges of segments",
+    Source.GAPS: "gaps",
+    Source.MISFIT: "a model test that fails",
+    Source.SHARED_NOISE: "shared noise",
+    Source.AXES: "axes that may be off",
+    Source.DIMENSIONS: "the number of dimensions",
+    Source.FAULTY: "a faulty channel",
+}
+"""What widens an interval beyond its scatter."""
 
 WITHOUT_ESTIMATE = (
     Flag.DEAD_CHANNEL

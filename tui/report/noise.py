@@ -12,8 +12,8 @@ from daq.results.decision.verdict import Verdict
 from daq.results.partners import without_partners
 from daq.results.precision import channel_covs
 from estimator.self_noise.result import Flag
-from tui.output.formatting import level_with_error, span
-from tui.output.results import flagged
+from tui.output.formatting import NOT_KNOWN, level_with_error, span
+from tui.output.results import flagged, unresolved, widened_by
 from tui.output.verdict_text import WORDS, headline, margin, not_judged, what_to_do
 from tui.output.vocabulary import FLAG_WORDS, PARTNER_WORDS
 from tui.report.figures.curves import noise_plots
@@ -82,8 +82,7 @@ def limits_section(snapshot: Snapshot, found: TestVerdict | None) -> Section | N
         f"dB re 1 ({snapshot.unit})²/Hz. A channel passes where the whole "
         "interval of its margin is above zero in every band, and fails where it is below zero in "
         "one. The intervals hold for all channels and bands together with a probability of 95 %, "
-        "and include what the clocks may add or take away, and motion that few averages do not "
-        "show."
+        "and include all that widens them."
     )
     table = Table(header, tuple(rows), left=frozenset({0, 1, 6}), tones=tones)
     return Section("Verdict against the limits", (table, Paragraph(note, "quiet")))
@@ -97,11 +96,14 @@ def noise_section(
         return Section("Self-noise", (Paragraph("Nothing can be said yet.", "doubtful"),))
     parts: list[Part] = [_band_table(snapshot, settings)]
     notes = [line for method in snapshot.results for line in flagged(snapshot, method)]
+    notes += [line for method in snapshot.results for line in unresolved(snapshot, method)]
+    notes += widened_by(snapshot, settings)
     notes += [f"{method}: {why}" for method, why in snapshot.refused.items()]
     parts += [
         Paragraph(
-            "The 95 % interval is that of the mean over the band. It is statistical: what is known "
-            "of the sensitivities comes on top. SNR: power of the motion over that of the noise.",
+            "The 95 % interval is that of the mean over the band, with all that widens it (below, "
+            "from 1 % of the noise on). What is known of the sensitivities comes on top. "
+            "SNR: power of the motion over that of the noise.",
             "quiet",
         )
     ]
@@ -150,9 +152,9 @@ def _band_table(snapshot: Snapshot, settings: Settings) -> Table:
             (
                 f"{label.sensor}.{label.channel}",
                 decibel(float(data[number])) if data[number] > 0 else no_signal,
-                decibel(mean[0], 2),
+                decibel(mean[0], 2) if mean[0] <= mean[2] else "withdrawn",
                 _interval(mean[1], mean[2]),
-                scientific(math.sqrt(mean[0])) if mean[0] > 0 else decibel(mean[0]),
+                scientific(math.sqrt(mean[0])) if 0 < mean[0] <= mean[2] else decibel(math.nan),
                 plain_number(covs[number], ".3f"),
                 plain_number(mean[3], ".3f"),
                 _snr(float(data[number]), mean[0]),
@@ -174,6 +176,8 @@ def _only(means: BandMeans) -> tuple[float, float, float, float]:
 
 
 def _interval(low: float, high: float) -> str:
+    if math.isinf(high):
+        return NOT_KNOWN
     if not high > 0:
         return "below 0" if high <= 0 else decibel(math.nan)
     return f"{decibel(low, 2)} … {decibel(high, 2)}" if low > 0 else f"below {decibel(high, 2)}"

@@ -17,7 +17,7 @@ from tui.application.dialogs import item
 from tui.application.test_view.panels import alerts, known_to
 from tui.output.advice.diagnostics import summary
 from tui.output.formatting import clock_time, level, level_with_error, percent, signed
-from tui.output.results import remarks
+from tui.output.results import remarks, widened_by
 from tui.output.verdict_text import (
     MARKS,
     STYLES,
@@ -57,7 +57,10 @@ def result(state: State, *, width: int) -> RenderableType:
     if snapshot.results:
         parts += [_channels(state, snapshot, settings, width=width)]
         parts += [*_notes(state, snapshot, settings), ""]
-    parts += [item(line) for line in (*remarks(snapshot), *summary(snapshot))]
+    parts += [
+        item(line)
+        for line in (*remarks(snapshot), *widened_by(snapshot, settings), *summary(snapshot))
+    ]
     if path is not None:
         parts += ["", Text.assemble(("recording  ", MUTED), str(path.resolve()))]
     return Group(*parts)

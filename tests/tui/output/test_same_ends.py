@@ -1,0 +1,147 @@
+"""One channel in one band has one interval, wherever it is shown."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from daq.bench.model import Limit
+from daq.bench.units import decibels
+from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics, Synchronisation
+from daq.results.band_summary import levels
+from daq.results.decision.limits import judge
+from daq.results.noise_budget import noise_budgets
+from estimator.levels.bands import band_edges
+from estimator.levels.contributions import Source
+from tests.tui.example_snapshot import SETTINGS, demo_bench, made_snapshot
+from tui.application.test_view.curves import noise_curve
+from tui.notebook.result import Result
+from tui.output.json_document import _band_means
+from tui.output.results import result_table, widened_by
+from tui.report.noise import noise_section
+from tui.report.parts import Items, Table
+
+if TYPE_CHECKING:
+    from daq.estimation.snapshot import Snapshot
+
+BAND = (9.0, 11.0)  # within one third of an octave: a limit there is judged in one band
+THIRD = replace(SETTINGS, band=BAND, methods=("three-sensor",))
+
+
+@pytest.fixture(name="snapshot", params=["exact", "wide"])
+def _snapshot(request: pytest.FixtureRequest) -> Snapshot:
+    snapshot = made_snapshot()
+    snapshot = replace(snapshot, results={"three-sensor": snapshot.results["three-sensor"]})
+    if request.param == "exact":
+        return snapshot
+    share = np.full_like(snapshot.data_psd, 0.03)
+    clocks = Synchronisation(noise_bias=share, removed=0.1 * np.abs(snapshot.data_psd) * 1e-3)
+    return replace(
+        snapshot,
+        diagnostics=SnapshotDiagnostics(clocks),
+        axis_tolerances=tuple(np.radians([1.0, 2.0, 1.0])),
+    )
+
+
+def test_table_report_json_notebook_curve_verdict_and_budget_have_the_same_ends(
+    snapshot: Snapshot,
+) -> None:
+    (method,) = snapshot.results
+    noise = snapshot.results[method]
+    edges = band_edges(snapshot.frequency, BAND)
+    found = levels(noise, snapshot, THIRD, edges)
+    low, high = (end[0] for end in found.ends())
+
+    document = _band_means(snapshot, THIRD)
+    np.testing.assert_array_equal([each["noise_psd_low"] for each in document], low)
+    np.testing.assert_array_equal([each["noise_psd_high"] for each in document], high)
+
+    notebook = Result(snapshot, THIRD).band()
+    np.testing.assert_array_equal(notebook.noise_low, low)
+    np.testing.assert_array_equal(notebook.noise_high, high)
+
+    for column in range(len(low)):
+        curve = noise_curve(
+            snapshot.frequency,
+            found.of_channel(column),
+            edges=edges,
+            label="",
+            style="",
+            band_style="",
+            marker="",
+        )
+        assert curve.high_db[0] == decibels(float(high[column]))
+        assert curve.low_db[0] == decibels(float(low[column])) or low[column] <= 0
+
+    console = Console(width=200, no_color=True)
+    with console.capture() as capture:
+        console.print(result_table(snapshot, THIRD))
+    rows = capture.get().replace("−", "-").splitlines()[1:]
+    for row, below, above, mean in zip(rows, low, high, found.mean[0], strict=False):
+        up = decibels(float(above)) - decibels(float(mean))
+        down = decibels(float(mean)) - decibels(float(below))
+        if (halves := re.search(r"±([\d.]+)", row)) is not None:
+            assert float(halves[1]) >= up - 0.006
+            assert float(halves[1]) >= down / 1.1 - 0.006
+        elif (halves := re.search(r"\+([\d.]+) -([\d.]+)", row)) is not None:
+            assert float(halves[1]) == pytest.approx(up, abs=0.006)
+            assert float(halves[2]) == pytest.approx(down, abs=0.006)
+        else:
+            bound = re.search(r"below (-[\d.]+)", row)
+            assert bound is not None
+            assert float(bound[1]) == pytest.approx(decibels(float(above)), abs=0.006)
+
+    section = noise_section(snapshot, THIRD, None)
+    table = next(part for part in section.parts if isinstance(part, Table))
+    for row_, below, above in zip(table.rows, low, high, strict=True):
+        ends = [float(x) for x in re.findall(r"-?[\d.]+", row_[3].replace("−", "-"))]
+        expected = [decibels(float(above))] if below <= 0 else [*map(decibels, (below, above))]
+        assert ends == pytest.approx(expected, abs=0.006)
+
+    for column, label in enumerate(snapshot.channels):
+        limit = Limit(
+            name="mask", frequency=BAND, psd=(1e-11, 1e-11), channels=(label.channel,),
+            sensors=(label.sensor,),
+        )  # fmt: skip
+        bench = demo_bench().model_copy(update={"limits": (limit,)})
+        verdict = judge(bench, snapshot, THIRD)
+        assert verdict is not None
+        (judged,) = verdict.limits
+        assert judged.low == pytest.approx(low[column], rel=1e-12)
+        assert judged.high == pytest.approx(high[column], rel=1e-12)
+
+    calibrated = {column: (1.0, 0.0) for column in range(len(low)) if found.mean[0, column] > 0}
+    budgets, _ = noise_budgets(
+        snapshot, THIRD, BAND, calibrated, averages=100.0, confidence=0.95, is_absolute=True
+    )
+    for column, budget in zip(calibrated, budgets, strict=True):
+        mean = found.of_channel(column)
+        for source, (below, above) in mean.parts.items():
+            (part,) = [each for each in budget.components if each.source == source]
+            side = max(float(below[0]), float(above[0])) / float(mean.mean[0])
+            assert part.relative == pytest.approx(side / math.sqrt(3))
+
+
+def test_what_widens_an_interval_is_named_with_its_size(snapshot: Snapshot) -> None:
+    lines = widened_by(snapshot, THIRD)
+    parts = noise_section(snapshot, THIRD, None).parts
+    notes = [each.text for part in parts if isinstance(part, Items) for each in part.entries]
+    assert all(line in notes for line in lines)
+    if snapshot.axis_tolerances:
+        (line,) = lines
+        assert "clocks (up to" in line
+        assert "axes that may be off (up to" in line
+        document = _band_means(snapshot, THIRD)[0]
+        assert [each["source"] for each in document["contributions"]] == [
+            Source.CLOCKS,
+            Source.AXES,
+        ]
+        assert document["scatter_high"] < document["noise_psd_high"]
+    else:
+        assert not lines
