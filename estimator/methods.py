@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 __all__ = ["METHODS", "Flag", "Method", "SelfNoise", "self_noise"]
 
 
+SMOOTH = 400.0
+"""Averages on which the course of the power in a block rests."""
 AT_ZERO = 0.05
 """Share of a block's bins at which the likelihood is largest at zero noise, from which neighbours
 count."""
@@ -129,6 +131,24 @@ def _shared(dims: tuple[int, ...]) -> int:
     return sorted(dims)[-3] if len(dims) > 2 else 0
 
 
+def _smooth(psd: FloatArray, block: IntArray, n_effective: float) -> FloatArray:
+    """Return the scale of every channel: its mean in a block, times the course of all channels.
+
+    The channels of a block keep their ratios, so that directions do not turn. The course rests on
+    `SMOOTH` averages: the scale of a bin's own power would make its noise too high. Of arrays of
+    shape (n_bins, n_channels).
+    """
+    first = np.flatnonzero(np.diff(block, prepend=-1))
+    count = np.diff(first, append=len(block))
+    mean = (np.add.reduceat(psd, first) / count[:, None])[block]
+    course = (psd / mean).mean(axis=1)
+    half = int(SMOOTH / n_effective / 2)
+    begin = np.maximum(np.arange(len(psd)) - half, first[block])
+    end = np.minimum(np.arange(len(psd)) + half + 1, (first + count)[block])
+    total = np.concatenate([[0.0], np.cumsum(course)])
+    return np.asarray(mean * ((total[end] - total[begin]) / (end - begin))[:, None])
+
+
 def _with_neighbours(
     found: SelfNoise,
     csm: ComplexArray,
@@ -159,11 +179,15 @@ def _with_neighbours(
     rows = np.flatnonzero(good & (n_dims <= usual) & fits)
     if not len(rows):
         return found
-    matrix = given.matrix[rows[:, None, None], columns[:, None], columns]
-    share = found.noise_psd[rows[:, None], columns] / given.psd[rows[:, None], columns]
-    scatter = found.cumulants[0][rows[:, None], columns] / given.psd[rows[:, None], columns] ** 2
     steps = [np.diff(each[rows], prepend=-1) != 0 for each in (blocks, n_dims)]
     number = np.cumsum(steps[0] | steps[1]) - 1
+    psd = given.psd[rows[:, None], columns]
+    scale = _smooth(psd, number, n_effective)
+    amplitude = np.sqrt(psd / scale)
+    matrix = given.matrix[rows[:, None, None], columns[:, None], columns]
+    matrix = matrix * amplitude[:, :, None] * amplitude[:, None, :]
+    share = found.noise_psd[rows[:, None], columns] / scale
+    scatter = found.cumulants[0][rows[:, None], columns] / scale**2
     unresolved = unresolved_blocks(
         matrix, number, n_dims[rows], share, scatter, dims=live, n_effective=n_effective
     )
@@ -185,7 +209,7 @@ def _with_neighbours(
     at = np.ix_(here, columns)
     gain = 1.0 if correct else (1 - n_dims[here] / n_effective)[:, None]
     noise, cumulants, flags = found.noise_psd.copy(), found.cumulants.copy(), found.flags.copy()
-    unit = given.psd[at] * gain
+    unit = scale[wanted][known] * gain
     noise[at] = pooled.noise[known] * unit
     for m in range(3):
         cumulants[m][at] = pooled.cumulants[m, known] * unit ** (m + 2)

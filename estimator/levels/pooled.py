@@ -41,6 +41,8 @@ OUTSTANDING = 1.8
 """Resolved eigenvalue over the edge of pure noise, ``(1 + sqrt(m / n))**2``."""
 APART = 4.0
 """Power of the last resolved dimension over that of the next one, unless all are resolved."""
+FEW = 5.0
+"""Averages a dimension, with fewer of which no bin resolves its motion by itself."""
 LEAST_PARTS = 4
 """Sub-blocks of a block at least, where they are made larger than `ENOUGH` asks for."""
 LEAKS = 3.0
@@ -237,7 +239,8 @@ def unresolved_blocks(
     averages = np.full(len(first), n_effective)
     q = n_dims[first]
     r = _n_resolved(X, np.arange(sample.size).reshape(sample.shape), averages, q, sensor)
-    return np.asarray((r < q) | ~np.logical_or.reduceat(known.all(axis=1), first))
+    few = n_effective < FEW * q  # directions of their own cost a bin more than a tenth in width
+    return np.asarray((r < q) | few | ~np.logical_or.reduceat(known.all(axis=1), first))
 
 
 def _bins(edges: IntArray, some: IntArray) -> IntArray:

@@ -1,0 +1,1 @@
+"""Studies of minutes to hours whose tables stand in ``docs/validation``: ``make studies``."""
