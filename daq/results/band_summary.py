@@ -144,10 +144,8 @@ def band_within(settings: Settings, frequency: FloatArray, known: float) -> tupl
     return low, min(high, known) if low < known else high
 
 
-def levels(
-    noise: SelfNoise, snapshot: Snapshot, settings: Settings, edges: NDArray[np.int64]
-) -> Levels:
-    """Return the noise of every channel in bands, with what its intervals consist of.
+class Spectrum:
+    """One method's noise at every frequency, from which levels of any bands are made.
 
     Every table, curve, verdict and budget takes its numbers from here.
 
@@ -155,24 +153,55 @@ def levels(
     ----------
     noise : SelfNoise
         One of the snapshot's results.
-    edges : int64, shape (n_bands + 1,)
-        Band b has bins ``edges[b]`` to ``edges[b + 1]``, excluded; increasing.
+    snapshot : Snapshot
+    settings : Settings
     """
-    width, correlation = np.gradient(snapshot.frequency), correlation_of(settings)
-    found = band_levels(noise.noise_psd, noise.cumulants, edges, correlation, weights=width)
-    weight = np.where(np.isfinite(noise.noise_psd), width[:, None], 0.0)
-    inside = slice(int(edges[0]), int(edges[-1]))
-    averages = averages_at(snapshot, snapshot.frequency[inside])
-    rest, scatter = unpredicted(snapshot.csm[inside], dims=snapshot.dims, n_effective=averages)
-    bound = band_levels(rest, scatter, edges - edges[0], correlation, weights=width[inside])
-    return Levels(
-        found,
-        tuple(
-            each.in_bands(edges, weight, noise.noise_psd)
-            for each in contributions(snapshot, noise.method)
-        ),
-        bound,
-    )
+
+    def __init__(self, noise: SelfNoise, snapshot: Snapshot, settings: Settings) -> None:
+        self._noise, self._snapshot = noise, snapshot
+        self._width = np.gradient(snapshot.frequency)
+        self._correlation = correlation_of(settings)
+        self._contributions = contributions(snapshot, noise.method)
+        known = np.isfinite(noise.noise_psd)
+        self._weight = np.where(known, self._width[:, None], 0.0)
+        self._bound: tuple[slice, FloatArray, FloatArray] = (slice(0, 0), np.empty(0), np.empty(0))
+
+    def levels(self, edges: NDArray[np.int64]) -> Levels:
+        """Return the noise of every channel in bands, with what its intervals consist of.
+
+        Parameters
+        ----------
+        edges : int64, shape (n_bands + 1,)
+            Band b has bins ``edges[b]`` to ``edges[b + 1]``, excluded; increasing.
+        """
+        noise, width, correlation = self._noise, self._width, self._correlation
+        found = band_levels(noise.noise_psd, noise.cumulants, edges, correlation, weights=width)
+        first, rest, scatter = self._unpredicted(int(edges[0]), int(edges[-1]))
+        here = slice(first, first + len(rest))
+        bound = band_levels(rest, scatter, edges - first, correlation, weights=width[here])
+        parts = (e.in_bands(edges, self._weight, noise.noise_psd) for e in self._contributions)
+        return Levels(found, tuple(parts), bound)
+
+    def _unpredicted(self, begin: int, end: int) -> tuple[int, FloatArray, FloatArray]:
+        """Return the bound at these bins or more, with the first of them."""
+        inside, rest, scatter = self._bound
+        if begin < inside.start or end > inside.stop:
+            if inside.stop > inside.start:
+                begin, end = min(begin, inside.start), max(end, inside.stop)
+            inside, snapshot = slice(begin, end), self._snapshot
+            averages = averages_at(snapshot, snapshot.frequency[inside])
+            rest, scatter = unpredicted(
+                snapshot.csm[inside], dims=snapshot.dims, n_effective=averages
+            )
+            self._bound = (inside, rest, scatter)
+        return inside.start, rest, scatter
+
+
+def levels(
+    noise: SelfNoise, snapshot: Snapshot, settings: Settings, edges: NDArray[np.int64]
+) -> Levels:
+    """Return the noise of every channel in bands: `Spectrum.levels`."""
+    return Spectrum(noise, snapshot, settings).levels(edges)
 
 
 def channel_means(

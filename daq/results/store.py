@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from daq.recording.repair import write_results
-from daq.results.decision.verdict import Verdict
+from estimator.decision.verdict import Verdict
 
 if TYPE_CHECKING:
     from pathlib import Path

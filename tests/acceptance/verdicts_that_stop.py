@@ -15,7 +15,7 @@ from collections import Counter
 import numpy as np
 
 from daq.results.decision.end import is_surely_decided
-from daq.results.decision.verdict import Verdict
+from estimator.decision.verdict import Verdict
 from tui.studies.verdicts import (
     FARTHEST_DB,
     LONGEST,

@@ -12,10 +12,10 @@ from rich.text import Text
 from daq.estimation.estimation import estimate
 from daq.recording.reader import Recording
 from daq.results.decision.limits import judge
-from daq.results.decision.verdict import Verdict
 from daq.results.noise_parameters import noise_parameters as parameters_of
 from daq.results.noise_parameters import quantisation_shares
 from daq.results.sources import sources
+from estimator.decision.verdict import Verdict
 from tui.output.advice.diagnostics import details, summary
 from tui.output.console import (
     check_places,

@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from daq.results.decision.decision_time import LIKELY
-from daq.results.decision.limits import MIN_AVERAGES
-from daq.results.decision.verdict import Obstacle, Verdict
+from estimator.decision.comparison import MIN_AVERAGES
+from estimator.decision.decision_time import LIKELY
+from estimator.decision.verdict import Obstacle, Verdict
 from tui.output.exit_codes import ExitCode
 from tui.output.formatting import level, listed, roughly, several, signed
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from daq.results.decision.verdict import LimitResult, Prediction, TestVerdict
+    from daq.results.decision.verdict import LimitResult, TestVerdict
+    from estimator.decision.verdict import Prediction
 
 WORDS: Mapping[Verdict, str] = {
     Verdict.PASS: "PASS",

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 from daq.bench.masks.mask import SOURCES
 from daq.bench.units import decibels
 from daq.results.band_summary import band_of, channel_means, data_means
-from daq.results.decision.verdict import Verdict
 from daq.results.partners import without_partners
 from daq.results.precision import channel_covs
+from estimator.decision.verdict import Verdict
 from estimator.self_noise.result import Flag
 from tui.output.formatting import NOT_KNOWN, level_with_error, span
 from tui.output.results import flagged, unresolved, widened_by

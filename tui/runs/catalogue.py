@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from datetime import datetime
     from pathlib import Path
 
-    from daq.results.decision.verdict import Verdict
+    from estimator.decision.verdict import Verdict
 
 
 @dataclass(frozen=True, slots=True)

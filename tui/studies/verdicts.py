@@ -15,9 +15,9 @@ import numpy as np
 from daq.bench.model import Bench, Channel, Limit, Sensor
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import ChannelLabel, Snapshot
-from daq.results.decision.decision_time import LIKELY
 from daq.results.decision.limits import judge
-from daq.results.decision.verdict import Verdict
+from estimator.decision.decision_time import LIKELY
+from estimator.decision.verdict import Verdict
 from estimator.errors import InsufficientDataError
 from estimator.methods import self_noise
 from estimator.spectra.welch import CrossSpectra, WelchSettings

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from daq.results.decision.limits import judge
-from daq.results.decision.verdict import Verdict
 from daq.results.precision import precision
+from estimator.decision.verdict import Verdict
 
 if TYPE_CHECKING:
     from daq.bench.end_condition import EndCondition

@@ -1,53 +1,40 @@
-"""Noise masks of the bench file, and which channels are below them for certain.
+"""The limits of a bench file, and which channels are below them: `estimator.decision` decides.
 
-A mask is judged in bands a third of an octave wide, where single frequencies scatter less: the mean
-noise beside the mean of the mask. Notches, peaks and steps of the mask divide the bands. A channel
-passes where the whole interval of its band means is below the mask in every band, and fails where
-the whole interval of one band is above it. The intervals hold for all channels, masks and bands
-together (Bonferroni): of tests with all channels just at the mask, one in forty fails.
-
-The ends are those of every table (`daq.results.band_summary.levels`) at another quantile: with all
-that widens them, and below the bound that needs no model. Noise that is below zero for certain is
-wrong, so it decides nothing. Of a channel that is clipped, or was dead for a while, the estimate is
-an upper bound.
+A limit is judged in bands a third of an octave wide, divided at notches, peaks and steps of the
+mask. The ends of the intervals are those of every table (`daq.results.band_summary.levels`), at the
+quantile that holds for all channels, limits and bands together.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.results.band_summary import averages_at, judged_method, levels
-from daq.results.decision.decision_time import Margins, predict
-from daq.results.decision.mask_bands import judged_range, mask_edges, mean_mask
-from daq.results.decision.verdict import (
-    REMOVED_BY_TIME,
-    LimitResult,
-    Obstacle,
-    TestVerdict,
-    Verdict,
-)
+from daq.results.band_summary import Spectrum, averages_at, highest_known, judged_method
+from daq.results.decision.verdict import LimitResult, TestVerdict
 from daq.results.partners import without_partners
+from estimator.decision.comparison import (
+    Comparison,
+    Judged,
+    joint_quantile,
+    prediction,
+    whole,
+)
+from estimator.decision.mask_bands import mask_edges, mean_mask
+from estimator.decision.verdict import Obstacle, Verdict
 from estimator.levels.contributions import Source
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
     from daq.bench.model import Bench, Limit
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import ChannelLabel, Snapshot
     from daq.results.band_summary import Levels
-    from daq.results.decision.verdict import Prediction
     from estimator.types import FloatArray
-
-MIN_AVERAGES = 20.0
-"""Averages below which the far tails of the interval have not been verified by simulation."""
 
 
 def judge(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> TestVerdict | None:
@@ -55,48 +42,30 @@ def judge(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> TestVe
     if bench is None or not bench.limits:
         return None
     method = judged_method(snapshot, settings)
-    pairs = [
-        (limit, column)
-        for limit in bench.limits
-        for column, label in enumerate(snapshot.channels)
-        if concerns(limit, label)
-    ]
-    edges = {limit.name: mask_edges(snapshot, limit) for limit in bench.limits}
-    n_bands = sum(max(0, edges[limit.name].size - 1) for limit, _ in pairs)
-    quantile = NormalDist().inv_cdf(1 - 0.025 / max(1, n_bands))
     noise = snapshot.results.get(method)
-    of_limit = {
-        name: None if noise is None or each.size < 2 else levels(noise, snapshot, settings, each)
-        for name, each in edges.items()
-    }
-    found = [
-        _compare(
-            bench,
-            limit,
-            column,
-            snapshot,
-            of_limit[limit.name],
-            edges=edges[limit.name],
-            quantile=quantile,
-        )
-        for limit, column in pairs
-    ]
-    limits = tuple(each.result(method) for each in found)
-    general = _general_obstacles(snapshot)
-    of_channels = {each.obstacle for each in limits if each.obstacle is not None}
-    obstacles = tuple(each for each in Obstacle if each in general or each in of_channels)
-    verdicts = {each.verdict for each in limits}
-    if general or not limits:
-        verdict = Verdict.NOT_DECIDED
-    elif Verdict.FAIL in verdicts:
-        verdict, obstacles = Verdict.FAIL, tuple(o for o in obstacles if o not in REMOVED_BY_TIME)
-    else:
-        undecided = Verdict.NOT_DECIDED in verdicts or bool(snapshot.not_estimated)
-        verdict = Verdict.NOT_DECIDED if undecided else Verdict.PASS
-    prediction = None
-    if verdict is Verdict.NOT_DECIDED and obstacles and set(obstacles) <= REMOVED_BY_TIME:
-        prediction = _prediction(found, snapshot, quantile)
-    return TestVerdict(verdict, limits, obstacles, prediction)
+    bands = [_Bands.of(bench, limit, snapshot) for limit in bench.limits]
+    quantile = joint_quantile(sum(each.n_bands * len(each.columns) for each in bands))
+    spectrum = None if noise is None else Spectrum(noise, snapshot, settings)
+    known: dict[bytes, _Columns] = {}  # limits often share their bands
+    found: list[Comparison] = []
+    judged: list[Judged] = []
+    limits: list[LimitResult] = []
+    for each in bands:
+        columns = known.get(each.edges.tobytes())
+        if columns is None and spectrum is not None and each.n_bands:
+            columns = _Columns.of(spectrum.levels(each.edges), quantile)
+            known[each.edges.tobytes()] = columns
+        for column in each.columns:
+            found.append(each.comparison(bench, snapshot, columns, column))
+            judged.append(found[-1].judged())
+            limits.append(each.result(snapshot.channels[column], method, found[-1], judged[-1]))
+    verdict, obstacles = whole(
+        judged, _general_obstacles(snapshot), is_complete=not snapshot.not_estimated
+    )
+    left = None
+    if verdict is Verdict.NOT_DECIDED:
+        left = prediction(found, obstacles, quantile=quantile, elapsed=snapshot.elapsed)
+    return TestVerdict(verdict, tuple(limits), obstacles, left)
 
 
 def concerns(limit: Limit, label: ChannelLabel) -> bool:
@@ -104,163 +73,163 @@ def concerns(limit: Limit, label: ChannelLabel) -> bool:
     return limit.concerns(label.sensor, label.channel)
 
 
-@dataclass(frozen=True, slots=True)
-class _Comparison:
-    """One channel beside one mask in all bands of it; arrays of shape (n_bands,).
+def mask_psd(bench: Bench, limit: Limit, label: ChannelLabel, frequency: FloatArray) -> FloatArray:
+    """Return a mask between its points, straight in log-log, in the unit of the result squared/Hz.
 
-    `outer_low` and `outer_high` are the ends of the interval with all that widens it; `low` and
-    `high` those by the scatter of the estimate alone, `no_clocks` the ends without what the clocks
-    do. NaN in bands without an estimate.
+    A mask without a unit is in the unit that the channel has in the bench file. A band that ends
+    just outside of the mask has its value at the end.
+    """
+    mask = limit.mask
+    inside = np.clip(frequency, mask.frequency[0], mask.frequency[-1])
+    return mask.at(inside, label.unit, of_channel=_unit_in_file(bench, label))
+
+
+def _unit_in_file(bench: Bench, label: ChannelLabel) -> str | None:
+    for sensor in bench.sensors:
+        for channel in sensor.channels:
+            if (sensor.name, channel.name) == (label.sensor, label.channel):
+                return channel.unit
+    return None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Columns:
+    """Levels of all channels in the bands of a limit, as a verdict needs them.
+
+    Each pair has lower and upper ends, shape (n_bands, n_channels): by the scatter alone, with all
+    that widens it, and with all but the clocks.
     """
 
-    limit: Limit
-    label: ChannelLabel
-    covers: tuple[float, float]
-    judged: tuple[float, float]
-    centre: FloatArray
-    mask: FloatArray
-    mean: FloatArray
-    cumulants: FloatArray
-    low: FloatArray
-    high: FloatArray
-    outer_low: FloatArray
-    outer_high: FloatArray
+    levels: Levels
+    scatter: tuple[FloatArray, FloatArray]
+    outer: tuple[FloatArray, FloatArray]
     no_clocks: tuple[FloatArray, FloatArray]
-    averages: FloatArray
-    is_alone: NDArray[np.bool_]
-    is_withdrawn: NDArray[np.bool_]
-    is_faulty: bool
+    withdrawn: NDArray[np.bool_]
 
-    def result(self, method: str) -> LimitResult:
-        """Return the verdict, with the numbers of the band where the channel does worst."""
+    @classmethod
+    def of(cls, found: Levels, quantile: float) -> _Columns:
+        """Return the columns at a quantile."""
+        return cls(
+            found,
+            found.of_scatter.interval(quantile),
+            found.ends(quantile),
+            found.ends(quantile, without={Source.CLOCKS}),
+            found.withdrawn(quantile),
+        )
 
-        def in_band(band: int | None, verdict: Verdict, obstacle: Obstacle | None) -> LimitResult:
-            def number(values: FloatArray) -> float:
-                return math.nan if band is None else float(values[band])
 
-            return LimitResult(
-                limit=self.limit.name,
-                sensor=self.label.sensor,
-                channel=self.label.channel,
-                method=method,
-                frequency=number(self.centre),
-                noise_psd=number(self.mean),
-                low=number(self.outer_low),
-                high=number(self.outer_high),
-                limit_psd=number(self.mask),
-                verdict=verdict,
-                covers=self.covers,
-                judged=self.judged,
-                obstacle=obstacle,
+@dataclass(frozen=True, slots=True, eq=False)
+class _Bands:
+    """The bands of one limit, and the channels that it is for."""
+
+    limit: Limit
+    edges: NDArray[np.int64]
+    judged: tuple[float, float]
+    columns: tuple[int, ...]
+    alone: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, bench: Bench, limit: Limit, snapshot: Snapshot) -> _Bands:
+        """Return the bands of a limit in a spectrum; the last ends where nothing is known."""
+        frequency, points = snapshot.frequency, np.asarray(limit.mask.frequency)
+        columns = tuple(n for n, each in enumerate(snapshot.channels) if concerns(limit, each))
+        known = highest_known(snapshot) or math.inf
+        edges = np.empty(0, dtype=np.int64)
+        if columns:
+            mask = mask_psd(bench, limit, snapshot.channels[columns[0]], frequency)
+            edges = mask_edges(frequency, mask, points, known=known)
+        alone = np.zeros((max(len(edges) - 1, 0), len(snapshot.channels)), np.bool_)
+        for band, centre in enumerate(_centres(frequency, edges).tolist()):
+            alone[band, list(without_partners(snapshot, (centre, centre)))] = True
+        return cls(limit, edges, _judged_range(frequency, points, edges, known), columns, alone)
+
+    @property
+    def n_bands(self) -> int:
+        """Number of bands."""
+        return max(len(self.edges) - 1, 0)
+
+    def comparison(
+        self, bench: Bench, snapshot: Snapshot, columns: _Columns | None, column: int
+    ) -> Comparison:
+        """Return the noise of a channel beside the mask."""
+        frequency, label = snapshot.frequency, snapshot.channels[column]
+        centre = _centres(frequency, self.edges)
+        nothing = np.full(centre.shape, np.nan)
+        mask = nothing
+        if centre.size:
+            mask = mean_mask(frequency, mask_psd(bench, self.limit, label, frequency), self.edges)
+        mean, cumulants = nothing, np.full((3, *centre.shape), np.nan)
+        scatter = outer = no_clocks = (nothing, nothing)
+        withdrawn = np.zeros(centre.shape, np.bool_)
+        if columns is not None:
+            found = columns.levels
+            complete = found.of_scatter.complete[:, column]
+            mean = np.where(complete, found.mean[:, column], np.nan)
+            cumulants = found.of_scatter.cumulants[:, :, column]
+            scatter, outer, no_clocks = (
+                (low[:, column], high[:, column])
+                for low, high in (columns.scatter, columns.outer, columns.no_clocks)
             )
-
-        known = np.isfinite(self.mean)
-        if not known.any():
-            why = Obstacle.NO_ESTIMATE if self.centre.size else Obstacle.OUTSIDE_SPECTRUM
-            return in_band(None, Verdict.NOT_DECIDED, why)
-        trusted = known & (self.averages >= MIN_AVERAGES) & ~self.is_alone
-        above = np.where(trusted, self.outer_low / self.mask, -math.inf)
-        if above.max() > 1:
-            return in_band(int(above.argmax()), Verdict.FAIL, None)
-        highest = np.where(known, self.outer_high / self.mask, -math.inf)
-        worst = int(highest.argmax())
-        if trusted.all() and highest.max() <= 1 and self.outer_high.min() > 0:
-            return in_band(worst, Verdict.PASS, None)
-        return in_band(worst, Verdict.NOT_DECIDED, self._obstacle(known, trusted))
-
-    def _obstacle(self, known: NDArray[np.bool_], trusted: NDArray[np.bool_]) -> Obstacle:
-        """Return what keeps the limit from being decided."""
-        would_fail = bool((self.low > self.mask).any())  # by scatter alone
-        would_pass = bool((self.high <= self.mask).all())
-        low, high = self.no_clocks
-        by_clocks = bool(((low > self.mask) & (self.outer_low <= self.mask)).any())
-        by_clocks |= bool((high <= self.mask).all() and (self.outer_high > self.mask).any())
-        reads_high = self.is_faulty and (would_fail or bool((self.mean > self.mask).any()))
-        reasons = (
-            (Obstacle.NO_ESTIMATE, not known.all()),
-            (Obstacle.NO_SHARED_MOTION, bool(self.is_alone.any())),
-            (Obstacle.TOO_FEW_AVERAGES, not trusted.all()),
-            (Obstacle.FAULTY_CHANNEL, reads_high),
-            (Obstacle.CLOCKS, by_clocks),
-            (Obstacle.MODEL_MISFIT, would_fail or would_pass or bool(self.is_withdrawn.any())),
+            withdrawn = columns.withdrawn[:, column]
+        diagnostics = snapshot.diagnostics
+        return Comparison(
+            centre=centre,
+            mask=mask,
+            mean=mean,
+            cumulants=cumulants,
+            low=scatter[0],
+            high=scatter[1],
+            outer_low=outer[0],
+            outer_high=outer[1],
+            no_clocks=no_clocks,
+            averages=averages_at(snapshot, centre),
+            is_alone=self.alone[:, column],
+            is_withdrawn=withdrawn,
+            is_faulty=column in diagnostics.clipped or column in diagnostics.stood_still,
         )
-        return next((reason for reason, holds in reasons if holds), Obstacle.SPANS_LIMIT)
 
-    def margins(self) -> Margins:
-        """Return the margins for a prediction; where the mean is not positive, from its spread."""
-        spread = np.sqrt(np.maximum(self.cumulants[0], 0.0))
-        positive = self.mean > 0
-        unit = np.where(positive, self.mean, spread)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            in_log = np.log(self.mask / self.mean)
-            in_linear = (self.mask - self.mean) / spread
-        added, removed = (
-            np.where(np.isfinite(part), np.maximum(part, 0.0), math.inf)
-            for part in (self.low - self.outer_low, self.outer_high - self.high)
-        )
-        return Margins(
-            margin=np.where(positive, in_log, in_linear),
-            cumulants=self.cumulants / np.stack([unit**k for k in (2, 3, 4)]),
-            added=np.log1p(added / self.mask),
-            removed=np.log1p(removed / self.mask),
-            can_fail=np.full(self.mean.shape, not self.is_faulty),
+    def result(
+        self, label: ChannelLabel, method: str, found: Comparison, judged: Judged
+    ) -> LimitResult:
+        """Return the verdict on a channel, with the numbers of the band where it does worst."""
+
+        def number(values: FloatArray) -> float:
+            return math.nan if judged.band is None else float(values[judged.band])
+
+        return LimitResult(
+            limit=self.limit.name,
+            sensor=label.sensor,
+            channel=label.channel,
+            method=method,
+            frequency=number(found.centre),
+            noise_psd=number(found.mean),
+            low=number(found.outer_low),
+            high=number(found.outer_high),
+            limit_psd=number(found.mask),
+            verdict=judged.verdict,
+            covers=(self.limit.mask.frequency[0], self.limit.mask.frequency[-1]),
+            judged=self.judged,
+            obstacle=judged.obstacle,
         )
 
 
-def _compare(
-    bench: Bench,
-    limit: Limit,
-    column: int,
-    snapshot: Snapshot,
-    found: Levels | None,
-    *,
-    edges: NDArray[np.int64],
-    quantile: float,
-) -> _Comparison:
-    label, frequency = snapshot.channels[column], snapshot.frequency
+def _centres(frequency: FloatArray, edges: NDArray[np.int64]) -> FloatArray:
     if edges.size < 2:
-        centre = mask = np.empty(0)
-    else:
-        centre = np.sqrt(frequency[edges[:-1]] * frequency[edges[1:] - 1])
-        mask = mean_mask(bench, limit, label, frequency, edges)
-    nothing = np.full(centre.shape, np.nan)
-    mean, cumulants = nothing, np.full((3, *centre.shape), np.nan)
-    scatter = outer = no_clocks = (nothing, nothing)
-    withdrawn = np.zeros(centre.shape, np.bool_)
-    if found is not None and centre.size:
-        complete = found.of_scatter.complete[:, column]
-        mean = np.where(complete, found.mean[:, column], np.nan)
-        cumulants = found.of_scatter.cumulants[:, :, column]
-        scatter, outer, no_clocks = (
-            (ends[0][:, column], ends[1][:, column])
-            for ends in (
-                found.of_scatter.interval(quantile),
-                found.ends(quantile),
-                found.ends(quantile, without={Source.CLOCKS}),
-            )
-        )
-        withdrawn = found.withdrawn(quantile)[:, column]
-    diagnostics = snapshot.diagnostics
-    return _Comparison(
-        limit=limit,
-        label=label,
-        covers=(limit.mask.frequency[0], limit.mask.frequency[-1]),
-        judged=judged_range(snapshot, limit, edges),
-        centre=centre,
-        mask=mask,
-        mean=mean,
-        cumulants=cumulants,
-        low=scatter[0],
-        high=scatter[1],
-        outer_low=outer[0],
-        outer_high=outer[1],
-        no_clocks=no_clocks,
-        averages=averages_at(snapshot, centre),
-        is_alone=np.array(
-            [column in without_partners(snapshot, (f, f)) for f in centre.tolist()], dtype=bool
-        ),
-        is_withdrawn=withdrawn,
-        is_faulty=column in diagnostics.clipped or column in diagnostics.stood_still,
+        return np.empty(0)
+    return np.asarray(np.sqrt(frequency[edges[:-1]] * frequency[edges[1:] - 1]))
+
+
+def _judged_range(
+    frequency: FloatArray, points: FloatArray, edges: NDArray[np.int64], known: float
+) -> tuple[float, float]:
+    """Return from and to which frequency a mask is judged; its own ends where it is to there."""
+    if edges.size < 2:
+        return math.nan, math.nan
+    low, high, spacing = float(points[0]), float(points[-1]), float(frequency[1])
+    first, last = float(frequency[edges[0]]), min(float(frequency[edges[-1] - 1]), known)
+    return (
+        low if low >= spacing else first,
+        high if high <= last + 2 * spacing else last,
     )
 
 
@@ -274,22 +243,3 @@ def _general_obstacles(snapshot: Snapshot) -> set[Obstacle]:
     if not snapshot.diagnostics.synchronisation.is_known:
         found.add(Obstacle.CLOCKS)
     return found
-
-
-def _prediction(
-    found: Sequence[_Comparison], snapshot: Snapshot, quantile: float
-) -> Prediction | None:
-    parts = [each.margins() for each in found]
-    return predict(
-        Margins(
-            margin=np.concatenate([part.margin for part in parts]),
-            cumulants=np.concatenate([part.cumulants for part in parts], axis=1),
-            added=np.concatenate([part.added for part in parts]),
-            removed=np.concatenate([part.removed for part in parts]),
-            can_fail=np.concatenate([part.can_fail for part in parts]),
-        ),
-        quantile=quantile,
-        elapsed=snapshot.elapsed,
-        averages=min(float(each.averages.min()) for each in found),
-        least=MIN_AVERAGES,
-    )

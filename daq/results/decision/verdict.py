@@ -1,52 +1,15 @@
-"""The verdict of a huddle test: pass, fail or not decided, and what keeps it from a decision."""
+"""What a huddle test says of each channel beside each limit of its bench file."""
 
 from __future__ import annotations
 
-import enum
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from daq.bench.units import decibels
 
-
-class Verdict(enum.StrEnum):
-    """Whether the noise is within the limits."""
-
-    PASS = "pass"  # noqa: S105 - no password
-    """All of the interval is below the limit: of every channel at every frequency judged."""
-    FAIL = "fail"
-    """All of the interval is above the limit: of a channel at some frequency."""
-    NOT_DECIDED = "not-decided"
-    """Neither: the interval spans the limit, or something is missing."""
-
-
-class Obstacle(enum.StrEnum):
-    """What keeps a limit from being decided."""
-
-    SENSORS_LOST = "sensors-lost"
-    """Every sensor was lost before the end of the recording."""
-    NO_SEGMENTS = "no-segments"
-    """The recording has no whole segment without gaps."""
-    NO_ESTIMATE = "no-estimate"
-    """The method that judges gives no noise for the channel in a band of the limit."""
-    OUTSIDE_SPECTRUM = "outside-spectrum"
-    """The limit has no frequency in common with the spectrum."""
-    NO_SHARED_MOTION = "no-shared-motion"
-    """A sensor records none of the motion that the others share: no noise can be told from it."""
-    FAULTY_CHANNEL = "faulty-channel"
-    """The channel is clipped or was dead for a while: its noise is lower than the estimate."""
-    MODEL_MISFIT = "model-misfit"
-    """One common motion does not explain the averages: the estimate may be too far off."""
-    CLOCKS = "clocks"
-    """The clocks may have added what is above the limit, or taken it away, or are not known."""
-    TOO_FEW_AVERAGES = "too-few-averages"
-    """With so few averages the interval cannot be trusted."""
-    SPANS_LIMIT = "spans-limit"
-    """The limit lies within the interval: a longer recording narrows it."""
-
-
-REMOVED_BY_TIME = frozenset({Obstacle.TOO_FEW_AVERAGES, Obstacle.SPANS_LIMIT})
-"""Obstacles that a longer recording removes."""
+if TYPE_CHECKING:
+    from estimator.decision.verdict import Obstacle, Prediction, Verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,26 +74,6 @@ class LimitResult:
         if self.known and self.low <= 0:
             return math.inf
         return decibels(self.limit_psd) - decibels(self.low)
-
-
-@dataclass(frozen=True, slots=True)
-class Prediction:
-    """How long a recording takes to decide.
-
-    Attributes
-    ----------
-    seconds : float or None
-        Total length that decides with a probability of 90 %; None where `longest` does not.
-    longest : float
-        The longest recording considered, in seconds.
-    resolution_db : float
-        Half the width of the interval in that recording, in dB, where the noise is closest to the
-        limit.
-    """
-
-    seconds: float | None
-    longest: float
-    resolution_db: float
 
 
 @dataclass(frozen=True, slots=True)

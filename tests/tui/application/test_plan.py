@@ -15,7 +15,7 @@ from daq.errors import HuddleError
 from daq.recording.sensor_state import SensorState
 from daq.results.decision.end import is_reached, is_surely_decided
 from daq.results.decision.limits import judge
-from daq.results.decision.verdict import Verdict
+from estimator.decision.verdict import Verdict
 from tests.tui.application.screen_text import screen_text
 from tests.tui.application.test_app import NARROW, ended, running, shown
 from tests.tui.example_snapshot import (

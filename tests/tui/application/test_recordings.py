@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 from textual.widgets import Input
 
-from daq.results.decision.verdict import Verdict
 from daq.results.store import store_results
+from estimator.decision.verdict import Verdict
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
 from tests.tui.application.test_app import NARROW, WIDE, shown
 from tests.tui.example_snapshot import ProgressCallback, demo_bench, growing, made_snapshot

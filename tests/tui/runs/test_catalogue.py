@@ -11,8 +11,8 @@ from daq.bench.model import Limit
 from daq.errors import RecordingError
 from daq.recording.reader import Recording
 from daq.results.decision.limits import judge
-from daq.results.decision.verdict import Verdict
 from daq.results.store import store_results
+from estimator.decision.verdict import Verdict
 from tests.tui.example_snapshot import SETTINGS, demo_bench, growing, made_snapshot
 from tui.application.recordings_view.rows import about, verdict
 from tui.runs.catalogue import catalogue, delete_recording

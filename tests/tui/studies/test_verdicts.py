@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from daq.results.decision.verdict import Obstacle, Verdict
+from estimator.decision.verdict import Obstacle, Verdict
 from tui.studies.verdicts import WRONG, Outcome, SimulatedTest, outcomes, verdicts
 
 N_TESTS = 60

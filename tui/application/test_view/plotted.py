@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.results.band_summary import levels
-from daq.results.decision.limits import concerns
-from daq.results.decision.mask_bands import mask_psd
+from daq.results.decision.limits import concerns, mask_psd
 from estimator.levels.bands import log_edges
 from tui.application.test_view.clocks import COLOURS
 from tui.application.test_view.curves import data_curve, mask_curve, noise_curve

@@ -12,8 +12,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
 from daq.bench.units import levels_db
 from daq.results.band_summary import levels
-from daq.results.decision.limits import concerns
-from daq.results.decision.mask_bands import mask_psd
+from daq.results.decision.limits import concerns, mask_psd
 from estimator.levels.bands import log_edges
 from tui.report.figures import drawing
 from tui.report.parts import Plot

@@ -14,8 +14,9 @@ from daq.bench.loading import parse
 from daq.estimation.contributions import contributions
 from daq.estimation.snapshot_diagnostics import Synchronisation
 from daq.results.band_summary import channel_means
-from daq.results.decision.limits import MIN_AVERAGES, judge
-from daq.results.decision.verdict import LimitResult, Obstacle, Verdict
+from daq.results.decision.limits import judge
+from estimator.decision.comparison import MIN_AVERAGES
+from estimator.decision.verdict import Obstacle, Verdict
 from estimator.diagnostics.advice import ModelMisfit
 from estimator.diagnostics.kinds import Level
 from estimator.levels.contributions import Source
@@ -28,6 +29,7 @@ from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot
 
 if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
+    from daq.results.decision.verdict import LimitResult
 
 
 def failing(psd: float, more: str = "", *, n_effective: float = 1000.0) -> list[str]:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.results.decision.verdict import Prediction
+from estimator.decision.verdict import Prediction
 from estimator.levels.interval import interval
 
 if TYPE_CHECKING:

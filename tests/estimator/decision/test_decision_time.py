@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from daq.results.decision.decision_time import LIKELY, Margins, predict
+from estimator.decision.decision_time import LIKELY, Margins, predict
 
 if TYPE_CHECKING:
-    from daq.results.decision.verdict import Prediction
+    from estimator.decision.verdict import Prediction
     from estimator.types import FloatArray
 
 QUANTILE = 3.5

@@ -1,0 +1,1 @@
+"""Whether noise is below masks: on arrays alone."""

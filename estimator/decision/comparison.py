@@ -1,0 +1,185 @@
+"""The noise of channels beside masks: which are below for certain, which above.
+
+A channel passes where the whole interval of its band means is below the mask in every band, and
+fails where the whole interval of one band is above it. The intervals hold for all channels, masks
+and bands together (Bonferroni): of tests with all channels just at the mask, one in forty fails.
+
+Noise that is below zero for certain is wrong, so it decides nothing. Of a channel that is clipped,
+or was dead for a while, the estimate is an upper bound.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.decision.decision_time import Margins, predict
+from estimator.decision.verdict import REMOVED_BY_TIME, Obstacle, Verdict
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+
+    from estimator.decision.verdict import Prediction
+    from estimator.types import BoolArray, FloatArray
+
+MIN_AVERAGES = 20.0
+"""Averages below which the far tails of the interval have not been verified by simulation."""
+
+
+def joint_quantile(n_bands: int) -> float:
+    """Return the standard deviations to either end of intervals that hold for all bands at once."""
+    return NormalDist().inv_cdf(1 - 0.025 / max(1, n_bands))
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """One channel beside one mask.
+
+    Attributes
+    ----------
+    verdict : Verdict
+    band : int or None
+        Where the channel does worst; None without an estimate in any band.
+    obstacle : Obstacle or None
+        None where it is decided.
+    """
+
+    verdict: Verdict
+    band: int | None
+    obstacle: Obstacle | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """The noise of one channel beside one mask in all bands of it; arrays of shape (n_bands,).
+
+    `outer_low` and `outer_high` are the ends of the interval with all that widens it; `low` and
+    `high` those by the scatter of the estimate alone, `no_clocks` the ends without what the clocks
+    do. NaN in bands without an estimate.
+    """
+
+    centre: FloatArray
+    mask: FloatArray
+    mean: FloatArray
+    cumulants: FloatArray
+    low: FloatArray
+    high: FloatArray
+    outer_low: FloatArray
+    outer_high: FloatArray
+    no_clocks: tuple[FloatArray, FloatArray]
+    averages: FloatArray
+    is_alone: BoolArray
+    is_withdrawn: BoolArray
+    is_faulty: bool
+
+    def judged(self) -> Judged:
+        """Return the verdict, and the band where the channel does worst."""
+        known = np.isfinite(self.mean)
+        if not known.any():
+            why = Obstacle.NO_ESTIMATE if self.centre.size else Obstacle.OUTSIDE_SPECTRUM
+            return Judged(Verdict.NOT_DECIDED, None, why)
+        trusted = known & (self.averages >= MIN_AVERAGES) & ~self.is_alone
+        above = np.where(trusted, self.outer_low / self.mask, -math.inf)
+        if above.max() > 1:
+            return Judged(Verdict.FAIL, int(above.argmax()))
+        highest = np.where(known, self.outer_high / self.mask, -math.inf)
+        worst = int(highest.argmax())
+        if trusted.all() and highest.max() <= 1 and self.outer_high.min() > 0:
+            return Judged(Verdict.PASS, worst)
+        return Judged(Verdict.NOT_DECIDED, worst, self._obstacle(known, trusted))
+
+    def _obstacle(self, known: BoolArray, trusted: BoolArray) -> Obstacle:
+        """Return what keeps the limit from being decided."""
+        would_fail = bool((self.low > self.mask).any())  # by scatter alone
+        would_pass = bool((self.high <= self.mask).all())
+        low, high = self.no_clocks
+        by_clocks = bool(((low > self.mask) & (self.outer_low <= self.mask)).any())
+        by_clocks |= bool((high <= self.mask).all() and (self.outer_high > self.mask).any())
+        reads_high = self.is_faulty and (would_fail or bool((self.mean > self.mask).any()))
+        reasons = (
+            (Obstacle.NO_ESTIMATE, not known.all()),
+            (Obstacle.NO_SHARED_MOTION, bool(self.is_alone.any())),
+            (Obstacle.TOO_FEW_AVERAGES, not trusted.all()),
+            (Obstacle.FAULTY_CHANNEL, reads_high),
+            (Obstacle.CLOCKS, by_clocks),
+            (Obstacle.MODEL_MISFIT, would_fail or would_pass or bool(self.is_withdrawn.any())),
+        )
+        return next((reason for reason, holds in reasons if holds), Obstacle.SPANS_LIMIT)
+
+    def margins(self) -> Margins:
+        """Return the margins for a prediction; where the mean is not positive, from its spread."""
+        spread = np.sqrt(np.maximum(self.cumulants[0], 0.0))
+        positive = self.mean > 0
+        unit = np.where(positive, self.mean, spread)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            in_log = np.log(self.mask / self.mean)
+            in_linear = (self.mask - self.mean) / spread
+        added, removed = (
+            np.where(np.isfinite(part), np.maximum(part, 0.0), math.inf)
+            for part in (self.low - self.outer_low, self.outer_high - self.high)
+        )
+        return Margins(
+            margin=np.where(positive, in_log, in_linear),
+            cumulants=self.cumulants / np.stack([unit**k for k in (2, 3, 4)]),
+            added=np.log1p(added / self.mask),
+            removed=np.log1p(removed / self.mask),
+            can_fail=np.full(self.mean.shape, not self.is_faulty),
+        )
+
+
+def whole(
+    judged: Sequence[Judged], general: Collection[Obstacle], *, is_complete: bool
+) -> tuple[Verdict, tuple[Obstacle, ...]]:
+    """Return the verdict on all channels and masks together, and what keeps it from a decision.
+
+    Parameters
+    ----------
+    judged : sequence of Judged
+    general : collection of Obstacle
+        What keeps the whole test from a decision.
+    is_complete : bool
+        Whether all channels are among them.
+    """
+    of_channels = {each.obstacle for each in judged if each.obstacle is not None}
+    obstacles = tuple(each for each in Obstacle if each in general or each in of_channels)
+    verdicts = {each.verdict for each in judged}
+    if general or not judged:
+        return Verdict.NOT_DECIDED, obstacles
+    if Verdict.FAIL in verdicts:
+        return Verdict.FAIL, tuple(each for each in obstacles if each not in REMOVED_BY_TIME)
+    if Verdict.NOT_DECIDED in verdicts or not is_complete:
+        return Verdict.NOT_DECIDED, obstacles
+    return Verdict.PASS, obstacles
+
+
+def prediction(
+    found: Sequence[Comparison],
+    obstacles: Collection[Obstacle],
+    *,
+    quantile: float,
+    elapsed: float,
+) -> Prediction | None:
+    """Return how long a recording takes to decide; None where something else than time is missing.
+
+    `elapsed` is the length of the recording so far, in seconds.
+    """
+    if not obstacles or not set(obstacles) <= REMOVED_BY_TIME:
+        return None
+    parts = [each.margins() for each in found]
+    return predict(
+        Margins(
+            margin=np.concatenate([part.margin for part in parts]),
+            cumulants=np.concatenate([part.cumulants for part in parts], axis=1),
+            added=np.concatenate([part.added for part in parts]),
+            removed=np.concatenate([part.removed for part in parts]),
+            can_fail=np.concatenate([part.can_fail for part in parts]),
+        ),
+        quantile=quantile,
+        elapsed=elapsed,
+        averages=min(float(each.averages.min()) for each in found),
+        least=MIN_AVERAGES,
+    )

@@ -1,0 +1,89 @@
+"""Whether noise is below a mask, on arrays alone."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from estimator.decision.comparison import Comparison, joint_quantile, prediction, whole
+from estimator.decision.verdict import Obstacle, Verdict
+
+QUANTILE = joint_quantile(3)
+
+
+def comparison(low: float, high: float, *, mask: float = 1.0, **changes: Any) -> Comparison:  # noqa: ANN401 - fields
+    """Return three bands of which the first two are well below the mask."""
+    mean = np.array([0.1, 0.1, (low + high) / 2])
+    ends = np.array([0.05, 0.05, low]), np.array([0.2, 0.2, high])
+    fields = {
+        "centre": np.array([1.0, 2.0, 4.0]),
+        "mask": np.full(3, mask),
+        "mean": mean,
+        "cumulants": np.stack([mean**k * 0.01 ** (k - 1) for k in (2, 3, 4)]),
+        "low": ends[0],
+        "high": ends[1],
+        "outer_low": ends[0],
+        "outer_high": ends[1],
+        "no_clocks": ends,
+        "averages": np.full(3, 100.0),
+        "is_alone": np.zeros(3, np.bool_),
+        "is_withdrawn": np.zeros(3, np.bool_),
+        "is_faulty": False,
+    } | changes
+    return Comparison(**fields)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "verdict", "obstacle"),
+    [
+        (0.2, 0.9, Verdict.PASS, None),
+        (1.1, 2.0, Verdict.FAIL, None),
+        (0.5, 2.0, Verdict.NOT_DECIDED, Obstacle.SPANS_LIMIT),
+        (-math.inf, math.inf, Verdict.NOT_DECIDED, Obstacle.NO_ESTIMATE),  # its mean is NaN
+        (-0.5, -0.1, Verdict.NOT_DECIDED, Obstacle.MODEL_MISFIT),  # below zero for certain
+    ],
+)
+def test_all_of_an_interval_decides(
+    low: float, high: float, verdict: Verdict, obstacle: Obstacle | None
+) -> None:
+    with np.errstate(invalid="ignore"):
+        judged = comparison(low, high).judged()
+    assert (judged.verdict, judged.obstacle) == (verdict, obstacle)
+    assert judged.band in {2, 0} if obstacle is Obstacle.NO_ESTIMATE else judged.band is not None
+
+
+def test_few_averages_and_channels_without_partners_decide_nothing() -> None:
+    few = comparison(1.1, 2.0, averages=np.full(3, 19.0)).judged()
+    assert few.obstacle is Obstacle.TOO_FEW_AVERAGES
+    alone = comparison(1.1, 2.0, is_alone=np.array([False, False, True])).judged()
+    assert alone.obstacle is Obstacle.NO_SHARED_MOTION
+    nothing = comparison(1.1, 2.0, mean=np.full(3, np.nan)).judged()
+    assert (nothing.band, nothing.obstacle) == (None, Obstacle.NO_ESTIMATE)
+
+
+def test_the_whole_verdict() -> None:
+    good, bad, open_ = (comparison(*e).judged() for e in ((0.2, 0.9), (1.1, 2.0), (0.5, 2.0)))
+    assert whole([good, good], (), is_complete=True) == (Verdict.PASS, ())
+    assert whole([good], (), is_complete=False)[0] is Verdict.NOT_DECIDED
+    assert whole([good, bad, open_], (), is_complete=True) == (Verdict.FAIL, ())
+    assert whole([good, open_], (), is_complete=True)[1] == (Obstacle.SPANS_LIMIT,)
+    assert whole([bad], {Obstacle.CLOCKS}, is_complete=True)[0] is Verdict.NOT_DECIDED
+    assert whole([], (), is_complete=True)[0] is Verdict.NOT_DECIDED
+
+
+def test_only_what_time_removes_is_predicted() -> None:
+    found = [comparison(0.5, 1.2)]
+    ahead = prediction(found, [Obstacle.SPANS_LIMIT], quantile=QUANTILE, elapsed=100.0)
+    assert ahead is not None
+    assert ahead.longest > 100.0
+    assert ahead.resolution_db < 0.1
+    assert prediction(found, [Obstacle.CLOCKS], quantile=QUANTILE, elapsed=100.0) is None
+    assert prediction(found, [], quantile=QUANTILE, elapsed=100.0) is None
+
+
+def test_more_bands_take_wider_intervals() -> None:
+    assert joint_quantile(1) == pytest.approx(1.96, abs=0.001)
+    assert joint_quantile(81) > 3.4
