@@ -6,7 +6,7 @@ PEER := tests/peers/async_labjack_peer
 PEER_CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/huddle-tests/async_labjack
 SOURCES := huddle.py daq estimator sim_devices tui tests benchmarks docs examples
 
-.PHONY: demo test test-long peers check bench docs session torture clean
+.PHONY: demo test test-long peers check bench studies docs session torture clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -17,7 +17,11 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	touch $@
 
-$(VENV)/.installed-docs: $(VENV)/.installed
+$(VENV)/.installed-studies: $(VENV)/.installed-dev  ## coverage of intervals and verdicts; hours
+	$(BIN)/python -m benchmarks.studies.levels
+	$(BIN)/python -m benchmarks.studies.leaning
+
+docs: $(VENV)/.installed
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
 	touch $@
 

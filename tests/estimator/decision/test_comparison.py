@@ -18,7 +18,7 @@ def comparison(low: float, high: float, *, mask: float = 1.0, **changes: Any) ->
     """Return three bands of which the first two are well below the mask."""
     mean = np.array([0.1, 0.1, (low + high) / 2])
     ends = np.array([0.05, 0.05, low]), np.array([0.2, 0.2, high])
-    fields = {
+    fields: dict[str, Any] = {
         "centre": np.array([1.0, 2.0, 4.0]),
         "mask": np.full(3, mask),
         "mean": mean,

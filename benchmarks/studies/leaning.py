@@ -1,0 +1,120 @@
+"""Sensors of one and two channels off plumb before motion in three dimensions.
+
+``python -m benchmarks.studies.leaning [BENCHES]`` prints the tables of
+``docs/validation/levels.md``: coverage, verdicts on limits 3 dB above and below the truth, and the
+half-width with twelve sensors. Nothing but the recording of arrays is shared with the estimator.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib import resources
+
+import numpy as np
+
+from daq.bench.model import Limit
+from daq.drivers.bench_file import parse
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.formats.arrays import recording_of_arrays
+from daq.results.band_summary import channel_means
+from daq.results.decision.limits import judge
+from estimator.decision.verdict import Verdict
+
+RATE, SECONDS = 100.0, 600.0
+TRUTH = 2 / RATE
+"""PSD of noise of variance 1."""
+BANDS = ((2.0, 10.0), (10.0, 30.0), (5.0, 6.0))
+SETTINGS = Settings(segment=2.0)
+BENCH = parse(resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8"))
+
+
+def leaning(
+    rng: np.random.Generator, *, n_sensors: int, n_channels: int, degrees: float, snr: float
+) -> dict[str, np.ndarray]:
+    """Return samples of sensors of unit noise whose axes are off by so much, rms."""
+    n = round(SECONDS * RATE)
+    motion = np.sqrt(snr) * rng.standard_normal((n, 3))
+    samples = {}
+    for number in range(n_sensors):
+        axes = np.eye(3)[::-1][:n_channels].copy()  # z, then y
+        across = np.radians(degrees) / np.sqrt(2) * rng.standard_normal((n_channels, 3))
+        axes += across * (axes == 0)
+        gains = 1 + 0.01 * rng.standard_normal((n_channels, 1))
+        noise = rng.standard_normal((n, n_channels))
+        samples[f"s{number:02}"] = motion @ (axes * gains).T + noise
+    return samples
+
+
+def random_benches(n_benches: int) -> None:
+    """Print coverage and verdicts of benches drawn at random."""
+    held: list[float] = []
+    wrong = decided = total = 0
+    for number in range(n_benches):
+        rng = np.random.default_rng([23, number])
+        n_sensors, n_channels = int(rng.integers(3, 13)), int(rng.integers(1, 3))
+        samples = leaning(
+            rng,
+            n_sensors=n_sensors,
+            n_channels=n_channels,
+            degrees=float(rng.uniform(0.1, 1.0)),
+            snr=10 ** rng.uniform(3, 5),
+        )
+        recording = recording_of_arrays(samples, RATE, channels="ZY"[:n_channels])
+        snapshot = estimate([recording], SETTINGS)
+        (noise,) = snapshot.results.values()
+        held += [
+            float(mean.low[0]) <= TRUTH <= float(mean.high[0])
+            for band in BANDS
+            for mean in channel_means(noise, snapshot, SETTINGS, band)
+        ]
+        factors = 2.0 ** rng.choice([-1, 1], len(snapshot.channels))
+        limits = tuple(
+            Limit(
+                name=label.name,
+                frequency=(2.0, 30.0),
+                psd=(TRUTH * factor,) * 2,
+                sensors=(label.sensor,),
+                channels=(label.channel,),
+            )
+            for label, factor in zip(snapshot.channels, factors.tolist(), strict=True)
+        )
+        found = judge(BENCH.model_copy(update={"limits": limits}), snapshot, SETTINGS)
+        assert found is not None
+        for result, factor in zip(found.limits, factors.tolist(), strict=True):
+            right = Verdict.PASS if factor > 1 else Verdict.FAIL
+            total += 1
+            decided += result.verdict is not Verdict.NOT_DECIDED
+            wrong += result.verdict not in {right, Verdict.NOT_DECIDED}
+    print(
+        f"{n_benches} benches: intervals cover {np.mean(held):.3f};"
+        f" of {total} verdicts {decided} decided, {wrong} wrong ({wrong / total:.1%})"
+    )
+
+
+def plumb() -> None:
+    """Print what single-axis sensors 1° off plumb at SNR 5e4 give."""
+    print("| sensors | covered | median upper end, dB | median estimate / truth | method |")
+    print("|---|---|---|---|---|")
+    for n_sensors in (3, 5, 6, 7, 12):
+        held, ends, ratios, method = [], [], [], ""
+        for number in range(20):
+            rng = np.random.default_rng([29, n_sensors, number])
+            samples = leaning(rng, n_sensors=n_sensors, n_channels=1, degrees=1.0, snr=5e4)
+            snapshot = estimate([recording_of_arrays(samples, RATE)], SETTINGS)
+            ((method, noise),) = snapshot.results.items()
+            for band in BANDS:
+                for mean in channel_means(noise, snapshot, SETTINGS, band):
+                    held.append(float(mean.low[0]) <= TRUTH <= float(mean.high[0]))
+                    ends.append(10 * np.log10(float(mean.high[0]) / TRUTH))
+                    ratios.append(float(mean.mean[0]) / TRUTH)
+        print(
+            f"| {n_sensors} | {np.mean(held):.3f} | {np.median(ends):.2f} |"
+            f" {np.median(ratios):.2f} | {method} |",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    plumb()
+    random_benches(int(sys.argv[1]) if len(sys.argv) > 1 else 200)
