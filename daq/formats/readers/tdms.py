@@ -80,7 +80,7 @@ class TdmsPart:
             start_ns=int(start.astype(np.int64)) + round(offset * NS_PER_S),
             sampling_rate=rate,
             samples=samples,
-            unit=str(properties.get("unit_string", "")),
+            unit=str(properties.get("unit_string") or properties.get("NI_UnitDescription") or ""),
         )
 
 

@@ -1,8 +1,9 @@
 """Time responses of universal files (UFF 58), read by pyuff, and WAV files, read by scipy.
 
 In a universal file a node is a sensor, named by its entity if there is one; its channels are the
-directions X, Y, Z. In a WAV file the file is a sensor, its channels are numbered. Neither has a
-date. 24-bit samples of WAV files are in the upper bits of 32, as scipy returns them.
+directions X, Y, Z; the unit is that of the label, or else follows from the data type and the units
+of data set 164. In a WAV file the file is a sensor, its channels are numbered. Neither has a date.
+24-bit samples of WAV files are in the upper bits of 32, as scipy returns them.
 """
 
 from __future__ import annotations
@@ -13,16 +14,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daq.errors import ImportFormatError
-from daq.formats.foreign_sensor import NS_PER_S, ForeignSensor, finite_stretches
+from daq.formats.foreign_sensor import NS_PER_S, Calibration, ForeignSensor, finite_stretches
 from daq.formats.readers.packages import load
 from daq.formats.traces import Trace
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+_FUNCTION = 58
+_UNITS = 164
 _TIME_RESPONSE = 1
 _EVEN = 1
 _DIRECTIONS = {0: "S", 1: "X", 2: "Y", 3: "Z", 4: "RX", 5: "RY", 6: "RZ"}
+_QUANTITIES = {8: "m", 11: "m/s", 12: "m/s²"}
+"""By the ordinate's specific data type: displacement, velocity, acceleration."""
 _UINT8_ZERO = 128
 
 
@@ -39,9 +44,14 @@ def read_uff(path: Path) -> list[Trace]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             file = pyuff.UFF(str(path))
-            numbers = [n for n, kind in enumerate(file.get_set_types()) if int(kind) == 58]
+            kinds = [int(kind) for kind in file.get_set_types()]
+            numbers = [n for n, kind in enumerate(kinds) if kind == _FUNCTION]
             sets = [file.read_sets(number) for number in numbers]
-            traces = [_trace(each) for each in sets if int(each["func_type"]) == _TIME_RESPONSE]
+            length = 1.0
+            if _UNITS in kinds:
+                length = float(file.read_sets(kinds.index(_UNITS))["length"])
+            responses = [each for each in sets if int(each["func_type"]) == _TIME_RESPONSE]
+            traces = [_trace(each, length) for each in responses]
     except Exception as error:
         raise ImportFormatError(f"{path}: pyuff cannot read it: {error}") from error
     if not traces:
@@ -52,7 +62,8 @@ def read_uff(path: Path) -> list[Trace]:
     return traces
 
 
-def _trace(function: dict[str, Any]) -> Trace:
+def _trace(function: dict[str, Any], length: float) -> Trace:
+    """Return a function as a trace; values of its unit system are `length` in a metre."""
     interval = float(function.get("abscissa_inc") or 0)
     if int(function.get("abscissa_spacing", _EVEN)) != _EVEN or interval <= 0:
         raise ValueError(f"an interval of {interval} s; expected evenly spaced samples")
@@ -61,13 +72,23 @@ def _trace(function: dict[str, Any]) -> Trace:
     name = f"{entity}.{node}" if entity and entity != "NONE" else node
     axis = _DIRECTIONS.get(abs(direction), str(direction))
     unit = str(function.get("ordinate_axis_units_lab") or "").strip()
+    unit = "" if unit.upper() == "NONE" else unit
+    calibration = None
+    if not unit:
+        quantity = _QUANTITIES.get(int(function.get("ordinate_spec_data_type") or 0), "")
+        if length == 1:
+            unit = quantity
+        elif quantity and length > 0:
+            origin = f"data type of UFF 58, with {length:g} length units in a metre of UFF 164"
+            calibration = Calibration(length, quantity, origin)
     return Trace(
         sensor=name,
         channel=f"-{axis}" if direction < 0 else axis,
         start_ns=round(float(function.get("abscissa_min") or 0) * NS_PER_S),
         sampling_rate=_rate(interval),
         samples=np.asarray(function["data"]),
-        unit="" if unit == "NONE" else unit,
+        unit=unit,
+        calibration=calibration,
     )
 
 

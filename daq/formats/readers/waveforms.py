@@ -1,19 +1,23 @@
 """Waveform formats that ObsPy reads: SAC, GSE2, GCF, SEG-2, SEG-Y and others.
 
 A sensor is ``network.station.location``, its channels are the channel codes. In SEG-2 and SEG-Y
-every trace is a sensor with one channel, named by the number of the trace.
+every trace is a sensor with one channel, named by the number of the trace. Samples stay counts; the
+calibrations that K-NET, Kinemetrics EVT, GSE2 and SEG-2 carry come along.
 """
 
 from __future__ import annotations
 
 import glob
+import math
 import warnings
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from daq.bench.units import STANDARD_GRAVITY
 from daq.errors import ImportFormatError
+from daq.formats.foreign_sensor import Calibration
 from daq.formats.readers.packages import load
 from daq.formats.traces import FilePart, LoadedPart, Trace
 
@@ -28,6 +32,7 @@ FORMATS = (
 """Waveform formats that are read, by ObsPy's names, in the order in which they are tried."""
 _NUMBERED = {"SEGY", "SEG2"}
 """Formats whose traces have numbers and no codes."""
+_EVT_FULL_SCALE = 1 << 23
 _HEAD = 4096
 _RESPONSES = (b"B050F03", b"FDSNStationXML")  # RESP, StationXML
 
@@ -106,6 +111,50 @@ def _traces(stream: Stream, fallback: str, *, numbered: bool) -> list[Trace]:
                 sampling_rate=float(stats.sampling_rate),
                 samples=np.asarray(trace.data),
                 fdsn=bool(codes) and not numbered,
+                calibration=_calibration(stats),
             )
         )
     return found
+
+
+def _calibration(stats: Any) -> Calibration | None:  # noqa: ANN401 - ObsPy has no types
+    """Return what the header of a trace says a count is; None where that is unknown."""
+    kind = str(stats.get("_format", ""))
+    if kind == "KNET":
+        return Calibration.of_count(float(stats.calib), "m/s²", "scale factor of K-NET")
+    if kind == "KINEMETRICS_EVT":
+        return _kinemetrics(stats.kinemetrics_evt)
+    if kind == "GSE2":
+        return _gse2(float(stats.calib), float(stats.gse2.calper), str(stats.gse2.instype))
+    if kind == "SEG2" and "DESCALING_FACTOR" in stats.seg2:
+        stacked = str(stats.seg2.get("STACK", "1")).strip()
+        origin = "descaling factor of SEG-2, at the receiver"
+        origin += "" if stacked in {"", "1"} else f"; a stack of {stacked}"
+        return Calibration.of_count(1e-3 * float(stats.calib), "V", origin)
+    return None
+
+
+def _kinemetrics(header: Any) -> Calibration | None:  # noqa: ANN401 - see above
+    """Return m/s² of a count, from V of full scale (23 bits and sign) and V per g of the sensor."""
+    full_scale, per_g = float(header.chan_fullscale), float(header.chan_sensitivity)
+    if not full_scale or not per_g:
+        return None
+    return Calibration.of_count(
+        full_scale / _EVT_FULL_SCALE / per_g * STANDARD_GRAVITY,
+        "m/s²",
+        "full scale and sensitivity of Kinemetrics EVT",
+        model=str(header.instrument),
+        serial_number=str(header.serialnumber),
+    )
+
+
+def _gse2(calib: float, period: float, model: str) -> Calibration | None:
+    """Return the calibration of nm in a count at a period; 1 at 1 s is what writers put by default.
+
+    In velocity: what seismometers are flat in.
+    """
+    if period <= 0 or (calib, period) == (1.0, 1.0):
+        return None
+    origin = f"CALIB of GSE2, known at {period:g} s and taken as flat in velocity"
+    velocity = 1e-9 * calib * 2 * math.pi / period
+    return Calibration.of_count(velocity, "m/s", origin, model=model.strip())
