@@ -2,7 +2,7 @@
 
 >>> import huddle
 >>> sensors = huddle.simulate("fig9", duration="2min")
->>> result = huddle.self_noise(sensors, fs=sensors.fs, unit="m/s²")
+>>> result = huddle.self_noise(sensors, fs=sensors.fs, sample_unit="m/s²")
 >>> result.noise_psd.shape
 (1001, 6)
 

@@ -21,7 +21,12 @@ a, b, c = (np.array(samples[name]) for name in "ABC")
 b[30_000:30_050] = np.nan  # lost samples
 
 result = huddle.self_noise(
-    {"A": a, "B": b, "C": c}, fs=fs, channels="XYZ", segment="5s", unit="m/s²", method="all"
+    {"A": a, "B": b, "C": c},
+    fs=fs,
+    channels="XYZ",
+    sample_unit="m/s²",
+    segment="5s",
+    method="all",
 )
 print(result)
 

@@ -15,7 +15,7 @@ from scipy import signal
 from typer.testing import CliRunner
 
 import huddle
-from daq.errors import WrongSettingError
+from daq.errors import ArrayError, ImportFormatError, WrongSettingError
 from estimator.errors import BandError
 from tui.cli.main import app
 from tui.output import extras
@@ -145,8 +145,47 @@ def test_a_unit_of_the_samples_is_turned_into_that_of_the_motion() -> None:
     np.testing.assert_allclose(
         motion.data_psd[1:], velocity.data_psd[1:] * (omega[1:] * 1e-3) ** 2, rtol=1e-12
     )
-    assert huddle.self_noise(sensors, fs=RATE, unit="m/s²", segment="1s").unit == "m/s²"
     assert huddle.self_noise(sensors, fs=RATE, segment="1s").unit == "counts"
+
+
+def test_counts_are_not_called_motion(tmp_path: Path) -> None:
+    sensors = triaxial()
+    with pytest.raises(ArrayError, match=r"A\.1 are counts.*response=.*sample_unit="):
+        huddle.self_noise(sensors, fs=RATE, unit="m/s²", segment="1s")
+    inventory: Any = pytest.importorskip("obspy", reason="ObsPy is an extra").core.inventory
+    stage = inventory.PolesZerosResponseStage(
+        stage_sequence_number=1,
+        stage_gain=5e4,
+        stage_gain_frequency=10.0,
+        input_units="M/S",
+        output_units="COUNTS",
+        pz_transfer_function_type="LAPLACE (RADIANS/SECOND)",
+        normalization_frequency=10.0,
+        normalization_factor=abs((20j * np.pi + 20) ** 2 + 400) / (20 * np.pi) ** 2,
+        zeros=[0, 0],
+        poles=[-20 + 20j, -20 - 20j],
+    )
+    response = inventory.Response(response_stages=[stage])
+    channel = inventory.Channel("HHZ", "00", 0, 0, 0, 0, response=response, sample_rate=RATE)
+    station = inventory.Station("ABC", 0, 0, 0, channels=[channel])
+    found = inventory.Inventory([inventory.Network("XX", [station])], source="test")
+    found.write(str(tmp_path / "a.xml"), format="STATIONXML")
+    for given in (tmp_path / "a.xml", str(tmp_path / "a.xml"), found, [found]):
+        result = huddle.self_noise(
+            sensors, fs=RATE, unit="m/s", segment="1s", response={"*": given}
+        )
+        plain = huddle.self_noise(sensors, fs=RATE, segment="1s")
+        s = 2j * np.pi * result.frequency[1:]
+        at_10 = 20j * np.pi
+        size = np.abs(s**2 / ((s + 20 - 20j) * (s + 20 + 20j)))
+        size *= 5e4 / np.abs(at_10**2 / ((at_10 + 20 - 20j) * (at_10 + 20 + 20j)))
+        np.testing.assert_allclose(
+            result.data_psd[1:], plain.data_psd[1:] / size[:, None] ** 2, rtol=1e-9
+        )
+    with pytest.raises(ImportFormatError, match=r"no response for A\.1; .*XX\.ABC\.00\.HHZ"):
+        huddle.self_noise(sensors, fs=RATE, segment="1s", response=found)
+    with pytest.raises(ArrayError, match="expected one of the two"):
+        huddle.self_noise(sensors, fs=RATE, segment="1s", response=found, sample_unit="m/s")
 
 
 def test_data_arrays_keep_their_unit_and_times() -> None:

@@ -49,7 +49,7 @@ def test_a_simulation_is_estimated_from_memory_and_from_its_recording(tmp_path: 
     simulation = huddle.simulate("fig9", duration="4min")
     assert simulation.fs == {"i": 200.0, "j": 200.0, "k": 200.0}
     assert {array.shape for array in simulation.values()} == {(48_000, 2)}
-    result = huddle.self_noise(simulation, fs=simulation.fs, unit="m/s²", segment="2s")
+    result = huddle.self_noise(simulation, fs=simulation.fs, sample_unit="m/s²", segment="2s")
     band = result.band(5, 60)
     inside = (result.frequency >= 5) & (result.frequency <= 60)
     truth = simulation.true_noise_psd(result.frequency[inside]).mean(axis=0)

@@ -24,6 +24,8 @@ from daq.formats.readers.waveforms import stream_part
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from daq.formats.response import Responses
+
     Samples: TypeAlias = NDArray[Any]
 
 NAME = "arrays"
@@ -62,7 +64,7 @@ def recording_of_arrays(
     *,
     channels: Sequence[str] | None = None,
     unit: str | None = None,
-    usual_unit: str | None = None,
+    responses: Responses | None = None,
 ) -> RecordingInMemory:
     """Return a recording of samples that are in memory; they are not copied.
 
@@ -76,20 +78,21 @@ def recording_of_arrays(
     channels : sequence of str, optional
         Names of the channels, the same for every sensor; "1", "2", … if not given.
     unit : str, optional
-        Unit of the samples, whatever the arrays say.
-    usual_unit : str, optional
-        Unit of the samples where neither `unit` nor the array says; "counts" if not given.
+        Unit of the samples, whatever the arrays say. Where it is not given and the array does not
+        say either, samples are counts.
+    responses : Responses, optional
+        Responses of the channels, by code and date.
 
     Raises
     ------
     ArrayError
         With the sensor, what was given and what was expected.
     ImportFormatError
-        If the traces of one sensor do not fit together.
+        If the traces of one sensor do not fit together, or a channel has no response.
     """
     given = _sensors(sensors, sampling_rate, channels)
     _check_together(given)
-    in_memory = [_in_memory(each, unit or each.unit or usual_unit or COUNTS) for each in given]
+    in_memory = [_in_memory(each, unit, responses) for each in given]
     return RecordingInMemory(in_memory, NAME)
 
 
@@ -296,14 +299,23 @@ def _duration(given: _Sensor) -> float:
     return given.n_samples / given.foreign.sampling_rate
 
 
-def _in_memory(given: _Sensor, unit: str) -> SensorInMemory:
-    known = canonical(unit)
-    return SensorInMemory(
-        given.foreign,
-        tuple(
-            Channel(name=channel, sensitivity=1.0, unit=known) for channel in given.foreign.channels
-        ),
-    )
+def _in_memory(given: _Sensor, unit: str | None, responses: Responses | None) -> SensorInMemory:
+    foreign = given.foreign
+    own = foreign.calibrations or (None,) * len(foreign.channels)
+    channels = []
+    for name, calibration in zip(foreign.channels, own, strict=True):
+        channel = Channel(name=name, sensitivity=1.0, unit=canonical(unit or given.unit or COUNTS))
+        if calibration is not None and not unit:
+            channel = Channel(
+                name=name, sensitivity=calibration.sensitivity, unit=canonical(calibration.unit)
+            )
+        known = responses and responses.of(foreign.name, name, foreign.dated_spans_ns())
+        if known:
+            channel = Channel(
+                name=name, sensitivity=known.sensitivity, unit=known.unit, response=known.shape
+            )
+        channels.append(channel)
+    return SensorInMemory(foreign, tuple(channels))
 
 
 def _described(value: object) -> str:

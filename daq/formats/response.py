@@ -14,6 +14,7 @@ import warnings
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,7 +34,6 @@ from daq.formats.readers.waveforms import load_obspy
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
-    from pathlib import Path
 
     from daq.bench.response import Stage
 
@@ -141,9 +141,10 @@ class Responses:
 
     Parameters
     ----------
-    files : sequence of Path
-        RESP or StationXML, and folders of them; each channel takes the response of its own code.
-    assigned : sequence of (str, Path)
+    files : sequence of Path or Inventory
+        RESP or StationXML, folders of them, or inventories of ObsPy; each channel takes the
+        response of its own code.
+    assigned : sequence of (str, Path or Inventory)
         Patterns of ``network.station.location.channel``, of a sensor or of a channel code, each
         with a file whose response those channels take whatever its code is. A sensor and a
         digitizer in two files are joined.
@@ -154,7 +155,9 @@ class Responses:
         ObsPy is absent, or a file holds no response that it understands.
     """
 
-    def __init__(self, files: Sequence[Path], assigned: Sequence[tuple[str, Path]] = ()) -> None:
+    def __init__(
+        self, files: Sequence[Path | Any], assigned: Sequence[tuple[str, Path | Any]] = ()
+    ) -> None:
         self._epochs = _read_all(files)
         self._assigned = [(pattern, _read_all([path])) for pattern, path in assigned]
 
@@ -210,11 +213,13 @@ class Responses:
         )
 
 
-def _read_all(paths: Sequence[Path]) -> list[_Epoch]:
+def _read_all(paths: Sequence[Path | Any]) -> list[_Epoch]:
     """Return the channel epochs of files, and of those in folders that hold responses."""
     found: list[_Epoch] = []
     for path in paths:
-        if path.is_dir():
+        if hasattr(path, "networks"):
+            epochs = _epochs_of(path, Path("inventory"))
+        elif path.is_dir():
             inside = (each for each in sorted(path.rglob("*")) if each.is_file())
             epochs = [
                 epoch for each in inside if _format_of(each) is not None for epoch in _read(each)
@@ -228,7 +233,7 @@ def _read_all(paths: Sequence[Path]) -> list[_Epoch]:
 
 
 def _read(path: Path) -> list[_Epoch]:
-    """Return the channel epochs of a file that have stages, those of a channel in order."""
+    """Return the channel epochs of a file."""
     obspy = load_obspy()
     if not path.is_file():
         raise ImportFormatError(f"{path}: no such file; expected RESP or StationXML")
@@ -246,6 +251,11 @@ def _read(path: Path) -> list[_Epoch]:
         raise ImportFormatError(
             f"{path}: expected a RESP or StationXML file; ObsPy cannot read it: {error}"
         ) from error
+    return _epochs_of(inventory, path)
+
+
+def _epochs_of(inventory: Any, path: Path) -> list[_Epoch]:  # noqa: ANN401 - ObsPy has no types
+    """Return the channel epochs of an inventory that have stages, those of a channel in order."""
     by_channel: dict[tuple[str, str], list[_Epoch]] = {}
     for network in inventory:
         for station in network:

@@ -8,10 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, Unpack
 
+from daq.bench.units import is_motion
 from daq.errors import ArrayError, WrongSettingError
 from daq.estimation.estimation import Estimation
 from daq.estimation.settings import Settings, check_fit
-from daq.formats.arrays import recording_of_arrays
+from daq.formats.arrays import COUNTS, recording_of_arrays
 from daq.recording.reader import Recording
 from tui.notebook.options import EstimateOptions, Time, called, moment, settings_of
 from tui.notebook.result import Result
@@ -19,9 +20,12 @@ from tui.notebook.result import Result
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from daq.formats.response import Responses
     from daq.recording.interface import ReadableRecording, ReadableSensor
 
 PathLike: TypeAlias = "str | os.PathLike[str]"
+Response: TypeAlias = "PathLike | Any"
+"""A file or folder of responses, or an Inventory of ObsPy."""
 _MIN_SENSORS = {"two-channel": 2, "all": 2}
 """Sensors that a method takes; three if it is not named here."""
 
@@ -32,6 +36,7 @@ def self_noise(
     *,
     channels: Sequence[str] | None = None,
     sample_unit: str | None = None,
+    response: Response | Sequence[Response] | Mapping[str, Response | Sequence[Response]] = None,
     **options: Unpack[EstimateOptions],
 ) -> Result:
     """Estimate the self-noise of every channel from samples in memory.
@@ -51,7 +56,12 @@ def self_noise(
     channels : sequence of str, optional
         Names of the channels, the same for every sensor, as in ``"XYZ"``.
     sample_unit : str, optional
-        Unit of the samples. Where not given: that of the DataArrays, else `unit`, else counts.
+        Unit of the samples. Where not given: what DataArrays and Streams say, else counts.
+    response : path, Inventory, sequence or mapping of them, optional
+        Responses that turn counts into motion: RESP or StationXML files, folders of them, or
+        inventories of ObsPy, each for the channels of its codes; or, in a mapping, for those whose
+        ``network.station.location.channel``, sensor or channel fits a pattern. A sensor and its
+        digitizer may be two.
     **options
         Options of the estimate: those of `estimate`.
 
@@ -87,10 +97,16 @@ def self_noise(
     (201,)
     """
     settings = settings_of(Settings(), options)
+    if response is not None and sample_unit is not None:
+        raise ArrayError(
+            f"sample_unit={sample_unit!r} and a response: samples with a unit have no response;"
+            " expected one of the two"
+        )
     recording = recording_of_arrays(
-        sensors, fs, channels=channels, unit=sample_unit, usual_unit=settings.unit
+        sensors, fs, channels=channels, unit=sample_unit, responses=_responses(response)
     )
     _check_sensors(recording.sensors, settings)
+    _check_units(recording.sensors, settings)
     check_fit(settings, recording.sensors, called=called)
     return _result([recording], settings)
 
@@ -208,6 +224,49 @@ def estimate(
 def _result(recordings: Sequence[ReadableRecording], settings: Settings) -> Result:
     with Estimation(recordings, settings) as estimation:
         return Result(estimation.finish(), settings)
+
+
+def _responses(given: object) -> Responses | None:
+    """Return responses as the import takes them.
+
+    Raises
+    ------
+    ImportFormatError
+        ObsPy is not installed, or a file holds no response.
+    """
+    if given is None:
+        return None
+    from daq.formats.response import Responses  # noqa: PLC0415 - ObsPy is an extra
+
+    if isinstance(given, dict):
+        assigned = [(name, each) for name, value in given.items() for each in _sources(value)]
+        return Responses([], assigned)
+    return Responses(_sources(given))
+
+
+def _sources(given: Any) -> list[Any]:  # noqa: ANN401 - paths, or inventories: ObsPy has no types
+    several = given if isinstance(given, (list, tuple)) else [given]
+    return [Path(each) if isinstance(each, (str, os.PathLike)) else each for each in several]
+
+
+def _check_units(sensors: Sequence[ReadableSensor], settings: Settings) -> None:
+    """Refuse to call counts motion.
+
+    Raises
+    ------
+    ArrayError
+        With the channel whose samples are counts.
+    """
+    if settings.unit is None or not is_motion(settings.unit):
+        return
+    for sensor in sensors:
+        for channel in sensor.channels:
+            if channel.unit == COUNTS:
+                raise ArrayError(
+                    f"unit={settings.unit!r}: the samples of {sensor.name}.{channel.name} are"
+                    " counts, as nothing says what they measure; expected response= (files, or an"
+                    " ObsPy Inventory), or sample_unit= where they are in a unit of motion"
+                )
 
 
 def _check_sensors(sensors: Sequence[ReadableSensor], settings: Settings) -> None:
