@@ -156,7 +156,12 @@ def assembled(
     sources = list(dict.fromkeys(p.part.source for pieces in channels.values() for p in pieces))
     more = len(sources) - _PIECES_NAMED
     source = ", ".join(sources[:_PIECES_NAMED]) + (f" and {more} more" if more > 0 else "")
-    return ForeignSensor(name, tuple(channels), rate, tuple(stretches), source, tuple(units))
+    n_samples = sum(stretch.n_samples for stretch in stretches)
+    beyond = [sum(run.n_samples for run in runs) - n_samples for runs in of_channel]
+    unused = tuple((each, n) for each, n in zip(channels, beyond, strict=True) if n > 0)
+    return ForeignSensor(
+        name, tuple(channels), rate, tuple(stretches), source, tuple(units), unused=unused
+    )
 
 
 def _together(of_channel: Sequence[Sequence[Run]]) -> Iterable[tuple[Run, ...]]:

@@ -109,6 +109,8 @@ class ForeignSensor:
 
     ``units`` holds one unit per channel, in which its samples are, or is empty where the format
     does not say. ``calibrations`` holds one for each channel whose samples are counts, or is empty.
+    ``unused`` holds the channels with samples that are in no stretch, as others have none there,
+    and how many these are.
     """
 
     name: str
@@ -118,6 +120,7 @@ class ForeignSensor:
     source: str
     units: tuple[str, ...] = ()
     calibrations: tuple[Calibration | None, ...] = ()
+    unused: tuple[tuple[str, int], ...] = ()
 
     def check(self) -> None:
         """Refuse what no recording can hold.

@@ -41,7 +41,9 @@ _NAMES_KEPT = 100
 class Imported:
     """What became of one sensor: ``missing`` samples lie in ``n_gaps`` gaps.
 
-    ``resampled`` channels were sampled at other instants than the first channel.
+    ``resampled`` channels were sampled at other instants than the first channel. ``unused`` are
+    channels with the number of their samples that are not in the recording, as other channels of
+    the sensor have none at these times.
     """
 
     sensor: str
@@ -52,6 +54,7 @@ class Imported:
     n_gaps: int
     missing: int
     resampled: tuple[str, ...] = ()
+    unused: tuple[tuple[str, int], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -409,4 +412,5 @@ def _imported(sensor: ForeignSensor) -> Imported:
         n_gaps=len(sensor.stretches) - 1,
         missing=sum(first - end for first, end in zip(first_samples[1:], ends[:-1], strict=True)),
         resampled=tuple(channel for channel in sensor.channels if channel in resampled),
+        unused=sensor.unused,
     )

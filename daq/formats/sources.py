@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from daq.errors import ImportFormatError
 from daq.formats.assembly import assembled
+from daq.formats.channel_runs import SAME_RATE
 from daq.formats.foreign_sensor import FIRST_DATE_NS
 from daq.formats.readers.registry import parts_of
 from daq.formats.readers.sds import SCHEME, sds_files
@@ -226,7 +227,7 @@ class _Index:
         """
         channels = self._pieces[name]
         if name in self._coded:
-            channels = dict(sorted(channels.items()))
+            channels = self._fastest(name, dict(sorted(channels.items())))
         if len(channels) > 1:
             for channel in list(channels):
                 try:
@@ -237,6 +238,22 @@ class _Index:
         if not channels:
             raise ImportFormatError(f"sensor {name!r}: none of its channels can be used")
         return self._assembled(name, channels, cache)
+
+    def _fastest(self, name: str, channels: dict[str, list[Piece]]) -> dict[str, list[Piece]]:
+        """Leave aside what is there at a higher rate too: BHZ beside HHZ, of one sensor."""
+        rates = {code: max(p.sampling_rate for p in channels[code]) for code in channels}
+        kept = {}
+        for code, pieces in channels.items():
+            alike = [
+                each for each in channels if each[1:] == code[1:] and len(code) == _CODE_LENGTH
+            ]
+            best = max(alike, key=lambda each: rates[each], default=code)
+            if rates[best] > rates[code] * (1 + SAME_RATE):
+                reason = f"{rates[code]:g} Hz, where {best[0]}{code[1]} has {rates[best]:g} Hz"
+                self.left_aside[f"{name}.{code}"] = reason
+            else:
+                kept[code] = pieces
+        return kept
 
     def _assembled(
         self, name: str, channels: dict[str, list[Piece]], cache: PartCache

@@ -170,6 +170,15 @@ def _show(result: ImportResult, out: Path, json: str | None) -> None:
                 f"{entry.sensor}: resampled to the instants of {entry.channels[0]}:"
                 f" {' '.join(entry.resampled)}"
             )
+        if entry.unused:
+            lost = ", ".join(
+                f"{n / entry.sampling_rate:.6g} s of {name}" for name, n in entry.unused
+            )
+            screen.print(
+                f"not imported: {lost}: other channels of {entry.sensor} have no samples there;"
+                " --channels chooses channels",
+                soft_wrap=True,
+            )
     for line in _calibrations(result):
         screen.print(line, soft_wrap=True)
     for reason in sorted(set(result.left_aside.values())):

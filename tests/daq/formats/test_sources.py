@@ -217,11 +217,11 @@ def test_rates_a_few_ppm_apart_are_one_and_others_are_refused(tmp_path: Path) ->
     write_records(tmp_path / "b", counts(600, 2), rate=rate, step_ns=1e9 / rate, start=start)
     sensor = opened([tmp_path / "a", tmp_path / "b"])
     assert (sensor.sampling_rate, len(sensor.stretches)) == (RATE, 1)
-    write_records(tmp_path / "c", counts(600, 2), channel="BHZ", rate=40.0, step_ns=25e6)
-    with pytest.raises(ImportFormatError, match=r"100 Hz in HHZ; 40 Hz in BHZ; .* --channels"):
+    write_records(tmp_path / "c", counts(600, 2), channel="BHN", rate=40.0, step_ns=25e6)
+    with pytest.raises(ImportFormatError, match=r"100 Hz in HHZ; 40 Hz in BHN; .* --channels"):
         opened([tmp_path / "a", tmp_path / "c"])
     assert opened([tmp_path / "a", tmp_path / "c"], Selection(channels=("B*",))).channels == (
-        "BHZ",
+        "BHN",
     )
 
 

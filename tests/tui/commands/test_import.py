@@ -9,7 +9,7 @@ import numpy as np
 from typer.testing import CliRunner
 
 from daq.recording.reader import Recording
-from tests.daq.formats.test_sources import counts, write_records
+from tests.daq.formats.test_sources import START, STEP, counts, write_records
 from tui.cli.main import app
 from tui.output.exit_codes import ExitCode
 
@@ -54,3 +54,31 @@ def test_overlap_is_a_choice_of_files_or_a_number_for_segments(tmp_path: Path) -
     assert run(*files, "--overlap", "most") == ExitCode.USAGE
     assert run(files[0], "--start", "noon") == ExitCode.USAGE
     assert run(files[0], "--start", "2026-11-21", "--end", "2026-11-20") == ExitCode.USAGE
+
+
+def test_samples_that_only_some_channels_have_are_said(tmp_path: Path) -> None:
+    """A day file of one channel is lost: its hour is lost for all, and not in silence."""
+    later = START + 600 * STEP
+    for channel in ("HHZ", "HHN"):
+        write_records(tmp_path / "a", counts(600, 1), channel=channel)
+    write_records(tmp_path / "a", counts(1400, 2), start=later)
+    arguments = ["import", str(tmp_path / "a"), "-o", str(tmp_path / "a.h5")]
+    found = CliRunner().invoke(app, arguments)
+    assert found.exit_code == ExitCode.DONE
+    assert "not imported: 14 s of HHZ: other channels of XX.ABC.00 have no" in found.stdout
+
+
+def test_of_one_sensor_at_two_rates_the_higher_is_imported(tmp_path: Path) -> None:
+    for channel, step in (("HHZ", 1), ("BHZ", 5), ("HHN", 1), ("LDO", 100)):
+        samples = counts(1000 // step, step)
+        options = {"step_ns": STEP * step, "rate": 100.0 / step}
+        write_records(tmp_path / "a", samples, channel=channel, **options)  # type: ignore[arg-type]  # a dictionary of floats
+    select = ["--channels", "?H?"]
+    arguments = ["import", str(tmp_path / "a"), "-o", str(tmp_path / "a.h5"), *select]
+    found = CliRunner().invoke(app, arguments)
+    assert found.exit_code == ExitCode.DONE, found.output
+    assert "left aside (20 Hz, where HH has 100 Hz): XX.ABC.00.BHZ" in found.stdout
+    with Recording.open(tmp_path / "a.h5") as recording:
+        (sensor,) = recording.sensors
+        assert [channel.name for channel in sensor.channels] == ["HHN", "HHZ"]
+        assert (sensor.sampling_rate, sensor.n_samples) == (100.0, 1000)
