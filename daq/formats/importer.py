@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from heapq import merge
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -20,7 +21,8 @@ from daq.bench.tables.fields import check_name
 from daq.bench.units import canonical
 from daq.errors import ImportFormatError, WrongSettingError
 from daq.formats.assembly import Columns
-from daq.formats.sources import open_sources
+from daq.formats.readers.fdsn import FDSN, fetch
+from daq.formats.sources import Selection, open_sources
 from daq.protocols.block import HostTime
 from daq.recording.array_writer import BLOCK_ROWS, ArrayWriter
 from daq.recording.file_format import SensorLayout
@@ -31,7 +33,6 @@ if TYPE_CHECKING:
     from daq.bench.estimate_settings import EstimateSettings
     from daq.formats.foreign_sensor import ForeignSensor, Stretch
     from daq.formats.response import Responses
-    from daq.formats.sources import Selection
 
 _ROWS_AT_ONCE = 16 * BLOCK_ROWS
 _NAMES_KEPT = 100
@@ -120,8 +121,9 @@ def import_files(
     Parameters
     ----------
     sources : sequence of str or Path
-        Files of any format that :mod:`daq.formats.readers` knows, or folders ``sds://ROOT``. A
-        sensor may be in several files.
+        Files of any format that :mod:`daq.formats.readers` knows, folders ``sds://ROOT``, or
+        channels of a data centre, ``fdsn://CENTRE/NETWORK.STATION.LOCATION.CHANNEL``, with their
+        responses. A sensor may be in several files.
     out : Path
         Recording to write; must not exist.
     bench : Bench, optional
@@ -149,16 +151,73 @@ def import_files(
     WrongSettingError
         `estimate` does not fit the sensors.
     """
-    opened = open_sources(sources, selection, sampling_rate=sampling_rate)
-    found = opened.sensors
+    files = [response] if isinstance(response, Path) else list(response)
+    with TemporaryDirectory(prefix="huddle-") as folder:
+        return _import(
+            _fetched(sources, files, selection or Selection(), Path(folder)),
+            out,
+            bench=bench,
+            response_for=response_for,
+            sampling_rate=sampling_rate,
+            estimate=estimate,
+            selection=selection,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Sources:
+    """What is imported: as it was given, as files, and with which responses."""
+
+    given: Sequence[str | Path]
+    files: Sequence[str | Path]
+    responses: Sequence[Path]
+    folder: Path
+
+    def named(self, foreign: ForeignSensor) -> ForeignSensor:
+        """Return a sensor that was fetched with the address that it is from."""
+        if str(self.folder) not in foreign.source:
+            return foreign
+        return replace(foreign, source=", ".join(map(str, self.given)))
+
+
+def _fetched(
+    sources: Sequence[str | Path], responses: Sequence[Path], selection: Selection, folder: Path
+) -> _Sources:
+    """Fetch what is not on this machine; given responses have precedence over those of a centre."""
+    files: list[str | Path] = []
+    found = list(responses)
+    for number, source in enumerate(sources):
+        if not str(source).startswith(FDSN):
+            files.append(source)
+            continue
+        own = folder / str(number)
+        own.mkdir()
+        fetched = fetch(str(source), selection.start_ns, selection.end_ns, own)
+        files += fetched.waveforms
+        if not responses:
+            found.append(fetched.responses)
+    return _Sources(sources, files, found, folder)
+
+
+def _import(
+    sources: _Sources,
+    out: Path,
+    *,
+    bench: Bench | None,
+    response_for: Sequence[tuple[str, Path]],
+    sampling_rate: float | None,
+    estimate: EstimateSettings | None,
+    selection: Selection | None,
+) -> ImportResult:
+    opened = open_sources(sources.files, selection, sampling_rate=sampling_rate)
+    found = {name: sources.named(sensor) for name, sensor in opened.sensors.items()}
     if bench is not None:
         found = _ordered(found, bench)
     responses = None
-    files = [response] if isinstance(response, Path) else list(response)
-    if files or response_for:
+    if sources.responses or response_for:
         from daq.formats.response import Responses  # noqa: PLC0415 - ObsPy is an extra
 
-        responses = Responses(files, response_for)
+        responses = Responses(sources.responses, response_for)
     taken: list[Taken] = []
     described = {
         name: _described(sensor, bench, responses, taken) for name, sensor in found.items()
@@ -170,7 +229,7 @@ def import_files(
         written,
         sensors=[_layout(described[name], sensor) for name, sensor in found.items()],
         created=HostTime(start, start),
-        attributes={"origin": _origin(sources)},
+        attributes={"origin": _origin(sources.given)},
         chunk_seconds=BLOCK_ROWS / max(sensor.sampling_rate for sensor in found.values()),
     ) as writer:
         _write(writer, tuple(found.values()))

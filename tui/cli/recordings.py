@@ -200,6 +200,8 @@ def plot(
     "huddle import *.mseed --response RESP.XX.ABC.00.HNZ --out lab.h5",
     "huddle import day*.mseed --channels 'HH?' --overlap first --out month.h5",
     "huddle import sds://archive --net XX --start 2026-11-01 --end 2026-11-08 --out week.h5",
+    "huddle import 'fdsn://EARTHSCOPE/IU.ANMO.{00,10}.BH?' --start 2026-11-01 --end 2026-11-02"
+    " --out anmo.h5",
     "huddle import samples.csv --bench lab.toml --out lab.h5",
 )
 @with_logging
@@ -207,7 +209,11 @@ def plot(
 def import_(
     sources: Annotated[
         list[str],
-        typer.Argument(metavar="SRC", help="Files, or sds://ROOT for an archive of day files."),
+        typer.Argument(
+            metavar="SRC",
+            help="Files, sds://ROOT for an archive of day files, or"
+            " fdsn://CENTRE/NET.STA.LOC.CHA for a data centre.",
+        ),
     ],
     *,
     out: Annotated[
