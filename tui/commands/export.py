@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from daq.recording.reader import Recording
+from daq.results.sources import sources
 from tui.commands.estimate import estimated
 from tui.notebook.curve_files import WRITERS, write_curves
 from tui.output.console import for_people, write_json
 from tui.output.formatting import several
+from tui.output.json_document import provenance
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -50,8 +52,8 @@ def export_recordings(
         known = ", ".join((MINISEED, *WRITERS))
         raise typer.BadParameter(f"--format {kind}: expected one of {known}")
     path = out or files[0].with_suffix(WRITERS[kind][0])
-    snapshot, _, _ = estimated(files, start=start, end=end, **wanted)
-    write_curves(snapshot, kind, path)
+    snapshot, settings, _ = estimated(files, start=start, end=end, **wanted)
+    write_curves(snapshot, kind, path, provenance(snapshot, settings, sources(files)))
     n_curves = len(snapshot.results) * len(snapshot.channels)
     for_people(json).print(f"{path} written: {several(n_curves, 'noise curve')}")
     write_json(json, {"file": str(path), "format": kind, "methods": list(snapshot.results)})

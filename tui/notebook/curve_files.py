@@ -1,14 +1,17 @@
 """Curves in files of other programs: tidy CSV and Parquet, netCDF, MAT, NumPy, UFF 58.
 
 A tidy table has one row for each method, channel and frequency. All densities are one-sided, in
-unit²/Hz; the unit is in a column, an attribute or a variable of every file.
+unit²/Hz; the unit is in a column, an attribute or a variable of every file. What made the estimate
+(program, settings, span of time, recordings with their SHA-256) is in every file too, for CSV in
+the file of metadata that CSV on the Web puts beside it.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -22,6 +25,8 @@ if TYPE_CHECKING:
 
     from daq.estimation.snapshot import Snapshot
 
+    Said: TypeAlias = dict[str, str]
+
 _COLUMNS = ("noise_psd", "noise_low", "noise_high", "cov")
 _FIELDS = ("noise_psd", "low", "high", "cov")
 _PSD = 9
@@ -29,9 +34,17 @@ _DOUBLE = 4
 _DIRECTIONS = {"X": 1, "Y": 2, "Z": 3, "E": 1, "N": 2, "1": 1, "2": 2, "3": 3}
 
 
-def _csv(snapshot: Snapshot, path: Path) -> None:
+def _csv(snapshot: Snapshot, path: Path, said: Said) -> None:
+    del said  # in the metadata beside it
     header = ("method", "sensor", "channel", "unit", "frequency_hz", "data_psd", *_COLUMNS)
     path.write_text(csv_text(header, _rows(snapshot)), encoding="utf-8")
+
+
+def _csv_metadata(path: Path, said: Said) -> None:
+    """Write what made a table beside it, as CSV on the Web has it."""
+    metadata = {"@context": "http://www.w3.org/ns/csvw", "url": path.name, "notes": [said]}
+    beside = path.with_name(f"{path.name}-metadata.json")
+    beside.write_text(json.dumps(metadata, ensure_ascii=False, indent=1), encoding="utf-8")
 
 
 def _rows(snapshot: Snapshot) -> Iterator[tuple[object, ...]]:
@@ -44,18 +57,20 @@ def _rows(snapshot: Snapshot) -> Iterator[tuple[object, ...]]:
                 yield (method, label.sensor, label.channel, label.unit, *numbers)
 
 
-def _parquet(snapshot: Snapshot, path: Path) -> None:
-    load("pyarrow")
+def _parquet(snapshot: Snapshot, path: Path, said: Said) -> None:
+    arrow, parquet = load("pyarrow"), load("pyarrow.parquet")
     frame = to_frame(snapshot)
     units = {(label.sensor, label.channel): label.unit for label in snapshot.channels}
     keys = zip(frame["sensor"], frame["channel"], strict=True)
     frame.insert(3, "unit", [units[key] for key in keys])
-    frame.rename(columns={"frequency": "frequency_hz"}).to_parquet(path, index=False)
+    frame = frame.rename(columns={"frequency": "frequency_hz"})
+    table = arrow.Table.from_pandas(frame, preserve_index=False)
+    parquet.write_table(table.replace_schema_metadata({**table.schema.metadata, **said}), path)
 
 
-def _netcdf(snapshot: Snapshot, path: Path) -> None:
+def _netcdf(snapshot: Snapshot, path: Path, said: Said) -> None:
     load("h5netcdf")
-    to_xarray(snapshot).to_netcdf(path, engine="h5netcdf")
+    to_xarray(snapshot, said).to_netcdf(path, engine="h5netcdf")
 
 
 def _arrays(snapshot: Snapshot) -> dict[str, Any]:
@@ -72,12 +87,12 @@ def _arrays(snapshot: Snapshot) -> dict[str, Any]:
     return found
 
 
-def _mat(snapshot: Snapshot, path: Path) -> None:
+def _mat(snapshot: Snapshot, path: Path, said: Said) -> None:
     from scipy.io import savemat  # noqa: PLC0415 - takes long
 
     found = {
         name: np.array(value, dtype=object) if isinstance(value, list) else value
-        for name, value in _arrays(snapshot).items()
+        for name, value in (_arrays(snapshot) | said).items()
     }
     savemat(
         str(path),
@@ -89,18 +104,22 @@ def _mat(snapshot: Snapshot, path: Path) -> None:
     )
 
 
-def _npz(snapshot: Snapshot, path: Path) -> None:
-    arrays: dict[str, Any] = {name: np.asarray(value) for name, value in _arrays(snapshot).items()}
+def _npz(snapshot: Snapshot, path: Path, said: Said) -> None:
+    arrays: dict[str, Any] = {
+        name: np.asarray(value) for name, value in (_arrays(snapshot) | said).items()
+    }
     with path.open("wb") as file:
         np.savez(file, **arrays)
 
 
-def _uff(snapshot: Snapshot, path: Path) -> None:
+def _uff(snapshot: Snapshot, path: Path, said: Said) -> None:
     pyuff = load("pyuff")
     path.unlink(missing_ok=True)
     file = pyuff.UFF(str(path))
     nodes = {name: number for number, name in enumerate(snapshot.sensor_names, start=1)}
     frequency = snapshot.frequency
+    digest = next((each["sha256"] for each in json.loads(said["recordings"])), None)
+    span = f"{said['time_coverage_start'][:23]} to {said['time_coverage_end'][:23]}"
     even = np.allclose(np.diff(frequency), frequency[1] - frequency[0])
     for column, label in enumerate(snapshot.channels):
         curves = {"data": snapshot.data_psd[:, column]}
@@ -116,6 +135,8 @@ def _uff(snapshot: Snapshot, path: Path) -> None:
                         func_type=_PSD,
                         id1=f"{label.name} {name}"[:80],
                         id2=f"one-sided, ({_ascii(label.unit)})^2/Hz"[:80],
+                        id3=f"{said['source']}; {span}"[:80],
+                        id4=f"SHA-256 {digest}"[:80] if digest else "NONE",
                         rsp_ent_name=_ascii(label.sensor)[:10],
                         rsp_node=nodes[label.sensor],
                         rsp_dir=_DIRECTIONS.get(label.channel[-1:].upper(), 0),
@@ -143,7 +164,7 @@ def _ascii(text: str) -> str:
     return text.replace("²", "^2").replace("µ", "u").encode("ascii", "replace").decode()
 
 
-WRITERS: dict[str, tuple[str, Callable[[Snapshot, Path], None]]] = {
+WRITERS: dict[str, tuple[str, Callable[[Snapshot, Path, Said], None]]] = {
     "csv": (".csv", _csv),
     "parquet": (".parquet", _parquet),
     "netcdf": (".nc", _netcdf),
@@ -154,7 +175,7 @@ WRITERS: dict[str, tuple[str, Callable[[Snapshot, Path], None]]] = {
 """Suffix and writer of each format."""
 
 
-def write_curves(snapshot: Snapshot, kind: str, path: Path) -> None:
+def write_curves(snapshot: Snapshot, kind: str, path: Path, said: Said) -> None:
     """Write all curves; the file has its name when it is complete.
 
     Parameters
@@ -163,6 +184,8 @@ def write_curves(snapshot: Snapshot, kind: str, path: Path) -> None:
     kind : str
         One of `WRITERS`.
     path : Path
+    said : dict of str to str
+        What made the estimate, as `tui.output.json_document.provenance` has it.
 
     Raises
     ------
@@ -173,9 +196,11 @@ def write_curves(snapshot: Snapshot, kind: str, path: Path) -> None:
     """
     part = path.with_name(f".{path.name}.part")
     try:
-        WRITERS[kind][1](snapshot, part)
+        WRITERS[kind][1](snapshot, part, said)
         with part.open("rb") as file:
             os.fsync(file.fileno())
         part.replace(path)
+        if kind == "csv":
+            _csv_metadata(path, said)
     finally:
         part.unlink(missing_ok=True)

@@ -301,11 +301,13 @@ class Result:
         """Return the spectra with the dimensions estimate, sensor, channel and frequency.
 
         The dimension ``estimate`` names the method. NaN where a sensor has no channel of a name
-        that others have. Needs xarray: ``pip install 'huddle-bench[notebook]'``.
+        that others have. Attributes say by which program, with which settings and from which span
+        of time, and what each flag means. Needs xarray: ``pip install 'huddle-bench[notebook]'``.
         """
         from tui.notebook.tables import to_xarray  # noqa: PLC0415 - loads xarray
+        from tui.output.json_document import provenance  # noqa: PLC0415 - seldom needed
 
-        return to_xarray(self.snapshot)
+        return to_xarray(self.snapshot, provenance(self.snapshot, self.settings))
 
     def to_frame(self) -> pd.DataFrame:
         """Return the spectra as a tidy table: a row a method, channel and frequency.

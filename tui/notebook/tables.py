@@ -6,9 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from estimator.self_noise.result import Flag
 from tui.output.extras import load
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     import pandas as pd
     import xarray as xr
     from numpy.typing import NDArray
@@ -27,8 +30,15 @@ _LONG_NAMES = {
 }
 
 
-def to_xarray(snapshot: Snapshot) -> xr.Dataset:
-    """Return the spectra of all methods; see `tui.notebook.result.Result.to_xarray`."""
+def to_xarray(snapshot: Snapshot, said: Mapping[str, str]) -> xr.Dataset:
+    """Return the spectra of all methods; see `tui.notebook.result.Result.to_xarray`.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+    said : mapping of str to str
+        Attributes: what made the estimate.
+    """
     xarray = load("xarray")
     labels = snapshot.channels
     sensors = list(snapshot.sensor_names)
@@ -60,6 +70,8 @@ def to_xarray(snapshot: Snapshot) -> xr.Dataset:
             "frequency": ("frequency", snapshot.frequency, {"units": "Hz"}),
         },
         attrs={
+            "Conventions": "CF-1.11",
+            **said,
             "n_segments": snapshot.n_segments,
             "effective_averages": snapshot.n_effective,
             "unit_of_motion": snapshot.unit,
@@ -69,6 +81,12 @@ def to_xarray(snapshot: Snapshot) -> xr.Dataset:
         found[name].attrs["long_name"] = long_name
         if name.endswith(("psd", "low", "high")):
             found[name].attrs["units"] = f"({snapshot.unit})²/Hz"
+    found["cov"].attrs["units"] = "1"
+    masks = np.array([int(flag) for flag in Flag], found["flags"].dtype)
+    found["flags"].attrs |= {
+        "flag_masks": masks,
+        "flag_meanings": " ".join(str(flag.name).lower() for flag in Flag),
+    }
     return found
 
 

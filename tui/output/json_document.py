@@ -5,10 +5,13 @@ docs/json.md describes it for people, ``tui/resources/result-1.schema.json`` for
 
 from __future__ import annotations
 
+import json
 from dataclasses import fields
 from datetime import datetime
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from daq.bench.estimate_settings import table_keys
 from daq.results.band_summary import band_of, channel_means, data_means
@@ -104,6 +107,39 @@ def document(
     if noise_parameters is not None:
         whole["noise_parameters"] = plain(noise_parameters_document(noise_parameters))
     return whole
+
+
+def provenance(
+    snapshot: Snapshot, settings: Settings, sources: Sequence[Source] = ()
+) -> dict[str, str]:
+    """Return what made an estimate, as texts that files of other programs can hold.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+    settings : Settings
+        It was made with.
+    sources : sequence of Source
+        The recordings it was made from; none for arrays.
+    """
+    start_ns = snapshot.start_utc_ns
+    recordings = [
+        {"file": each.path.name, "run_id": each.run_id, "sha256": each.sha256 or None}
+        for each in sources
+    ]
+    return {
+        "title": "Self-noise of sensors, from a huddle test",
+        "source": f"huddle-bench {version('huddle-bench')}",
+        "time_coverage_start": _instant(start_ns),
+        "time_coverage_end": _instant(start_ns + round(snapshot.elapsed * 1e9)),
+        "confidence_of_intervals": "0.95",
+        "settings": json.dumps(_settings(settings, snapshot), ensure_ascii=False),
+        "recordings": json.dumps(recordings, ensure_ascii=False),
+    }
+
+
+def _instant(utc_ns: int) -> str:
+    return f"{np.datetime64(utc_ns, 'ns')}Z"
 
 
 def _recording(source: Source) -> dict[str, Any]:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import csv
+import hashlib
+import importlib
 import io
 import json
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -289,3 +292,45 @@ def test_parquet(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
     ]
     np.testing.assert_array_equal(found, snapshot.results[method].noise_psd[:, 4])
     assert set(table["unit"]) == {"m/s²"}
+
+
+def said_by_file(folder: Path, kind: str, path: Path) -> dict[str, str]:
+    """Return what a file says of what made it, read by a program that is not ours."""
+    if kind == "csv":
+        metadata = json.loads((folder / f"{path.name}-metadata.json").read_text(encoding="utf-8"))
+        assert metadata["url"] == path.name
+        return dict(metadata["notes"][0])
+    if kind == "netcdf":
+        with xr.open_dataset(path, engine="h5netcdf") as found:
+            assert found.attrs["Conventions"] == "CF-1.11"
+            meanings = found["flags"].attrs["flag_meanings"].split()
+            masks = found["flags"].attrs["flag_masks"].tolist()
+            assert dict(zip(meanings, masks, strict=True))["dead_channel"] == 4
+            return dict(found.attrs)
+    if kind == "mat":
+        arrays = {key: np.asarray(value) for key, value in loadmat(path).items()}
+        return {key: str(value[0]) for key, value in arrays.items() if value.shape == (1,)}
+    if kind == "npz":
+        with np.load(path, allow_pickle=False) as found:
+            return {key: str(found[key]) for key in found if found[key].shape == ()}
+    parquet = importlib.import_module("pyarrow.parquet")
+    metadata = parquet.read_schema(path).metadata
+    return {key.decode(): value.decode() for key, value in metadata.items()}
+
+
+@pytest.mark.parametrize("kind", ["csv", "netcdf", "mat", "npz", "parquet"])
+def test_every_export_says_what_made_it(recording: Path, tmp_path: Path, kind: str) -> None:
+    if kind == "parquet":
+        pytest.importorskip("pyarrow", reason="pyarrow is large, and an extra")
+    path = tmp_path / f"a.{kind}"
+    found = run(recording, "--format", kind, "-o", path, "--segment", "5s")
+    assert found.exit_code == ExitCode.DONE, found.output
+    said = said_by_file(tmp_path, kind, path)
+    (source,) = json.loads(said["recordings"])
+    assert source["sha256"] == hashlib.sha256(recording.read_bytes()).hexdigest()
+    assert source["file"] == "a.h5"
+    assert json.loads(said["settings"])["segment"] == 5.0
+    assert said["source"] == f"huddle-bench {version('huddle-bench')}"
+    assert said["time_coverage_start"] == "2026-11-21T03:00:00.000007000Z"
+    assert said["time_coverage_end"].startswith("2026-11-21T03:01:20")
+    assert said["confidence_of_intervals"] == "0.95"
