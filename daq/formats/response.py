@@ -213,6 +213,11 @@ class Responses:
         )
 
 
+def is_response(path: Path) -> bool:
+    """Whether a file is RESP or StationXML."""
+    return _format_of(path) is not None
+
+
 def _read_all(paths: Sequence[Path | Any]) -> list[_Epoch]:
     """Return the channel epochs of files, and of those in folders that hold responses."""
     found: list[_Epoch] = []
