@@ -22,6 +22,7 @@ from daq.bench.units import canonical
 from daq.errors import ImportFormatError, WrongSettingError
 from daq.formats.assembly import Columns
 from daq.formats.readers.fdsn import FDSN, fetch
+from daq.formats.readers.packed import is_packed, unpacked
 from daq.formats.sources import Selection, open_sources
 from daq.protocols.block import HostTime
 from daq.recording.array_writer import BLOCK_ROWS, ArrayWriter
@@ -174,7 +175,7 @@ class _Sources:
     folder: Path
 
     def named(self, foreign: ForeignSensor) -> ForeignSensor:
-        """Return a sensor that was fetched with the address that it is from."""
+        """Return a sensor that was fetched or unpacked with what it was given as."""
         if str(self.folder) not in foreign.source:
             return foreign
         return replace(foreign, source=", ".join(map(str, self.given)))
@@ -183,14 +184,17 @@ class _Sources:
 def _fetched(
     sources: Sequence[str | Path], responses: Sequence[Path], selection: Selection, folder: Path
 ) -> _Sources:
-    """Fetch what is not on this machine; given responses have precedence over those of a centre."""
+    """Fetch and unpack; given responses have precedence over those of a centre."""
     files: list[str | Path] = []
     found = list(responses)
     for number, source in enumerate(sources):
+        own = folder / str(number)
+        if is_packed(Path(source)) and "://" not in str(source):
+            files += unpacked(Path(source), own)
+            continue
         if not str(source).startswith(FDSN):
             files.append(source)
             continue
-        own = folder / str(number)
         own.mkdir()
         fetched = fetch(str(source), selection.start_ns, selection.end_ns, own)
         files += fetched.waveforms

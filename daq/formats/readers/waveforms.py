@@ -70,7 +70,7 @@ def waveform_format(path: Path) -> str:
     if any(mark in head for mark in _RESPONSES):
         raise ImportFormatError("it holds responses, no samples; give it with --response")
     known = ", ".join(FORMATS)
-    raise ImportFormatError(f"unknown format; expected one of {known}, not compressed")
+    raise ImportFormatError(f"unknown format; expected one of {known}")
 
 
 def waveform_parts(path: Path) -> Iterator[FilePart]:
@@ -101,12 +101,13 @@ def _traces(stream: Stream, fallback: str, *, numbered: bool) -> list[Trace]:
     found = []
     for number, trace in enumerate(stream, start=1):
         stats = trace.stats
-        codes = [code for code in (stats.network, stats.station, stats.location) if code]
+        codes = [str(stats[each]).strip() for each in ("network", "station", "location")]
+        codes = [code for code in codes if code]
         sensor = str(number) if numbered else ".".join(codes) or fallback
         found.append(
             Trace(
                 sensor=sensor,
-                channel="1" if numbered else stats.channel or str(number),
+                channel="1" if numbered else stats.channel.strip() or str(number),
                 start_ns=int(stats.starttime.ns),
                 sampling_rate=float(stats.sampling_rate),
                 samples=np.asarray(trace.data),
