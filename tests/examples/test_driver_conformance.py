@@ -6,12 +6,10 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import pytest
 
 from tests.waiting import limit
-
-if TYPE_CHECKING:
-    import pytest
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "driver"
 BROKEN = """
@@ -278,11 +276,22 @@ def run_suite(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]
     )
 
 
-def test_the_example_passes_its_suite(tmp_path: Path) -> None:
-    plugin = ("-p", "daq.conformance.plugin", "-p", "pytest_asyncio")
-    done = run_suite(tmp_path, *plugin, str(EXAMPLE / "tests"))
+PLUGINS = ("-p", "daq.conformance.plugin", "-p", "pytest_asyncio")
+
+
+@pytest.mark.parametrize(
+    ("chosen", "n_tests"),
+    [
+        ("TestAX3", 11),
+        ("TestSdk and (rows or loop or hang_up)", 3),
+        pytest.param("TestSdk", 11, marks=pytest.mark.long),
+    ],
+)
+def test_the_examples_pass_their_suite(chosen: str, n_tests: int, tmp_path: Path) -> None:
+    """The driver with a protocol of its own, and the one through a library that blocks."""
+    done = run_suite(tmp_path, *PLUGINS, "-k", chosen, str(EXAMPLE / "tests"))
     assert done.returncode == 0, done.stdout
-    assert "11 passed" in done.stdout
+    assert f"{n_tests} passed" in done.stdout
 
 
 def test_the_suite_catches_every_broken_driver(tmp_path: Path, subtests: pytest.Subtests) -> None:
@@ -291,8 +300,7 @@ def test_the_suite_catches_every_broken_driver(tmp_path: Path, subtests: pytest.
     (tmp_path / "tests_of_the_example.py").write_text(sound, encoding="utf-8")
     (tmp_path / "test_broken.py").write_text(BROKEN, encoding="utf-8")
     chosen = [f"test_broken.py::Test{name}::{test}" for name, (test, _) in FAILING.items()]
-    plugins = ("-p", "daq.conformance.plugin", "-p", "pytest_asyncio")
-    done = run_suite(tmp_path, *plugins, *chosen)
+    done = run_suite(tmp_path, *PLUGINS, *chosen)
     failed = [line for line in done.stdout.splitlines() if line.startswith("FAILED")]
     for one, (name, (_, reason)) in zip(chosen, FAILING.items(), strict=True):
         with subtests.test(name):

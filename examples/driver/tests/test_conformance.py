@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from huddle_ax3.driver import DRIVER
+from huddle_ax3.sdk_driver import DRIVER as SDK_DRIVER
 from huddle_ax3.simulator import COUNTS_PER_UNIT, serve_tcp
 
 from daq.bench.model import Channel, Sensor
@@ -14,11 +15,13 @@ from daq.conformance.suite import DriverConformance, Sent, Served
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from daq.drivers.interface import DriverType
+
 
 class TestAX3(DriverConformance):
     """Every test of the suite."""
 
-    driver = DRIVER
+    driver: ClassVar[DriverType] = DRIVER
 
     @contextlib.asynccontextmanager
     async def serve(self) -> AsyncIterator[Served]:
@@ -27,7 +30,7 @@ class TestAX3(DriverConformance):
         number = one.server.sockets[0].getsockname()[1]
         sensor = Sensor(
             name="A",
-            driver=DRIVER.name,
+            driver=self.driver.name,
             port=f"socket://127.0.0.1:{number}",
             sampling_rate=100.0,
             channels=tuple(Channel(name=name, sensitivity=COUNTS_PER_UNIT) for name in "XYZ"),
@@ -39,3 +42,9 @@ class TestAX3(DriverConformance):
             drop=lambda: one.device.lose(20),
         )
         one.close()
+
+
+class TestSdk(TestAX3):
+    """The same through a library whose calls block."""
+
+    driver = SDK_DRIVER
