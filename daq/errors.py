@@ -111,6 +111,10 @@ class WrongDeviceError(DeviceError, ValueError):
         """Identity of the device found, such as a serial number, to distinguish wrong devices."""
 
 
+class ReplayError(HuddleError, ValueError):
+    """A driver does not do what a log of its port has; the message has both."""
+
+
 class RecordingError(HuddleError, OSError):
     """A recording cannot be read or written."""
 

@@ -22,6 +22,7 @@ from daq.errors import DeviceError, NoAnswerError, NotConnectedError, WrongDevic
 from daq.protocols.block import Block, Event, EventKind
 from daq.recording.sensor_state import STATE_AFTER, SensorState
 from daq.transport.serial_ports import serial_ports
+from daq.transport.wire_log import session_ends
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterator, Callable, Sequence
@@ -278,6 +279,8 @@ class Connection:
                     f"{self.port}: stalled: no block for {detector.seconds:.2g} s"
                     f"{'; ' if hint else ''}{hint}"
                 ) from error
+            finally:
+                session_ends()
 
     async def _after_suspension(
         self, block: Block, before: float, queue: asyncio.Queue[Item]

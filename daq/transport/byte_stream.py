@@ -40,6 +40,26 @@ class Transport(Protocol):
         ...
 
 
+class StreamLog(Protocol):
+    """Notes everything that a driver reads and sends; see :mod:`daq.transport.wire_log`."""
+
+    def received(self, received: bytes, at: HostTime) -> None:
+        """Note bytes that the driver read."""
+        ...
+
+    def unread(self, received: bytes) -> None:
+        """Note bytes that the driver discarded."""
+        ...
+
+    def sent(self, payload: bytes) -> None:
+        """Note bytes before they are sent."""
+        ...
+
+    def lost(self, reason: str) -> None:
+        """Note that the port closed by itself."""
+        ...
+
+
 HIGH_WATER = 4 * 1024 * 1024
 """Number of unread bytes at which the transport pauses."""
 
@@ -61,6 +81,8 @@ class ByteStream:
         self._paused = False
         self._expected = 1  # bytes; the initial value of every transport
         self._wire: Transport
+        self.log: StreamLog | None = None
+        """Where everything read and sent is logged."""
 
     def attach(self, wire: Transport) -> None:
         """Set the transport (called when the port is open)."""
@@ -104,6 +126,8 @@ class ByteStream:
         if self._paused and self._failure is None:
             self._paused = False
             self._wire.resume()
+        if self.log is not None:
+            self.log.received(received, at)
         return received, at
 
     async def write(self, payload: bytes) -> None:
@@ -114,6 +138,8 @@ class ByteStream:
         NotConnectedError
             If the port is closed.
         """
+        if self.log is not None:
+            self.log.sent(payload)
         if self._failure is None:
             try:
                 await self._wire.write(payload)
@@ -125,6 +151,8 @@ class ByteStream:
     def discard(self) -> int:
         """Discard unread bytes; return their number."""
         size, self._size = self._size, 0
+        if self.log is not None:
+            self.log.unread(b"".join(self._chunks))
         self._chunks.clear()
         return size
 
@@ -141,6 +169,8 @@ class ByteStream:
     def lost(self, reason: str) -> None:
         """End the stream after a failure of the port (called by the transport)."""
         if self._failure is None:
+            if self.log is not None:
+                self.log.lost(reason)
             self._failure = f"the port closed ({reason}); check cable and power"
         self._wake()
 

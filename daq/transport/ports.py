@@ -21,6 +21,7 @@ import contextlib
 from typing import TYPE_CHECKING
 
 from daq.errors import NotConnectedError
+from daq.transport import wire_log
 from daq.transport.address import check_serial, host_and_port
 from daq.transport.byte_stream import ByteStream
 from daq.transport.port_errors import why
@@ -60,7 +61,13 @@ async def open_port(
     NotConnectedError
         If the port cannot be opened; the message has the cause and the remedy.
     """
+    log = wire_log.active()
+    if isinstance(log, wire_log.Replay):
+        yield log.open(port, label)
+        return
     stream = ByteStream(label or f"port {port}", clock)
+    if log is not None:
+        stream.log = log.opened(port, stream.label, clock)
     try:
         if port.startswith(("socket://", "tcp://")):
             host, number = host_and_port(port)

@@ -12,6 +12,7 @@ from collections import deque
 from typing import TYPE_CHECKING, cast
 
 from daq.errors import NotConnectedError
+from daq.transport import wire_log
 from daq.transport.address import host_and_port
 
 if TYPE_CHECKING:
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
     from daq.host_clock import HostClock
     from daq.protocols.block import HostTime
+    from daq.transport.byte_stream import StreamLog
 
 MAX_UNREAD = 8192
 """Maximum number of unread datagrams; beyond, the oldest are dropped."""
@@ -39,6 +41,8 @@ class DatagramStream(asyncio.DatagramProtocol):
         self.strangers: set[str] = set()
         """Hosts other than the first; their datagrams are ignored."""
         self._transport: asyncio.DatagramTransport
+        self.log: StreamLog | None = None
+        """Where everything read and sent is logged."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Keep the transport."""
@@ -75,14 +79,21 @@ class DatagramStream(asyncio.DatagramProtocol):
                 )
             self._arrived.clear()
             await self._arrived.wait()
-        return self._waiting.popleft()
+        received, at = self._waiting.popleft()
+        if self.log is not None:
+            self.log.received(received, at)
+        return received, at
 
     def discard(self) -> None:
         """Discard unread datagrams."""
+        if self.log is not None:
+            self.log.unread(b"".join(received for received, _ in self._waiting))
         self._waiting.clear()
 
     def send(self, payload: bytes) -> None:
         """Send a datagram to the server."""
+        if self.log is not None:
+            self.log.sent(payload)
         if not self._transport.is_closing():
             self._transport.sendto(payload)
 
@@ -107,6 +118,10 @@ async def open_datagrams(
     NotConnectedError
         If listening or connecting fails.
     """
+    log = wire_log.active()
+    if isinstance(log, wire_log.Replay):
+        yield cast("DatagramStream", log.open(address, label))
+        return
     try:
         where = host_and_port(address)
         transport, stream = await asyncio.get_running_loop().create_datagram_endpoint(
@@ -116,6 +131,8 @@ async def open_datagrams(
         )
     except (OSError, ValueError) as error:
         raise NotConnectedError(f"{label}: {error}") from error
+    if log is not None:
+        stream.log = log.opened(address, label, clock)
     try:
         yield stream
     finally:

@@ -156,6 +156,14 @@ def record(
         bool,
         typer.Option("--until-stopped", help="Ignore the duration of the bench file."),
     ] = False,
+    wire_log: Annotated[
+        Path | None,
+        typer.Option(
+            "--wire-log",
+            metavar="FILE",
+            help="Also log every byte received and sent, for tests of drivers.",
+        ),
+    ] = None,
     out: OutOption = None,
     json: JsonOption = None,
 ) -> None:
@@ -178,6 +186,7 @@ def record(
         estimate=estimate,
         until_stopped=until_stopped,
         operator=operator,
+        wire_log=wire_log,
         out=out,
         json=json,
     )

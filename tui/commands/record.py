@@ -6,7 +6,7 @@ import logging
 import math
 import subprocess
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -19,6 +19,7 @@ from daq.errors import WrongSettingError
 from daq.host_clock import SystemClock
 from daq.python_process import python_command
 from daq.recording.storage.names import recording_path
+from daq.transport.wire_log import logging_to
 from tui.output.console import notices, write_json
 from tui.output.formatting import clock_time, roughly, several
 from tui.simulation.host_time import host_time
@@ -44,6 +45,7 @@ def record_bench(
     estimate: str | None = None,
     out: Path | None,
     json: str | None,
+    wire_log: Path | None = None,
 ) -> None:
     """Record a bench until the duration has passed, or until SIGINT or SIGTERM.
 
@@ -65,6 +67,8 @@ def record_bench(
         Settings of the estimate in place of those of the bench file, as its table in JSON.
     out : Path, optional
     json : str, optional
+    wire_log : Path, optional
+        New file for every byte that ports receive and send.
 
     Raises
     ------
@@ -95,7 +99,8 @@ def record_bench(
     )
     screen = notices()
     gaps = GapLog()
-    with _watched(out, until):
+    wires = nullcontext() if wire_log is None else logging_to(wire_log)
+    with _watched(out, until), wires:
         if screen.is_terminal:
             with Live(console=screen, refresh_per_second=2, transient=True) as live:
 

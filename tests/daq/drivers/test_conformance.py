@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import pytest
 
+from daq.conformance.replay import replay
 from daq.conformance.suite import EARLY, LATENCY, check_counters, check_truth, watching_the_loop
 from daq.drivers.registry import driver_names, driver_type
 from daq.errors import DeviceError, NoAnswerError, NotConnectedError
 from daq.protocols.block import Block, BlockFlag, Event
 from daq.protocols.errors import RemoteProtocolError
+from daq.transport.wire_log import logging_to, session_ends
 from tests.daq.drivers.driver_modes import CASES, RATE, Served, serving_all
 from tests.daq.drivers.reading import reading
 from tests.devices import host_clock
@@ -21,6 +23,7 @@ from tests.waiting import limit
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterator, Iterator
+    from pathlib import Path
 
     from daq.bench.model import Sensor
 
@@ -111,6 +114,35 @@ def test_the_event_loop_is_not_blocked(served: Served, mode: str) -> None:
         return blocked
 
     assert not asyncio.run(run())
+
+
+@pytest.mark.parametrize("mode", [mode for mode in CASES if mode != "registers tcp"])
+async def test_a_logged_session_is_replayed(served: Served, mode: str, tmp_path: Path) -> None:
+    """Every block and event, with its host time; pymodbus has ports of its own."""
+    kind, chosen = driver_type(CASES[mode]["driver"]), served.sensors(mode)
+    found: list[Block | Event] = []
+    n_samples = 0
+    with logging_to(tmp_path / "wire.jsonl"):
+        async with reading(kind, chosen, speed=SPEED) as items:
+            async for item in items:
+                found.append(item)
+                n_samples += item.n_samples if isinstance(item, Block) else 0
+                if n_samples >= N * chosen[0].sampling_rate / RATE:
+                    session_ends()
+                    break
+    replayed = await replay(tmp_path / "wire.jsonl", kind, chosen, limit=limit())
+    for was, now in zip(found, replayed, strict=False):
+        if isinstance(was, Block):
+            assert isinstance(now, Block)
+            np.testing.assert_array_equal(was.counts, now.counts)
+            assert was.first_sample == now.first_sample
+            assert was.device_counter == now.device_counter
+            assert was.flags == now.flags
+            assert was.received == now.received
+        else:
+            assert isinstance(now, Event)
+            assert was.text == now.text
+    assert len(replayed) >= len(found)
 
 
 @pytest.mark.parametrize("mode", CASES)
