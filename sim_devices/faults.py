@@ -8,7 +8,8 @@ file::
     sensors = ["A"]         # devices of these sensors (default: all)
     at = 12.0               # world time of the first occurrence, s
     every = 30.0            # period of repetition, s (default: once)
-    count = 3               # bytes, or frames
+    spread = 20.0           # each occurrence is later by up to this, at random (default: 0 s)
+    count = 3               # bytes, frames or samples
 
 Kinds that affect the next unit (frame, packet, reply) of a device, in every family:
 
@@ -37,6 +38,14 @@ silent     one unit of a bus is off, and restarts afterwards
 clip       samples end at ± ``level`` counts (of ``channel``, or of all)
 dead       samples are 0 (of ``channel``, or of all)
 moved      the sensor is on another floor, with a motion of its own; so are all that are moved
+========== ==========================================================================
+
+Kinds that the device's counter does not show:
+
+========== ==========================================================================
+skip       ``count`` samples are neither sent nor counted
+repeat     the last ``count`` samples are sent and counted again, as new ones
+coarse     stated UTC is rounded down to steps of ``level`` s, for the whole run
 ========== ==========================================================================
 
 Others: ``spike`` adds ``level`` counts to one sample; ``reset`` restarts the device; ``wrap`` makes
@@ -84,13 +93,15 @@ if TYPE_CHECKING:
 Kind: TypeAlias = Literal[
     "drop", "cut", "corrupt", "checksum", "garbage", "duplicate", "merge", "late",
     "jitter", "latency", "batching", "stall", "pause", "disconnect", "silent",
-    "clip", "dead", "spike", "moved",
+    "clip", "dead", "spike", "moved", "skip", "repeat", "coarse",
     "reset", "wrap", "overflow",
 ]  # fmt: skip
 DELAYS = ("jitter", "latency", "batching")
 LASTING = (*DELAYS, "stall", "pause", "disconnect")
 UNIT_KINDS = ("drop", "cut", "corrupt", "checksum", "garbage", "duplicate", "merge", "late")
 SAMPLE_KINDS = ("clip", "dead", "spike")
+SLIPS = ("skip", "repeat")
+"""Kinds after which the device's counter is wrong."""
 PATIENCE = 1.0
 """Seconds after which a fault expires if no unit is sent."""
 
@@ -103,6 +114,7 @@ class Fault(BaseModel):
     kind: Kind
     at: NonNegativeFloat
     every: PositiveFloat | None = None
+    spread: NonNegativeFloat = 0.0
     sensors: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
     count: PositiveInt = 1
     duration: NonNegativeFloat = 1.0
@@ -111,17 +123,34 @@ class Fault(BaseModel):
     seed: int = 0
 
     @model_validator(mode="after")
-    def _delays_by_something(self) -> Self:
-        if self.kind in DELAYS and self.level <= 0:
+    def _is_possible(self) -> Self:
+        if self.kind in (*DELAYS, "coarse") and self.level <= 0:
             raise ValueError(f"{self.kind} has level {self.level:g}; expected seconds above 0")
+        if self.spread and (self.kind in (*SAMPLE_KINDS, "silent", "moved", "coarse")):
+            raise ValueError(f"{self.kind} has spread {self.spread:g}; expected none")
+        if self.every is not None and self.spread > self.every:
+            raise ValueError(f"spread {self.spread:g}; expected at most every, {self.every:g}")
         return self
 
-    def times(self, begin: float = 0.0) -> Iterator[float]:
-        """Yield the world times of the fault in s, from ``begin`` on."""
-        if self.every is None:
-            return iter((self.at,) if self.at >= begin else ())
-        first, every = max(0, math.ceil((begin - self.at) / self.every)), self.every
-        return (self.at + k * every for k in itertools.count(first))
+    def times(self, begin: float = 0.0, *, name: str = "") -> Iterator[float]:
+        """Yield the world times of the fault in s, from ``begin`` on.
+
+        Random delays (``spread``) differ from device to device, by their ``name``.
+        """
+        every, repetitions = (
+            self.every or 0.0,
+            range(1) if self.every is None else itertools.count(),
+        )
+        if self.every is not None:
+            first = max(0, math.ceil((begin - self.spread - self.at) / every))
+            repetitions = itertools.count(first)
+        for k in repetitions:
+            late = 0.0
+            if self.spread:
+                rng = np.random.default_rng([self.seed, k, zlib.crc32(name.encode())])
+                late = float(rng.uniform(0, self.spread))
+            if self.at + k * every + late >= begin:
+                yield self.at + k * every + late
 
     def is_on(self, times: FloatArray) -> NDArray[np.bool_]:
         """Return whether a lasting fault is on at world ``times`` (n,)."""
@@ -190,6 +219,11 @@ def check(faults: Sequence[Fault], n_channels: Mapping[str, int]) -> None:
         raise ScenarioError(*wrong)
 
 
+def _slips_of(fault: Fault, sensor: str) -> Iterator[tuple[float, int]]:
+    n_skipped = fault.count if fault.kind == "skip" else -fault.count
+    return ((at, n_skipped) for at in fault.times(name=sensor))
+
+
 class SampleFaults:
     """Faults that change samples before the device sends them."""
 
@@ -197,6 +231,24 @@ class SampleFaults:
         self._faults = [fault for fault in faults if fault.kind in SAMPLE_KINDS]
         self._silences = [fault for fault in faults if fault.kind == "silent"]
         self._moves = [fault for fault in faults if fault.kind == "moved"]
+        self._slips = [fault for fault in faults if fault.kind in SLIPS]
+        self._coarse = [fault for fault in faults if fault.kind == "coarse"]
+
+    def slips(self, sensor: str) -> Iterator[tuple[float, int]]:
+        """Yield the world time of each slip of a sensor's counter, and the samples it skips.
+
+        Negative numbers are samples that are counted again.
+        """
+        mine = [one for one in self._slips if one.sensors is None or sensor in one.sensors]
+        return heapq.merge(*(_slips_of(one, sensor) for one in mine))
+
+    def stated_ns(self, sensor: str, utc_ns: int) -> int:
+        """Return the UTC in ns that a device states."""
+        for fault in self._coarse:
+            if fault.sensors is None or sensor in fault.sensors:
+                step = round(fault.level * 1e9)
+                utc_ns = utc_ns // step * step
+        return utc_ns
 
     def is_moved(self, sensor: str, times: FloatArray) -> NDArray[np.bool_]:
         """Return where a sensor is on another floor at world ``times`` (n,)."""
@@ -255,9 +307,9 @@ class LineFaults:
         )
         self._schedule: list[tuple[float, int, Fault, Iterator[float]]] = []
         for index, fault in enumerate(faults):
-            if fault.kind not in (*SAMPLE_KINDS, "moved", "silent", "wrap"):
+            if fault.kind not in (*SAMPLE_KINDS, *SLIPS, "moved", "silent", "wrap", "coarse"):
                 # lasting faults may have begun before the device started
-                times = fault.times(begin - fault.duration * (fault.kind in LASTING))
+                times = fault.times(begin - fault.duration * (fault.kind in LASTING), name=name)
                 first = next(times, None)
                 if first is not None:
                     self._schedule.append((first, index, fault, times))

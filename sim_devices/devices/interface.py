@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
@@ -20,7 +20,7 @@ from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -142,6 +142,7 @@ class Source:
             table["sensors"][sensor]["sampling_rate"] = self.sampling_rate
         self._simulated = Scenario.from_dict(table)
         self._world = World(self._simulated)
+        self._slips: dict[str, _Slips] = {}
 
     def at_rate(self, sampling_rate: float) -> Source:
         """Return a source with the same world and another sampling rate."""
@@ -157,18 +158,46 @@ class Source:
 
     def counts(self, sensor: str, first_sample: int, n: int) -> NDArray[np.float64]:
         """Return the main channels in counts, neither rounded nor clipped, (n, n_channels)."""
-        samples = self._world.samples(sensor, first_sample, n)
+        if not n:
+            return self._world.samples(sensor, first_sample, n) * self._sensitivities[sensor]
+        index, _ = self._counted(sensor, first_sample, n)
+        first, rows = int(index.min()), index - index.min()
+        samples: FloatArray = self._world.samples(sensor, first, int(rows.max()) + 1)[rows]
         if self._faults is None:
             return samples * self._sensitivities[sensor]
         times = self.times(sensor, first_sample, n)
         moved = self._faults.is_moved(sensor, times)
         if moved.any():
-            samples[moved] = self._other_floor.samples(sensor, first_sample, n)[moved]
+            other = self._other_floor.samples(sensor, first, int(rows.max()) + 1)[rows]
+            samples[moved] = other[moved]
         return self._faults.apply(sensor, samples * self._sensitivities[sensor], times)
 
     def times(self, sensor: str, first_sample: int, n: int) -> FloatArray:
         """Return the world time of each sample in s, shape (n,)."""
-        return self._world.sample_times(sensor, first_sample, n)
+        if not n:
+            return np.empty(0)
+        _, index = self._counted(sensor, first_sample, n)
+        first = int(index.min())
+        times = self._world.sample_times(sensor, first, int(index.max()) - first + 1)
+        at: FloatArray = times[index - first]
+        return at
+
+    def stated_ns(self, sensor: str, utc_ns: int) -> int:
+        """Return what the device states where UTC is ``utc_ns``."""
+        return utc_ns if self._faults is None else self._faults.stated_ns(sensor, utc_ns)
+
+    def _counted(
+        self, sensor: str, first_sample: int, n: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return which samples of the sensor the device counts as these.
+
+        The second array is for their times: a sample that is counted again comes without delay.
+        """
+        index = first_sample + np.arange(n)
+        if self._faults is None:
+            return index, index
+        slips = self._slips.setdefault(sensor, _Slips(self._faults.slips(sensor)))
+        return slips.counted(index, lambda at: self._first_taken_after(sensor, at))
 
     def is_silent(self, sensor: str, now: float) -> bool:
         """Return whether a fault switches this unit of a shared line off at ``now``."""
@@ -176,11 +205,18 @@ class Source:
 
     def first_sample_after(self, sensor: str, now: float) -> int:
         """Return the index of the first sample taken at or after world time ``now``."""
-        guess = max(0, math.floor((now - float(self.times(sensor, 0, 1)[0])) * self.sampling_rate))
-        while guess > 0 and float(self.times(sensor, guess, 1)[0]) >= now:
+        return self._first_after(now, partial(self.times, sensor))
+
+    def _first_taken_after(self, sensor: str, now: float) -> int:
+        """Return :meth:`first_sample_after` without slips of the device's counter."""
+        return self._first_after(now, partial(self._world.sample_times, sensor))
+
+    def _first_after(self, now: float, times: Callable[[int, int], FloatArray]) -> int:
+        guess = max(0, math.floor((now - float(times(0, 1)[0])) * self.sampling_rate))
+        while guess > 0 and float(times(guess, 1)[0]) >= now:
             guess = max(0, guess - max(1, round(guess * 1e-4)))
         while True:
-            later = np.flatnonzero(self.times(sensor, guess, 256) >= now)
+            later = np.flatnonzero(times(guess, 256) >= now)
             if later.size:
                 return guess + int(later[0])
             guess += 256
@@ -195,3 +231,32 @@ class Source:
             sensor: np.array([c.sensitivity for c in channels if not c.auxiliary])
             for sensor, channels in self.device.channels.items()
         }
+
+
+class _Slips:
+    """Where a device's counter skips or repeats samples of its sensor without saying so."""
+
+    def __init__(self, planned: Iterator[tuple[float, int]]) -> None:
+        self._planned = planned
+        self._next = next(planned, None)
+        self._starts, self._shifts, self._repeats = [0], [0], [0]
+
+    def counted(
+        self, index: NDArray[np.int64], first_taken_after: Callable[[float], int]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the samples counted as ``index``, and those at whose times they come."""
+        while self._next is not None:
+            at, skipped = self._next
+            taken = first_taken_after(at)
+            start = taken - self._shifts[-1]
+            if start > index[-1]:
+                break
+            self._starts.append(max(start, self._starts[-1]))
+            self._shifts.append(self._shifts[-1] + max(skipped, -taken))
+            self._repeats.append(min(max(0, -skipped), taken))
+            self._next = next(self._planned, None)
+        which = np.searchsorted(self._starts, index, side="right") - 1
+        starts, repeats = np.array(self._starts)[which], np.array(self._repeats)[which]
+        counted = index + np.array(self._shifts)[which]
+        held = starts + np.array(self._shifts)[which] + repeats - 1
+        return counted, np.where(index - starts < repeats, held, counted)

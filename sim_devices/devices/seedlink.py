@@ -62,7 +62,7 @@ class Station:
         self._delays = [int(delays.get(code, 0)) for code in codes]
         self._rate = source.sampling_rate
         offset = -device.utc_ns % _NS / _NS
-        self._source = source.disciplined(offset)
+        self._source, self._sensor = source.disciplined(offset), sensor
         self._samples = Samples(self._source, [sensor])
         self._utc_ns = device.utc_ns
         self._keep = float(settings.get("keep", KEEP))
@@ -118,7 +118,7 @@ class Station:
             self.station,
             self._location,
             self.channels[column],
-            start_ns // 1000 * 1000,
+            self._source.stated_ns(self._sensor, start_ns // 1000 * 1000),
             Fraction(self._rate).limit_denominator(1000),
             counts[:, column].astype(np.int32),
         )

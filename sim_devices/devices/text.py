@@ -58,6 +58,7 @@ class TextDevice:
         self._start = str(device.settings.get("start", "")).encode()
         self._stop = str(device.settings.get("stop", "")).encode()
         self._tail = LILY_TAIL if device.settings.get("preset") == "lily" else ()
+        self._source, self._sensor = source, device.sensors[0]
         self._samples = Samples(source, device.sensors)
         self._received = b""
         self._sends = False
@@ -113,7 +114,8 @@ class TextDevice:
     def _time(self, index: int) -> str:
         since_start = self._format.time_format in SINCE_START
         start_ns = 0 if since_start else self._utc_ns
-        return encode_time(start_ns + round(self._samples.time(index) * _NS), self._format)
+        utc_ns = start_ns + round(self._samples.time(index) * _NS)
+        return encode_time(self._source.stated_ns(self._sensor, utc_ns), self._format)
 
     def _written(self, values: Sequence[float]) -> list[str]:
         if self._format.hexadecimal_bits is not None:

@@ -18,8 +18,8 @@ class SampleClock:
     """World time of each sample of a sensor.
 
     The rate error of the oscillator is `ppm`, plus a random walk (linear between knots), plus an
-    exponential step. The time is its exact integral, and so it is smooth. The random walk is zero
-    up to sample 0.
+    exponential step, a ramp and a cycle. The time is its exact integral, and so it is smooth. The
+    random walk is zero up to sample 0.
     """
 
     def __init__(self, clock: SensorClock, *, sampling_rate: float, key: tuple[int, int]) -> None:
@@ -41,6 +41,14 @@ class SampleClock:
             constant = clock.step.time_constant
             settling = constant * -np.expm1(-since / constant) if constant else 0.0
             times -= clock.step.ppm * 1e-6 * (since - settling)
+        if clock.ramp is not None:
+            since = np.maximum(nominal - clock.ramp.time, 0.0)
+            within = np.minimum(since, clock.ramp.duration)
+            integral = within**2 / (2 * clock.ramp.duration) + (since - within)
+            times -= clock.ramp.ppm * 1e-6 * integral
+        if clock.cycle is not None:
+            angular = 2 * np.pi / clock.cycle.period
+            times -= clock.cycle.ppm * 1e-6 * (1 - np.cos(angular * nominal)) / angular
         return np.asarray(times)
 
     def _wander(self, nominal: FloatArray) -> FloatArray:

@@ -40,18 +40,35 @@ class TemperatureStep(Table):
     time_constant: NonNegativeFloat = 60.0
 
 
+class TemperatureRamp(Table):
+    """Linear change of the rate by `ppm`, from `time` (s) on, within `duration` (s)."""
+
+    time: float
+    ppm: float
+    duration: PositiveFloat = 180.0
+
+
+class TemperatureCycle(Table):
+    """Change of the rate by `ppm` times the sine of a cycle of `period` (s), from sample 0 on."""
+
+    ppm: float
+    period: PositiveFloat = 1200.0
+
+
 class SensorClock(Table):
     """Clock of a sensor.
 
     Sample n is taken at world time `offset + n / (sampling_rate (1 + ppm 1e-6))` in s, plus the
     effects of `wander` (a random walk of the rate; standard deviation in ppm after one hour) and of
-    a temperature step.
+    the temperature: a step, a ramp and a cycle.
     """
 
     offset: float = 0.0
     ppm: float = 0.0
     wander: NonNegativeFloat = 0.0
     step: TemperatureStep | None = None
+    ramp: TemperatureRamp | None = None
+    cycle: TemperatureCycle | None = None
 
 
 class Response(Table):

@@ -46,6 +46,67 @@ def strike(**fault: Any) -> list[bytes]:  # noqa: ANN401 -- a line of a script
     return faults.send([UNIT] * 4, 1.0)
 
 
+def slipping(*script: dict[str, Any]) -> tuple[Source, Source]:
+    """Return a sensor whose device's counter slips, and the same sensor without."""
+    one = DeviceSpec(("A",), "text", "pty", 200.0, {"A": (ChannelSpec("x", 1e6),) * 3})
+    world = scenario("A")
+    return Source(world, one, faults=SampleFaults(parse(list(script)))), Source(world, one)
+
+
+def test_samples_are_lost_or_counted_twice_without_the_counter_saying_so() -> None:
+    slipped, sound = slipping(
+        {"kind": "skip", "at": 1.0, "count": 3}, {"kind": "repeat", "at": 2.0, "count": 20}
+    )
+    whole = np.concatenate([slipped.counts("A", k, 50) for k in range(0, 600, 50)])
+    true = sound.counts("A", 0, 700)
+    expected = [*range(200), *range(203, 400), *range(380, 400), *range(400, 583)]
+    np.testing.assert_array_equal(whole, true[expected])
+    np.testing.assert_array_equal(slipped.counts("A", 390, 20), whole[390:410])
+    times, true_times = slipped.times("A", 0, 600), sound.times("A", 0, 700)
+    at = np.array(expected)
+    at[397:417] = 399  # what is counted again comes at once
+    np.testing.assert_array_equal(times, true_times[at])
+    assert slipped.first_sample_after("A", 2.5) == 517
+    assert sound.first_sample_after("A", 2.5) == 500
+
+
+def test_random_repetitions_differ_from_device_to_device_and_are_the_same_in_every_run() -> None:
+    (fault,) = parse([{"kind": "reset", "at": 10.0, "every": 30.0, "spread": 20.0}])
+    times = {}
+    for name in "AB":
+        times[name] = np.array(
+            [t for t, _ in zip(fault.times(name=name), range(200), strict=False)]
+        )
+        begin = times[name][57] - 0.001
+        later = fault.times(begin, name=name)
+        assert [next(later) for _ in range(3)] == times[name][57:60].tolist()
+    late = times["A"] - (10.0 + 30.0 * np.arange(200))
+    assert late.min() >= 0
+    assert late.max() <= 20
+    assert late.std() == pytest.approx(20 / 12**0.5, rel=0.15)
+    assert np.abs(times["A"] - times["B"]).max() > 5
+
+
+async def test_stated_utc_comes_in_steps() -> None:
+    """Of 0.1 ms, although the device could state microseconds."""
+    table = device("A", "text", sampling_rate=100.0, port="tcp", settings={"time_column": 3})
+    script = [{"kind": "coarse", "at": 0.0, "level": 1e-2}]
+    with serving(spec(table, speed=4.0) | {"faults": script}) as (one,):
+        (sensor,) = sensors(one, table, settings={"time_column": 3})
+        async with AsyncExitStack() as stack:
+            session = await stack.enter_async_context(
+                driver_type("text").open([sensor], host_clock(4.0))
+            )
+            n_blocks = 0
+            async for item in session.read():
+                if isinstance(item, Block):
+                    assert item.device_counter is not None
+                    assert item.device_counter % 10**7 == 0
+                    n_blocks += 1
+                if n_blocks == 3:
+                    break
+
+
 def test_faults_change_units() -> None:
     assert strike(kind="drop", count=2) == [UNIT] * 2
     assert strike(kind="cut", count=4) == [UNIT[:8] + UNIT[12:], *[UNIT] * 3]

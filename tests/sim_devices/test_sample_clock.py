@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim_devices.world.sample_clock import SampleClock
-from sim_devices.world.tables import SensorClock, TemperatureStep
+from sim_devices.world.tables import SensorClock, TemperatureCycle, TemperatureRamp, TemperatureStep
 
 RATE = 200.0
 
@@ -54,3 +54,17 @@ def test_a_temperature_step_settles() -> None:
     assert np.all(error[:101] == 0)
     assert np.diff(error)[-1] == pytest.approx(-4.0, rel=1e-6)
     assert error[-1] == pytest.approx(-4.0 * (899 - 30), rel=1e-6)
+
+
+def test_a_ramp_and_a_cycle_are_the_integrals_of_their_rates() -> None:
+    """Against a sum over the rates that the tables state."""
+    tables = SensorClock(
+        ramp=TemperatureRamp(time=100.0, ppm=30.0, duration=180.0),
+        cycle=TemperatureCycle(ppm=5.0, period=300.0),
+    )
+    times = SampleClock(tables, sampling_rate=10.0, key=(0, 0)).times(0, 6001)
+    middle = np.arange(6000) / 10.0 + 0.05
+    rate = 30.0 * np.clip((middle - 100.0) / 180.0, 0, 1)
+    rate += 5.0 * np.sin(2 * np.pi * middle / 300.0)
+    error = np.concatenate(([0.0], np.cumsum(rate * 1e-6 * 0.1)))
+    np.testing.assert_allclose(np.arange(6001) / 10.0 - times, error, atol=1e-9)
