@@ -58,6 +58,7 @@ CASES: dict[str, dict[str, Any]] = {
         "settings": {"link": "scream", "patience": 2.0},
     },
     "fifo": {"driver": "fifo", "settings": {}},
+    "fifo tcp": {"driver": "fifo", "port": "tcp", "settings": {}},
     "seedlink 4": {**SEEDLINK, "settings": {**STATION}},
     "seedlink 3": {
         **SEEDLINK,

@@ -76,6 +76,7 @@ FAULTS: dict[str, dict[str, dict[str, Any]]] = {
     "scream udp": _RESET | _GARBAGE,
     "scream tcp": _RESET | _GARBAGE,
     "fifo": _CHECKED,  # what a power failure takes is not always noticed
+    "fifo tcp": _CHECKED,
     "seedlink 4": _RESET | _GARBAGE,
     "seedlink 3": _RESET | _GARBAGE,
     "text serial": _RESET | _XOR,
@@ -185,10 +186,11 @@ def test_each_sample_has_its_index(
                     assert set(kinds) <= KINDS
                     if "disconnect" in struck[mode] and "udp" not in mode:
                         assert kinds.count("connected") >= 2
-                    _hold_against_the_world(served, mode, sensor)
+                    hold_against_the_world(served, mode, sensor)
 
 
-def _hold_against_the_world(served: Served, mode: str, sensor: SensorRecord) -> None:
+def hold_against_the_world(served: Served, mode: str, sensor: SensorRecord) -> None:
+    """See that each recorded sample is in its place."""
     blocks, counts = sensor.blocks, sensor.counts()
     assert len(counts) == blocks["n_samples"].sum()
     rows = np.cumsum(blocks["n_samples"]) - blocks["n_samples"]
