@@ -40,7 +40,8 @@ def served() -> Iterator[Served]:
 
 
 def test_no_driver_is_left_out() -> None:
-    assert {case["driver"] for case in CASES.values()} == set(driver_names())
+    tested_elsewhere = {"epson-can"}  # its bus is within a process: test_epson_can.py
+    assert {case["driver"] for case in CASES.values()} | tested_elsewhere == set(driver_names())
 
 
 @pytest.mark.parametrize("mode", CASES)
