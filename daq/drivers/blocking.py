@@ -19,7 +19,7 @@ import contextlib
 import logging
 import threading
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -61,7 +61,9 @@ class Samples:
     reason : str
         Why samples are missing, as the library says.
     flags : BlockFlag
-        For example ``CLIPPED``.
+        For example ``CLIPPED``, or ``MISSING_ESTIMATED`` where ``missing`` is not exact.
+    received : HostTime or None
+        When the library had them; by default, when the read returned.
     """
 
     counts: NDArray[Any]
@@ -69,6 +71,7 @@ class Samples:
     missing: int = 0
     reason: str = ""
     flags: BlockFlag = BlockFlag.NONE
+    received: HostTime | None = None
 
 
 class BlockingSource:
@@ -165,13 +168,13 @@ class BlockingSource:
 
     def _put(self, samples: Samples) -> None:
         """Queue samples with the present time, or drop and count them."""
-        at = self._clock.now()
+        at = samples.received or self._clock.now()
         if len(self._queue) >= self._room:
             self._n_dropped += samples.missing + len(samples.counts)
             return
         if self._n_dropped:
             missing, reason = self._n_dropped + samples.missing, "the computer was too slow"
-            samples = Samples(samples.counts, samples.position, missing, reason, samples.flags)
+            samples = replace(samples, missing=missing, reason=reason)
             self._n_dropped = 0
         self._queue.append((samples, at))
 
