@@ -72,6 +72,7 @@ FAMILIES = {
     "fifo": "sim_devices.devices.fifo:create",
     "text": "sim_devices.devices.text:create",
     "seedlink": "sim_devices.devices.seedlink:create",
+    "iio": "sim_devices.devices.iio:create",
 }
 """Driver name → ``module:function`` that creates its simulated device."""
 

@@ -64,6 +64,7 @@ CASES: dict[str, dict[str, Any]] = {
         **SEEDLINK,
         "settings": {**STATION, "station": "S2", "protocol": "3", "channels": ["HN?"]},
     },
+    "iio": {"driver": "iio", "port": "tcp", "settings": {}},
     "text serial": {
         "driver": "text",
         "settings": {

@@ -149,7 +149,7 @@ async def test_a_logged_session_is_replayed(served: Served, mode: str, tmp_path:
 @pytest.mark.parametrize("mode", CASES)
 async def test_a_port_that_is_not_there_is_named(served: Served, mode: str) -> None:
     scheme = served.device(mode).port.partition("://")[0]
-    known = scheme in {"modbus-tcp", "seedlink", "udp"}
+    known = scheme in {"modbus-tcp", "seedlink", "udp", "iio"}
     port = f"{scheme}://127.0.0.1:1" if known else "socket://127.0.0.1:1"
     if mode == "text udp":  # listens itself, at an address that is not this computer's
         port = "udp://192.0.2.1:8888"
@@ -193,7 +193,7 @@ async def outcome(mode: str, chosen: list[Sensor]) -> tuple[Exception | None, in
 
 def _scheme(port: str) -> str:
     scheme = port.partition("://")[0]
-    return scheme if scheme in {"modbus-tcp", "seedlink"} else "socket"
+    return scheme if scheme in {"modbus-tcp", "seedlink", "iio"} else "socket"
 
 
 @pytest.mark.parametrize("garbage", [b"", bytes(range(256)) * 3], ids=["silence", "garbage"])

@@ -79,6 +79,12 @@ FAULTS: dict[str, dict[str, dict[str, Any]]] = {
     "fifo tcp": _CHECKED,
     "seedlink 4": _RESET | _GARBAGE,
     "seedlink 3": _RESET | _GARBAGE,
+    "iio": {
+        "overflow": {"duration": 1.5},
+        "stall": {"duration": 1.6},
+        "late": {"duration": 0.6},
+        "disconnect": {"duration": 4.0},
+    },
     "text serial": _RESET | _XOR,
     "text tcp": _RESET | _PACKETS,
     "text udp": _RESET | _GARBAGE,
