@@ -81,6 +81,7 @@ class Findings:
                 dims=dims,
                 n_effective=min(band.n_effective for band in bands),
                 equalised_by=edges.sources,
+                unproven=edges.unproven,
             )
             order = list(Level)
             advice = sorted([*whole.advice, *leaks], key=lambda each: order.index(each.level))

@@ -6,6 +6,10 @@ Filters come from the poles and zeros of the bench file, from the responses that
 or from both in turn. They are found from the first `FILTER_SEGMENTS` segments of each recording, in
 a few rounds: each shows what the filters so far have left. So an estimate is a function of its
 files, whether these were followed while they grew or not.
+
+Filters found from averages are guilty until proven: segments that they were not found from are
+averaged with them and without, and the filters of a sensor are used only if its noise is then lower
+by more than chance.
 """
 
 from __future__ import annotations
@@ -16,16 +20,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.estimation.noise_estimates import responses
+from daq.estimation.noise_estimates import responses, up_to
 from daq.estimation.snapshot_diagnostics import (
     EdgeLeakage,
 )
 from estimator.errors import InsufficientDataError
 from estimator.methods import self_noise
 from estimator.responses.edge_leakage import band_shares, channel_responses, slope_factor
-from estimator.responses.equalisation import correction, leakage_threshold, significant_minimum
+from estimator.responses.equalisation import (
+    correction,
+    leakage_threshold,
+    lowers_noise,
+    significant_minimum,
+)
 from estimator.spectra.equaliser import Equaliser, bounded, design, tail_leakage, with_short_tails
-from estimator.spectra.windows import get_window
+from estimator.spectra.multiresolution import Band
+from estimator.spectra.windows import effective_averages, get_window
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,15 +43,20 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.model import Channel
+    from daq.estimation.segments.segment_pass import Pass
     from estimator.self_noise.result import SelfNoise
-    from estimator.spectra.multiresolution import Band
     from estimator.spectra.welch import WelchSettings
 
     FloatArray = NDArray[np.float64]
     ComplexArray = NDArray[np.complex128]
 
 FILTER_SEGMENTS = 240
-"""Segments of each recording, from its start, that filters are found from."""
+"""Segments of each recording, from its start, that filters are found from at most."""
+PROOF_SEGMENTS = 120
+"""Segments after these, at most, that have to prove the filters."""
+FOUND_FROM = 2 / 3
+"""Share of a recording's segments that filters are found from at most."""
+_GROUPS = 5  # of segments, that have to prove filters: the fewest whose scatter is known
 ROUNDS = 3
 METHOD = "three-sensor"
 """Method of the noise with which leakage is compared: it takes little time."""
@@ -93,7 +108,7 @@ class Equalisation:
         window = get_window(welch.window, welch.segment_length)
         self._factor = slope_factor(window, welch.sampling_rate)
         known = mode in {"auto", "known"} and len(channels) > 1
-        self._known = self._by_bench(channels) if known else None
+        self.known = self._by_bench(channels) if known else None
         self._found: tuple[tuple[tuple[float, bytes], ...], _Leaks | None] = (), None
         self._can_estimate = mode in {"auto", "estimated"} and welch.segment_length % 2 == 0
         self.is_settled = not self._can_estimate or len(dims) < 3
@@ -103,12 +118,14 @@ class Equalisation:
         """Forget what was estimated."""
         self._wanted: ComplexArray | None = None
         self._reference: int | None = None
-        self.filters = self._known
+        self.filters = self.known
+        self.unproven: tuple[int, ...] = ()
+        """Sensors whose filters did not lower the noise of other segments."""
 
     @property
     def sources(self) -> tuple[str, ...]:
         """Where filters come from: "known", "estimated", both or neither."""
-        return ("known",) * (self._known is not None) + ("estimated",) * (self._wanted is not None)
+        return ("known",) * (self.known is not None) + ("estimated",) * (self._wanted is not None)
 
     def _by_bench(self, channels: Sequence[tuple[str, Channel]]) -> Equaliser | None:
         """Return filters that make all channels answer like one, by their poles and zeros."""
@@ -154,12 +171,10 @@ class Equalisation:
         bands : sequence of Band
             Of samples filtered as now, in the channels' own units.
         """
-        n_effective = min((band.n_effective for band in bands), default=0.0)
-        if self.is_settled or n_effective < _MIN_AVERAGES:
+        found = self._leaks_as_filtered(bands) if self.leaks(bands) else None
+        if found is None:
             return False
-        found = self._leaks_as_filtered(bands)
-        if found is None or not found.share.max(initial=0.0) > leakage_threshold(n_effective):
-            return False
+        n_effective = min(band.n_effective for band in bands)
         frequency = np.concatenate([band.frequencies for band in bands])
         csm = bands[0].csm if len(bands) == 1 else np.concatenate([b.csm for b in bands])
         wanted, self._reference = correction(
@@ -174,11 +189,98 @@ class Equalisation:
         )
         if (wanted == 1).all():
             return False
-        self._wanted = wanted if self._wanted is None else self._wanted * wanted
-        longest = self._welch.segment_length // 2 - 1
-        estimated = design(self._wanted, self._welch.sampling_rate, longest=longest)
-        self.filters = estimated if self._known is None else self._known.then(estimated)
+        self._design(wanted if self._wanted is None else self._wanted * wanted)
         return True
+
+    def _design(self, wanted: ComplexArray) -> None:
+        longest = self._welch.segment_length // 2 - 1
+        estimated = design(wanted, self._welch.sampling_rate, longest=longest)
+        self._wanted = wanted
+        self.filters = estimated if self.known is None else self.known.then(estimated)
+
+    def leaks(self, bands: Sequence[Band]) -> bool:
+        """Return whether more leaks, as filtered now, than is left alone.
+
+        Parameters
+        ----------
+        bands : sequence of Band
+            As `revise` takes them.
+        """
+        n_effective = min((band.n_effective for band in bands), default=0.0)
+        if self.is_settled or n_effective < _MIN_AVERAGES:
+            return False
+        found = self._leaks_as_filtered(bands)
+        return found is not None and found.share.max(initial=0.0) > leakage_threshold(n_effective)
+
+    def prove(self, pieces: Sequence[tuple[Pass, int, int]]) -> bool:
+        """Drop estimated filters that do not lower the noise; return whether any was dropped.
+
+        Parameters
+        ----------
+        pieces : sequence of (Pass, int, int)
+            Segments that filters were not found from: first segment, and their number.
+        """
+        if self._wanted is None or self.filters is None:
+            return False
+        moved = np.flatnonzero((self._wanted != 1).any(axis=0))
+        sensor_of = np.repeat(np.arange(len(self._dims)), self._dims)
+        sensors = np.unique(sensor_of[moved])
+        groups = [
+            (each, int(rows[0]), len(rows))
+            for each, first, count in pieces
+            for rows in np.array_split(first + np.arange(count), _GROUPS)
+            if len(rows)
+        ]
+        noise = self._jackknifed(groups, None), self._jackknifed(groups, self.filters)
+        proven = np.zeros(len(self._dims), np.bool_)
+        if noise[0] is not None and noise[1] is not None:
+            inner = slice(1, -1)
+            frequency = self._welch.frequencies[inner]
+            before, after = (each[:, inner] for each in noise if each is not None)
+            proven = lowers_noise(before, after, frequency, dims=self._dims)
+        self.unproven = tuple(sensors[~proven[sensors]].tolist())
+        if not self.unproven:
+            return False
+        dropped = np.isin(sensor_of, self.unproven)
+        if dropped[moved].all():
+            self._wanted, self.filters = None, self.known
+        else:
+            self._design(np.where(dropped, 1.0, self._wanted))
+        return True
+
+    def _jackknifed(
+        self, groups: Sequence[tuple[Pass, int, int]], filters: Equaliser | None
+    ) -> FloatArray | None:
+        """Return the noise without each group of segments, shape (n_groups, n_freqs, n_channels).
+
+        In the channels' own units; None if there is too little data.
+        """
+        filters = self.known if filters is None else filters
+        hop = self._welch.hop
+        # Segments without filters are at the same samples as those with.
+        reach = 0 if self.filters is None else self.filters.reach
+        sums = [each.averages(filters, first * hop + reach, n) for each, first, n in groups]
+        sums = [each for each in sums if each.n_segments]
+        total = sum(each.n_segments for each in sums)
+        if len(sums) < _GROUPS:
+            return None
+        frequency = self._welch.frequencies
+        whole = sum((each.n_segments / total) * each.csm() for each in sums)
+        response = None if filters is None else np.abs(filters.response(frequency)) ** -2.0
+        window = get_window(self._welch.window, self._welch.segment_length)
+        usable = min(each.aligned.usable for each, _, _ in groups)
+        noise = []
+        for each in sums:
+            left = total - each.n_segments
+            csm = (total * whole - each.n_segments * each.csm()) / left
+            averages = effective_averages(window, hop, left)
+            band = up_to(Band(self._welch, frequency, csm, left, averages), usable)
+            found = self._noise((band,))
+            if found is None:
+                return None
+            psd = found[0].noise_psd
+            noise.append(psd if response is None else psd * response)
+        return np.array(noise)
 
     def leakage(
         self, bands: Sequence[Band], channels: Sequence[tuple[str, Channel]], unit: str
@@ -215,6 +317,7 @@ class Equalisation:
                 share=found.share,
                 whole_share=np.maximum(whole.share, found.share),
                 sources=self.sources,
+                unproven=self.unproven,
             )
 
     def noise(self, bands: Sequence[Band]) -> tuple[SelfNoise, ...] | None:

@@ -24,7 +24,13 @@ import numpy as np
 
 from daq.bench.units import canonical
 from daq.errors import CannotAlignError
-from daq.estimation.equalisation import FILTER_SEGMENTS, ROUNDS, Equalisation
+from daq.estimation.equalisation import (
+    FILTER_SEGMENTS,
+    FOUND_FROM,
+    PROOF_SEGMENTS,
+    ROUNDS,
+    Equalisation,
+)
 from daq.estimation.noise_estimates import averages
 from daq.estimation.recording_set import (
     check_same,
@@ -236,7 +242,7 @@ class Estimation:
                 self._passes[number] = self._pass(each.recording)
             self._passes[number].doubt_stated_times()
         is_exact = all(each.aligned.is_exact for each in self._passes)
-        if not is_exact:
+        if not (is_exact and self._equalisation.is_settled):
             self._equalisation.reset()
         self._filter()
         check_span(self._passes, self.settings)
@@ -253,13 +259,16 @@ class Estimation:
             nonlocal total
             total += n
 
-        if is_exact and not self._equalisation.is_settled:
-            self._settle(count)  # before all segments are taken: most of them are taken once
+        is_long = all(each.n_complete >= FILTER_SEGMENTS + PROOF_SEGMENTS for each in self._passes)
+        if is_exact and is_long and not self._equalisation.is_settled:
+            self._find_filters(count)  # before all segments are taken: most are taken once
+            self._equalisation.is_settled = True
         for each in self._passes:
             each.finish(count, repeat)
             keep_few([one.single for one in self._passes])
-        if not is_exact:  # clocks that are wrong look like responses that differ
-            self._equalise_in_rounds(count)
+        if self._equalisation.leaks(averages(self._passes)):
+            # with the clocks known: clocks that are wrong look like responses that differ
+            self._find_filters(count)
             for each in self._passes:
                 each.advance(count)
                 keep_few([one.single for one in self._passes])
@@ -294,32 +303,42 @@ class Estimation:
     def _equalise_growing(self) -> None:
         """Find filters from the segments so far; for good once there are enough of them."""
         enough = all(
-            each.n_seen >= FILTER_SEGMENTS and each.aligned.is_exact for each in self._passes
+            each.n_seen >= FILTER_SEGMENTS + PROOF_SEGMENTS and each.aligned.is_exact
+            for each in self._passes
         )
-        if enough:
-            self._settle()
-        elif self._equalisation.revise(averages(self._passes)):
-            self._filter()
+        if enough or self._equalisation.leaks(averages(self._passes)):
+            self._find_filters()
         self._equalisation.is_settled = enough
         for each in self._passes:
             each.advance()
 
-    def _settle(self, progress: Callable[[int], None] | None = None) -> None:
-        """Find filters from the first segments: the same from a growing and a finished file."""
-        self._equalisation.reset()
-        for each in self._passes:
-            if each.filters is not self._equalisation.filters or each.n_seen > FILTER_SEGMENTS:
-                each.equalise(self._equalisation.filters)
-            each.advance(progress, most=FILTER_SEGMENTS)
-        self._equalise_in_rounds(progress)
+    def _find_filters(self, progress: Callable[[int], None] | None = None) -> None:
+        """Find filters from the first segments, and prove them with the next.
 
-    def _equalise_in_rounds(self, progress: Callable[[int], None] | None) -> None:
+        They are the same from a growing and a finished file.
+        """
+        self._equalisation.reset()
+        self._filter()  # filters shorten what is complete
+        most = [min(FILTER_SEGMENTS, int(FOUND_FROM * each.n_complete)) for each in self._passes]
+
+        def take() -> None:
+            for each, first in zip(self._passes, most, strict=True):
+                if each.filters is not self._equalisation.filters or each.n_seen > first:
+                    each.equalise(self._equalisation.filters)
+                each.advance(progress, most=first)
+
+        take()
         for _ in range(ROUNDS):
             if not self._equalisation.revise(averages(self._passes)):
                 break
-            self._filter()
-            for each in self._passes:
-                each.advance(progress, most=FILTER_SEGMENTS)
+            take()
+        apart = math.ceil(self._passes[0].welch.segment_length / self._passes[0].welch.hop) - 1
+        pieces = []
+        for each, first in zip(self._passes, most, strict=True):
+            begin = first + apart  # shares no sample with what filters were found from
+            pieces.append((each, begin, min(PROOF_SEGMENTS, each.n_complete - begin)))
+        self._equalisation.prove([piece for piece in pieces if piece[2] > 0])
+        self._filter()
 
     def snapshot(self) -> Snapshot:
         """Return the estimate from the segments taken so far."""

@@ -79,6 +79,9 @@ class EdgeLeakage:
     sources : tuple of str
         Where the responses come from that are equalised: "known" (the bench file) and
         "estimated"; empty where nothing is.
+    unproven : tuple of int
+        Sensors whose estimated filters are not used: they did not lower the noise of segments that
+        they were not found from.
     """
 
     left: FloatArray
@@ -87,6 +90,7 @@ class EdgeLeakage:
     share: FloatArray
     whole_share: FloatArray
     sources: tuple[str, ...] = ()
+    unproven: tuple[int, ...] = ()
 
     @property
     def most(self) -> FloatArray:

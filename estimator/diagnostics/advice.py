@@ -361,6 +361,8 @@ class UnequalResponses(Advice):
         The same without equalisation.
     equalised_by : tuple of str
         Sources of the equalised responses: "known", "estimated", both, or neither.
+    unproven : tuple of int
+        Sensors with filters that did not lower the noise of other segments, and are not used.
     """
 
     kind: ClassVar[AdviceKind] = AdviceKind.UNEQUAL_RESPONSES
@@ -368,3 +370,4 @@ class UnequalResponses(Advice):
     share: float
     share_without: float
     equalised_by: tuple[str, ...]
+    unproven: tuple[int, ...] = ()

@@ -3,6 +3,10 @@
 One sensor is the reference, and the channels of the others are filtered towards it. In theory any
 sensor can be the reference; one with short filters is chosen: removing a resonance takes a few
 samples, imitating it takes many.
+
+Averages say nothing of a response where there is no coherent motion. A filter keeps its nearest
+known value there, in size and phase: an extrapolated curve amplified noise by 44 dB. What is found
+from data is used only where other segments prove it (`lowers_noise`).
 """
 
 from __future__ import annotations
@@ -13,6 +17,7 @@ import numpy as np
 
 from estimator.diagnostics.advice import UnequalResponses
 from estimator.diagnostics.kinds import Level
+from estimator.likelihood.dimension import bands
 from estimator.responses.edge_leakage import band_shares
 from estimator.self_noise.coherency import own_channels
 from estimator.spectra.equaliser import (
@@ -27,7 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from estimator.responses.edge_leakage import ChannelResponses
-    from estimator.types import ComplexArray, FloatArray
+    from estimator.types import BoolArray, ComplexArray, FloatArray
 
 THRESHOLD = 0.01
 """Leakage from which channels are filtered, as a share of the noise in a third of an octave."""
@@ -42,6 +47,9 @@ SIGNIFICANCE = 3.0
 _EQUAL_ENOUGH = 0.5  # fraction of the threshold below which a channel is not filtered
 _STIFFNESS = 1.0
 _MORE_CHANNELS = 0.02  # cost of each filtered channel, in units of `tail_leakage`
+_COHERENT = 20.0  # times 1 / averages, the coherence of independent noise: exceeded by e^-20
+_MIN_KNOWN = 8  # frequencies with coherent motion, below which a response is not known
+_BY_CHANCE = 1e-3  # probability that a useless filter is proven, and a harmless one rejected
 
 
 def leakage_threshold(n_effective: float) -> float:
@@ -69,6 +77,7 @@ def leakage_advice(
     dims: tuple[int, ...],
     n_effective: float,
     equalised_by: tuple[str, ...],
+    unproven: tuple[int, ...] = (),
 ) -> Iterator[UnequalResponses]:
     """Yield advice on leakage at the edges of segments, with or without equalisation.
 
@@ -82,6 +91,8 @@ def leakage_advice(
         Channels of each sensor.
     n_effective : float
     equalised_by : tuple of str
+    unproven : tuple of int
+        Sensors whose filters are not used.
     """
     least = leakage_threshold(n_effective)
     most = np.maximum(share, share_without)
@@ -107,6 +118,7 @@ def leakage_advice(
         share=left,
         share_without=float(share_without.max()),
         equalised_by=equalised_by,
+        unproven=unproven,
     )
 
 
@@ -189,9 +201,68 @@ def _towards(
         weight = np.where(usable, weight / np.maximum(np.abs(inverse), 1e-150) ** 2, 0.0)
         if usable.sum() < len(usable) // 2:
             continue
-        even = smoothed(inverse, weight, stiffness=_STIFFNESS)
+        known = usable & (g > _COHERENT / max(n_effective, 1.0)) & (f <= USABLE * f[-1])
+        if np.count_nonzero(known) < _MIN_KNOWN:
+            continue
+        even = _held(smoothed(inverse, weight, stiffness=_STIFFNESS), known)
         if len(f) != len(grid) or not np.array_equal(f, grid):
             even = np.interp(grid, f, even.real) + 1j * np.interp(grid, f, even.imag)
         wanted[:, channel] = bounded(even)
         wanted[:, [channel]] = with_short_tails(wanted[:, [channel]])
     return wanted
+
+
+def _held(response: ComplexArray, known: BoolArray) -> ComplexArray:
+    """Return a response that is, where it is not known, between its nearest known values."""
+    at, where = np.arange(len(response)), np.flatnonzero(known)
+    size, angle = np.abs(response), np.unwrap(np.angle(response[where]))
+    return np.asarray(np.interp(at, where, size[where]) * np.exp(1j * np.interp(at, where, angle)))
+
+
+def lowers_noise(
+    before: FloatArray, after: FloatArray, frequency: FloatArray, *, dims: tuple[int, ...]
+) -> BoolArray:
+    """Return for each sensor whether filters lower its noise by more than chance.
+
+    And raise it by more than chance in no third of an octave.
+
+    Parameters
+    ----------
+    before, after : float64, shape (n_groups, n_freqs, n_channels)
+        Noise PSD of the same segments without and with filters, each without one of the groups of
+        segments (jackknife). NaN where it is not known.
+    frequency : float64, shape (n_freqs,)
+        Hz, ascending.
+    dims : tuple of int
+        Channels of each sensor.
+
+    Returns
+    -------
+    bool, shape (n_sensors,)
+
+    Notes
+    -----
+    Both share their noise, so the scatter of the difference is that of the leakage alone. Its
+    standard deviation is ``sqrt((G - 1) / G sum (d_g - d)²)`` with G groups.
+    """
+    from scipy.stats import t as student  # noqa: PLC0415 - only where something is equalised
+
+    n_groups = len(before)
+    starts = np.flatnonzero(np.diff(bands(frequency), prepend=-1))
+    known = (np.isfinite(before) & np.isfinite(after)).all(axis=0)
+    lowered, noise = (
+        np.add.reduceat(np.where(known, part, 0.0), starts, axis=1)
+        for part in (before - after, np.abs(after))
+    )
+    edges = np.cumsum([0, *dims[:-1]])
+    lowered, noise = (np.add.reduceat(part, edges, axis=2) for part in (lowered, noise))
+    total = noise.mean(axis=0)
+    share = np.where(total > 0, lowered / np.where(total > 0, total, 1.0), 0.0)
+    limit = float(student.isf(_BY_CHANCE, n_groups - 1))
+
+    def exceeds(values: FloatArray, least: float) -> BoolArray:
+        mean = values.mean(axis=0)
+        squares = ((values - mean) ** 2).sum(axis=0)
+        return np.asarray(mean > least + limit * np.sqrt((n_groups - 1) / n_groups * squares))
+
+    return exceeds(share.mean(axis=1), 0.0) & ~exceeds(-share, THRESHOLD).any(axis=0)

@@ -255,10 +255,9 @@ def smoothed(values: ComplexArray, weight: FloatArray, *, stiffness: float) -> C
     n = len(values)
     penalty = np.zeros((4, n))
     third = np.array([-1.0, 3.0, -3.0, 1.0])
-    for first in range(n - 3):
-        for row in range(4):
-            for column in range(row, 4):
-                penalty[3 - (column - row), first + column] += third[row] * third[column]
+    for row in range(4):
+        for column in range(row, 4):
+            penalty[3 - (column - row), column : column + n - 3] += third[row] * third[column]
     banded = stiffness * penalty
     banded[3] += weight
     right = weight * np.where(weight > 0, values, 0.0)

@@ -152,7 +152,7 @@ def _band_table(snapshot: Snapshot, settings: Settings) -> Table:
             (
                 f"{label.sensor}.{label.channel}",
                 decibel(float(data[number])) if data[number] > 0 else no_signal,
-                decibel(mean[0], 2) if mean[0] <= mean[2] else "withdrawn",
+                "withdrawn" if mean[0] > mean[2] else decibel(mean[0], 2),
                 _interval(mean[1], mean[2]),
                 scientific(math.sqrt(mean[0])) if 0 < mean[0] <= mean[2] else decibel(math.nan),
                 plain_number(covs[number], ".3f"),

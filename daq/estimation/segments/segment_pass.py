@@ -213,18 +213,7 @@ class Pass:
         source = self._newest if live and len(pieces) == 1 else self.aligned
 
         def read(piece: tuple[int, int]) -> _Samples:
-            first, count = piece
-            begin, end = first * hop, (first + count - 1) * hop + length
-            samples, valid = source.read(begin, end + 2 * reach)
-            usable = valid & self._finite(samples)
-            self._silence(samples)
-            clipped = self._clipped(begin, len(samples))
-            raw, flat = samples[reach : reach + count * hop], usable[reach : reach + count * hop]
-            if self.filters is not None:
-                samples = self.filters.apply(np.where(usable[:, None], samples, 0.0))
-                usable = surrounded(usable, reach)
-                clipped = None if clipped is None else ~surrounded(~clipped, reach)
-            return _Samples(samples, usable, clipped, raw, flat)
+            return self._read(source, self.filters, piece[0] * hop, piece[1])
 
         for (first, count), part in zip(pieces, read_ahead(read, pieces), strict=True):
             samples, usable, clipped = part.samples, part.usable, part.clipped
@@ -275,6 +264,40 @@ class Pass:
                 repeating(self.n_seen)
             self.restart()
             self.advance(progress)
+
+    def averages(self, filters: Equaliser | None, begin: int, count: int) -> CrossSpectra:
+        """Return spectra of `count` segments from grid sample `begin` on, filtered.
+
+        Gaps and clipped blocks are left out, and nothing else. It changes nothing of the pass.
+        """
+        reach = 0 if filters is None else filters.reach
+        part = self._read(self.aligned, filters, begin - reach, count)
+        usable = part.usable if part.clipped is None else part.usable & ~part.clipped
+        starts = np.arange(count) * self.welch.hop
+        spectra = CrossSpectra(self.welch, self.n_channels, threads=1)
+        spectra.add(part.samples, starts[whole_segments(usable, starts, self.welch.segment_length)])
+        return spectra
+
+    def _read(
+        self,
+        source: AlignedRecording | NewestSamples,
+        filters: Equaliser | None,
+        begin: int,
+        count: int,
+    ) -> _Samples:
+        """Return `count` segments, the first with what filters need before it from `begin` on."""
+        reach, n_hops = 0 if filters is None else filters.reach, count * self.welch.hop
+        length = n_hops - self.welch.hop + self.welch.segment_length + 2 * reach
+        samples, valid = source.read(begin, begin + length)
+        usable = valid & self._finite(samples)
+        self._silence(samples)
+        clipped = self._clipped(begin, len(samples))
+        raw, flat = samples[reach : reach + n_hops], usable[reach : reach + n_hops]
+        if filters is not None:
+            samples = filters.apply(np.where(usable[:, None], samples, 0.0))
+            usable = surrounded(usable, reach)
+            clipped = None if clipped is None else ~surrounded(~clipped, reach)
+        return _Samples(samples, usable, clipped, raw, flat)
 
     def _take(self, samples: FloatArray, starts: NDArray[np.int64], first: int) -> None:
         """Add the segments that begin at rows `starts` of `samples`.

@@ -16,6 +16,7 @@ from daq.estimation.settings import Settings
 from estimator.diagnostics.advice import UnequalResponses
 from estimator.methods import self_noise
 from sim_devices.world.scenario import Scenario
+from tests import known_clocks
 from tests.daq.alignment.recordings import Sensor, blocks, create, write
 from tui.studies.synthesis import synthesise
 
@@ -239,3 +240,17 @@ def test_a_measured_response_counts_as_far_as_it_was_measured(tmp_path: Path) ->
     boxcar = np.abs(np.cos(np.pi * snapshot.frequency / RATE)) ** 2
     flat = noise[inside][:, :3] * boxcar[inside, None] / NOISE
     assert abs(np.mean(flat) - 1) < 0.15  # of which the errors are 0.05; without filters 100
+
+
+def test_equal_sensors_are_not_spoilt_where_nothing_moves(tmp_path: Path) -> None:
+    """Three flat sensors of other rates; no motion above 39 Hz, where noise was doubled."""
+    scene = known_clocks.Scene(rates=(100.0, 250.0, 200.0), reach=0.35)
+    known_clocks.record(tmp_path / "r.h5", scene)
+    snapshot = estimate([tmp_path / "r.h5"], Settings())
+    still = (snapshot.frequency > 40.0) & (snapshot.frequency < 44.0)
+    noise = snapshot.results["three-sensor"].noise_psd[still].mean(axis=0)
+    # 40 frequencies of 112 averages: 2 % of scatter
+    np.testing.assert_allclose(noise, known_clocks.NOISE, rtol=0.1)
+    edges = snapshot.diagnostics.edge_leakage
+    assert edges is not None
+    assert not edges.sources

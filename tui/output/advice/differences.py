@@ -113,6 +113,14 @@ def _unequal_responses(advice: UnequalResponses, names: Names) -> Explanation:
         differ = "The responses of all sensors differ"
     differ += f" at {where(advice)}"
     channel = names.channels[advice.channel]
+    if advice.unproven:
+        return Explanation(
+            f"{differ}, by the averages: {percent(advice.share)} of the estimate of {channel} or "
+            "more would be motion that leaks. But filters for "
+            f"{names.list_sensors(advice.unproven)} did not lower the noise of segments that they "
+            "were not found from, and are not used.",
+            "Record longer, or use longer segments. The interval includes the leakage.",
+        )
     if not advice.equalised_by:
         return Explanation(
             f"{differ}: motion leaks into the noise at the edges of segments, "

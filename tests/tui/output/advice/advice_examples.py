@@ -318,6 +318,19 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
         ),
         ("The responses of all sensors differ", "would be 40 times the noise of b.x", "12 % of"),
     ),
+    (
+        UnequalResponses(
+            level=Level.WARNING,
+            sensors=(1,),
+            band=BAND,
+            channel=3,
+            share=0.12,
+            share_without=0.12,
+            equalised_by=(),
+            unproven=(1,),
+        ),
+        ("filters for b did not lower the noise", "are not used", "12 % of"),
+    ),
 ]
 
 

@@ -1,0 +1,241 @@
+"""Builds recordings of three sensors whose clocks, and whose noise, are known.
+
+Shares no code with the alignment: the motion is a spectrum, made on a grid four times finer than
+the fastest sensor, and read from there by splines of the fifth degree (error below -100 dB).
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from scipy.interpolate import make_interp_spline
+
+from daq.bench.model import Channel
+from daq.protocols.block import Block, BlockFlag, HostTime
+from daq.recording.file_format import SensorLayout
+from daq.recording.writer import RecordingWriter
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from daq.estimation.snapshot import Snapshot
+
+    FloatArray = NDArray[np.float64]
+    IntArray = NDArray[np.int64]
+
+NAMES = "ABC"
+NOISE = 1.0
+"""One-sided PSD of every channel's noise, unit²/Hz."""
+_ORIGIN = HostTime(7_000_000_000_000, 1_468_458_000_000_000_000)
+_MARGIN = 5.0  # seconds of motion before and after
+_FINE = 4
+_COUNTS = 1000.0  # of one standard deviation of noise
+_BLOCK = 0.1  # seconds
+_POLL = 0.016
+
+
+@dataclass(frozen=True)
+class Oscillator:
+    """A clock: its rate in ppm, and a cycle of the rate, as of a heated room."""
+
+    ppm: float = 0.0
+    cycle_ppm: float = 0.0
+    period: float = 600.0
+    phase: float = 0.0
+
+    def seconds(self, nominal: FloatArray) -> FloatArray:
+        """Return the true time of samples, given by their number over the nominal rate."""
+        turn = 2 * np.pi / self.period
+        cycle = (np.cos(self.phase) - np.cos(turn * nominal + self.phase)) / turn
+        return np.asarray(nominal - 1e-6 * (self.ppm * nominal + self.cycle_ppm * cycle))
+
+
+STEADY = (Oscillator(), Oscillator(15.0), Oscillator(-20.0))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is recorded.
+
+    Attributes
+    ----------
+    slips : mapping of int to sequence of (float, int)
+        By sensor: when (s), and how many samples are lost without being counted; negative: samples
+        that are counted twice.
+    leaps : mapping of int to sequence of (float, int)
+        How many samples the count runs ahead though none is lost.
+    restarts : mapping of int to (float, float, float)
+        Shortest and longest time between restarts, and how long the sensor is gone, in s.
+    """
+
+    rates: tuple[float, float, float] = (200.0, 200.0, 200.0)
+    snr: float = 1e4
+    motion: Literal["white", "red", "coloured"] = "white"
+    seconds: float = 600.0
+    polled: bool = False
+    clocks: tuple[Oscillator, Oscillator, Oscillator] = STEADY
+    slips: Mapping[int, Sequence[tuple[float, int]]] = field(default_factory=dict)
+    leaps: Mapping[int, Sequence[tuple[float, int]]] = field(default_factory=dict)
+    restarts: Mapping[int, tuple[float, float, float]] = field(default_factory=dict)
+    n_channels: int = 3
+    seed: int = 1
+    reach: float = 0.35
+    """Highest frequency of the motion's flat part, as a fraction of the lowest sampling rate."""
+
+    @property
+    def top(self) -> float:
+        """Highest frequency of the motion's flat part, Hz."""
+        return self.reach * min(self.rates)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """When each sample that is in the recording was taken, by its index in it."""
+
+    scene: Scene
+    index: tuple[IntArray, ...]
+    seconds: tuple[FloatArray, ...]
+
+    def residual(self, snapshot: Snapshot) -> FloatArray:
+        """Return the rms of what varies of the real errors against the first sensor, in s.
+
+        Of the segments that no sensor interrupts.
+        """
+        delays, at = snapshot.drift[:, 1:], snapshot.drift[:, 0]
+        at = at + (snapshot.start_utc_ns - _ORIGIN.utc_ns) * 1e-9
+        error = []
+        whole = np.ones(len(at), dtype=bool)
+        half = 1.0 + (at[1] - at[0] if len(at) > 1 else 0.0)
+        for number, rate in enumerate(self.scene.rates):
+            position = (at - delays[:, number]) * rate
+            error.append(np.interp(position, self.index[number], self.seconds[number]))
+            steps = np.diff(self.seconds[number]) * rate
+            breaks = np.flatnonzero((np.abs(steps - 1) > 0.1) | (np.diff(self.index[number]) != 1))
+            for stop in self.seconds[number][breaks]:
+                whole &= np.abs(error[-1] - stop) > half
+        apart = np.array(error)[:, whole] - error[0][whole]
+        return np.asarray(apart.std(axis=1)) if whole.any() else np.full(len(apart), np.nan)
+
+
+def _spectrum(scene: Scene, frequency: FloatArray) -> FloatArray:
+    """Return the PSD of the motion."""
+    f, top = frequency, scene.top
+    level = {
+        "white": np.ones_like(f),
+        "red": 1 / (1 + (f / 2.0) ** 4),
+        "coloured": 1e-3
+        + 1 / (1 + ((f - 0.1 * top) / (0.02 * top)) ** 2)
+        + 0.3 / (1 + ((f - 0.6 * top) / (0.03 * top)) ** 2),
+    }[scene.motion]
+    edge = np.clip((f - top) / (0.1 * top), 0.0, 1.0)
+    return np.asarray(scene.snr * NOISE * level * np.cos(np.pi / 2 * edge) ** 2)
+
+
+def _motion(scene: Scene, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """Return times and the motion in three directions, shape (n, 3)."""
+    rate = _FINE * max(scene.rates)
+    n = int((scene.seconds + 2 * _MARGIN) * rate) // 2 * 2
+    frequency = np.arange(n // 2 + 1, dtype=np.float64) * (rate / n)
+    size = np.sqrt(_spectrum(scene, frequency) * rate * n / 4)
+    lines = rng.standard_normal((len(frequency), 3, 2)) @ np.array([1.0, 1j])
+    lines[0] = 0.0
+    return np.arange(n) / rate - _MARGIN, np.fft.irfft(lines * size[:, None], n, axis=0)
+
+
+def _taken(
+    scene: Scene, sensor: int, rng: np.random.Generator
+) -> tuple[IntArray, FloatArray, IntArray, IntArray]:
+    """Return index, true time and noise number of recorded samples, and where the clock restarts.
+
+    A sample counted twice has one noise.
+    """
+    rate, clock = scene.rates[sensor], scene.clocks[sensor]
+    number = np.arange(int(scene.seconds * rate))
+    seconds = clock.seconds(number / rate) + 0.1 * sensor + 0.37 / rate * sensor
+    copies = np.ones(len(number), np.int64)
+    for when, lost in scene.slips.get(sensor, ()):
+        at = int(np.searchsorted(seconds, when))
+        if lost > 0:
+            copies[at : at + lost] = 0
+        else:
+            copies[at] += -lost
+    begins: list[float] = []
+    if sensor in scene.restarts:
+        shortest, longest, gone = scene.restarts[sensor]
+        stop = float(rng.uniform(shortest, longest))
+        while stop < scene.seconds - shortest:
+            copies[(seconds >= stop) & (seconds < stop + gone)] = 0
+            begins.append(stop + gone)
+            stop += gone + float(rng.uniform(shortest, longest))
+    kept = np.repeat(np.arange(len(number)), copies)
+    taken = seconds[kept]
+    index = np.arange(len(kept))
+    for when, ahead in scene.leaps.get(sensor, ()):
+        index = index + ahead * (taken >= when)
+    restarts = np.searchsorted(taken, begins)
+    for row in restarts.tolist():  # another phase of the sampling, and a count that is only near
+        taken[row:] += rng.uniform(0, 1) / rate
+        index[row:] += int(rng.integers(0, 30))
+    return index, taken, kept, restarts
+
+
+def record(path: Path, scene: Scene) -> Truth:
+    """Write a recording and return what is true of it."""
+    rng = np.random.default_rng(scene.seed)
+    at, motion = _motion(scene, rng)
+    spline = make_interp_spline(at, motion, k=5)
+    layouts, blocks = [], []
+    indices, times = [], []
+    for sensor, rate in enumerate(scene.rates):
+        index, taken, kept, restarts = _taken(scene, sensor, rng)
+        deviation = np.sqrt(NOISE * rate / 2)
+        noise = deviation * rng.standard_normal((kept[-1] + 1, scene.n_channels))
+        turn = np.linalg.qr(rng.standard_normal((3, 3)))[0][: scene.n_channels]
+        scale = _COUNTS / deviation
+        counts = np.round(scale * (spline(taken) @ turn.T + noise[kept])).astype(np.int32)
+        layouts.append(
+            SensorLayout(
+                NAMES[sensor],
+                tuple(Channel(name=f"c{n}", sensitivity=scale) for n in range(scene.n_channels)),
+                rate,
+                counts.dtype,
+            )
+        )
+        edges = {0, len(index), *range(0, len(index), round(_BLOCK * rate)), *restarts.tolist()}
+        edges |= set((np.flatnonzero(np.diff(index) != 1) + 1).tolist())
+        rows = sorted(edges)
+        phase = rng.uniform(0, _POLL)
+        for first, end in itertools.pairwise(rows):
+            arrival = taken[end - 1] + 1e-3 * rng.exponential()
+            if scene.polled:
+                arrival = np.ceil((arrival - phase) / _POLL) * _POLL + phase
+            ns = round(float(arrival) * 1e9)
+            begins = first == 0 or first in restarts
+            blocks.append(
+                Block(
+                    NAMES[sensor],
+                    int(index[first]),
+                    counts[first:end],
+                    HostTime(_ORIGIN.monotonic_ns + ns, _ORIGIN.utc_ns + ns),
+                    flags=BlockFlag.CLOCK_RESTART if begins else BlockFlag.NONE,
+                )
+            )
+        indices.append(index)
+        times.append(taken)
+    writer = RecordingWriter.create(path, sensors=layouts, created=_ORIGIN)
+    for block in sorted(blocks, key=lambda block: block.received.monotonic_ns):
+        writer.append(block)
+    writer.close()
+    return Truth(scene, tuple(indices), tuple(times))
+
+
+def utc_text(seconds: float) -> str:
+    """Return the UTC of an instant of a recording, to the second."""
+    second = _ORIGIN.utc_ns // 10**9 + int(seconds)
+    return str(np.datetime64(second, "s")).partition("T")[2]
