@@ -85,7 +85,7 @@ class Scene:
     restarts: Mapping[int, tuple[float, float, float]] = field(default_factory=dict)
     n_channels: int = 3
     seed: int = 1
-    reach: float = 0.35
+    reach: float = 0.43
     """Highest frequency of the motion's flat part, as a fraction of the lowest sampling rate."""
 
     @property

@@ -164,6 +164,7 @@ def clock_states(passes: Sequence[Pass]) -> tuple[ClockState, ...]:
                 corrected=max(each.corrected for each in every),
                 drifts=bool(wrong),
                 unchecked=any(each.unchecked for each in every),
+                is_understood=all(each.is_understood for each in every),
             )
         )
     return tuple(states)

@@ -62,6 +62,12 @@ _WELL_KNOWN = 0.02  # samples to which delays must be known to be of use
 _UTC_JUMP = 0.01  # samples
 _DRIFT = 1e-4  # by which a sampling clock may run off its rate
 _LEAP = 1e-3  # seconds; how well a step must agree with a leap second
+_OSCILLATOR = 200.0  # ppm; no oscillator of an instrument is off by more
+_CERTAIN = 3.0  # standard deviations
+_FAR_OFF = 6.0  # standard deviations, beyond which a measured delay is not on the clock
+_SEEN_AS = 1e-6  # seconds; the least of these standard deviations
+_SCATTER = 1.5  # stated deviations of measured delays, to which they may scatter of themselves
+_A_FEW = 0.05  # share of measured delays that may be off: false ones, where motion is weak
 _BREAKS = BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
 
 
@@ -372,7 +378,7 @@ class ArrivalTimes:
         if refined and known_to > _WELL_KNOWN / self.sampling_rate:  # the samples hardly know
             return self._filtered(sensor, slope, anchors, None)
         curve = smoothed.lateness + (smoothed.constant if refined else 0.0)
-        epochs = []
+        epochs, late_seen = [], late
         every = zip(self._rows(epoch), self._bounds(), anchors, is_placed.tolist(), strict=True)
         for mine, bounds, anchor, placed in every:
             if placed:
@@ -397,4 +403,31 @@ class ArrivalTimes:
             n_epochs=len(epochs),
             refined=refined,
         )
+        seen = observations.from_samples
+        state = _guarded(state, (late_seen - curve)[seen], variance[seen], self.sampling_rate)
         return Clock(tuple(epochs), state)
+
+
+def _guarded(
+    state: ClockState, late_by: FloatArray, variance: FloatArray, sampling_rate: float
+) -> ClockState:
+    """Return a state whose residual is that of the measured delays about the clock they gave.
+
+    A clock is not understood if more than a few do not lie on it. Where few are off, these are
+    false delays, and say nothing of the clock. Nor is it understood if its rate is no oscillator's:
+    samples are then lost one by one, and times are off by up to half a sample.
+    """
+    is_understood = True
+    residual = state.residual
+    if len(late_by):
+        late_by = late_by - median(late_by)
+        off = np.abs(late_by) > _FAR_OFF * np.sqrt(np.maximum(variance, _SEEN_AS**2))
+        is_understood = float(off.mean()) <= _A_FEW
+        used = ~off if is_understood else np.ones(len(off), np.bool_)
+        excess = float(np.mean(late_by[used] ** 2 - _SCATTER**2 * variance[used]))
+        residual = max(residual, math.sqrt(max(excess, 0.0)))
+    if abs(state.ppm) - _CERTAIN * state.ppm_std > _OSCILLATOR:
+        is_understood = False
+        if len(late_by):
+            residual = math.hypot(residual, 1 / (math.sqrt(12) * sampling_rate))
+    return replace(state, residual=residual, is_understood=is_understood)

@@ -183,6 +183,9 @@ class ClockState:
         Whether stated UTC drifts and could not be corrected; by `residual` then.
     unchecked : bool
         Whether stated UTC could not be compared with the motion.
+    is_understood : bool
+        False where delays measured from the motion do not lie on the clock, or its rate is off by
+        more than an oscillator's: `residual` is then what they scatter about it.
     """
 
     sensor: str
@@ -199,6 +202,7 @@ class ClockState:
     corrected: float = 0.0
     drifts: bool = False
     unchecked: bool = False
+    is_understood: bool = True
 
     def relative_time(self, other: ClockState) -> RelativeTime:
         """Return how the times of this sensor are known against those of another."""

@@ -213,6 +213,14 @@ def wrong_times(snapshot: Snapshot) -> list[str]:
             " could not be compared with the motion: it is too weak, or the recording too short. If"
             " they drift, the noise is wrong by a share of the motion."
         )
+    lines += [
+        f"The clock of {clock.sensor} ({signed(clock.ppm, '+.0f')} ppm) is not understood: its"
+        f" samples are off by about {_short(clock.residual * 1e6)} µs rms. The intervals include"
+        " this error, and limits are not decided. Check whether samples are lost or repeated"
+        " without being counted (buffers, cable, the logger's software), and the sampling rate."
+        for clock in snapshot.clocks
+        if not clock.is_understood
+    ]
     nominal = [clock.sensor for clock in snapshot.clocks if math.isnan(clock.residual)]
     if nominal:
         lines.append(

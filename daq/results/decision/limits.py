@@ -240,6 +240,7 @@ def _general_obstacles(snapshot: Snapshot) -> set[Obstacle]:
         found.add(Obstacle.SENSORS_LOST)
     if snapshot.n_segments == 0:
         found.add(Obstacle.NO_SEGMENTS)
-    if not snapshot.diagnostics.synchronisation.is_known:
+    is_known = snapshot.diagnostics.synchronisation.is_known
+    if not is_known or not all(clock.is_understood for clock in snapshot.clocks):
         found.add(Obstacle.CLOCKS)
     return found

@@ -201,6 +201,15 @@ def test_clocks_that_nobody_knows_decide_nothing() -> None:
             assert found.prediction is None  # time does not mend it
 
 
+def test_a_clock_that_is_not_understood_decides_nothing() -> None:
+    snapshot = made_snapshot(n_effective=5000.0)
+    assert verdict_on(snapshot, 12e-12).verdict is Verdict.PASS
+    clocks = tuple(replace(each, is_understood=each.sensor != "B") for each in snapshot.clocks)
+    found = verdict_on(replace(snapshot, clocks=clocks), 12e-12)
+    assert found.verdict is Verdict.NOT_DECIDED
+    assert Obstacle.CLOCKS in found.obstacles
+
+
 def test_noise_that_is_negative_for_certain_does_not_pass() -> None:
     snapshot = made_snapshot(n_effective=5000.0)
     noise = snapshot.results["three-sensor"]
