@@ -119,6 +119,9 @@ class Truth:
             breaks = np.flatnonzero((np.abs(steps - 1) > 0.1) | (np.diff(self.index[number]) != 1))
             for stop in self.seconds[number][breaks]:
                 whole &= np.abs(error[-1] - stop) > half
+        for clock in snapshot.clocks:
+            for slip in clock.slips:
+                whole &= np.abs(at - seconds_of(slip.utc_ns)) > half + slip.within
         apart = np.array(error)[:, whole] - error[0][whole]
         return np.asarray(apart.std(axis=1)) if whole.any() else np.full(len(apart), np.nan)
 
@@ -235,7 +238,6 @@ def record(path: Path, scene: Scene) -> Truth:
     return Truth(scene, tuple(indices), tuple(times))
 
 
-def utc_text(seconds: float) -> str:
-    """Return the UTC of an instant of a recording, to the second."""
-    second = _ORIGIN.utc_ns // 10**9 + int(seconds)
-    return str(np.datetime64(second, "s")).partition("T")[2]
+def seconds_of(utc_ns: int) -> float:
+    """Return the seconds from the beginning of a recording to an instant."""
+    return (utc_ns - _ORIGIN.utc_ns) * 1e-9

@@ -22,6 +22,7 @@ import numpy as np
 from daq.alignment.grid import SNAP, Grid, grid_rate
 from daq.alignment.resampling import USABLE
 from daq.alignment.sensor_reader import SensorSource, main_columns
+from daq.alignment.slip_search import find_by_arrivals, find_by_motion
 from daq.alignment.stated_utc import place_stated, take_drift, undoubted
 from daq.errors import CannotAlignError
 from daq.timing.clock_model import ClockSource, ClockState, nominal
@@ -293,13 +294,17 @@ class AlignedRecording:
         )
         together = together and len({source.record.sampling_rate for source in sources}) == 1
         reference = sources[self._reference]
+        measurable = [sources[number] for number in numbers if sources[number] is not reference]
+        for source in sources:
+            find_by_arrivals(source)
+        find_by_motion(reference, [each for each in measurable if each.learnt])
         utc = UtcRate() if all(each.device_utc for each in sources) else reference.utc_rate()
         first_of: dict[str, SensorSource] = {}
         for source in [reference, *(each for each in sources if each is not reference)]:
             name = source.clock_name
             first = first_of.get(name) or source.repeats(first_of.values()) or source
             first_of[name] = first
-            measured = None if source is reference else source.measured(reference.known_clock)
+            measured = None if source is reference else source.measured(reference)
             if source.polled:
                 source.clock = utc.by_utc(source.by_instants())
             elif first is not source and not source.device_utc:

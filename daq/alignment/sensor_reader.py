@@ -13,9 +13,10 @@ from daq.alignment.growing_rows import GrowingRows
 from daq.errors import CannotAlignError
 from daq.protocols.block import BlockFlag
 from daq.timing.arrival_times import ArrivalTimes
-from daq.timing.clock_model import MeasuredDelays, OffsetSource
+from daq.timing.clock_model import LostCount, MeasuredDelays, OffsetSource
 from daq.timing.quantiles import median
 from daq.timing.sample_instants import from_instants
+from daq.timing.slips import Slips
 from daq.timing.utc_rate import UtcRate
 
 if TYPE_CHECKING:
@@ -77,6 +78,8 @@ class SensorSource:
     """Times of a polled sensor's samples that `by_instants` has read, in s."""
     _utc_rate: tuple[int, UtcRate] = (0, UtcRate())
     """How many blocks `utc_rate` has read, and what it found."""
+    slips: Slips = field(default_factory=Slips)
+    """Samples that it lost without counting them."""
     offset_in_doubt: bool = False
     """Whether the offset of its sample index to others of its clock is an estimate."""
 
@@ -190,16 +193,34 @@ class SensorSource:
             first_rows=np.array([run.first_row for run in self.runs]),
         )
 
-    def measured(self, reference: Clock) -> MeasuredDelays | None:
-        """Return the sample times that follow from measured delays against the reference."""
-        if not self.learnt:
-            return None
+    def delays(self, reference: SensorSource) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return sample indices, their times by measured delays, and the standard deviation of it.
+
+        That is infinite where delays are not known, as where a sensor slips.
+        """
         found = self.learnt.values  # of segments with gaps after those without
         index, at_reference, delay, std = found[np.argsort(found[:, 0], kind="stable")].T
-        seconds = reference.at(at_reference) - delay - self.frame_delay
-        starts = np.array([epoch.start for epoch in reference.epochs[1:]])
+        slips = self.slips.holds(index) | reference.slips.holds(at_reference)
+        seconds = reference.known_clock.at(at_reference) - delay
+        return index, seconds, np.where(slips, np.inf, std)
+
+    def measured(self, reference: SensorSource) -> MeasuredDelays | None:
+        """Return the times of samples, all counted, that follow from measured delays."""
+        if not self.learnt:
+            return None
+        index, seconds, std = self.delays(reference)
+        slips = {
+            end for each in reference.slips.all for end in (each.first_sample, each.end_sample)
+        }
+        later = reference.known_clock.epochs[1:]
+        starts = np.array([epoch.start for epoch in later if epoch.first_sample not in slips])
         restarts = np.ceil(self.known_clock.position(starts)).astype(np.int64)
-        return MeasuredDelays(index, seconds, std, restarts)
+        return MeasuredDelays(
+            index + self.slips.ahead(index),
+            seconds - self.frame_delay,
+            std,
+            restarts + self.slips.ahead(restarts),
+        )
 
     def utc_rate(self) -> UtcRate:
         """Return the rate of the UTC that it states, if any, against the computer's clock."""
@@ -222,7 +243,20 @@ class SensorSource:
         if self.device_utc:
             return self._judged(self.arrivals.solve(name, measured))
         measured = None if measured is None else utc.by_computer(measured)
-        return utc.by_utc(self.arrivals.solve(name, measured))
+        clock = utc.by_utc(self.arrivals.counting(self.slips).solve(name, measured))
+        clock = clock.without(self.slips)
+        return replace(clock, state=replace(clock.state, slips=self._dated(clock)))
+
+    def _dated(self, clock: Clock) -> tuple[LostCount, ...]:
+        found = []
+        for each in self.slips.all:
+            if each.n_samples == 0:  # blocks were late, and nothing was lost
+                continue
+            ends = clock.at(np.array([each.first_sample, each.end_sample], dtype=np.float64))
+            middle, within = float(ends.mean()), float(np.ptp(ends)) / 2
+            utc_ns = self.arrivals.origin_utc_ns + round(middle * 1e9)
+            found.append(LostCount(utc_ns, within, each.n_samples))
+        return tuple(found)
 
     def _judged(self, clock: Clock) -> Clock:
         """Return the clock of stated UTC with what its comparison with the motion says of it."""

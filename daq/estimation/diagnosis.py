@@ -165,6 +165,7 @@ def clock_states(passes: Sequence[Pass]) -> tuple[ClockState, ...]:
                 drifts=bool(wrong),
                 unchecked=any(each.unchecked for each in every),
                 is_understood=all(each.is_understood for each in every),
+                slips=tuple(slip for each in every for slip in each.slips),
             )
         )
     return tuple(states)

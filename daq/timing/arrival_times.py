@@ -50,6 +50,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from daq.timing.slips import Slips
+
     FloatArray = NDArray[np.float64]
     BoolArray = NDArray[np.bool_]
     IntArray = NDArray[np.int64]
@@ -238,6 +240,38 @@ class ArrivalTimes:
             self._unmeasured = self._filtered(sensor, *self._lines(), None)
         return self._unmeasured
 
+    def counting(self, slips: Slips) -> ArrivalTimes:
+        """Return the same arrivals by an index that counts the samples of these slips too.
+
+        Without those for which the count is not known.
+        """
+        if not slips:
+            return self
+        kept = ~slips.holds(self._index)
+        lost = np.setdiff1d(self._epoch, self._epoch[kept])  # an epoch keeps one arrival at least
+        kept |= np.isin(self._epoch, lost)
+        ahead = slips.ahead(self._index)
+        starts = np.array(self._epoch_starts)
+        return replace(
+            self,
+            _index=(self._index + ahead)[kept],
+            _late=(self._late - ahead / self.sampling_rate)[kept],
+            _epoch=self._epoch[kept],
+            _epoch_starts=(starts + slips.ahead(starts)).tolist(),
+            _end_sample=self._end_sample + int(slips.ahead(np.array([self._end_sample]))[0]),
+            _line=None,
+            _unmeasured=None,
+        )
+
+    def lateness(self) -> tuple[FloatArray, FloatArray]:
+        """Return when early arrivals were, on the sensor's own count, and their lateness, in s."""
+        return self._index / self.sampling_rate, self._late
+
+    @property
+    def restarts(self) -> IntArray:
+        """The first sample of every epoch but the first."""
+        return np.array(self._epoch_starts[1:], dtype=np.int64)
+
     def with_motion(self, sensor: str, measured: MeasuredDelays) -> Clock:
         """Return the clock that arrivals, or what is stated, and measured delays give together."""
         if not len(measured.restarts):
@@ -423,7 +457,8 @@ def _guarded(
         late_by = late_by - median(late_by)
         off = np.abs(late_by) > _FAR_OFF * np.sqrt(np.maximum(variance, _SEEN_AS**2))
         is_understood = float(off.mean()) <= _A_FEW
-        used = ~off if is_understood else np.ones(len(off), np.bool_)
+        certain = np.sqrt(variance) < _WELL_KNOWN / sampling_rate  # these are hardly ever false
+        used = ~off | certain if is_understood else np.ones(len(off), np.bool_)
         excess = float(np.mean(late_by[used] ** 2 - _SCATTER**2 * variance[used]))
         residual = max(residual, math.sqrt(max(excess, 0.0)))
     if abs(state.ppm) - _CERTAIN * state.ppm_std > _OSCILLATOR:

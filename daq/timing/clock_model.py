@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from daq.timing.slips import Slips
+
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
 
@@ -151,6 +153,25 @@ class RelativeTime(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class LostCount:
+    """Samples that a sensor lost without counting them.
+
+    Attributes
+    ----------
+    utc_ns : int
+        When, in ns since 1970: the middle of what is known.
+    within : float
+        By how much that may be wrong, in seconds.
+    n_samples : int
+        Negative: samples that were counted twice.
+    """
+
+    utc_ns: int
+    within: float
+    n_samples: int
+
+
+@dataclass(frozen=True, slots=True)
 class ClockState:
     """What is known about one sensor's clock.
 
@@ -186,6 +207,8 @@ class ClockState:
     is_understood : bool
         False where delays measured from the motion do not lie on the clock, or its rate is off by
         more than an oscillator's: `residual` is then what they scatter about it.
+    slips : tuple of LostCount
+        Samples lost, or repeated, without being counted; the clock allows for them.
     """
 
     sensor: str
@@ -203,6 +226,7 @@ class ClockState:
     drifts: bool = False
     unchecked: bool = False
     is_understood: bool = True
+    slips: tuple[LostCount, ...] = ()
 
     def relative_time(self, other: ClockState) -> RelativeTime:
         """Return how the times of this sensor are known against those of another."""
@@ -315,18 +339,7 @@ class Clock:
         known_by : OffsetSource
             How n is known.
         """
-        ends = [*(epoch.first_sample for epoch in self.epochs[1:]), _NEVER]
-        starts = [-_NEVER, *ends[:-1]]
-        found = []
-        for first, end, n in stretches:
-            for number in range(bisect_right(ends, first + n), len(ends)):
-                epoch, start, stop = self.epochs[number], starts[number] - n, ends[number] - n
-                if start >= end:
-                    break
-                if max(first, start) < min(end, stop):
-                    index, bounds = epoch.index - n, (max(first, start), min(end, stop))
-                    found.append(Epoch(*bounds, index, epoch.seconds, epoch.is_placed))
-        epochs = tuple(found)
+        epochs = self._shifted([(*each, True) for each in stretches])
         state = replace(
             self.state.shared_by(sensor),
             offset=epochs[0].start,
@@ -334,6 +347,32 @@ class Clock:
             offset_source=known_by,
         )
         return Clock(epochs, state)
+
+    def without(self, slips: Slips) -> Clock:
+        """Return a clock that counts the samples of slips by the index that does not count them."""
+        if not slips:
+            return self
+        first, end = self.epochs[0].first_sample, self.epochs[-1].end_sample - slips.total
+        return replace(self, epochs=self._shifted(slips.stretches(first, end)))
+
+    def _shifted(self, stretches: Sequence[tuple[int, int, int, bool]]) -> tuple[Epoch, ...]:
+        """Return epochs by an index i instead of i + n, from first to end of each stretch.
+
+        The fourth number says whether the times are known.
+        """
+        ends = [*(epoch.first_sample for epoch in self.epochs[1:]), _NEVER]
+        starts = [-_NEVER, *ends[:-1]]
+        found = []
+        for first, end, n, is_placed in stretches:
+            for number in range(bisect_right(ends, first + n), len(ends)):
+                epoch, start, stop = self.epochs[number], starts[number] - n, ends[number] - n
+                if start >= end:
+                    break
+                if max(first, start) < min(end, stop):
+                    index, bounds = epoch.index - n, (max(first, start), min(end, stop))
+                    is_known = is_placed and epoch.is_placed
+                    found.append(Epoch(*bounds, index, epoch.seconds, is_known))
+        return tuple(found)
 
     def _by_epoch(
         self,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -40,6 +41,7 @@ from tui.output.vocabulary import (
 if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from daq.timing.clock_model import ClockState
     from estimator.levels.contributions import Source
 
 LEAST_SAID = 0.01
@@ -183,7 +185,7 @@ def _short(value: float) -> str:
 
 
 def wrong_times(snapshot: Snapshot) -> list[str]:
-    """Return remarks on times that are wrong, or may be: drifting, not compared, or nominal."""
+    """Return remarks on times that are wrong, or may be: drifting, miscounted, or nominal."""
     wrong = [clock for clock in snapshot.clocks if clock.corrected and not clock.drifts]
     lost = [clock for clock in snapshot.clocks if clock.drifts]
     unchecked = [clock.sensor for clock in snapshot.clocks if clock.unchecked]
@@ -213,6 +215,7 @@ def wrong_times(snapshot: Snapshot) -> list[str]:
             " could not be compared with the motion: it is too weak, or the recording too short. If"
             " they drift, the noise is wrong by a share of the motion."
         )
+    lines += [_lost(clock) for clock in snapshot.clocks if clock.slips]
     lines += [
         f"The clock of {clock.sensor} ({signed(clock.ppm, '+.0f')} ppm) is not understood: its"
         f" samples are off by about {_short(clock.residual * 1e6)} µs rms. The intervals include"
@@ -229,6 +232,26 @@ def wrong_times(snapshot: Snapshot) -> list[str]:
             "error."
         )
     return lines
+
+
+def _lost(clock: ClockState) -> str:
+    """Return which samples a sensor lost without counting them, and what to check."""
+    total = sum(abs(slip.n_samples) for slip in clock.slips)
+    verbs = {slip.n_samples > 0 for slip in clock.slips}
+    verb = "lost or repeated" if len(verbs) > 1 else "lost" if verbs == {True} else "repeated"
+    first, last = (_time_of_day(clock.slips[at].utc_ns) for at in (0, -1))
+    when = f"at about {first} UTC"
+    if len(clock.slips) > 1:
+        when = f"between {first} and {last} UTC, {len(clock.slips)} times,"
+    return (
+        f"{clock.sensor} {verb} {several(total, 'sample')} {when} without counting"
+        f" {'it' if total == 1 else 'them'}. Its count was corrected, and the segments around are"
+        " excluded. Check the buffers and the cable of the logger, and the load of its computer."
+    )
+
+
+def _time_of_day(utc_ns: int) -> str:
+    return f"{datetime.fromtimestamp(utc_ns // 10**9, UTC):%H:%M:%S}"
 
 
 def not_searched(snapshot: Snapshot) -> list[str]:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import itertools
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pytest
 
 from daq.estimation.estimation import estimate
+from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
+from daq.recording.reader import Recording
 from daq.results.band_summary import levels
-from tests.known_clocks import NOISE, Scene, record
+from tests.known_clocks import NOISE, Oscillator, Scene, record, seconds_of
 from tui.output.results import wrong_times
 
 if TYPE_CHECKING:
@@ -39,6 +43,12 @@ def errors(snapshot: Snapshot, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return error, (low <= NOISE) & (high >= NOISE)
 
 
+def assert_right(error: np.ndarray, holds: np.ndarray) -> None:
+    """Of 27 intervals of 95 % one is expected not to hold the truth, by a little."""
+    assert holds.mean() >= 0.85
+    assert (abs(error)[~holds] < 0.6).all()
+
+
 @pytest.mark.parametrize("snr", [3.0, 1e4])
 def test_the_stated_residual_of_a_good_clock_is_that_of_its_filter(
     tmp_path: Path, snr: float
@@ -64,3 +74,99 @@ def test_samples_lost_all_the_time_are_not_taken_for_a_fast_clock(tmp_path: Path
     (line,) = wrong_times(snapshot)
     assert "The clock of B (−985 ppm) is not understood" in line
     assert "lost or repeated without being counted" in line
+
+
+LATER = 150.0
+LONG = pytest.mark.long
+
+
+@pytest.mark.parametrize(
+    ("scene", "lost"),
+    [
+        pytest.param({"slips": {1: [(LATER, 1)]}}, {1: 1}, id="one sample"),
+        pytest.param({"slips": {2: [(LATER, -1)]}}, {2: -1}, id="one counted twice", marks=LONG),
+        pytest.param({"slips": {1: [(LATER, 100)]}}, {1: 100}, id="a block"),
+        pytest.param({"leaps": {1: [(LATER, 37)]}}, {1: -37}, id="a gap that is none"),
+        pytest.param({"slips": {0: [(LATER, 2)]}}, {0: 2}, id="in the reference"),
+        pytest.param({"slips": {1: [(LATER, 1)]}, "polled": True}, {1: 1}, id="polled", marks=LONG),
+        pytest.param({"slips": {1: [(LATER, 1)]}, "snr": 3.0}, {1: 1}, id="weak motion"),
+        pytest.param(
+            {"slips": {1: [(LATER, 1)]}, "rates": (100.0, 250.0, 200.0)},
+            {1: 1},
+            id="other rates",
+            marks=LONG,
+        ),
+    ],
+)
+def test_samples_lost_without_being_counted_are_found_and_corrected(
+    tmp_path: Path, scene: dict[str, Any], lost: dict[int, int]
+) -> None:
+    made = Scene(**{"seconds": 300.0, **scene})
+    snapshot, truth = estimated(tmp_path, made)
+    found = [tuple(slip.n_samples for slip in clock.slips) for clock in snapshot.clocks]
+    assert found == [(lost[n],) if n in lost else () for n in range(3)]
+    (slip,) = (slip for clock in snapshot.clocks for slip in clock.slips)
+    assert abs(seconds_of(slip.utc_ns) - LATER) <= slip.within < 15.0
+    error, holds = errors(snapshot, made)
+    assert_right(error, holds)
+    assert snapshot.n_dropped < 10
+    residual = np.array(list(snapshot.diagnostics.synchronisation.residual.values()))
+    assert (residual > truth.residual(snapshot) / 2)[1:].all()
+    assert (residual < 1e-4).all()
+    name = "ABC"[next(iter(lost))]
+    (line,) = wrong_times(snapshot)
+    assert line.startswith(f"{name} {'lost' if min(lost.values()) > 0 else 'repeated'}")
+
+
+def test_a_sample_lost_every_minute_is_found_every_time(tmp_path: Path) -> None:
+    slips = {1: [(60.0 * n, 1) for n in range(1, 5)]}
+    scene = Scene(seconds=300.0, slips=slips)
+    snapshot, _ = estimated(tmp_path, scene)
+    assert [slip.n_samples for slip in snapshot.clocks[1].slips] == [1, 1, 1, 1]
+    error, holds = errors(snapshot, scene)
+    assert_right(error, holds)
+    assert "B lost 4 samples between 01:01:00" in wrong_times(snapshot)[0]
+
+
+def test_a_sample_lost_near_the_end_is_part_of_the_residual(tmp_path: Path) -> None:
+    """Too few segments are left to tell a slip from false delays."""
+    scene = Scene(seconds=300.0, slips={1: [(290.0, 1)]})
+    snapshot, _ = estimated(tmp_path, scene)
+    assert not any(clock.slips for clock in snapshot.clocks)
+    stated = snapshot.diagnostics.synchronisation.residual["B"]
+    assert stated > 4e-4
+    _, holds = errors(snapshot, scene)
+    assert holds.all()
+
+
+def test_between_two_sensors_arrivals_say_which_lost_samples(tmp_path: Path) -> None:
+    for slipped in (0, 1):
+        scene = Scene(seconds=300.0, slips={slipped: [(LATER, 8)]})
+        record(tmp_path / f"{slipped}.h5", scene)
+        settings = replace(SETTINGS, methods=("two-channel",))
+        with Recording.open(tmp_path / f"{slipped}.h5") as recording:
+            part = Pass(recording, settings, sensors={"A", "B"})
+            part.finish()
+            found = [[slip.n_samples for slip in clock.slips] for clock in part.aligned.clocks]
+        assert found == [[8] * (slipped == 0), [8] * (slipped == 1)]
+
+
+@pytest.mark.parametrize(
+    ("motion", "polled"),
+    [
+        ("coloured", True),
+        *(
+            pytest.param(motion, polled, marks=LONG)
+            for motion, polled in itertools.product(("white", "red"), (False, True))
+        ),
+    ],
+)
+def test_no_slip_is_found_in_a_healthy_recording(
+    tmp_path: Path, motion: Literal["white", "red", "coloured"], *, polled: bool
+) -> None:
+    warm = (Oscillator(5.0, 10.0, 120.0), Oscillator(60.0), Oscillator(-40.0, 10.0, 120.0, 2.0))
+    for snr in (0.3, 30.0, 1e5):
+        scene = Scene(seconds=240.0, snr=snr, motion=motion, polled=polled, clocks=warm, seed=3)
+        snapshot, _ = estimated(tmp_path, scene)
+        assert not any(clock.slips for clock in snapshot.clocks)
+        (tmp_path / "r.h5").unlink()
