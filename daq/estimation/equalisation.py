@@ -26,7 +26,12 @@ from daq.estimation.snapshot_diagnostics import (
 )
 from estimator.errors import InsufficientDataError
 from estimator.methods import self_noise
-from estimator.responses.edge_leakage import band_shares, channel_responses, slope_factor
+from estimator.responses.edge_leakage import (
+    band_shares,
+    channel_responses,
+    scatter_of_slopes,
+    slope_factor,
+)
 from estimator.responses.equalisation import (
     correction,
     leakage_threshold,
@@ -61,8 +66,8 @@ ROUNDS = 3
 METHOD = "three-sensor"
 """Method of the noise with which leakage is compared: it takes little time."""
 _ASSUMED_SNR = 1e6  # of known responses that differ
-_PREDICTION = 0.2  # above 0.14, the noise of a prediction under Hann (`ChannelResponses.leakage`)
 _EQUAL = 1e-6  # mean leakage by known responses, as a share, that is not worth a filter
+_SEEN = 3.0  # standard deviations by which leakage in a third of an octave is more than scatter
 _IMPERFECT = 2e-3  # share of the leakage that equalisation may leave unseen
 _AT_LOW = 6.0  # lines of a spectrum, below which it is more: filters know little of 0 Hz
 _MIN_AVERAGES = 20.0  # averages, below which responses are too uncertain to estimate filters from
@@ -382,8 +387,10 @@ class Equalisation:
             left, deviation = channel_responses(csm, band.frequencies, dims=self._dims).leakage(
                 motion, factor, n_effective=band.n_effective
             )
+            feigned = scatter_of_slopes(window, band.settings.sampling_rate) / band.n_effective
+            left -= feigned * np.where(np.isfinite(noise), np.abs(noise), 0.0)
             share, deviation = band_shares(left, deviation, np.abs(noise), band.frequencies)
-            share = share - _noise_of_prediction(band, factor)
+            left = np.where(share > _SEEN * deviation, left, 0.0)  # the rest is scatter
             least = significant_minimum(share, deviation, band.frequencies)
             parts.append((motion, left, least))
         return _Leaks(noise_of_bands, *map(np.concatenate, zip(*parts, strict=True)))
@@ -395,16 +402,6 @@ def _key(bands: Sequence[Band]) -> tuple[tuple[float, bytes], ...]:
         (band.n_effective, hashlib.sha256(np.ascontiguousarray(band.csm).ravel().data).digest())
         for band in bands
     )
-
-
-def _noise_of_prediction(band: Band, factor: float) -> float:
-    """Return what the noise of the predictions adds to leakage, as a share of the noise.
-
-    Beyond that of a Hann window, which the threshold allows for: a rectangular one, whose slope is
-    two jumps, has 150 times as much with segments of a thousand samples.
-    """
-    length = band.settings.segment_length / band.settings.sampling_rate
-    return _PREDICTION * max(factor * 3 * length**2 - 1, 0.0) / max(band.n_effective, 1.0)
 
 
 def _held(response: ComplexArray) -> ComplexArray:

@@ -42,8 +42,8 @@ LARGE = 0.3
 """Leakage from which an estimate is wrong, as a share of the noise."""
 WITH_MOST = 0.1
 """Share of the largest leakage from which a sensor is reported with the one that leaks most."""
-SIGNIFICANCE = 3.0
-"""Standard deviations by which leakage must exceed the threshold."""
+SIGNIFICANCE = 4.5
+"""Standard deviations by which leakage must exceed the threshold; it scatters as powers do."""
 _EQUAL_ENOUGH = 0.5  # fraction of the threshold below which a channel is not filtered
 _STIFFNESS = 1.0
 _MORE_CHANNELS = 0.02  # cost of each filtered channel, in units of `tail_leakage`
