@@ -19,7 +19,7 @@ from daq.estimation.snapshot_diagnostics import (
     Synchronisation,
 )
 from daq.timing.clock_model import RelativeTime
-from estimator.diagnostics.advice import Advice, Gain, ModelMisfit
+from estimator.diagnostics.advice import Advice, Delay, Gain, ModelMisfit
 from estimator.diagnostics.diagnose import Diagnostics, diagnose
 from estimator.diagnostics.kinds import Level, Untested
 from estimator.diagnostics.misfit import SharedNoise
@@ -74,17 +74,21 @@ class Findings:
         """Return findings with advice on leakage at the edges of segments, worst first."""
         whole, untested = found
         if whole is not None and edges is not None:
-            leaks = leakage_advice(
-                np.concatenate([band.frequencies for band in bands]),
-                edges.share,
-                edges.whole_share,
-                dims=dims,
-                n_effective=min(band.n_effective for band in bands),
-                equalised_by=edges.sources,
-                unproven=edges.unproven,
+            leaks = list(
+                leakage_advice(
+                    np.concatenate([band.frequencies for band in bands]),
+                    edges.share,
+                    edges.whole_share,
+                    dims=dims,
+                    n_effective=min(band.n_effective for band in bands),
+                    equalised_by=edges.sources,
+                    unproven=edges.unproven,
+                )
             )
+            differ = {sensor for each in leaks for sensor in each.sensors}
+            rest = [each for each in whole.advice if not _is_by_response(each, differ)]
             order = list(Level)
-            advice = sorted([*whole.advice, *leaks], key=lambda each: order.index(each.level))
+            advice = sorted([*rest, *leaks], key=lambda each: order.index(each.level))
             whole = replace(whole, advice=tuple(advice))
         return cls(clipped, stood_still, whole, untested, edges)
 
@@ -351,6 +355,11 @@ def _is_across(
         abs(amount) <= max(most[one], most[other])
         for (one, other), amount in zip(advice.channels, advice.amounts, strict=True)
     )
+
+
+def _is_by_response(advice: Advice, differ: set[int]) -> bool:
+    """Whether a lag comes from the phase of a sensor whose response differs."""
+    return isinstance(advice, Delay) and bool(differ.intersection(advice.sensors))
 
 
 def _n_known(band: Band) -> int:

@@ -38,7 +38,14 @@ from estimator.responses.equalisation import (
     lowers_noise,
     significant_minimum,
 )
-from estimator.spectra.equaliser import Equaliser, bounded, design, tail_leakage, with_short_tails
+from estimator.spectra.equaliser import (
+    USABLE,
+    Equaliser,
+    bounded,
+    design,
+    tail_leakage,
+    with_short_tails,
+)
 from estimator.spectra.multiresolution import Band
 from estimator.spectra.windows import effective_averages, get_window
 
@@ -239,7 +246,7 @@ class Equalisation:
         noise = self._jackknifed(groups, None), self._jackknifed(groups, self.filters)
         proven = np.zeros(len(self._dims), np.bool_)
         if noise[0] is not None and noise[1] is not None:
-            inner = slice(1, -1)
+            inner = slice(1, int(USABLE * len(self._welch.frequencies)))
             frequency = self._welch.frequencies[inner]
             before, after = (each[:, inner] for each in noise if each is not None)
             proven = lowers_noise(before, after, frequency, dims=self._dims)

@@ -102,6 +102,29 @@ def test_what_leaks_is_predicted_and_widens_intervals(biased: Snapshot) -> None:
     assert advice.share > 0.8
 
 
+def test_a_response_that_differs_is_not_also_a_clock_that_lags(tmp_path: Path) -> None:
+    """A first-order low-pass of 40 Hz delays by 4 ms, which a late clock could do as well."""
+    rng = np.random.default_rng(3)
+    motion = 1e4 * rng.standard_normal((N, 3))
+    late = 1 / (1 + 1j * np.arange(N // 2 + 1) * RATE / N / 40.0)
+    late_motion = np.fft.irfft(np.fft.rfft(motion, axis=0) * late[:, None], N, axis=0)
+    sensors = {
+        name: Sensor(seen + 100 * rng.standard_normal((N, 3)), rate=RATE, clock="one")
+        for name, seen in (("a", motion), ("b", late_motion), ("c", motion))
+    }
+    path = write(tmp_path / "r.h5", sensors)
+    plain, equalised = (estimate([path], replace(OFF, equalise=each)) for each in ("off", "auto"))
+    for snapshot, sources in ((plain, ()), (equalised, ("estimated",))):
+        (advice,) = snapshot.diagnostics.advice
+        assert isinstance(advice, UnequalResponses)
+        assert 1 in advice.sensors
+        edges = snapshot.diagnostics.edge_leakage
+        assert edges is not None
+        assert edges.sources == sources
+    assert excess(plain, 2, 15)[1] > 0.1
+    assert abs(excess(equalised, 2, 15)).max() < 0.05
+
+
 def test_equalised_by_measured_responses_the_noise_is_the_true_one(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     writer = create(path, recorded())

@@ -113,12 +113,13 @@ def _unequal_responses(advice: UnequalResponses, names: Names) -> Explanation:
         differ = "The responses of all sensors differ"
     differ += f" at {where(advice)}"
     channel = names.channels[advice.channel]
-    if advice.unproven:
+    unproven = names.list_sensors(advice.unproven) if advice.unproven else ""
+    if advice.unproven and not advice.equalised_by:
         return Explanation(
             f"{differ}, by the averages: {percent(advice.share)} of the estimate of {channel} or "
             "more would be motion that leaks. But filters for "
-            f"{names.list_sensors(advice.unproven)} did not lower the noise of segments that they "
-            "were not found from, and are not used.",
+            f"{unproven} did not lower the noise of segments that they were not found from, and are"
+            " not used.",
             "Record longer, or use longer segments. The interval includes the leakage.",
         )
     if not advice.equalised_by:
@@ -133,6 +134,8 @@ def _unequal_responses(advice: UnequalResponses, names: Names) -> Explanation:
         f"{differ}: equalised before the window, {sources}. Without, leakage at the edges of "
         f"segments would be {ratio(advice.share_without)} times the noise of {channel}"
     )
+    if advice.unproven:
+        text += f". Filters for {unproven} did not lower the noise, and are not used"
     if advice.level is Level.NOTE:
         return Explanation(f"{text}.")
     return Explanation(
