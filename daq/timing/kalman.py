@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     BoolArray = NDArray[np.bool_]
 
 _WALKS = 10.0 ** np.arange(-10.0, -6.4, 0.5)  # random walk of the rate, s/s per √s
+_FAST_WALKS = 10.0 ** np.arange(-6.0, -4.4, 0.5)  # by a changing temperature; seen by samples only
 _NOISES = 10.0 ** np.arange(-6.0, -2.4, 0.5)  # of arrival observations, s
 _STEADY = 1.1e-8  # at most, of an oscillator that is left in peace: 0.25 ppm in ten minutes
 _START = np.array([1e-2, 1e-4, 1.0])  # what is not known at first: s, s/s, s
@@ -110,7 +111,9 @@ def smooth(observations: Observations, *, least_noise: float = 0.0) -> Smoothed:
     least_noise : float
         Standard deviation of arrivals, in s, that they have at least.
     """
-    strengths = _WALKS, np.array(sorted(set(np.maximum(_NOISES, least_noise).tolist())))
+    seen = observations.from_samples.any()
+    walks = np.concatenate([_WALKS, _FAST_WALKS]) if seen else _WALKS
+    strengths = walks, np.array(sorted(set(np.maximum(_NOISES, least_noise).tolist())))
     walks, noises = (grid.ravel() for grid in np.meshgrid(*strengths, indexing="ij"))
     likelihood = _filter(observations, walks, noises, None)
     likelihood -= (np.log10(walks / _USUAL) / _USUALLY) ** 2 / 2
