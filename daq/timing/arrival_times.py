@@ -330,6 +330,19 @@ class ArrivalTimes:
         apart = np.diff(at).min() if len(at) > 1 else 0.0  # half a segment, by default
         return np.asarray(~measured & (lengths < 2 * apart))
 
+    def _poorly_known(self, epoch: IntArray, std: FloatArray, seen: BoolArray) -> BoolArray:
+        """Return which epochs are known by arrivals only, and worse than delays are of use.
+
+        None, unless others are known well. Given are the epoch of each observation, the standard
+        deviation of the clock there, and whether it is a measured delay.
+        """
+        n_epochs = len(self._epoch_starts)
+        rows = np.maximum(np.bincount(epoch, minlength=n_epochs), 1)
+        rms = np.sqrt(np.bincount(epoch, std**2, minlength=n_epochs) / rows)
+        is_seen = np.bincount(epoch[seen], minlength=n_epochs) > 0
+        well = rms <= _WELL_KNOWN / self.sampling_rate
+        return np.asarray(~is_seen & ~well & (is_seen & well).any())
+
     def _stretches(self, length: float) -> IntArray:
         """Return which stretch of `length` samples of its epoch each arrival lies in.
 
@@ -348,6 +361,7 @@ class ArrivalTimes:
         anchors: list[float],
         measured: MeasuredDelays,
         arrivals: tuple[FloatArray, FloatArray, IntArray],
+        unplaced: BoolArray | None,
     ) -> tuple[BoolArray, tuple[FloatArray, FloatArray, IntArray, FloatArray]]:
         """Return which epochs are placed, and arrivals and measured delays in order.
 
@@ -358,6 +372,8 @@ class ArrivalTimes:
         at = measured.index[known]
         which = np.searchsorted(self._epoch_starts, at, side="right") - 1
         is_placed = ~self._without_segment(at, which)
+        if unplaced is not None:
+            is_placed &= ~unplaced
         used = is_placed[epoch]
         lateness = measured.seconds[known] - at / self.sampling_rate
         lateness -= slope * at + np.array(anchors)[which]
@@ -374,6 +390,7 @@ class ArrivalTimes:
         slope: float,
         anchors: list[float],
         measured: MeasuredDelays | None,
+        unplaced: BoolArray | None = None,
     ) -> Clock:
         left = self._late - slope * self._index - np.array(anchors)[self._epoch]
         duration = float(self._index[-1] - self._index[0] + 1) / self.sampling_rate
@@ -393,7 +410,8 @@ class ArrivalTimes:
         variance = np.zeros(len(index))
         is_placed = np.ones(len(anchors), np.bool_)
         if measured is not None:
-            is_placed, rows = self._with_delays(slope, anchors, measured, (index, late, epoch))
+            arrived = (index, late, epoch)
+            is_placed, rows = self._with_delays(slope, anchors, measured, arrived, unplaced)
             index, late, epoch, variance = rows
         observations = Observations(
             seconds=index / self.sampling_rate,
@@ -408,6 +426,11 @@ class ArrivalTimes:
         refined = bool(observations.from_samples.any())
         if not refined:  # nothing checks the line within the time of one observation
             residual = math.hypot(residual, max(hidden, 2 * scatter) / len(kept))
+        if refined and unplaced is None:
+            seen = observations.from_samples
+            poor = self._poorly_known(epoch, smoothed.std, seen)
+            if poor.any():  # arrivals alone know them; the others need not suffer from it
+                return self._filtered(sensor, slope, anchors, measured, poor)
         known_to = float(np.sqrt(np.mean(smoothed.std**2)))
         if refined and known_to > _WELL_KNOWN / self.sampling_rate:  # the samples hardly know
             return self._filtered(sensor, slope, anchors, None)

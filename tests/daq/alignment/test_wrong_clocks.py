@@ -185,3 +185,16 @@ def test_a_rate_that_follows_the_temperature_is_followed(
     real = truth.residual(snapshot)[1]
     assert stated / 2 < real < 2 * stated
     assert_right(*errors(snapshot, scene))
+
+
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=LONG)])
+def test_sensors_that_all_restart_are_aligned_or_left_out(tmp_path: Path, seed: int) -> None:
+    """Where restarts of several leave an epoch without a delay, arrivals hardly know it."""
+    restarts = dict.fromkeys(range(3), (20.0, 40.0, 1.5))
+    scene = Scene(seconds=600.0, restarts=restarts, polled=True, seed=seed)
+    snapshot, truth = estimated(tmp_path, scene)
+    assert all(clock.refined and clock.is_understood for clock in snapshot.clocks[1:])
+    assert snapshot.n_segments > 50
+    assert (truth.residual(snapshot) < 5e-6).all()
+    assert max(snapshot.diagnostics.synchronisation.residual.values()) < 2e-5
+    assert_right(*errors(snapshot, scene))
