@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -19,7 +20,7 @@ from daq.recording.file_format import SensorLayout
 from daq.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -59,7 +60,7 @@ class Oscillator:
 STEADY = (Oscillator(), Oscillator(15.0), Oscillator(-20.0))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """What is recorded.
 
@@ -76,7 +77,7 @@ class Scene:
 
     rates: tuple[float, float, float] = (200.0, 200.0, 200.0)
     snr: float = 1e4
-    motion: Literal["white", "red", "coloured"] = "white"
+    motion: Literal["white", "red", "coloured", "hum"] = "white"
     seconds: float = 600.0
     polled: bool = False
     clocks: tuple[Oscillator, Oscillator, Oscillator] = STEADY
@@ -135,6 +136,7 @@ def _spectrum(scene: Scene, frequency: FloatArray) -> FloatArray:
         "coloured": 1e-3
         + 1 / (1 + ((f - 0.1 * top) / (0.02 * top)) ** 2)
         + 0.3 / (1 + ((f - 0.6 * top) / (0.03 * top)) ** 2),
+        "hum": 1e-4 / (1 + (f / 2.0) ** 4) + np.exp(-0.5 * ((f - 50.0) / 0.02) ** 2),
     }[scene.motion]
     edge = np.clip((f - top) / (0.1 * top), 0.0, 1.0)
     return np.asarray(scene.snr * NOISE * level * np.cos(np.pi / 2 * edge) ** 2)
@@ -190,10 +192,40 @@ def _taken(
 
 def record(path: Path, scene: Scene) -> Truth:
     """Write a recording and return what is true of it."""
+    for _ in growing(path, scene, every=scene.seconds):
+        pass
+    return truth_of(scene)
+
+
+def truth_of(scene: Scene) -> Truth:
+    """Return what is true of a recording."""
+    _, _, truth = _made(scene)
+    return truth
+
+
+def growing(path: Path, scene: Scene, *, every: float) -> Iterator[float]:
+    """Write a recording; yield the seconds so far each time that so many are on disk."""
+    layouts, blocks, _ = _made(scene)
+    writer = RecordingWriter.create(path, sensors=layouts, created=_ORIGIN)
+    later = every
+    for block in blocks:
+        writer.append(block)
+        seconds = (block.received.monotonic_ns - _ORIGIN.monotonic_ns) * 1e-9
+        if seconds > later:
+            later += every
+            writer.commit()
+            yield seconds
+    writer.close()
+    yield scene.seconds
+
+
+@lru_cache(maxsize=1)
+def _made(scene: Scene) -> tuple[list[SensorLayout], list[Block], Truth]:
     rng = np.random.default_rng(scene.seed)
     at, motion = _motion(scene, rng)
     spline = make_interp_spline(at, motion, k=5)
-    layouts, blocks = [], []
+    layouts: list[SensorLayout] = []
+    blocks: list[Block] = []
     indices, times = [], []
     for sensor, rate in enumerate(scene.rates):
         index, taken, kept, restarts = _taken(scene, sensor, rng)
@@ -231,11 +263,8 @@ def record(path: Path, scene: Scene) -> Truth:
             )
         indices.append(index)
         times.append(taken)
-    writer = RecordingWriter.create(path, sensors=layouts, created=_ORIGIN)
-    for block in sorted(blocks, key=lambda block: block.received.monotonic_ns):
-        writer.append(block)
-    writer.close()
-    return Truth(scene, tuple(indices), tuple(times))
+    blocks.sort(key=lambda block: block.received.monotonic_ns)
+    return layouts, blocks, Truth(scene, tuple(indices), tuple(times))
 
 
 def seconds_of(utc_ns: int) -> float:

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import pytest
 
-from daq.estimation.estimation import estimate
+from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
 from daq.results.band_summary import levels
-from tests.known_clocks import NOISE, Oscillator, Scene, record, seconds_of
+from tests.known_clocks import NOISE, Oscillator, Scene, growing, record, seconds_of
 from tui.output.results import wrong_times
 
 if TYPE_CHECKING:
@@ -198,3 +198,22 @@ def test_sensors_that_all_restart_are_aligned_or_left_out(tmp_path: Path, seed: 
     assert (truth.residual(snapshot) < 5e-6).all()
     assert max(snapshot.diagnostics.synchronisation.residual.values()) < 2e-5
     assert_right(*errors(snapshot, scene))
+
+
+def test_slips_are_the_same_in_a_recording_that_was_followed(tmp_path: Path) -> None:
+    scene = Scene(seconds=300.0, slips={1: [(LATER, 1)], 2: [(200.0, 100)]})
+    path = tmp_path / "r.h5"
+    following: Estimation | None = None
+    for seconds in growing(path, scene, every=20.0):
+        following = following or Estimation([path], SETTINGS)
+        following.update()
+        if seconds > 270.0:
+            clocks = following.snapshot().clocks
+    assert following is not None
+    with following:
+        ended = following.finish()
+    whole = estimate([path], SETTINGS)
+    lost = [[slip.n_samples for slip in clock.slips] for clock in clocks]
+    assert lost == [[], [1], [100]]
+    assert ended.clocks == whole.clocks
+    np.testing.assert_array_equal(ended.csm, whole.csm)
