@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     FloatArray = NDArray[np.float64]
+    BoolArray = NDArray[np.bool_]
     IntArray = NDArray[np.int64]
     ComplexArray = NDArray[np.complex128]
 
@@ -47,6 +48,8 @@ MIN_SEGMENTS = 6
 _SHARED = 0.1  # samples; precision of delays in most segments, for sensors with common motion
 REFERENCES = 3
 """Maximum number of sensors tried as reference, to bound the cost."""
+_ALIKE = 2.0  # standard deviations of its height, by which a peak may be lower than the highest
+_WEAK = 0.15  # share from which on noise may make any of several peaks the highest
 _SIGNIFICANT = 50.0  # 2 E / κ: a peak of seven standard deviations
 _LONGEST = 32.0  # samples, in both directions
 _CLEAR = 1.5  # ratio to the peak nearest zero: the peaks of one line are about equal
@@ -253,26 +256,33 @@ class DelayEstimator:
         weighted = np.matmul(predicted.conj(), weight)
         crossed = np.einsum("fsp,fsp->fs", weighted, xj)
         energy = np.einsum("fsp,fsp->fs", weighted, predicted).real
-        tau = self._peak(crossed)
         # Neighbouring frequencies share samples of the window: κ of them count as one.
         w2 = self.window**2
         kappa = len(w2) * float(w2 @ w2) / float(w2.sum()) ** 2
         total = energy.sum(axis=0)
-        met = (crossed * _turn(omega, tau)).real.sum(axis=0)
         informative = omega**2 @ energy
         # The share of P's noise, which predicts nothing: d0 dj / n, for Wishart matrices.
         spurious = x0.shape[2] * xj.shape[2] / frame.n_segments * float(omega @ omega)
         with np.errstate(divide="ignore", invalid="ignore"):
             share = np.maximum(1 - spurious / informative.mean(), 0.0)
             std = np.sqrt(kappa / (2 * informative)) / share
+            alike = _ALIKE * np.sqrt(kappa / total) / share
+        alike = np.minimum(np.nan_to_num(alike, nan=1.0), 1.0)
+        tau, is_one = self._peak(crossed, alike)
+        met = (crossed * _turn(omega, tau)).real.sum(axis=0)
         # R is an estimate too: correct by the mean of an inverse Wishart matrix.
         freedom = max(frame.n_segments - x0.shape[2], 1)
         std *= math.sqrt(freedom / max(freedom - xj.shape[2] - 1, 1))
         known = (2 * total / kappa > _SIGNIFICANT) & (met > 0.3 * total)
+        known &= is_one | (alike < _WEAK)  # else the cycle is chosen by chance
         return tau, np.where(known, std, np.inf)
 
-    def _peak(self, crossed: ComplexArray) -> FloatArray:
-        """Return the τ that maximises Re Σ crossed exp(iωτ), for every column."""
+    def _peak(self, crossed: ComplexArray, alike: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Return the τ that maximises Re Σ crossed exp(iωτ) for every column, and if it is alone.
+
+        Of peaks that are lower by less than the share `alike`, shape (n_segments,), the nearest to
+        zero: those of hum, a few cycles apart, are equal but for noise.
+        """
         reach = min(self._n_grid // 2 - 1, int(_LONGEST / self.sampling_rate / self._step))
         even, odd = (np.zeros((crossed.shape[1], reach + 1)) for _ in range(2))
         # For so few τ a product with the transform's matrix costs less than the transform.
@@ -282,7 +292,14 @@ class DelayEstimator:
             even += some.real.T @ cosine[: len(some)]
             odd += some.imag.T @ sine[: len(some)]
         near = np.concatenate([(even + odd)[:, :0:-1], even - odd], axis=1)
-        return self._polished(crossed, (np.argmax(near, axis=1) - reach) * self._step)
+        highest = np.argmax(near, axis=1)
+        middle = near[:, 1:-1]
+        high = middle >= (1 - alike[:, None]) * near.max(axis=1, keepdims=True)
+        peaks = high & (middle >= near[:, :-2]) & (middle >= near[:, 2:]) & (middle > 0)
+        away = np.where(peaks, np.abs(np.arange(1 - reach, reach)), reach + 1)
+        nearest = np.where(peaks.any(axis=1), np.argmin(away, axis=1) + 1, highest)
+        is_one = np.count_nonzero(peaks, axis=1) < 2
+        return self._polished(crossed, (nearest - reach) * self._step), is_one
 
     @property
     def _n_grid(self) -> int:

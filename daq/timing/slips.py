@@ -226,7 +226,8 @@ def arrive_otherwise(arrivals: tuple[FloatArray, FloatArray], *, node: float) ->
         before, after = least[max(0, low - _NODES + 1) : low + 1], least[low + 1 :]
         half = abs(change[low]) / 2  # else they are held up for a while
         for_good = after.min() > before.max() + half or after.max() < before.min() - half
-        if for_good and min(low + 1, len(after)) >= _LEAST:
+        short, long = sorted((low + 1, len(after)))
+        if for_good and (short >= _LEAST or long >= _NODES):
             size = median(after[:_NODES]) - median(before)
             found.append(Step(float(at[low]), float(at[low + 1]), size))
     return found

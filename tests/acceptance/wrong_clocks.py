@@ -8,7 +8,6 @@ the real residual, and the slips that were found. One core, about ten minutes.
 from __future__ import annotations
 
 import itertools
-import os
 import sys
 import tempfile
 from dataclasses import dataclass, field, replace
@@ -30,7 +29,7 @@ EDGES = np.array([0.02, 0.05, 0.1, 0.2, 0.3, 0.43])
 """Of bands, as fractions of the lowest sampling rate."""
 WITHIN = 0.3
 """dB of the truth that a level may be off, whatever its interval says."""
-PROCESSES = max(1, (os.cpu_count() or 2) // 2)
+PROCESSES = 2
 
 
 @dataclass
@@ -133,6 +132,7 @@ def main(names: list[str]) -> int:
     groups: dict[str, Group] = {}
     with Pool(PROCESSES) as pool:
         for name, error, holds, ratios, n_slips, doubtful in pool.imap(one, jobs):
+            print(".", end="", file=sys.stderr, flush=True)
             group = groups.setdefault(name, Group())
             group.errors.append(error)
             group.holds.append(holds)
