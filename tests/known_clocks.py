@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
+
+Motion: TypeAlias = Literal["white", "red", "coloured", "hum"]
 
 NAMES = "ABC"
 NOISE = 1.0
@@ -77,7 +79,7 @@ class Scene:
 
     rates: tuple[float, float, float] = (200.0, 200.0, 200.0)
     snr: float = 1e4
-    motion: Literal["white", "red", "coloured", "hum"] = "white"
+    motion: Motion = "white"
     seconds: float = 600.0
     polled: bool = False
     clocks: tuple[Oscillator, Oscillator, Oscillator] = STEADY

@@ -62,6 +62,8 @@ def find_by_motion(reference: SensorSource, others: Sequence[SensorSource]) -> N
         return low, high
 
     def reference_slipped(step: Step) -> bool:
+        if reference.device_utc or reference.polled:
+            return False
         at = of_reference(step.before, step.after)
         return _slipped(reference, replace(step, size=-step.size), *at)
 

@@ -148,7 +148,7 @@ def steps(at: FloatArray, late: FloatArray, std: FloatArray, *, least: float) ->
     """
     if len(at) < 2 * _LEAST:
         return []
-    wide = np.diff(at)
+    wide = np.maximum(np.diff(at), 1e-9)
     slope = np.diff(late) / wide
     half = _SLOPES // 2
     padded = np.pad(slope, half, mode="reflect" if len(slope) > half else "edge")

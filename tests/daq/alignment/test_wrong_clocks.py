@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.estimation.snapshot import Snapshot
-    from tests.known_clocks import Truth
+    from tests.known_clocks import Motion, Truth
 
 SETTINGS = Settings(equalise="off")
 EDGES = (0.02, 0.1, 0.25, 0.43)
@@ -165,7 +165,7 @@ def test_between_two_sensors_arrivals_say_which_lost_samples(tmp_path: Path) -> 
     ],
 )
 def test_no_slip_is_found_in_a_healthy_recording(
-    tmp_path: Path, motion: Literal["white", "red", "coloured", "hum"], *, polled: bool
+    tmp_path: Path, motion: Motion, *, polled: bool
 ) -> None:
     """Nor a clock doubted, where hum lets delays be off by whole cycles."""
     warm = (Oscillator(5.0, 10.0, 120.0), Oscillator(60.0), Oscillator(-40.0, 10.0, 120.0, 2.0))

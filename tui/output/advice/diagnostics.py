@@ -58,7 +58,8 @@ def summary(snapshot: Snapshot) -> list[str]:
         )
         if diagnostics.untested is None:
             more = any(each.n_factors > each.usual for each in diagnostics.dimensions)
-            if not failing and not more:  # what more dimensions explain is said below
+            understood = all(clock.is_understood for clock in snapshot.clocks)
+            if not failing and not more and understood:  # further dimensions are told below
                 lines.append(
                     f"The model test passes in all bands: {model(found.n_factors, snapshot.dims)} "
                     "explains what the sensors have in common."
