@@ -202,10 +202,14 @@ class Recording:
             refresh(self._committed)
             counts: NDArray[np.int64] = self._committed[...]
             check_counts(counts, len(self.sensors))
-            is_new = [s.extend(row) for s, row in zip(self.sensors, counts[:-1], strict=True)]
+            closed = bool(counts[-1, file_format.CLOSED])
+            is_new = [
+                sensor.extend(row, closed=closed)
+                for sensor, row in zip(self.sensors, counts[:-1], strict=True)
+            ]
             n_events = self._events.n_rows
             self._events.extend(int(counts[-1, file_format.EVENTS]))
-        self.closed = bool(counts[-1, file_format.CLOSED])
+        self.closed = closed
         return any(is_new) or self._events.n_rows > n_events or self.closed
 
     def close(self) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daq.errors import RecordingError
+from daq.errors import NotARecordingError, RecordingError
 from daq.recording import file_format
 from daq.recording.chunks.block_table import BlockTable
 from daq.recording.chunks.checksums import intact_blocks
@@ -58,6 +58,7 @@ class SensorRecord:
 
     def __init__(self, group: h5py.Group) -> None:
         attributes = group.attrs
+        self._group = group
         self.name: str = group.name.rpartition("/")[2]
         self.model = text(attributes, "model")
         self.serial_number = text(attributes, "serial_number")
@@ -214,10 +215,27 @@ class SensorRecord:
                 f" {first_row} and {last_row}: {error}"
             ) from error
 
-    def extend(self, counts: NDArray[np.int64]) -> bool:
-        """Add the rows counted in a row of ``/committed``; return whether there are new ones."""
+    def extend(self, counts: NDArray[np.int64], *, closed: bool = False) -> bool:
+        """Add the rows counted in a row of ``/committed``; return whether there are new ones.
+
+        Raises
+        ------
+        NotARecordingError
+            If a closed recording has other numbers of rows or blocks than were committed.
+        RecordingError, OSError
+            If rows are missing or cannot be read.
+        """
         before = self.n_samples, self.gap_rows.n_rows
-        self.blocks.extend(int(counts[file_format.BLOCKS]), int(counts[file_format.ROWS]))
+        n_rows = int(counts[file_format.ROWS])
+        try:
+            self.blocks.extend(int(counts[file_format.BLOCKS]), n_rows, closed=closed)
+        except RecordingError as error:
+            if not closed:
+                raise
+            lost = n_rows - self.blocks.n_samples
+            raise NotARecordingError(
+                f"{error}; sensor {self.name!r}: {lost} of {n_rows} samples are lost"
+            ) from error
         self.gap_rows.extend(int(counts[file_format.GAPS]))
         if self.blocks.n_samples > self.n_samples:
             refresh(self._samples)
@@ -230,4 +248,18 @@ class SensorRecord:
                     f" {self.blocks.n_samples} were committed"
                 )
             self.n_samples = self.blocks.n_samples
+        if closed:
+            self._check_lengths(counts)
         return before != (self.n_samples, self.gap_rows.n_rows)
+
+    def _check_lengths(self, counts: NDArray[np.int64]) -> None:
+        """Check that the datasets of a closed recording end with the committed rows."""
+        expected = {name: int(counts[file_format.ROWS]) for name in ("samples", "instants")}
+        expected |= {"blocks": int(counts[file_format.BLOCKS])}
+        for name, n_rows in expected.items():
+            found = self._group[name].shape[0]
+            if found != n_rows and (name != "instants" or found):
+                raise NotARecordingError(
+                    f"{self._samples.file.filename}: damaged: {self._group.name}/{name} has"
+                    f" {found} rows; expected {n_rows}"
+                )

@@ -65,17 +65,25 @@ class BlockTable:
             self._clipped = [np.concatenate(self._clipped)]
         return self._clipped[0] if self._clipped else np.empty((0, 2), np.int64)
 
-    def extend(self, n_rows: int, n_samples: int) -> None:
+    def extend(self, n_rows: int, n_samples: int, *, closed: bool = False) -> None:
         """Add blocks up to row ``n_rows``, without those that end beyond ``n_samples``.
 
         A crash may leave one of the two numbers older than the other. Blocks and samples are cut to
-        end together.
+        end together. A closed recording was completed, so it has exactly these numbers.
+
+        Raises
+        ------
+        RecordingError
+            If the blocks are not contiguous, or those of a closed recording have another number of
+            samples.
         """
         if n_rows > self._n_rows:
             refresh(self._dataset)
         for first in range(self._n_rows, n_rows, _ROWS_PER_READ):
             blocks = self._read(first, min(first + _ROWS_PER_READ, n_rows))
             ends = blocks["first_row"] + blocks["n_samples"]
+            if closed:
+                self._check_contiguous(blocks)  # `ends` of damaged blocks are not in order
             n_whole = int(np.searchsorted(ends, n_samples, side="right"))
             self._check_contiguous(blocks[:n_whole])
             if n_whole:
@@ -85,6 +93,11 @@ class BlockTable:
                 self._keep_newest(blocks[:n_whole])
             if n_whole < len(blocks):
                 break
+        if closed and self.n_samples != n_samples:
+            raise RecordingError(
+                f"{self._where}: damaged: its blocks have {self.n_samples} samples; expected"
+                f" {n_samples}"
+            )
 
     def covering(self, first_row: int, last_row: int) -> NDArray[np.void]:
         """Return the blocks with rows ``first_row`` to ``last_row`` (not included) of samples."""
@@ -98,6 +111,8 @@ class BlockTable:
     def _check_contiguous(self, blocks: NDArray[np.void]) -> None:
         """Check that each block begins at the row where the previous one ends.
 
+        If not, ``n_samples`` becomes the number of samples whose blocks are certain.
+
         Raises
         ------
         RecordingError
@@ -108,6 +123,8 @@ class BlockTable:
         wrong = np.flatnonzero((blocks["first_row"] != expected) | (blocks["n_samples"] <= 0))
         if len(wrong):
             at = int(wrong[0])
+            # Either this row is wrong, or the number of samples of the row before.
+            self.n_samples = int(expected[max(at - 1, 0)])
             raise RecordingError(
                 f"{self._where}: damaged: row {self._n_rows + at} has its samples at row"
                 f" {blocks['first_row'][at]}; expected {expected[at]}"
