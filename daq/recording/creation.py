@@ -11,6 +11,7 @@ import numpy as np
 
 from daq.recording import file_format
 from daq.recording.description import make_checksums
+from daq.recording.manifest import make_manifest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -37,23 +38,21 @@ def write_attributes(
         software = f"huddle {version('huddle-bench')}"
     except PackageNotFoundError:
         software = "huddle"
-    file.attrs.update(
-        {
-            "format": file_format.FORMAT,
-            "format_version": file_format.FORMAT_VERSION,
-            "run_id": uuid.uuid4().hex,
-            "created": utc.isoformat(timespec="microseconds"),
-            "created_utc_ns": created.utc_ns,
-            "created_monotonic_ns": created.monotonic_ns,
-            "software": software,
-            "bench": "" if bench is None else bench.text,
-            "operator": "" if bench is None else bench.operator,
-            "location": "" if bench is None else bench.location,
-        }
-        | attributes
-    )
+    known: dict[str, Any] = {
+        "format": file_format.FORMAT,
+        "format_version": file_format.FORMAT_VERSION,
+        "run_id": uuid.uuid4().hex,
+        "created": utc.isoformat(timespec="microseconds"),
+        "created_utc_ns": created.utc_ns,
+        "created_monotonic_ns": created.monotonic_ns,
+        "software": software,
+        "bench": "" if bench is None else bench.text,
+        "operator": "" if bench is None else bench.operator,
+        "location": "" if bench is None else bench.location,
+    } | attributes
     if control is not None:
-        file.attrs["control_port"], file.attrs["control_token"] = control
+        known["control_port"], known["control_token"] = control
+    file.attrs.update({name: file_format.fixed(value) for name, value in known.items()})
 
 
 def make_datasets(file: h5py.File, sensors: Sequence[SensorLayout], chunk_seconds: float) -> None:
@@ -62,7 +61,7 @@ def make_datasets(file: h5py.File, sensors: Sequence[SensorLayout], chunk_second
     for sensor in sensors:
         group = groups.create_group(sensor.name)
         for key in ("model", "serial_number", "driver", "port", "clock", "sampling_rate"):
-            group.attrs[key] = getattr(sensor, key)
+            group.attrs[key] = file_format.fixed(getattr(sensor, key))
         n_channels = len(sensor.channels)
         # Reading a chunk takes at least 10 µs, so at low rates a chunk has 2 s.
         min_rows = min(_MIN_CHUNK_ROWS, round(2 * sensor.sampling_rate))
@@ -88,15 +87,17 @@ def make_datasets(file: h5py.File, sensors: Sequence[SensorLayout], chunk_second
             fletcher32=True,
             **filters,
         )
-        instants.attrs["unit"] = "ns"
+        instants.attrs["unit"] = file_format.fixed("ns")
         _make_table(group, "blocks", file_format.BLOCK_DTYPE, file_format.BLOCKS_PER_CHUNK)
         _make_table(group, "gaps", file_format.GAP_DTYPE, file_format.GAPS_PER_CHUNK)
     _make_table(file, "events", file_format.EVENT_DTYPE, file_format.EVENTS_PER_CHUNK)
     make_checksums(file, len(sensors))
     committed = file.create_dataset("committed", data=np.zeros((len(sensors) + 1, 3), "<i8"))
-    committed.attrs["sensors"] = [sensor.name for sensor in sensors]
-    committed.attrs["columns"] = ["rows", "blocks", "gaps"]
-    committed.attrs["last_row"] = ["events", "closed", "unused"]
+    fixed = file_format.fixed
+    committed.attrs["sensors"] = fixed([sensor.name for sensor in sensors])
+    committed.attrs["columns"] = fixed(["rows", "blocks", "gaps"])
+    committed.attrs["last_row"] = fixed(["events", "closed", "unused"])
+    make_manifest(file)
 
 
 def _make_table(group: h5py.Group, name: str, dtype: np.dtype[Any], n_rows: int) -> None:

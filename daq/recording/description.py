@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daq.errors import NotARecordingError
+from daq.recording.file_format import fixed, texts
 from daq.recording.storage.refusals import dataset
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ _SAMPLES = ("channels", "sensitivity", "unit", "direction", "auxiliary", "respon
 def write_checksums(file: h5py.File) -> None:
     """Write ``/checksums`` of a complete recording."""
     if CHECKSUMS in file:
-        names = list(file["committed"].attrs["sensors"])
+        names = texts(file["committed"].attrs["sensors"])
         tables = [file["sensors"][name]["gaps"][...].tobytes() for name in names]
         file[CHECKSUMS][...] = _checksums(file, [*tables, file["events"][...].tobytes()])
 
@@ -94,7 +95,7 @@ def result_crc32(arrays: Mapping[str, Any], attributes: Mapping[str, Any]) -> in
 
 def _checksums(file: h5py.File, tables: list[bytes]) -> np.ndarray[Any, np.dtype[np.uint32]]:
     committed = file["committed"]
-    names = list(committed.attrs["sensors"])
+    names = list(texts(committed.attrs["sensors"]))
     groups = [file["sensors"][name] for name in names]
     described = [_described_sensor(group) for group in groups]
     described.append(_text(file.attrs, _FILE) + json.dumps(names))
@@ -116,12 +117,11 @@ def _text(attributes: h5py.AttributeManager, names: tuple[str, ...]) -> str:
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401 - any attribute
-    if isinstance(value, (np.ndarray, np.generic)):
-        return value.tolist()
-    return value
+    value = texts(value)
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
 
 
 def make_checksums(file: h5py.File, n_sensors: int) -> None:
     """Create ``/checksums`` of a new recording."""
     file.create_dataset(CHECKSUMS, data=np.zeros((n_sensors + 1, 3), "<u4"))
-    file[CHECKSUMS].attrs["columns"] = ["description", "gaps or events", "committed"]
+    file[CHECKSUMS].attrs["columns"] = fixed(["description", "gaps or events", "committed"])

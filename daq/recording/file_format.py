@@ -6,6 +6,7 @@ import zlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import h5py
 import numpy as np
 
 from daq.bench.model import Channel, Sensor
@@ -19,7 +20,8 @@ if TYPE_CHECKING:
     from daq.bench.driver_rules import DriverRules
 
 FORMAT = "huddle-recording"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+"""Version 2 has a manifest, and strings of fixed length; version 1 is read."""
 LIBVER = ("v110", "v110")
 """HDF5 file format of recordings."""
 
@@ -104,26 +106,52 @@ class SensorLayout:
         )
 
 
+def fixed(value: Any) -> Any:  # noqa: ANN401 - any attribute
+    """Return an attribute with its strings, if it has any, as UTF-8 of fixed length.
+
+    HDF5 stores strings of variable length in its global heap, which has no checksum. One changed
+    bit there can send every reader around in a circle.
+    """
+    if isinstance(value, str):
+        encoded = value.encode()
+        return np.array(encoded, h5py.string_dtype("utf-8", max(1, len(encoded))))
+    if isinstance(value, (list, tuple)) and value and all(isinstance(v, str) for v in value):
+        several = [v.encode() for v in value]
+        return np.array(several, h5py.string_dtype("utf-8", max(1, *map(len, several))))
+    return value
+
+
+def texts(value: Any) -> Any:  # noqa: ANN401 - any attribute
+    """Return an attribute as stored by this or an earlier version, with its strings as `str`."""
+    if isinstance(value, bytes):
+        return value.decode()
+    if isinstance(value, np.ndarray) and value.dtype.kind in "SO":
+        return [v.decode() if isinstance(v, bytes) else v for v in value.tolist()]
+    return value
+
+
 def channel_attributes(channels: Sequence[Channel]) -> dict[str, Any]:
     """Return the attributes of the dataset ``samples`` that describe channels."""
     return {
-        "channels": [channel.name for channel in channels],
+        "channels": fixed([channel.name for channel in channels]),
         "sensitivity": np.array([channel.sensitivity for channel in channels]),
-        "unit": [channel.unit for channel in channels],
-        "direction": [channel.direction or "" for channel in channels],
+        "unit": fixed([channel.unit for channel in channels]),
+        "direction": fixed([channel.direction or "" for channel in channels]),
         "auxiliary": np.array([channel.auxiliary for channel in channels], dtype=np.int8),
-        "response": [
-            "" if channel.response is None else response_to_json(channel.response)
-            for channel in channels
-        ],
+        "response": fixed(
+            [
+                "" if channel.response is None else response_to_json(channel.response)
+                for channel in channels
+            ]
+        ),
     }
 
 
 def channels_of(attributes: Any) -> tuple[Channel, ...]:  # noqa: ANN401  (h5py is untyped)
     """Return the channels described by :func:`channel_attributes`."""
     columns = zip(
-        *(attributes[key] for key in ("channels", "sensitivity", "unit", "direction")),
-        *(attributes[key] for key in ("auxiliary", "response")),
+        *(texts(attributes[key]) for key in ("channels", "sensitivity", "unit", "direction")),
+        *(texts(attributes[key]) for key in ("auxiliary", "response")),
         strict=True,
     )
     return tuple(

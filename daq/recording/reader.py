@@ -74,7 +74,7 @@ class Recording:
         self.continues = text(attributes, CONTINUES) if CONTINUES in attributes else ""
         """The ``run_id`` of the recording that this one continues; empty for most."""
         self._committed = dataset(file, "committed", np.dtype("<i8"))
-        names = [str(name) for name in self._committed.attrs["sensors"]]
+        names = [str(name) for name in file_format.texts(self._committed.attrs["sensors"])]
         if not names or len(set(names)) < len(names):
             raise ValueError(f"sensors {names}; expected different names")
         groups = member(file, "sensors")
@@ -140,9 +140,9 @@ class Recording:
         """Return all events from index ``first`` on."""
         return tuple(
             Event(
-                sensor=row["sensor"].decode(),
-                kind=EventKind.of(row["kind"].decode()),
-                text=row["text"].decode(),
+                sensor=row["sensor"].decode(errors="replace"),
+                kind=EventKind.of(row["kind"].decode(errors="replace")),
+                text=row["text"].decode(errors="replace"),
                 received=HostTime(int(row["monotonic_ns"]), int(row["utc_ns"])),
             )
             for row in self._events.rows()[first:]
@@ -173,13 +173,13 @@ class Recording:
             if "results" not in self._file:
                 return {}
             group = member(self._file, "results")
-            return {method: dict(member(group, method).attrs) for method in group}
+            return {method: _attributes(member(group, method)) for method in group}
 
     def _result(
         self, method: str, entry: h5py.Group
     ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         arrays = {key: dataset(entry, key)[...] for key in entry}
-        attributes = dict(entry.attrs)
+        attributes = _attributes(entry)
         stored = attributes.pop("crc32", None)
         if stored is not None and stored != result_crc32(arrays, attributes):
             raise NotARecordingError(
@@ -223,9 +223,13 @@ class Recording:
         self.close()
 
 
+def _attributes(group: h5py.Group) -> dict[str, Any]:
+    return {name: file_format.texts(value) for name, value in group.attrs.items()}
+
+
 def check_format(path: Path, file: h5py.File) -> None:
     """Raise NotARecordingError for other HDF5 files, and for newer formats."""
-    found = file.attrs.get("format")
+    found = file_format.texts(file.attrs.get("format"))
     if found != file_format.FORMAT:
         what = "it has no attribute format" if found is None else f"its format is {found!r}"
         raise NotARecordingError(

@@ -12,7 +12,7 @@ import contextlib
 import io
 import shutil
 import uuid
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,15 +24,23 @@ from daq.host_clock import SystemClock
 from daq.protocols.block import EventKind
 from daq.recording import file_format
 from daq.recording.description import result_crc32, write_checksums
-from daq.recording.file_format import LIBVER
+from daq.recording.file_format import LIBVER, fixed
+from daq.recording.manifest import (
+    RESULTS,
+    RESULTS_MANIFEST,
+    differences,
+    root_sha256,
+    write_manifest,
+)
 from daq.recording.reader import Recording
 from daq.recording.storage.journal import JournalContents, journal_path, read_journal, rebuild
 from daq.recording.storage.locking import is_being_written
 from daq.recording.storage.names import create_private, sync_directory, sync_file
+from daq.recording.storage.refusals import damage_named, text
 from daq.recording.storage.superblock import Superblock
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from numpy.typing import NDArray
 
@@ -40,6 +48,7 @@ if TYPE_CHECKING:
     from daq.recording.sensor_record import SensorRecord
 
 _ROWS_PER_READ = 1 << 17
+_SUPERBLOCK = "the superblock: the recorder was killed while it closed the file"
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,15 +84,26 @@ class Verification:
     sensors: tuple[SensorVerification, ...]
     n_events: int
     damaged_tables: tuple[str, ...] = ()
+    changed: tuple[str, ...] = ()
+    """Datasets and attributes of a closed recording that differ from its manifest."""
+    root_sha256: str = ""
+    """SHA-256 of the manifest; empty if there is none."""
 
     @property
     def intact(self) -> bool:
-        """Whether the checksums of all committed blocks, gaps and events are correct."""
-        return not self.damaged_tables and not any(s.bad_blocks for s in self.sensors)
+        """Whether all committed rows, and everything in the manifest, are as they were written."""
+        damaged = self.damaged_tables or self.changed
+        return not damaged and not any(s.bad_blocks for s in self.sensors)
 
 
-def verify(path: str | Path) -> Verification:
-    """Check the checksums of all committed blocks.
+def verify(path: str | Path, *, progress: Callable[[], object] = lambda: None) -> Verification:
+    """Check the checksums of all committed blocks, and every object of a closed recording.
+
+    Parameters
+    ----------
+    path : path
+    progress : callable
+        Called after each part of the file.
 
     Raises
     ------
@@ -93,8 +113,8 @@ def verify(path: str | Path) -> Verification:
     path = Path(path)
     being_written = is_being_written(path) if path.is_file() else False
     with Recording.open(path) as recording:
-        sensors = tuple(_verify_sensor(sensor) for sensor in recording.sensors)
-        return Verification(
+        sensors = tuple(_verify_sensor(sensor, progress) for sensor in recording.sensors)
+        report = Verification(
             path,
             recording.closed,
             being_written,
@@ -102,6 +122,14 @@ def verify(path: str | Path) -> Verification:
             len(recording.events),
             recording.damaged_tables,
         )
+    if not report.closed or being_written:
+        return report
+    if Superblock.of(path).is_open:  # killed between its last commit and the end of closing
+        return replace(report, changed=(_SUPERBLOCK,))
+    # As other programs open it: a wrong superblock, for example, stops those.
+    with damage_named(path), h5py.File(path, "r", locking=False) as file:
+        changed = tuple(differences(file, progress=progress))
+        return replace(report, changed=changed, root_sha256=root_sha256(file))
 
 
 def repair(path: str | Path, *, now: HostTime | None = None) -> Verification:
@@ -144,6 +172,9 @@ def repair(path: str | Path, *, now: HostTime | None = None) -> Verification:
                 _cut_to_committed(file, report)
                 _add_last_events(file, report, now)
             write_checksums(file)
+            write_manifest(file)
+            if RESULTS in file:
+                write_manifest(file, RESULTS_MANIFEST)
     if journal is not None:
         journal_path(path).unlink(missing_ok=True)
     _remove_useless_journal(path)
@@ -167,7 +198,7 @@ def _own_journal(path: Path) -> JournalContents | None:
     if contents is None or not path.is_file():
         return None
     with h5py.File(io.BytesIO(contents.created), "r") as created:
-        run_id: str = created.attrs["run_id"]
+        run_id = text(created.attrs, "run_id")
     with path.open("rb") as file:  # the attributes, written once, survive most damage
         return contents if run_id.encode() in file.read(len(contents.created)) else None
 
@@ -219,14 +250,16 @@ def write_results(
             group = file.create_group(f"results/{method}")
             for name, values in arrays.items():
                 group.create_dataset(name, data=values)
-            group.attrs.update(attributes)
+            group.attrs.update({name: fixed(value) for name, value in attributes.items()})
             stored = {name: group[name][...] for name in group}
             group.attrs["crc32"] = result_crc32(stored, dict(group.attrs))
+        write_manifest(file, RESULTS_MANIFEST)
 
 
-def _verify_sensor(sensor: SensorRecord) -> SensorVerification:
+def _verify_sensor(sensor: SensorRecord, progress: Callable[[], object]) -> SensorVerification:
     for first in range(0, sensor.n_samples, _ROWS_PER_READ):
         sensor.intact_counts(first, min(first + _ROWS_PER_READ, sensor.n_samples))
+        progress()
     first_rows = sensor.blocks["first_row"]
     return SensorVerification(
         name=sensor.name,

@@ -36,6 +36,7 @@ from daq.recording import file_format
 from daq.recording.chunks.chunk_writer import SensorRows, TableBuffer
 from daq.recording.creation import make_datasets, write_attributes
 from daq.recording.description import write_checksums
+from daq.recording.manifest import write_manifest
 from daq.recording.storage.journal import Journal
 from daq.recording.storage.locking import WriterLock
 from daq.recording.storage.names import (
@@ -47,6 +48,7 @@ from daq.recording.storage.names import (
     sync_file,
     taken,
 )
+from daq.recording.storage.refusals import text
 from daq.recording.storage.retries import reason_of, repeated
 
 if TYPE_CHECKING:
@@ -93,7 +95,7 @@ class RecordingWriter:
         self._sensors = {s.name: SensorRows(file["sensors"][s.name], s) for s in sensors}
         self._events = TableBuffer(file["events"])
         self._committed = file["committed"]
-        self._run_id = str(file.attrs["run_id"])
+        self._run_id = text(file.attrs, "run_id")
         self._failed = False
 
     @classmethod
@@ -297,6 +299,7 @@ class RecordingWriter:
             self._committed[...] = counts
             if closed:
                 write_checksums(self._file)
+                write_manifest(self._file, contents=self._contents_sha256())
             repeated(self._file.flush)
         return Committed(
             {
@@ -306,6 +309,12 @@ class RecordingWriter:
             self._events.n_rows,
             closed,
         )
+
+    def _contents_sha256(self) -> dict[str, bytes]:
+        found = {self._events.name: self._events.sha256.digest()}
+        for sensor in self._sensors.values():
+            found |= sensor.contents_sha256()
+        return found
 
     def _chunked(self) -> dict[str, tuple[h5py.Dataset, ...]]:
         return {

@@ -7,18 +7,34 @@ Writes the counts to docs/validation/torture.md. A share of the cases, as in
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 import tempfile
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tests.torture.crashes import disk_faults, kill_faults
-from tests.torture.damaged_files import LIMIT, contents, flips, make_recording, tally
+from tests.torture.damaged_files import (
+    FAULTS,
+    LIMIT,
+    changed_blocks,
+    changed_sectors,
+    contents,
+    flips,
+    make_recording,
+    tally,
+)
 from tests.torture.power_cuts import MODELS, faults, recorded, shim
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
 PAGE = Path(__file__).parents[2] / "docs" / "validation" / "torture.md"
-KILLS, CUTS, DISK_ERRORS, FLIPS = 300, 100, 50, 500
+KILLS, CUTS, DISK_ERRORS, FLIPS, SECTORS = 300, 100, 50, 50_000, 10_000
+_FILES = 200
+"""Damaged files on disk at the same time."""
 HEAD = """# Recordings under torture
 
 `make torture` records with the writer of the product, and lets the process be killed, the power be
@@ -39,8 +55,10 @@ TAIL = """
 - *Disk errors*: from a random call on, once or permanently, `pwrite`, `fsync`, `write` or
   `ftruncate` fails with ENOSPC or EIO. One `pwrite` or `write` that fails must not end the
   recording; otherwise the recorder must end with an error message.
-- *Flipped bits*: one bit of a closed recording, in 80 % of the cases outside of the samples. A
-  reader may take ten seconds at most.
+- *Flipped bits*: one bit of a closed recording, in 80 % of the cases outside of the samples; or
+  one bit of a row of a table of blocks. *Changed sectors*: 512 bytes that become zero, random, or
+  those of another sector. Reader and `huddle verify` may take ten seconds at most; whatever they
+  call intact, a program with plain h5py must be able to read.
 """
 
 
@@ -82,15 +100,24 @@ def torture(share: float, folder: Path) -> list[Row]:
             add(Row(f"power cuts, {model}", n, faults(operations, model, n, folder, seed=seed)))
         n = max(1, round(DISK_ERRORS * share))
         add(Row("disk errors", n, disk_faults(library, folder, n, seed=2)))
-    n = max(1, round(FLIPS * share))
-    whole = folder / "whole.h5"
-    make_recording(whole)
-    counts = tally(list(flips(whole, n, seed=3)), contents(whole), folder, limit=LIMIT)
-    good = ("refused", "damage named", "read as it was")
-    wrong = Counter({what: count for what, count in counts.items() if what not in good})
-    remark = f" ({', '.join(f'{counts[what]} {what}' for what in good)})"
-    add(Row("flipped bits", n, list(wrong.elements()), remark))
+    add(_changes("flipped bits", flips, round(FLIPS * share), folder))
+    add(_changes("flipped bits in block tables", changed_blocks, round(FLIPS * share), folder))
+    add(_changes("changed sectors", changed_sectors, round(SECTORS * share), folder))
     return rows
+
+
+def _changes(name: str, change: Callable[..., Iterator[bytes]], n: int, folder: Path) -> Row:
+    """Return the row of one kind of damage to a closed recording."""
+    whole, n = folder / "whole.h5", max(1, n)
+    if not whole.exists():
+        make_recording(whole)
+    counts: Counter[str] = Counter()
+    changed, expected = change(whole, n, seed=3), contents(whole)
+    while files := list(itertools.islice(changed, _FILES)):
+        counts += tally(files, expected, folder, limit=LIMIT)
+    wrong = Counter({what: count for what, count in counts.items() if what in FAULTS})
+    good = ", ".join(f"{n} {what}" for what, n in counts.items() if what not in FAULTS)
+    return Row(name, n, list(wrong.elements()), f" ({good})")
 
 
 def main() -> int:

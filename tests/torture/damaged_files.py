@@ -1,4 +1,4 @@
-"""Single bits of a recording are flipped: everything read from it is right, or its damage is said.
+"""Bits and sectors of a recording are changed: what is read is right, or its damage is named.
 
 A child process reads the files one after another, so that neither a hang nor a crash of a library
 ends the tests.
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 CREATED = HostTime(1_000_000_000, 1_790_000_000_000_000_000)
+SECTOR = 512
+FAULTS = ("hang", "crash", "changed silently", "intact but unreadable")
 LIMIT = 10.0
 """Seconds that reading a file may take before it counts as a hang."""
 
@@ -80,6 +82,36 @@ def flips(path: Path, n: int, *, seed: int) -> Iterator[bytes]:
         yield bytes(changed)
 
 
+def changed_blocks(path: Path, n: int, *, seed: int) -> Iterator[bytes]:
+    """Yield copies of a file with one flipped bit each in the rows of a table of blocks."""
+    rng = np.random.default_rng(seed)
+    content = path.read_bytes()
+    with h5py.File(path) as file:
+        tables = [sensor["blocks"] for sensor in file["sensors"].values()]
+        places = [
+            (table.id.get_chunk_info(0).byte_offset, len(table) * table.dtype.itemsize)
+            for table in tables
+        ]
+    for _ in range(n):
+        first, size = places[rng.integers(len(places))]
+        changed = bytearray(content)
+        changed[first + int(rng.integers(size))] ^= 1 << int(rng.integers(8))
+        yield bytes(changed)
+
+
+def changed_sectors(path: Path, n: int, *, seed: int) -> Iterator[bytes]:
+    """Yield copies of a file with one sector each that is zero, random, or another sector's."""
+    rng = np.random.default_rng(seed)
+    content = path.read_bytes()
+    n_sectors = len(content) // SECTOR
+    for _ in range(n):
+        at, other = (rng.integers(n_sectors, size=2) * SECTOR).tolist()
+        kinds = (bytes(SECTOR), rng.bytes(SECTOR), content[other : other + SECTOR])
+        changed = bytearray(content)
+        changed[at : at + SECTOR] = kinds[rng.integers(len(kinds))]
+        yield bytes(changed)
+
+
 def contents(path: Path) -> str:
     """Return a digest of everything that can be read from a recording.
 
@@ -116,7 +148,27 @@ def outcome(path: Path, expected: str) -> str:
         return "refused"
     if not intact:
         return "damage named"
+    if not _plain_h5py_reads(path):
+        return "intact but unreadable"
     return "read as it was" if found == expected else "changed silently"
+
+
+def _plain_h5py_reads(path: Path) -> bool:
+    """Return whether a program that knows nothing of huddle can read all objects of a file."""
+
+    def read(_: str, found: h5py.Group | h5py.Dataset) -> None:
+        for name in found.attrs:
+            found.attrs[name]
+        if isinstance(found, h5py.Dataset):
+            found[...]
+
+    try:
+        with h5py.File(path) as file:
+            read("", file)
+            file.visititems(read)
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError):
+        return False
+    return True
 
 
 def tally(files: Sequence[bytes], expected: str, folder: Path, *, limit: float) -> Counter[str]:

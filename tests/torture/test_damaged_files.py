@@ -6,20 +6,33 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.torture.damaged_files import LIMIT, contents, flips, make_recording, tally
+from tests.torture.damaged_files import (
+    FAULTS,
+    LIMIT,
+    changed_blocks,
+    changed_sectors,
+    contents,
+    flips,
+    make_recording,
+    tally,
+)
 from tests.waiting import limit
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
 
 @pytest.mark.long
-def test_no_flipped_bit_is_taken_for_data_or_stops_the_reader(tmp_path: Path) -> None:
+@pytest.mark.parametrize("change", [flips, changed_blocks, changed_sectors])
+def test_no_change_is_taken_for_data_or_stops_the_reader(
+    tmp_path: Path, change: Callable[..., Iterator[bytes]]
+) -> None:
     whole = tmp_path / "whole.h5"
     make_recording(whole)
-    files = list(flips(whole, 80, seed=4))
+    files = list(change(whole, 80, seed=4))
     counts = tally(files, contents(whole), tmp_path, limit=limit(LIMIT))
     assert counts.total() == 80
-    for fault in ("hang", "crash", "changed silently"):
+    for fault in FAULTS:
         assert counts[fault] == 0, counts
-    assert counts["damage named"] > 0
+    assert counts["damage named"] + counts["refused"] > 0

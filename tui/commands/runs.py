@@ -131,7 +131,7 @@ def verify_recordings(sources: Sequence[Path], *, json: str | None) -> None:
             state = str(error)
         else:
             damaged = [s.name for s in report.sensors if s.bad_blocks]
-            damaged += report.damaged_tables
+            damaged += [*report.damaged_tables, *report.changed]
             state = f"damaged: {', '.join(damaged)}" if damaged else "intact"
         found.append((path, state))
         for_people(json).print(f"{path}: {state.removeprefix(f'{path}: ')}", soft_wrap=True)

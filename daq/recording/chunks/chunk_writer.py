@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import zlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -56,10 +57,13 @@ class TableBuffer:
 
     def __init__(self, dataset: h5py.Dataset) -> None:
         self._rows = AppendedRows(dataset)
+        self.name: str = dataset.name
         self._waiting: list[NDArray[np.void]] = []
         self.n_rows = 0
         self.written = b""
         """Rows written by the last `write`, as bytes."""
+        self.sha256 = hashlib.sha256()
+        """Of all written rows."""
 
     def add(self, row: NDArray[np.void]) -> None:
         """Buffer a row until the next `write`."""
@@ -75,6 +79,7 @@ class TableBuffer:
         repeated(lambda: self._rows.write(self.n_rows, rows))
         self.n_rows += len(rows)
         self.written = rows.tobytes()
+        self.sha256.update(self.written)
         self._waiting.clear()
 
 
@@ -88,6 +93,8 @@ class ChunkBuffer:
         self._filled = 0
         self._unsafe: list[tuple[int, NDArray[Any]]] = []
         self.n_written = 0
+        self.sha256 = hashlib.sha256()
+        """Of all written rows."""
 
     def write_again(self) -> None:
         """Write the chunks that are not yet safe again, without HDF5's cache.
@@ -149,6 +156,7 @@ class ChunkBuffer:
             report(error)
             repeated(self.write_again)
         self.n_written += len(rows)
+        self.sha256.update(np.ascontiguousarray(rows, self.dataset.dtype).data)
 
 
 @dataclass(slots=True)
@@ -243,6 +251,13 @@ class SensorRows:
         self._end_current()
         self.samples.finish()
         self.instants.finish()
+
+    def contents_sha256(self) -> dict[str, bytes]:
+        """Return the SHA-256 of all written rows of each dataset, by its path."""
+        return {
+            **{b.dataset.name: b.sha256.digest() for b in (self.samples, self.instants)},
+            **{t.name: t.sha256.digest() for t in (self.blocks, self.gaps)},
+        }
 
     @property
     def committable_rows(self) -> int:

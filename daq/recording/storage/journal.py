@@ -261,7 +261,7 @@ def rebuild(damaged: Path, contents: JournalContents, copy: Path) -> None:
         h5py.File(copy, "r+", libver=file_format.LIBVER, locking=False) as file,
         damaged.open("rb") as source,
     ):
-        names = list(file["committed"].attrs["sensors"])
+        names = file_format.texts(file["committed"].attrs["sensors"])
         if counts is None:
             return
         for name, row in zip(names, counts, strict=False):

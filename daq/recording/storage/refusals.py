@@ -129,6 +129,8 @@ def check_counts(counts: np.ndarray[Any, np.dtype[Any]], n_sensors: int) -> None
 def text(attributes: h5py.AttributeManager, name: str) -> str:
     """Return an attribute; raise TypeError if it is no text."""
     found = attributes[name]
+    if isinstance(found, bytes):  # of fixed length
+        found = found.decode()
     if not isinstance(found, str):
         raise TypeError(f"attribute {name} is {type(found).__name__}; expected a text")
     return found

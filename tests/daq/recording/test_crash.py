@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from daq.bench.model import Channel
-from daq.errors import NotARecordingError, RecordingError
+from daq.errors import RecordingError
 from daq.protocols.block import Block, HostTime
 from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording, control_address
@@ -177,7 +177,7 @@ def test_a_truncated_file_of_a_killed_recorder_is_handled(
     with path.open("r+b") as raw:
         raw.truncate(int(kept * path.stat().st_size))
     if kept < 0.5:
-        with pytest.raises(NotARecordingError):
+        with pytest.raises(RecordingError):
             verify(path)
     else:
         # What came first is there and said to be right; what is cut off is said to be missing.

@@ -127,12 +127,12 @@ def test_plain_h5py_reads_a_recording(tmp_path: Path) -> None:
     writer.append(block("a", 0, 250))
     writer.close()
     with h5py.File(path, "r") as file:
-        assert file.attrs["format"] == "huddle-recording"
+        assert file.attrs["format"].decode() == "huddle-recording"
         dataset = file["sensors/a/samples"]
         assert dataset.shape == (250, 3)
         assert dataset.chunks == (100, 3)
         assert dataset.fletcher32
-        assert list(dataset.attrs["unit"]) == ["m/s²", "V", "°C"]
+        assert [unit.decode() for unit in dataset.attrs["unit"]] == ["m/s²", "V", "°C"]
         np.testing.assert_array_equal(dataset[...], samples(0, 250))
 
 
