@@ -42,7 +42,7 @@ _BYTES_PER_READ = 1 << 22
 
 def make_manifest(file: h5py.File) -> None:
     """Create the empty ``/manifest`` of a new recording, whose other objects are all there."""
-    names = [ROOT, *(name for name, _ in _items(file, MANIFEST))]
+    names = [ROOT, *(name for name, _ in items(file, MANIFEST))]
     file.create_dataset(MANIFEST, data=np.zeros(len(names), _dtype(names)))
 
 
@@ -108,7 +108,7 @@ def computed(
     """Return the SHA-256 of all datasets and attributes that a manifest covers, by name."""
     known = contents or {}
     found = {}
-    for path, value in _items(file, name):
+    for path, value in items(file, name):
         if isinstance(value, h5py.Dataset):
             try:
                 inner = known[path] if path in known else _contents_sha256(value, progress)
@@ -121,7 +121,7 @@ def computed(
     return found
 
 
-def _items(file: h5py.File, manifest: str) -> Iterator[tuple[str, Any]]:
+def items(file: h5py.File, manifest: str = MANIFEST) -> Iterator[tuple[str, Any]]:
     """Yield the datasets, and the values of the attributes, that a manifest covers."""
     if manifest == RESULTS_MANIFEST:
         if RESULTS in file:

@@ -24,7 +24,9 @@ from daq.protocols.block import Event, EventKind, HostTime
 from daq.recording import file_format
 from daq.recording.description import damaged_tables, result_crc32
 from daq.recording.sensor_record import CommittedRows, SensorRecord
+from daq.recording.storage import trial
 from daq.recording.storage.journal import journal_path
+from daq.recording.storage.locking import is_being_written
 from daq.recording.storage.names import CONTINUES
 from daq.recording.storage.opening import open_file, refresh, source_of
 from daq.recording.storage.refusals import (
@@ -91,8 +93,14 @@ class Recording:
             _LOGGER.warning("%s: damaged: wrong checksum of the %s", path, name)
 
     @classmethod
-    def open(cls, path: str | Path) -> Recording:
+    def open(cls, path: str | Path, *, tried: bool = False) -> Recording:
         """Open a recording: growing, closed, or left open by a killed recorder.
+
+        Parameters
+        ----------
+        path : path
+        tried : bool
+            Whether the file is known to be harmless, or this process may hang.
 
         Raises
         ------
@@ -103,7 +111,7 @@ class Recording:
         """
         path = Path(path)
         try:
-            file = open_file(path)
+            file = open_file(path, tried=tried)
             try:
                 with damage_named(path):
                     check_format(path, file)
@@ -259,7 +267,10 @@ def control_address(path: str | Path) -> tuple[int, str] | None:
         As :meth:`Recording.open` does.
     """
     path = Path(path)
-    source = source_of(path, Superblock.of(path))
+    superblock = Superblock.of(path)
+    if not is_being_written(path):
+        trial.tried(path)
+    source = source_of(path, superblock)
     with damage_named(path), h5py.File(source, "r") as file:
         check_format(path, file)
         committed = dataset(file, "committed", np.dtype("<i8"))

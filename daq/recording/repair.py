@@ -38,6 +38,7 @@ from daq.recording.storage.locking import is_being_written
 from daq.recording.storage.names import create_private, sync_directory, sync_file
 from daq.recording.storage.refusals import damage_named, text
 from daq.recording.storage.superblock import Superblock
+from daq.recording.storage.trial import remember
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -96,7 +97,9 @@ class Verification:
         return not damaged and not any(s.bad_blocks for s in self.sensors)
 
 
-def verify(path: str | Path, *, progress: Callable[[], object] = lambda: None) -> Verification:
+def verify(
+    path: str | Path, *, progress: Callable[[], object] = lambda: None, tried: bool = False
+) -> Verification:
     """Check the checksums of all committed blocks, and every object of a closed recording.
 
     Parameters
@@ -104,6 +107,8 @@ def verify(path: str | Path, *, progress: Callable[[], object] = lambda: None) -
     path : path
     progress : callable
         Called after each part of the file.
+    tried : bool
+        As for `Recording.open`.
 
     Raises
     ------
@@ -112,7 +117,7 @@ def verify(path: str | Path, *, progress: Callable[[], object] = lambda: None) -
     """
     path = Path(path)
     being_written = is_being_written(path) if path.is_file() else False
-    with Recording.open(path) as recording:
+    with Recording.open(path, tried=tried) as recording:
         sensors = tuple(_verify_sensor(sensor, progress) for sensor in recording.sensors)
         report = Verification(
             path,
@@ -254,6 +259,7 @@ def write_results(
             stored = {name: group[name][...] for name in group}
             group.attrs["crc32"] = result_crc32(stored, dict(group.attrs))
         write_manifest(file, RESULTS_MANIFEST)
+    remember(path)
 
 
 def _verify_sensor(sensor: SensorRecord, progress: Callable[[], object]) -> SensorVerification:

@@ -50,6 +50,7 @@ from daq.recording.storage.names import (
 )
 from daq.recording.storage.refusals import text
 from daq.recording.storage.retries import reason_of, repeated
+from daq.recording.storage.trial import remember
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -244,6 +245,7 @@ class RecordingWriter:
                 if self._journal is not None:
                     self._journal.remove()
                 sync_directory(self.path.parent)
+                remember(self.path)
             return done
         finally:
             self.abandon()

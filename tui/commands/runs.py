@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from daq.errors import HuddleError, RecordingError
-from daq.recording.repair import verify
+from daq.recording.storage.trial import trials
 from tui.output.console import check_places, for_people, write_json, write_text
 from tui.output.csv_text import csv_text
 from tui.service.records.places import NoServiceError, Place
@@ -124,15 +124,12 @@ def verify_recordings(sources: Sequence[Path], *, json: str | None) -> None:
         If one is damaged or lost.
     """
     found = []
-    for path in _recordings(sources):
-        try:
-            report = verify(path)
-        except (HuddleError, OSError) as error:
-            state = str(error)
-        else:
-            damaged = [s.name for s in report.sensors if s.bad_blocks]
-            damaged += [*report.damaged_tables, *report.changed]
-            state = f"damaged: {', '.join(damaged)}" if damaged else "intact"
+    # In children: a file that hangs or crashes HDF5 is damaged, and the others are verified.
+    for path, report in trials(_recordings(sources), "verify"):
+        damaged = ", ".join(report.get("damaged", ()))
+        state = report.get("error") or (f"damaged: {damaged}" if damaged else "intact")
+        if "fatal" in report:
+            state = f"damaged: {report['fatal']}"
         found.append((path, state))
         for_people(json).print(f"{path}: {state.removeprefix(f'{path}: ')}", soft_wrap=True)
     bad = [path.name for path, state in found if state != "intact"]

@@ -5,7 +5,8 @@ Theory of operation
 Only a file that is being written is opened as a SWMR reader. HDF5 then repeats the read of a
 metadata block with a wrong checksum up to 100 times, and doubles the pause before each attempt: in
 a damaged file this takes longer than an hour. So the number of attempts is limited for such files.
-A file at rest is opened without SWMR, and read with one attempt.
+A file at rest is opened without SWMR, and read with one attempt; but first in a child process
+(:mod:`daq.recording.storage.trial`).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import h5py
 
 from daq.errors import NotARecordingError
+from daq.recording.storage import trial
 from daq.recording.storage.locking import is_being_written
 from daq.recording.storage.superblock import ClearedFile, Superblock
 
@@ -35,8 +37,10 @@ read in order, and few of them again; by default it keeps 8 MB (HDF5 2.0) in 819
 26 MB of a day of three sensors, and 16 MB of 64 sensors for the places alone."""
 
 
-def open_file(path: Path) -> h5py.File:
+def open_file(path: Path, *, tried: bool = True) -> h5py.File:
     """Open a file for reading: growing, closed, or left open by a killed recorder.
+
+    Unless `tried`, a file at rest is first opened in a child process, once.
 
     Raises
     ------
@@ -52,6 +56,8 @@ def open_file(path: Path) -> h5py.File:
             f"{path}: truncated: {superblock.n_bytes} of {superblock.end} bytes; copy the file"
             " again"
         )
+    if not growing and not tried:
+        trial.tried(path)
     try:
         if growing:
             _register_driver()

@@ -16,6 +16,7 @@ from daq.errors import RecordingError
 from daq.recording.manifest import MANIFEST, RESULTS_MANIFEST
 from daq.recording.reader import Recording
 from daq.recording.repair import verify, write_results
+from tests.daq.recording.heap_loops import with_variable_strings
 from tests.torture.damaged_files import make_recording
 
 if TYPE_CHECKING:
@@ -143,17 +144,8 @@ def test_a_file_that_plain_hdf5_refuses_is_not_intact(closed: Path) -> None:
 
 
 def test_a_recording_of_version_1_is_read_and_verified(closed: Path) -> None:
+    with_variable_strings(closed)
     with h5py.File(closed, "r+") as file:
-
-        def with_variable_strings(_: str, found: h5py.Group | h5py.Dataset) -> None:
-            for name, value in list(found.attrs.items()):
-                if isinstance(value, bytes):
-                    found.attrs[name] = value.decode()
-                elif isinstance(value, np.ndarray) and value.dtype.kind == "S":
-                    found.attrs[name] = [text.decode() for text in value]
-
-        with_variable_strings("", file)
-        file.visititems(with_variable_strings)
         file.attrs["format_version"] = 1
         del file[MANIFEST], file[RESULTS_MANIFEST]
         file["checksums"][-1, 0] = _description_crc32(file)
