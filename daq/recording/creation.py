@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daq.recording import file_format
+from daq.recording.chunks.manifest import make_manifest
 from daq.recording.description import make_checksums
-from daq.recording.manifest import make_manifest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -4,38 +4,48 @@ Theory of operation
 -------------------
 A recording is never changed in place. A copy in the same folder is changed, fsynced and renamed to
 the original, so that the name always refers to an intact file.
+
+``python -m daq.recording.repair TASK FILE…`` is the child of :mod:`daq.recording.storage.trial`.
+Its task is ``open`` or ``verify``. For each file it prints a line of JSON; before it, a line with a
+point for each part that was read. It may hang or be killed at any file.
 """
 
 from __future__ import annotations
 
 import contextlib
 import io
+import json
+import logging
 import shutil
+import sys
 import uuid
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
 
-from daq.errors import RecordingError
+from daq.errors import HuddleError, RecordingError
 from daq.host_clock import SystemClock
 from daq.protocols.block import EventKind
 from daq.recording import file_format
-from daq.recording.description import result_crc32, write_checksums
-from daq.recording.file_format import LIBVER, fixed
-from daq.recording.manifest import (
+from daq.recording.chunks.manifest import (
     RESULTS,
     RESULTS_MANIFEST,
     differences,
+    items,
     root_sha256,
     write_manifest,
 )
+from daq.recording.description import result_crc32, write_checksums
+from daq.recording.file_format import LIBVER, fixed
 from daq.recording.reader import Recording
 from daq.recording.storage.journal import JournalContents, journal_path, read_journal, rebuild
 from daq.recording.storage.locking import is_being_written
 from daq.recording.storage.names import create_private, sync_directory, sync_file
+from daq.recording.storage.opening import open_file
 from daq.recording.storage.refusals import damage_named, text
 from daq.recording.storage.superblock import Superblock
 from daq.recording.storage.trial import remember
@@ -137,7 +147,12 @@ def verify(
         return replace(report, changed=changed, root_sha256=root_sha256(file))
 
 
-def repair(path: str | Path, *, now: HostTime | None = None) -> Verification:
+def repair(
+    path: str | Path,
+    *,
+    now: HostTime | None = None,
+    progress: Callable[[], object] = lambda: None,
+) -> Verification:
     """Close a recording that a killed recorder or a power cut left open.
 
     The recording is rebuilt from its journal, if there is one, with all acknowledged rows.
@@ -157,11 +172,11 @@ def repair(path: str | Path, *, now: HostTime | None = None) -> Verification:
         )
     journal = _own_journal(path)
     if journal is None:
-        report = verify(path)
+        report = verify(path, progress=progress)
         if not _is_left_open(path, report):
             _remove_useless_journal(path)
             return report
-    elif (whole := _whole(path, journal)) is not None:
+    elif (whole := _whole(path, journal, progress)) is not None:
         journal_path(path).unlink()
         return whole
     now = SystemClock().now() if now is None else now
@@ -171,7 +186,7 @@ def repair(path: str | Path, *, now: HostTime | None = None) -> Verification:
                 raw.write(Superblock.of(path).cleared())
         else:
             rebuild(path, journal, copy)
-            report = verify(copy)
+            report = verify(copy, progress=progress)
         with h5py.File(copy, "r+", libver=LIBVER) as file:
             if not report.closed:
                 _cut_to_committed(file, report)
@@ -183,7 +198,7 @@ def repair(path: str | Path, *, now: HostTime | None = None) -> Verification:
     if journal is not None:
         journal_path(path).unlink(missing_ok=True)
     _remove_useless_journal(path)
-    return verify(path)
+    return verify(path, progress=progress)
 
 
 def _is_left_open(path: Path, report: Verification | Recording) -> bool:
@@ -208,10 +223,12 @@ def _own_journal(path: Path) -> JournalContents | None:
         return contents if run_id.encode() in file.read(len(contents.created)) else None
 
 
-def _whole(path: Path, journal: JournalContents) -> Verification | None:
+def _whole(
+    path: Path, journal: JournalContents, progress: Callable[[], object]
+) -> Verification | None:
     """Return the report on a closed file with all rows of its journal; else None."""
     try:
-        report = verify(path)
+        report = verify(path, progress=progress)
         is_whole = report.intact and not _is_left_open(path, report)
     except RecordingError:
         return None
@@ -332,3 +349,45 @@ def _replaced(path: Path, *, copied: bool = True) -> Iterator[Path]:
         ) from error
     finally:
         copy.unlink(missing_ok=True)
+
+
+def main() -> None:
+    """Carry out a task on files, each of which may hold this process up."""
+    logging.disable()
+    task, *paths = sys.argv[1:]
+    _print_progress()
+    for path in map(Path, paths):
+        try:
+            found = _opened(path) if task == "open" else _verified(path)
+        except (HuddleError, OSError) as error:
+            found = {"error": str(error)}
+        print(json.dumps(found), flush=True)
+
+
+def _opened(path: Path) -> dict[str, Any]:
+    """Read all that a reader reads before the samples."""
+    with Recording.open(path, tried=True) as recording:
+        recording.results()
+    with open_file(path) as file, damage_named(path):
+        for _ in chain(items(file), items(file, RESULTS_MANIFEST)):
+            _print_progress()
+    return {"opened": True}
+
+
+def _verified(path: Path) -> dict[str, Any]:
+    report = verify(path, progress=_print_progress, tried=True)
+    damaged = [sensor.name for sensor in report.sensors if sensor.bad_blocks]
+    return {
+        "intact": report.intact,
+        "closed": report.closed,
+        "damaged": [*damaged, *report.damaged_tables, *report.changed],
+        "root_sha256": report.root_sha256,
+    }
+
+
+def _print_progress() -> None:
+    print(".", flush=True)
+
+
+if __name__ == "__main__":
+    main()

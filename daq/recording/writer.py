@@ -34,9 +34,9 @@ import numpy as np
 from daq.errors import DiskError, RecordingError
 from daq.recording import file_format
 from daq.recording.chunks.chunk_writer import SensorRows, TableBuffer
+from daq.recording.chunks.manifest import write_manifest
 from daq.recording.creation import make_datasets, write_attributes
 from daq.recording.description import write_checksums
-from daq.recording.manifest import write_manifest
 from daq.recording.storage.journal import Journal
 from daq.recording.storage.locking import WriterLock
 from daq.recording.storage.names import (

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import shutil
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
+from daq.bench.model import Channel
 from daq.errors import RecordingError
+from daq.protocols.block import Block, HostTime
+from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
 from daq.recording.repair import repair
 from daq.recording.storage.journal import journal_path
+from daq.recording.writer import RecordingWriter
 from tests.torture.power_cuts import MODELS, Operation, faults, recorded, replay, shim
 
 if TYPE_CHECKING:
@@ -62,14 +67,18 @@ def test_a_journal_of_another_recording_is_not_used(
     """It lies there when a recording was replaced by another file of its name."""
     path = tmp_path / "r.h5"
     replay(operations, len(operations) * 2 // 3, "prefix", np.random.default_rng(1), tmp_path)
-    with Recording.open(path) as recording:
-        run_id = recording.run_id
-    content = path.read_bytes()
-    path.write_bytes(content.replace(run_id.encode(), run_id[::-1].encode()))
+    sensor = SensorLayout("a", (Channel(name="x", sensitivity=1.0),), 100.0, np.dtype("i4"))
+    at = HostTime(10**9, 10**18)
+    other = RecordingWriter.create(tmp_path / "other.h5", sensors=[sensor], created=at)
+    other.append(Block("a", 0, np.ones((200, 1), np.int32), at))
+    other.commit()
+    other.abandon()
+    shutil.copyfile(other.path, path)
+    run_id = other.run_id
     journal = journal_path(path).read_bytes()
     assert repair(path).closed
     with Recording.open(path) as recording:
-        assert recording.run_id == run_id[::-1]
+        assert recording.run_id == run_id
     assert journal_path(path).read_bytes() == journal
 
 

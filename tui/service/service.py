@@ -153,7 +153,8 @@ class Service:
         now = self._clock.now()
         runs = self._store.runs(self.bench.name)
         self._known = {run.key for run in runs if run.state is not RunState.DUE}
-        for run in runs:
+        # A run whose estimate has failed before waits for the others.
+        for run in sorted(runs, key=lambda run: run.attempts):
             if run.state is RunState.RECORDING:
                 _LOGGER.info("run %s is taken up: it was being recorded", run.name)
                 self._windows.put_nowait(run)

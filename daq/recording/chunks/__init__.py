@@ -1,4 +1,4 @@
-"""Bulk access to the rows of a recording: complete chunks, tables of blocks, checksums.
+"""Bulk access to the rows of a recording: complete chunks, tables of blocks, checksums, manifest.
 
 Uses datasets and counts; opens and names no file.
 """

@@ -4,7 +4,7 @@ Theory of operation
 -------------------
 HDF5 trusts what a file holds. In a damaged global heap it goes around in a circle for ever; other
 damage crashes it. Neither can be caught in the process itself. So a file at rest is opened once by
-a child (:mod:`daq.recording.trial_child`), which is ended if it makes no progress for `LIMIT`
+a child (:mod:`daq.recording.repair`), which is ended if it makes no progress for `LIMIT`
 seconds. Only if the child lives does this process open the file; errors are then its own to report.
 
 A file is tried once. An extended attribute has the size and the time of change with which it was
@@ -32,7 +32,7 @@ _START = 120.0
 """Seconds that a child may need to start, on a computer with much else to do."""
 _MARK = "user.huddle.opened"
 _OPENED: set[tuple[int, int, int, int]] = set()
-_CHILD = "daq.recording.trial_child"
+_CHILD = "daq.recording.repair"
 
 
 def tried(path: Path) -> None:

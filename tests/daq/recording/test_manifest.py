@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from daq.errors import RecordingError
-from daq.recording.manifest import MANIFEST, RESULTS_MANIFEST
+from daq.recording.chunks.manifest import MANIFEST, RESULTS_MANIFEST
 from daq.recording.reader import Recording
 from daq.recording.repair import verify, write_results
 from tests.daq.recording.heap_loops import with_variable_strings

@@ -162,6 +162,7 @@ def test_no_process_of_python_is_started_in_any_other_way() -> None:
     }
     assert starts == users | {
         str(Path("daq", "archive", "execution.py")),
+        str(Path("daq", "recording", "storage", "trial.py")),
         str(Path("sim_devices", "server", "launch.py")),
         str(Path("tui", "commands", "record.py")),
         str(Path("tui", "runs", "recorder_process.py")),

@@ -116,6 +116,23 @@ async def test_an_estimate_that_was_killed_is_made_again(tmp_path: Path) -> None
     assert len(place.steps.finished) == 2
 
 
+async def test_a_run_whose_estimate_failed_waits_for_others_after_a_restart(
+    tmp_path: Path,
+) -> None:
+    place = Place(tmp_path)
+    await place.serve(HOUR + 580, killed=True)  # 13:10:10
+    (first,) = place.store.unfinished("lab")
+    place.store.save(replace(first, attempts=1))
+    second = replace(first, due=first.due + timedelta(minutes=5), parts=("b.h5",), attempts=0)
+    place.store.save(second)
+    await place.serve(120)
+    names = [
+        [part.rpartition("/")[2] for part in request.parts] for request in place.steps.finished
+    ]
+    assert names[1:] == [["b.h5"], list(first.parts)]
+    assert not place.store.unfinished("lab")
+
+
 async def test_an_estimate_that_always_dies_is_given_up(tmp_path: Path) -> None:
     place = Place(tmp_path)
     place.steps.outcomes = [FinishFailedError("the estimate was killed (signal 9)")] * 9

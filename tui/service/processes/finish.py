@@ -4,7 +4,7 @@ A process of its own, so that neither memory nor a crash of a library concerns t
 be killed at any moment and started again: it changes nothing that it has changed before.
 
 ``python -m tui.service.processes.finish REQUEST`` takes a `Request` as JSON, and prints an
-`Outcome` as JSON.
+`Outcome` as JSON; before it, lines with a point for as long as it makes progress.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import errno
 import json
 import sys
+import time
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,7 +38,7 @@ from tui.service.records.parts import with_continuations
 from tui.service.records.run_state import BandNoise
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from daq.estimation.snapshot import Snapshot
 
@@ -117,18 +118,22 @@ def options_table(wanted: Mapping[str, object]) -> dict[str, Any]:
     }
 
 
-def finish(request: Request) -> Outcome:
-    """Repair, estimate, store, report; also the files in which recorders went on."""
+def finish(request: Request, progress: Callable[[], object] = lambda: None) -> Outcome:
+    """Repair, estimate, store, report; also the files in which recorders went on.
+
+    `progress` is called as long as something is done: it need not be called by an estimate that
+    HDF5 keeps busy for ever.
+    """
     parts = with_continuations(map(Path, request.parts))
     try:
-        outcome = _finished(replace(request, parts=[str(part) for part in parts]))
+        outcome = _finished(replace(request, parts=[str(part) for part in parts]), progress)
     except (HuddleError, EstimatorError, OSError) as error:
         outcome = Outcome(error=str(error) or type(error).__name__, refused=is_of_disk(error))
     return replace(outcome, parts=tuple(part.name for part in parts))
 
 
-def _finished(request: Request) -> Outcome:
-    paths, notes, refused = _repaired([Path(part) for part in request.parts])
+def _finished(request: Request, progress: Callable[[], object]) -> Outcome:
+    paths, notes, refused = _repaired([Path(part) for part in request.parts], progress)
     table = EstimateTable.model_validate(request.options)
     names = table_keys()
     wanted = {names[key]: getattr(table, key) for key in table.model_fields_set}
@@ -137,7 +142,12 @@ def _finished(request: Request) -> Outcome:
         about = {s.name: (s.model, s.serial_number) for s in recording.sensors}
     settings = chosen(Settings.of(bench), **wanted)
     paths = _long_enough(paths, settings.segment, notes)
-    snapshot = estimate(paths, settings)
+
+    def of_segments(_done: int, _total: int) -> None:
+        progress()
+
+    snapshot = estimate(paths, settings, progress=of_segments)
+    progress()
     last = paths[-1]
     try:  # first into the recording, whatever becomes of other files
         store_results(last, snapshot)
@@ -171,7 +181,9 @@ def is_of_disk(error: BaseException | None) -> bool:
     return False
 
 
-def _repaired(parts: Sequence[Path]) -> tuple[list[Path], list[str], bool]:
+def _repaired(
+    parts: Sequence[Path], progress: Callable[[], object]
+) -> tuple[list[Path], list[str], bool]:
     """Close what was left open.
 
     Returns
@@ -188,7 +200,7 @@ def _repaired(parts: Sequence[Path]) -> tuple[list[Path], list[str], bool]:
     errors: list[HuddleError] = []
     for part in parts:
         try:
-            if not repair(part).intact:
+            if not repair(part, progress=progress).intact:
                 notes.append(f"{part.name}: damaged blocks are left out")
         except HuddleError as error:
             errors.append(error)
@@ -251,12 +263,27 @@ def _noise(
     return tuple(found)
 
 
+class _Heartbeat:
+    """Prints a line with a point, at most once a second."""
+
+    def __init__(self) -> None:
+        self._next = 0.0
+
+    def __call__(self) -> None:
+        """Print, if it is time."""
+        now = time.monotonic()
+        if now >= self._next:
+            self._next = now + 1.0
+            sys.stdout.write(".\n")
+            sys.stdout.flush()
+
+
 def main() -> None:
     """Finish what the argument says; print the outcome."""
     configure(style=LogFormat.JSON)
     found = json.loads(sys.argv[1])
     request = Request(**found | {"bands": tuple((low, high) for low, high in found["bands"])})
-    sys.stdout.write(json.dumps(finite(asdict(finish(request)))))
+    sys.stdout.write(json.dumps(finite(asdict(finish(request, _Heartbeat())))))
 
 
 if __name__ == "__main__":

@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 POLL = 0.2
 """Seconds between looks at a process."""
 _LONG = 60.0
+SILENCE = 600.0
+"""Seconds without progress after which an estimate is ended."""
 
 
 class Recorder(Protocol):
@@ -172,7 +174,7 @@ class ProcessSteps:
             )
         finally:
             lock.release()
-        return await _outcome(process)
+        return await outcome_of(process)
 
     def release(self, part: str) -> None:
         """Remove the mark of a recording."""
@@ -184,15 +186,45 @@ class FinishFailedError(HuddleError):
     """The process that estimates ended without an outcome."""
 
 
-async def _outcome(process: Process) -> Outcome:
+async def outcome_of(process: Process, *, silence: float = SILENCE) -> Outcome:
+    """Return what a process that estimates has printed; it is ended if it makes no progress.
+
+    Parameters
+    ----------
+    process : Process
+        Prints a line with a point whenever it makes progress, and an outcome last.
+    silence : float
+        Longest time in s without progress.
+
+    Raises
+    ------
+    FinishFailedError
+        If it makes no progress, or ends without an outcome.
+    """
     log = ChildLog("the estimate")
+    stdout, stderr = process.stdout, process.stderr
+    if stdout is None or stderr is None:
+        raise FinishFailedError("the estimate has no pipes")
+    errors_read = asyncio.create_task(stderr.read())
+    out = b""
     try:
-        out, errors = await process.communicate()
-    except BaseException:
+        while True:
+            async with asyncio.timeout(silence):
+                part = await stdout.read(1 << 16)
+            if not part:
+                break
+            out = (out + part).rpartition(b".\n")[2]
+        errors = await errors_read
+        await process.wait()
+    except TimeoutError:
+        raise FinishFailedError(
+            f"the estimate made no progress for {silence / 60:g} minutes and was ended"
+        ) from None
+    finally:
         with contextlib.suppress(ProcessLookupError):
             process.kill()
         await process.wait()
-        raise
+        await errors_read
     if errors:
         log.feed(errors.rstrip() + b"\n")
     with contextlib.suppress(ValueError):
