@@ -172,6 +172,11 @@ class Recording:
             entries = {method: member(group, method) for method in group}
             return {method: self._result(method, entry) for method, entry in entries.items()}
 
+    def about_results(self) -> dict[str, Any]:
+        """Return the attributes of all results together; the service writes which run they are."""
+        with damage_named(self.path):
+            return _attributes(member(self._file, "results")) if "results" in self._file else {}
+
     def result_attributes(self) -> dict[str, dict[str, Any]]:
         """Return the attributes of the stored results by method, without reading their arrays.
 

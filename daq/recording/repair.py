@@ -241,6 +241,7 @@ def _whole(
 def write_results(
     path: str | Path,
     results: Mapping[str, tuple[Mapping[str, NDArray[Any]], Mapping[str, Any]]],
+    about: Mapping[str, str] | None = None,
 ) -> None:
     """Write the results of an estimate to ``/results``, replacing earlier ones.
 
@@ -252,6 +253,8 @@ def write_results(
     path : path
     results : mapping
         Arrays and attributes by name of the method, as from `Recording.results`.
+    about : mapping, optional
+        Attributes of ``/results`` itself.
 
     Raises
     ------
@@ -275,6 +278,8 @@ def write_results(
             group.attrs.update({name: fixed(value) for name, value in attributes.items()})
             stored = {name: group[name][...] for name in group}
             group.attrs["crc32"] = result_crc32(stored, dict(group.attrs))
+        for name, value in (about or {}).items():
+            file.require_group(RESULTS).attrs[name] = fixed(value)
         write_manifest(file, RESULTS_MANIFEST)
     remember(path)
 

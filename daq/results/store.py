@@ -8,6 +8,7 @@ from daq.recording.repair import write_results
 from estimator.decision.verdict import Verdict
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from daq.estimation.snapshot import Snapshot
@@ -16,11 +17,17 @@ if TYPE_CHECKING:
     from estimator.types import FloatArray
 
 
-def store_results(path: str | Path, snapshot: Snapshot, verdict: TestVerdict | None = None) -> None:
+def store_results(
+    path: str | Path,
+    snapshot: Snapshot,
+    verdict: TestVerdict | None = None,
+    about: Mapping[str, str] | None = None,
+) -> None:
     """Write the results of all methods to ``/results`` of a recording, in one pass.
 
     Earlier results are replaced. A crash leaves the recording with all results or with none. The
-    verdict on the limits of the bench stands beside the result of every method.
+    verdict on the limits of the bench stands beside the result of every method. `about` becomes
+    attributes of ``/results``.
 
     Raises
     ------
@@ -30,7 +37,9 @@ def store_results(path: str | Path, snapshot: Snapshot, verdict: TestVerdict | N
     stored = {} if verdict is None else {"verdict": verdict.verdict.value}
     results = {method: result_arrays(snapshot, method) for method in snapshot.results}
     write_results(
-        path, {method: (arrays, about | stored) for method, (arrays, about) in results.items()}
+        path,
+        {method: (arrays, own | stored) for method, (arrays, own) in results.items()},
+        about,
     )
 
 

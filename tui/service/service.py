@@ -17,6 +17,7 @@ from datetime import timedelta
 from typing import TYPE_CHECKING
 
 from daq.errors import HuddleError
+from tui.service.healing import heal
 from tui.service.hooks import events_of
 from tui.service.planning import GRACE, missed_runs, next_runs
 from tui.service.processes.finish import Outcome, Request, is_of_disk
@@ -93,6 +94,7 @@ class Service:
         self._unsaved: dict[str, Run] = {}
         self._windows: asyncio.Queue[Run] = asyncio.Queue()
         self._estimates: asyncio.Queue[Run] = asyncio.Queue()
+        self._checked: tuple[int, int] | None = None
         self._repeats: set[asyncio.Task[None]] = set()
         self.recording: Run | None = None
         self.window: Window | None = None
@@ -129,6 +131,7 @@ class Service:
         StoreError
             If the database cannot be used at the start.
         """
+        self._check_database()
         self._take_up()
         recorder = asyncio.create_task(self._record_windows())
         estimator = asyncio.create_task(self._estimate_runs())
@@ -199,6 +202,7 @@ class Service:
             self._wake.clear()
             if self._wants_reload:
                 self._load_again()
+            self._check_database()
             self._write_unsaved()
             run, now = self.next_run, self._clock.now()
             left = MAX_SLEEP if run is None else (run.due - now).total_seconds()
@@ -295,6 +299,7 @@ class Service:
             dict(self._options),
             self.bench.recording.report,
             self.bench.history.bands,
+            run.record(),
         )
         try:
             outcome = await self._steps.finish(request)
@@ -369,6 +374,23 @@ class Service:
         except StoreError as error:
             _LOGGER.error("%s; it is tried again", error)  # noqa: TRY400 - its message says all
             self._unsaved[run.key] = run
+
+    def _check_database(self) -> None:
+        """Restore the database if it is damaged; make the copy of the day.
+
+        Recordings do not wait for it: a run that cannot be written is kept and written later.
+        """
+        now, state = self._clock.now(), self._store.state()
+        try:
+            if state != self._checked:
+                if heal(self._store, self.bench, now):
+                    self._unsaved |= {run.key: run for run in self._planned.values()}
+                    if self.recording is not None:
+                        self._unsaved[self.recording.key] = self.recording
+                self._checked = self._store.state()
+            self._store.copy(now.date())
+        except StoreError as error:
+            _LOGGER.error("%s; it is tried again", error)  # noqa: TRY400 - its message says all
 
     def _write_unsaved(self) -> None:
         for run in list(self._unsaved.values()):

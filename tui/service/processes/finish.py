@@ -35,7 +35,7 @@ from tui.output.logs.lines import configure
 from tui.output.logs.options import LogFormat
 from tui.runs.estimate_settings import chosen
 from tui.service.records.parts import with_continuations
-from tui.service.records.run_state import BandNoise
+from tui.service.records.run_state import RUN, BandNoise
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -63,12 +63,15 @@ class Request:
         ``html`` or ``pdf``.
     bands : list of (float, float)
         Further bands in Hz whose noise is wanted.
+    run : dict or None
+        The run, as `Run.record` has it; it is stored with the result.
     """
 
     parts: list[str]
     options: dict[str, Any]
     report: str | None = None
     bands: tuple[tuple[float, float], ...] = ()
+    run: dict[str, Any] | None = None
 
     def text(self) -> str:
         """Return the request as an argument."""
@@ -149,12 +152,22 @@ def _finished(request: Request, progress: Callable[[], object]) -> Outcome:
     snapshot = estimate(paths, settings, progress=of_segments)
     progress()
     last = paths[-1]
+    found = judge(bench, snapshot, settings)
+    verdict = "" if found is None else str(found.verdict)
+    noise = _noise(snapshot, settings, request.bands, about, notes)
+    about_run = {}
+    if request.run is not None:
+        record = request.run | {
+            "recordings": [Path(part).name for part in request.parts],
+            "verdict": verdict,
+            "noise": [asdict(each) for each in noise],
+        }
+        about_run = {RUN: json.dumps(finite(record))}
     try:  # first into the recording, whatever becomes of other files
-        store_results(last, snapshot)
+        store_results(last, snapshot, about=about_run)
     except HuddleError as error:
         notes.append(f"the result is not in the recording: {error}")
         refused |= is_of_disk(error)
-    found = judge(bench, snapshot, settings)
     result = document(snapshot, settings, sources=sources(paths), verdict=found)
     try:
         write_json(str(last.with_suffix(".json")), result)
@@ -167,8 +180,6 @@ def _finished(request: Request, progress: Callable[[], object]) -> Outcome:
         except (HuddleError, OSError) as error:
             notes.append(f"no report: {error}")
             refused |= is_of_disk(error)
-    noise = _noise(snapshot, settings, request.bands, about, notes)
-    verdict = "" if found is None else str(found.verdict)
     return Outcome(verdict, tuple(notes), noise, refused=refused)
 
 

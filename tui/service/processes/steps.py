@@ -24,7 +24,7 @@ from tui.runs.child_log import ChildLog
 from tui.runs.recorder_process import RecorderFailedError, RecorderProcess
 from tui.service.processes.finish import Outcome, Request
 from tui.service.processes.locks import Lock, is_held, kill_holder
-from tui.service.records.parts import with_continuations
+from tui.service.records.parts import mark_of, with_continuations
 
 if TYPE_CHECKING:
     from asyncio.subprocess import Process
@@ -117,10 +117,10 @@ class ProcessSteps:
             first.parent.mkdir(parents=True, exist_ok=True)
             for out in _numbered(first):
                 with contextlib.suppress(FileExistsError):
-                    _mark(out).touch(mode=0o600, exist_ok=False)
+                    mark_of(out).touch(mode=0o600, exist_ok=False)
                     if not out.exists():
                         return out.name
-                    _mark(out).unlink()
+                    mark_of(out).unlink()
         except OSError as error:
             raise RecordingError(f"{first.parent}: cannot be written: {error.strerror}") from error
         raise AssertionError
@@ -134,7 +134,7 @@ class ProcessSteps:
             If it cannot be started.
         """
         out = self._folder / part
-        lock = Lock.take(_mark(out))
+        lock = Lock.take(mark_of(out))
         if lock is None:
             raise RecordingError(f"{out}: another recorder of the service is writing it")
         try:
@@ -162,7 +162,7 @@ class ProcessSteps:
         FinishFailedError
             If the process ended without an outcome.
         """
-        mark = _mark(Path(request.parts[-1]))
+        mark = mark_of(Path(request.parts[-1]))
         lock = await _taken(mark)  # one of an earlier service may still run
         try:
             process = await asyncio.create_subprocess_exec(
@@ -179,7 +179,7 @@ class ProcessSteps:
     def release(self, part: str) -> None:
         """Remove the mark of a recording."""
         with contextlib.suppress(OSError):
-            _mark(self._folder / part).unlink(missing_ok=True)
+            mark_of(self._folder / part).unlink(missing_ok=True)
 
 
 class FinishFailedError(HuddleError):
@@ -279,7 +279,7 @@ class _FoundRecorder:
 
     @property
     def is_running(self) -> bool:
-        return is_held(_mark(self._out)) or (self._out.exists() and is_being_written(self._out))
+        return is_held(mark_of(self._out)) or (self._out.exists() and is_being_written(self._out))
 
     async def ends_within(self, seconds: float) -> bool:
         loop = asyncio.get_running_loop()
@@ -300,7 +300,7 @@ class _FoundRecorder:
             pass
 
     def kill(self) -> None:
-        kill_holder(_mark(self._out))
+        kill_holder(mark_of(self._out))
 
     def failure(self) -> str:
         try:
@@ -326,11 +326,6 @@ async def _status(out: Path) -> dict[str, Any] | None:
     except (HuddleError, OSError, ValueError):
         return None
     return answer if isinstance(answer.get("elapsed"), (int, float)) else None
-
-
-def _mark(out: Path) -> Path:
-    """Return the lock beside a recording."""
-    return out.with_name(f".{out.name}.run")
 
 
 def _numbered(first: Path) -> Iterator[Path]:

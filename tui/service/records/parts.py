@@ -33,6 +33,11 @@ def with_continuations(parts: Iterable[Path]) -> list[Path]:
     return list(dict.fromkeys(found))
 
 
+def mark_of(recording: Path) -> Path:
+    """Return the mark beside a recording of the service whose run is not over; also its lock."""
+    return recording.with_name(f".{recording.name}.run")
+
+
 def _run_ids(path: Path) -> tuple[str, str] | None:
     """Return the run_id of a file, and the one that it continues; None if it is torn."""
     try:

@@ -24,6 +24,9 @@ from typing import Any
 from daq.bench.end_condition import NEVER, EndCondition
 from daq.errors import HuddleError
 
+RUN = "service_run"
+"""Attribute of ``/results`` of the last recording of a run: its `Run.record`, with the outcome."""
+
 
 class RunState(StrEnum):
     """Where a run is in its life."""
@@ -171,6 +174,38 @@ class Run:
         """Return the run with further reasons, separated by semicolons, without repetitions."""
         reasons = [*(self.reason.split("; ") if self.reason else []), *reason.split("; ")]
         return replace(self, reason="; ".join(dict.fromkeys(reasons)))
+
+    def record(self) -> dict[str, Any]:
+        """Return what a recording keeps, from which the database can be made again."""
+        return self.document() | {"queue": self.queue}
+
+    @classmethod
+    def of_record(cls, record: dict[str, Any]) -> Run:
+        """Return the run that is done, from `record` with ``verdict`` and ``noise``.
+
+        Raises
+        ------
+        KeyError, TypeError, ValueError
+            If it is no such record.
+        """
+        due, started = from_text(record["due"]), from_text(record["started"])
+        if due is None:
+            raise ValueError("a run without a due time")
+        return cls(
+            bench=str(record["bench"]),
+            entry=str(record["entry"]),
+            due=due,
+            duration=float(record["duration"]),
+            target_cov=record["target_cov"],
+            queue=bool(record["queue"]),
+            state=RunState.DONE,
+            reason=str(record["reason"]),
+            started=started,
+            ended=None if started is None else started + timedelta(seconds=record["duration"]),
+            parts=tuple(map(str, record["recordings"])),
+            verdict=str(record["verdict"] or ""),
+            noise=tuple(BandNoise.of(*each.values()) for each in record["noise"]),
+        )
 
     def document(self) -> dict[str, Any]:
         """Return the run as JSON (docs/service.md)."""

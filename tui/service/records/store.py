@@ -10,15 +10,16 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import sqlite3
 from dataclasses import astuple, fields
-from datetime import datetime
+from datetime import date, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daq.bench.end_condition import EndCondition
 from daq.errors import HuddleError
-from daq.recording.storage.names import PRIVATE
+from daq.recording.storage.names import PRIVATE, sync_file
 from tui.service.records.run_state import UNFINISHED, BandNoise, Run, RunState, from_text, utc_text
 
 if TYPE_CHECKING:
@@ -26,6 +27,10 @@ if TYPE_CHECKING:
 
 NAME = "runs.sqlite"
 VERSION = 1
+COPIES = 7
+"""Daily copies that are kept."""
+EMPTY = "it is empty"
+_DAMAGE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 _BUSY = 10.0
 """Seconds that a change waits for another program's."""
 _SCHEMA = """
@@ -154,6 +159,104 @@ class RunStore:
         """Return the runs that something has kept from their end."""
         return self.runs(bench, *UNFINISHED)
 
+    def damage(self) -> str:
+        """Return what is wrong with the database; empty if nothing is, or it cannot be asked now.
+
+        An empty database is damaged if its newest copy is not: runs are never removed from it.
+        """
+        newest = next(iter(self.copies()), None)
+        try:
+            found = _check(self.path)
+        except FileNotFoundError:
+            return "" if newest is None else "it is missing"
+        except (sqlite3.Error, OSError) as error:
+            code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+            return str(error) if code in _DAMAGE else ""
+        if found == EMPTY and newest is None:
+            return ""
+        return found
+
+    def state(self) -> tuple[int, int] | None:
+        """Return size and time of change of the file, to see whether it must be checked again."""
+        try:
+            found = self.path.stat()
+        except OSError:
+            return None
+        return found.st_size, found.st_mtime_ns
+
+    def copies(self) -> list[Path]:
+        """Return the daily copies, the newest first."""
+        return sorted(self._copies.glob("????-??-??.sqlite"), reverse=True)
+
+    def copy(self, day: date) -> None:
+        """Make the copy of a day, unless there is one; keep the newest `COPIES`.
+
+        Raises
+        ------
+        StoreError
+            If the disk refuses it.
+        """
+        target = self._copies / f"{day:%Y-%m-%d}.sqlite"
+        if target.exists() or not self.path.exists():
+            return
+        new = target.with_suffix(".new")
+        try:
+            self._copies.mkdir(mode=0o700, exist_ok=True)
+            new.unlink(missing_ok=True)
+            os.close(os.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY, PRIVATE))
+            with (
+                contextlib.closing(sqlite3.connect(self.path, timeout=_BUSY)) as source,
+                contextlib.closing(sqlite3.connect(new)) as copied,
+            ):
+                source.backup(copied)
+            if _check(new) == "":
+                sync_file(new)
+                new.replace(target)
+            new.unlink(missing_ok=True)
+            for old in self.copies()[COPIES:]:
+                old.unlink()
+        except (sqlite3.Error, OSError) as error:
+            raise StoreError(f"{target}: the database of runs cannot be copied: {error}") from error
+
+    def restore(self, now: datetime) -> tuple[Path | None, Path | None]:
+        """Move a damaged database away, and put its newest good copy in its place.
+
+        Returns
+        -------
+        moved, copy : Path or None
+            Where the damaged file is now, and which copy was taken.
+
+        Raises
+        ------
+        StoreError
+            If the disk refuses it.
+        """
+        moved = None
+        try:
+            if self.path.exists():
+                moved = self.path.with_name(f"{NAME}.damaged-{now:%Y%m%dT%H%M%S}")
+                for suffix in ("", "-journal"):
+                    with contextlib.suppress(FileNotFoundError):
+                        self.path.with_name(NAME + suffix).replace(
+                            moved.with_name(moved.name + suffix)
+                        )
+            for copy in self.copies():
+                with contextlib.suppress(sqlite3.Error):
+                    if _check(copy) == "":
+                        new = self.path.with_name(f".{NAME}.new")
+                        new.unlink(missing_ok=True)
+                        shutil.copy(copy, new)
+                        sync_file(new)
+                        new.replace(self.path)
+                        return moved, copy
+        except OSError as error:
+            raise StoreError(f"{self.path}: cannot be restored: {error}") from error
+        return moved, None
+
+    @property
+    def _copies(self) -> Path:
+        return self.path.with_name(".runs-copies")
+
     @contextlib.contextmanager
     def _changed(self) -> Iterator[sqlite3.Connection]:
         with self._opened() as database:
@@ -178,7 +281,7 @@ class RunStore:
         except (sqlite3.Error, OSError) as error:
             raise StoreError(
                 f"{self.path}: the database of runs cannot be used ({error}); if it is damaged,"
-                " move it away: recordings are not affected"
+                " huddle serve restores it: recordings are not affected"
             ) from error
 
     def _prepare(self, database: sqlite3.Connection) -> None:
@@ -191,6 +294,19 @@ class RunStore:
         if version < VERSION:
             database.executescript(f"BEGIN IMMEDIATE; {_SCHEMA} PRAGMA user_version = {VERSION};")
             database.execute("COMMIT")
+
+
+def _check(path: Path) -> str:
+    """Return what SQLite finds wrong with a database, `EMPTY`, or nothing."""
+    if not path.exists():
+        raise FileNotFoundError(path)
+    with contextlib.closing(sqlite3.connect(path, timeout=_BUSY)) as database:
+        found = [str(row[0]) for row in database.execute("PRAGMA quick_check(1)")]
+        if found != ["ok"]:
+            return "; ".join(found)
+        if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'runs'").fetchone():
+            return EMPTY
+        return "" if database.execute("SELECT 1 FROM runs LIMIT 1").fetchone() else EMPTY
 
 
 def _row(run: Run) -> dict[str, Any]:

@@ -1,0 +1,177 @@
+"""A damaged database of runs ends nothing: it is restored from its copy and from the recordings."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import sqlite3
+from dataclasses import replace
+from datetime import timedelta
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.protocols.block import HostTime
+from daq.recording.file_format import SensorLayout
+from daq.recording.writer import RecordingWriter
+from tests.tui.service.bench_files import START, Place
+from tests.tui.service.test_continuations import record
+from tui.service.healing import heal
+from tui.service.planning import next_runs
+from tui.service.processes.finish import Request, finish
+from tui.service.records.parts import mark_of
+from tui.service.records.run_state import Run, RunState
+from tui.service.records.store import COPIES
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+HOUR = 3600.0
+
+
+def done_run(place: Place, part: str = "r.h5") -> Run:
+    """Return a run with a real recording and its real result, as the database has it."""
+    (run,) = next_runs(place.bench, START, set())
+    run = run.to(RunState.RECORDING, started=run.due, parts=(part,)).to(RunState.ESTIMATING)
+    folder = place.bench.recording_directory
+    record(folder / part, 12)
+    outcome = finish(Request([str(folder / part)], {"segment": "2s"}, run=run.record()))
+    assert outcome.error == ""
+    assert outcome.noise
+    ended = run.due + timedelta(seconds=run.duration)
+    return run.to(RunState.DONE, verdict=outcome.verdict, noise=outcome.noise, ended=ended)
+
+
+def damage_page(path: Path, page: int, rng: np.random.Generator) -> None:
+    content = bytearray(path.read_bytes())
+    content[page * 4096 : (page + 1) * 4096] = rng.bytes(4096)
+    path.write_bytes(content)
+
+
+def emptied(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def overwritten(path: Path) -> None:
+    path.write_bytes(b"no database" * 1000)
+
+
+def removed(path: Path) -> None:
+    path.unlink()
+
+
+def without_rows(path: Path) -> None:
+    database = sqlite3.connect(path)
+    database.execute("DELETE FROM runs")
+    database.commit()
+    database.close()
+
+
+@pytest.mark.parametrize(
+    ("damage", "copied"),
+    [(emptied, False), (overwritten, False), (removed, True), (without_rows, True)],
+)
+def test_all_runs_are_there_again(tmp_path: Path, damage: object, *, copied: bool) -> None:
+    place = Place(tmp_path)
+    run = done_run(place)
+    place.store.save(run)
+    if copied:
+        place.store.copy(START.date())
+        (place.bench.recording_directory / "r.h5").unlink()
+    damage(place.store.path)  # type: ignore[operator]  # one of the functions above
+    assert heal(place.store, place.bench, START)
+    assert place.store.damage() == ""
+    (found,) = place.store.runs()
+    assert found == run
+    assert found.noise == run.noise
+    assert not math.isnan(found.noise[0].psd)
+    assert not heal(place.store, place.bench, START)
+
+
+def test_a_damaged_database_is_moved_away_and_named_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    place = Place(tmp_path)
+    place.store.save(done_run(place))
+    overwritten(place.store.path)
+    with caplog.at_level(logging.ERROR):
+        heal(place.store, place.bench, START)
+        heal(place.store, place.bench, START)
+    (said,) = [each for each in caplog.records if each.levelno >= logging.ERROR]
+    assert "restored from no copy and 1 recordings" in said.getMessage()
+    (moved,) = place.store.path.parent.glob("runs.sqlite.damaged-*")
+    assert moved.read_bytes().startswith(b"no database")
+
+
+@pytest.mark.parametrize("page", range(6))
+def test_no_damaged_page_ends_a_service(tmp_path: Path, page: int) -> None:
+    """Every page of the database, after a day of runs; the service then has its next run."""
+    place = Place(tmp_path)
+    (first,) = next_runs(place.bench, START, set())
+    for hour in range(60):
+        run = replace(first, due=first.due - timedelta(hours=hour + 1), reason="x" * 200)
+        place.store.save(run.to(RunState.MISSED, ended=START))
+    place.store.copy(START.date())
+    n_pages = place.store.path.stat().st_size // 4096
+    damage_page(place.store.path, page * n_pages // 6, np.random.default_rng(page))
+    heal(place.store, place.bench, START)
+    assert len(place.store.runs()) == 60
+    place.store.save(first)
+    assert len(place.store.runs()) == 61
+
+
+@pytest.mark.virtual_time
+async def test_a_service_records_on_and_writes_its_run_again(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    service = place.service()
+    task = asyncio.create_task(service.run())
+    await asyncio.sleep(HOUR + 100)  # within the window of 13:00
+    overwritten(place.store.path)
+    await asyncio.sleep(60)
+    states = {f"{run.due:%H:%M}": str(run.state) for run in place.store.runs()}
+    assert states == {"13:00": "recording", "14:00": "due"}
+    await asyncio.sleep(HOUR)
+    service.request_stop()
+    await asyncio.gather(task)
+    assert place.store.runs()[0].state is RunState.DONE
+    assert len(place.steps.started) >= 1
+
+
+@pytest.mark.virtual_time
+async def test_a_service_starts_on_a_damaged_database(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    await place.serve(1.5 * HOUR)
+    overwritten(place.store.path)
+    await place.serve(HOUR)
+    assert ("14:00", "done") in place.states()
+
+
+@pytest.mark.virtual_time
+async def test_seven_daily_copies_are_kept(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    await place.serve(10 * 24 * HOUR)
+    names = [path.stem for path in place.store.copies()]
+    assert len(names) == COPIES
+    assert names[0] == "2026-12-01"
+
+
+def test_an_unfinished_run_is_taken_up_and_other_recordings_are_left_alone(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    folder = place.bench.recording_directory
+    record(folder / "of_a_person.h5", 2)
+    assert not heal(place.store, place.bench, START)
+    assert place.store.runs() == []
+    (run,) = next_runs(place.bench, START, set())
+    utc_ns = round((run.due + timedelta(seconds=2)).timestamp() * 1e9)
+    layout = SensorLayout("a", place.bench.sensors[0].channels, 100.0, np.dtype("i4"))
+    at = HostTime(10**9, utc_ns)
+    RecordingWriter.create(
+        folder / "of_the_service.h5", place.bench, sensors=[layout], created=at
+    ).close()
+    mark_of(folder / "of_the_service.h5").touch()
+    assert heal(place.store, place.bench, START)
+    (found,) = place.store.runs()
+    assert (found.key, found.state) == (run.key, RunState.ESTIMATING)
+    assert found.parts == ("of_the_service.h5",)

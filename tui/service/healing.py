@@ -1,0 +1,98 @@
+"""Restores a damaged database of runs: from its newest copy, and from the recordings.
+
+Theory of operation
+-------------------
+The database is copied once a day. A damaged one is moved away, never repaired: SQLite may find some
+of its rows wrong without a sign. Runs that the copy does not have are read from their recordings.
+The last recording of a run that is done has the run and its noise as an attribute of ``/results``.
+A run that is not done has a mark beside its recording; its entry is the one that was due when the
+recording began.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from datetime import UTC, timedelta
+from typing import TYPE_CHECKING
+
+from daq.errors import HuddleError
+from daq.recording.reader import Recording
+from daq.recording.storage.locking import is_being_written
+from tui.service.planning import GRACE, missed_runs
+from tui.service.records.parts import mark_of
+from tui.service.records.run_state import RUN, Run, RunState
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from datetime import datetime
+    from pathlib import Path
+
+    from daq.bench.model import Bench
+    from tui.service.records.store import RunStore
+
+_LOGGER = logging.getLogger(__name__)
+
+
+def heal(store: RunStore, bench: Bench, now: datetime) -> bool:
+    """Restore the database if it is damaged; return whether it was.
+
+    Raises
+    ------
+    StoreError
+        If the disk refuses it.
+    """
+    damage = store.damage()
+    is_lost = not damage and not store.runs()  # emptied before there was any copy
+    if not damage and not is_lost:
+        return False
+    moved, copy = store.restore(now) if damage else (None, None)
+    known = {part for run in store.runs() for part in run.parts}
+    n_found = 0
+    for run in _runs_of_recordings(bench, known):
+        store.save(run)
+        n_found += 1
+    if is_lost and not n_found:  # a new one
+        return False
+    _LOGGER.error(
+        "%s: damaged (%s); %s; restored from %s and %d recordings",
+        store.path,
+        damage or "it is empty",
+        "nothing was moved" if moved is None else f"moved to {moved.name}",
+        "no copy" if copy is None else f"the copy {copy.name}",
+        n_found,
+    )
+    return True
+
+
+def _runs_of_recordings(bench: Bench, known: set[str]) -> Iterator[Run]:
+    """Yield the runs of recordings that no run has, the newest first."""
+    for path in sorted(bench.recording_directory.glob("*.h5"), reverse=True):
+        if path.name not in known:
+            try:
+                run = _run_of(bench, path)
+            except (HuddleError, OSError, KeyError, TypeError, ValueError) as error:
+                _LOGGER.warning("%s: no run can be read from it: %s", path, error)
+                continue
+            if run is not None:
+                known.update(run.parts)
+                yield run
+
+
+def _run_of(bench: Bench, path: Path) -> Run | None:
+    """Return the run of a recording; None if the service did not make it."""
+    with Recording.open(path) as recording:
+        created = recording.created.astimezone(UTC)
+        about = recording.about_results()
+        own = recording.bench
+    if RUN in about:
+        run = Run.of_record(json.loads(about[RUN]))
+        return run if path.name in run.parts else None
+    if not mark_of(path).exists() or own is None or own.name != bench.name:
+        return None
+    due, _ = missed_runs(bench, created - GRACE, created + timedelta(seconds=1), lambda _: False)
+    if not due:
+        return None
+    state = RunState.RECORDING if is_being_written(path) else RunState.ESTIMATING
+    run = due[-1].to(RunState.RECORDING, started=created, parts=(path.name,))
+    return run if state is RunState.RECORDING else run.to(state)
