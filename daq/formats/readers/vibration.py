@@ -8,6 +8,7 @@ of data set 164. In a WAV file the file is a sensor, its channels are numbered. 
 
 from __future__ import annotations
 
+import re
 import warnings
 from typing import TYPE_CHECKING, Any
 
@@ -116,7 +117,7 @@ def read_wav(path: Path, sampling_rate: float | None = None) -> tuple[ForeignSen
             warnings.simplefilter("ignore")  # about chunks that hold no samples
             rate, samples = wavfile.read(path)
     except Exception as error:  # of any kind, on damaged files
-        raise ImportFormatError(f"{path}: expected a WAV file; {error}") from error
+        raise ImportFormatError(f"{path}: {_wav_fault(path, str(error))}") from error
     samples = samples[:, np.newaxis] if samples.ndim == 1 else samples
     if samples.dtype == np.uint8:
         samples = samples.astype(np.int16) - _UINT8_ZERO
@@ -125,3 +126,15 @@ def read_wav(path: Path, sampling_rate: float | None = None) -> tuple[ForeignSen
         raise ImportFormatError(f"{path}: no samples in it")
     channels = tuple(str(number) for number in range(1, samples.shape[1] + 1))
     return (ForeignSensor(path.stem, channels, float(rate), stretches, str(path)),)
+
+
+def _wav_fault(path: Path, error: str) -> str:
+    """Return why a file is no WAV file that can be read."""
+    with path.open("rb") as file:
+        head = file.read(12)
+    if head[:4] not in {b"RIFF", b"RIFX", b"RF64"} or head[8:12] != b"WAVE":
+        return f"begins with {head[:4]!r}; a WAV file begins with RIFF, its length, and WAVE"
+    found = re.search(r"Unknown wave file format: (\w+)", error)
+    if found is not None:
+        return f"WAV samples of format {found[1]}; expected PCM or floating-point samples"
+    return "the WAV file is damaged or cut off; copy the file again"

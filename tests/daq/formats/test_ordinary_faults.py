@@ -93,6 +93,23 @@ def test_a_matlab_file_that_inflates_to_gigabytes_is_refused(
         import_files([tmp_path / "a.mat"], tmp_path / "a.h5")
 
 
+_WAV = b"RIFF\x24\0\0\0WAVEfmt "
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"hello, world", "begins with b'hell'; a WAV file begins with RIFF"),
+        (_WAV, "damaged or cut off"),
+        (_WAV + struct.pack("<IHHIIHH", 16, 7, 1, 8000, 8000, 1, 8) + b"data\0\0\0\0", "MULAW"),
+    ],
+)
+def test_what_a_wav_file_has_wrong_is_named(tmp_path: Path, content: bytes, said: str) -> None:
+    (tmp_path / "a.wav").write_bytes(content)
+    with pytest.raises(ImportFormatError, match=said):
+        import_files([tmp_path / "a.wav"], tmp_path / "a.h5")
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [
@@ -101,6 +118,10 @@ def test_a_matlab_file_that_inflates_to_gigabytes_is_refused(
         (b"time,A.X,A.X\n0.0,1,2\n0.1,1,2\n", "several channels are named 'X'"),
         (b"time,A.X\n", "expected rows of 2 cells"),
         (b"", "expected a first line that names every column"),
+        (b"time (s),A.X\n1e12,1\n1000000000001,2\n", "time '1e12': beyond the year 2262"),
+        (b"time,A.X\n2500-01-01T00:00:00,1\n2500-01-01T00:00:01,2\n", "beyond the year 2262"),
+        (b"time,A.X\n0,1\ninf,2\n", "time 'inf': expected a finite number"),
+        (b"time,A.X\nnan,1\n1,2\n", "time 'nan': expected a finite number"),
     ],
 )
 def test_what_a_csv_has_wrong_is_named(tmp_path: Path, content: bytes, said: str) -> None:

@@ -118,7 +118,7 @@ def test_status_with_and_without_a_service(place: Path) -> None:
 def test_a_database_that_is_none_is_refused(tmp_path: Path) -> None:
     store = RunStore(tmp_path)
     store.path.write_bytes(b"no database" * 100)
-    with pytest.raises(StoreError, match="move it away: recordings are not affected"):
+    with pytest.raises(StoreError, match="huddle serve restores it: recordings are not affected"):
         store.runs()
 
 

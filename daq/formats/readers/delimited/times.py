@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from datetime import datetime, timedelta
 from typing import TYPE_CHECKING
@@ -61,11 +62,22 @@ def nanoseconds(cells: Sequence[str], unit: str, *, decimal_comma: bool) -> NDAr
         value = float(first)
     except ValueError:
         order = _order(cells)
-        return np.array([_dated(cell, order) for cell in cells], dtype=np.int64)
+        return _within_range([_dated(cell, order) for cell in cells], cells)
     scale = _SCALES.get(unit.lower())
     if scale is None:
         scale = next((each for least, each in _EPOCHS if abs(value) > least), NS_PER_S)
-    return np.array([_scaled(cell, scale, comma=decimal_comma) for cell in cells], dtype=np.int64)
+    return _within_range([_scaled(cell, scale, comma=decimal_comma) for cell in cells], cells)
+
+
+def _within_range(times: list[int], cells: Sequence[str]) -> NDArray[np.int64]:
+    try:
+        return np.array(times, dtype=np.int64)
+    except OverflowError:
+        at = next(number for number, ns in enumerate(times) if abs(ns) >= 1 << 63)
+        raise ValueError(
+            f"time {cells[at]!r}: beyond the year 2262; expected seconds since 1970 or less, or"
+            " their unit in the header, as in time (ms)"
+        ) from None
 
 
 def _scaled(cell: str, scale: int, *, comma: bool) -> int:
@@ -73,7 +85,10 @@ def _scaled(cell: str, scale: int, *, comma: bool) -> int:
     text = cell.replace(",", ".") if comma else cell
     whole, _, fraction = text.partition(".")
     if not whole.lstrip("+-").isdigit() or (fraction and not fraction.isdigit()):
-        return round(float(text) * scale)
+        value = float(text) * scale
+        if not math.isfinite(value):
+            raise ValueError(f"time {cell!r}: expected a finite number")
+        return round(value)
     sign: int = -1 if whole.startswith("-") else 1
     digits = fraction[:18]
     return int(whole) * scale + sign * (int(digits or "0") * scale // int(10 ** len(digits)))
