@@ -43,11 +43,26 @@ def scenario_of(bench: Bench) -> Scenario:
     if not bench.simulation:
         expected = "is missing; expected a table with motion and sensors (huddle init writes one)"
         raise BenchFileError(FileFault("simulation", expected), source=source)
-    scenario = Scenario.from_dict(bench.simulation, sampling_rate=bench.sampling_rate)
+    table, tables = bench.simulation, bench.simulation.get("sensors")
+    if isinstance(tables, dict):
+        rates = {sensor.name: sensor.sampling_rate for sensor in bench.sensors}
+        own = {
+            name: {"sampling_rate": rates[name], **each}
+            if isinstance(each, dict) and name in rates
+            else each
+            for name, each in tables.items()
+        }
+        table = {**table, "sensors": own}
+    scenario = Scenario.from_dict(table, sampling_rate=bench.sampling_rate)
     for sensor in bench.sensors:
         if sensor.name not in scenario.names:
             expected = "is missing; expected a table for every sensor"
             fault = FileFault(f"simulation.sensors.{sensor.name}", expected)
+            raise BenchFileError(fault, source=source)
+        rate = scenario.sensors[sensor.name].sampling_rate
+        if rate != sensor.sampling_rate:
+            expected = f"is {rate:g} Hz; expected {sensor.sampling_rate:g} Hz, as of the sensor"
+            fault = FileFault(f"simulation.sensors.{sensor.name}.sampling_rate", expected)
             raise BenchFileError(fault, source=source)
         if scenario.n_channels(sensor.name) != sensor.n_main_channels:
             expected = (

@@ -64,6 +64,46 @@ def test_a_bench_files_own_simulation(tmp_path: Path) -> None:
     assert recording.sensors[0].channels[0].sensitivity == 1710799.9
 
 
+MIXED = """
+name = "mixed"
+sampling_rate = 20.0
+
+[simulation]
+motion.spectra = [{shape = "white", level = 1e-6}]
+"""
+SENSOR = """
+[[sensors]]
+name = "{name}"
+driver = "text"
+port = "/dev/{name}"
+sampling_rate = {rate}
+channels = [{{name = "x", sensitivity = 1e6}}]
+
+[simulation.sensors.{name}]
+noise = {{shape = "white", level = 1e-9}}
+"""
+
+
+def test_sensors_of_different_rates_have_blocks_of_a_second(tmp_path: Path) -> None:
+    rates = {"A": 100.0, "B": 20.0, "C": 20.0}
+    bench, out = tmp_path / "mixed.toml", tmp_path / "mixed.h5"
+    text = MIXED + "".join(SENSOR.format(name=name, rate=rate) for name, rate in rates.items())
+    bench.write_text(text, encoding="utf-8")
+    simulate_recording(str(bench), out=out, duration=30.0, json=None)
+    with Recording.open(out) as recording:
+        for sensor in recording.sensors:
+            blocks = sensor.blocks[:]
+            assert set(blocks["n_samples"]) == {rates[sensor.name]}
+            steps = np.diff(blocks["monotonic_ns"])
+            assert abs(steps.mean() - 1e9) < 1e6
+            ends = (blocks["monotonic_ns"] - recording.created_at.monotonic_ns) / 1e9
+            np.testing.assert_allclose(ends, np.arange(1, 31), atol=1 / rates[sensor.name] + 1e-6)
+    result = tmp_path / "wrong.toml"
+    result.write_text(text + "sampling_rate = 50.0\n", encoding="utf-8")
+    with pytest.raises(BenchFileError, match="is 50 Hz; expected 20 Hz, as of the sensor"):
+        simulate_recording(str(result), out=tmp_path / "wrong.h5", duration=30.0, json=None)
+
+
 def test_what_cannot_be_simulated_is_said_and_leaves_no_file(tmp_path: Path) -> None:
     out = tmp_path / "none.h5"
     with pytest.raises(ScenarioError, match="'fig6' is neither a file nor a scenario"):
