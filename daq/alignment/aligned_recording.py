@@ -30,6 +30,7 @@ from daq.timing.utc_rate import UtcRate
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -42,6 +43,9 @@ if TYPE_CHECKING:
 
 _GROWTH = 0.05  # fraction by which a recording grows before its clocks are set again
 _FIRST_GROWTH = 0.25  # the same for a short recording, up to
+MAX_PPM = 1000.0
+"""Error of a sampling clock that is refused: quartz is good to 100 ppm, and the
+estimate resamples by small errors only."""
 _MIN_SECONDS = 30.0  # this time in s: three observations of the clock's filter
 
 
@@ -325,6 +329,10 @@ class AlignedRecording:
                 if clock.state.refined:  # relative to the reference, whose rate is also uncertain
                     clock = clock.rate_known_to(reference.known_clock.state.ppm_std)
                 source.clock = clock
+        if self._recording.closed:  # before that, arrivals may be few
+            for source in sources:
+                if not source.polled:
+                    _check_rate(self._recording.path, source)
 
     def refresh(self) -> None:
         """Read newly committed blocks, and set every clock."""
@@ -403,3 +411,15 @@ class AlignedRecording:
     def _start(self) -> float:
         """Return the time from the recording's creation to grid sample 0, in s."""
         return 0.0 if self._grid is None else self._grid.start
+
+
+def _check_rate(path: str | Path, source: SensorSource) -> None:
+    """Raise CannotAlignError if a clock is further off than that of any device that works."""
+    state = source.known_clock.state
+    if abs(state.ppm) - 3 * state.ppm_std > MAX_PPM:
+        rate = source.record.sampling_rate
+        raise CannotAlignError(
+            f"{path}: sensor {source.record.name!r} sent {rate * (1 + state.ppm * 1e-6):.4g}"
+            f" samples per second; expected its sampling rate, {rate:g} Hz, to 0.1 %: state the"
+            " right sampling rate, or check whether samples are lost"
+        )

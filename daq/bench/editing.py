@@ -38,6 +38,14 @@ def set_sensor_values(path: str | Path, values: Mapping[str, Mapping[str, str]])
     replace_file(path, tomlkit.dumps(document))
 
 
+def without_tables(text: str, *names: str) -> str:
+    """Return the text of a bench file without these tables, whatever way they are written."""
+    document = tomlkit.parse(text)
+    for name in names:
+        document.pop(name, None)
+    return tomlkit.dumps(document)
+
+
 def with_sensor(text: str, values: Mapping[str, Any], *, replaces: str = "") -> str:
     """Return the text of a bench file with another sensor, or with other values of one.
 

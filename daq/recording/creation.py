@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daq.bench.tables.unattended import Hooks
 from daq.recording import file_format
 from daq.recording.chunks.manifest import make_manifest
 from daq.recording.description import make_checksums
@@ -46,13 +47,25 @@ def write_attributes(
         "created_utc_ns": created.utc_ns,
         "created_monotonic_ns": created.monotonic_ns,
         "software": software,
-        "bench": "" if bench is None else bench.text,
+        "bench": "" if bench is None else recorded_text(bench),
         "operator": "" if bench is None else bench.operator,
         "location": "" if bench is None else bench.location,
     } | attributes
     if control is not None:
         known["control_port"], known["control_token"] = control
     file.attrs.update({name: file_format.fixed(value) for name, value in known.items()})
+
+
+def recorded_text(bench: Bench) -> str:
+    """Return the text of a bench file without the tables that may hold secrets.
+
+    A recording is passed on. Commands and addresses of a service are of no use in it.
+    """
+    if bench.hooks == Hooks() and bench.metrics is None:
+        return bench.text
+    from daq.bench.editing import without_tables  # noqa: PLC0415 - tomlkit takes 30 ms to import
+
+    return without_tables(bench.text, *file_format.PRIVATE_TABLES)
 
 
 def make_datasets(file: h5py.File, sensors: Sequence[SensorLayout], chunk_seconds: float) -> None:

@@ -25,6 +25,9 @@ FORMAT_VERSION = 2
 LIBVER = ("v110", "v110")
 """HDF5 file format of recordings."""
 
+PRIVATE_TABLES = ("hooks", "metrics")
+"""Tables of the bench file that are not recorded."""
+
 NO_COUNTER = -1
 """``device_counter`` of a block without one."""
 

@@ -19,6 +19,7 @@ import numpy as np
 from daq.bench.end_condition import EndCondition
 from daq.bench.loading import parse
 from daq.bench.model import estimate_settings
+from daq.bench.tables.unattended import Hooks
 from daq.errors import BenchFileError, NotARecordingError
 from daq.protocols.block import Event, EventKind, HostTime
 from daq.recording import file_format
@@ -133,6 +134,12 @@ class Recording:
             return None
         with contextlib.suppress(BenchFileError):
             bench = parse(self.bench_text, str(self.path))
+            if bench.hooks != Hooks():  # of a version that recorded them
+                _LOGGER.warning(
+                    "%s: holds the commands of [hooks], which may have secrets in them; do not pass"
+                    " it on",
+                    self.path,
+                )
             if self._estimate:
                 table = estimate_settings(json.loads(self._estimate))
                 bench = bench.model_copy(update={"estimate": table})

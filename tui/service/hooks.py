@@ -11,6 +11,7 @@ import contextlib
 import json
 import logging
 import os
+import re
 import signal
 import sys
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from tui.service.clock import Clock
     from tui.service.records.store import RunStore
 
+_VARIABLE = re.compile(r"\$\{(\w+)\}")
 _LOGGER = logging.getLogger(__name__)
 _MOST_OUTPUT = 400
 """Characters of what a failed hook wrote that are logged."""
@@ -114,7 +116,12 @@ class HookRunner:
 
 
 async def run_hook(command: Sequence[str], document: bytes, timeout: float) -> str:  # noqa: ASYNC109
-    """Run a command with a document on its standard input; return what went wrong, or nothing."""
+    """Run a command with a document on its standard input; return what went wrong, or nothing.
+
+    ``${NAME}`` in its words is replaced by the variable of the environment, if there is one: so a
+    bench file names secrets and does not hold them.
+    """
+    command = [_VARIABLE.sub(lambda m: os.environ.get(m[1], m[0]), word) for word in command]
     try:
         process = await asyncio.create_subprocess_exec(
             *command,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import signal
 import sys
@@ -25,7 +26,7 @@ from tui.service.clock import SystemTime
 from tui.service.processes.locks import Lock
 from tui.service.processes.steps import ProcessSteps
 from tui.service.records.places import service_lock
-from tui.service.records.run_state import RunState
+from tui.service.records.run_state import RUN, Run, RunState
 from tui.service.records.store import RunStore
 from tui.simulation.devices import simulated
 
@@ -86,13 +87,15 @@ async def test_the_first_run_makes_its_folder_and_leaves_recording_result_and_ro
     names = {entry.name for entry in out.parent.iterdir()}
     assert names == {
         *(out.name, out.with_suffix(".json").name, "runs.sqlite"),
-        *(".demo.toml", ".demo.service"),
+        *(".demo.toml", ".demo.service", ".runs-copies"),
     }
     assert all(
         (out.parent / name).stat().st_mode & 0o077 == 0 for name in names if "json" not in name
     )
     with Recording.open(out) as recording:
         assert recording.results()
+        stored = Run.of_record(json.loads(recording.about_results()[RUN]))
+    assert (stored.key, stored.verdict, stored.noise) == (run.key, run.verdict, run.noise)
 
 
 def test_two_services_never_have_the_same_recording(tmp_path: Path) -> None:

@@ -46,6 +46,18 @@ def test_each_outcome_has_its_hooks() -> None:
     assert events_of(recorded.to(RunState.FAILED), every) == ("on_failed",)
 
 
+async def test_a_hook_names_its_secrets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
+    (tmp_path / "token").write_text("s3cret", encoding="utf-8")
+    out = tmp_path / "out"
+    program = "import sys, shutil; shutil.copy(sys.argv[1], sys.argv[2])"
+    command = [sys.executable, "-c", program, "${CREDENTIALS_DIRECTORY}/token", str(out)]
+    assert await run_hook(command, b"{}", limit()) == ""
+    assert out.read_text(encoding="utf-8") == "s3cret"
+    problem = await run_hook(["${NO_SUCH_VARIABLE}"], b"{}", limit())
+    assert problem.startswith("${NO_SUCH_VARIABLE}: cannot be started")
+
+
 async def test_a_hook_that_fails_is_tried_again_and_reads_the_run(tmp_path: Path) -> None:
     script = (
         f"echo x >> {tmp_path}/tries; test $(wc -l < {tmp_path}/tries) -ge 2 && cat > {tmp_path}/in"
