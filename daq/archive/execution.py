@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import queue
 import subprocess
 import threading
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict
+from ipaddress import ip_address
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 from daq.archive.task import Outcome, Task, run
 from daq.errors import ArchiveError
@@ -20,6 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Sequence
     from types import ModuleType
 
+_LOGGER = logging.getLogger(__name__)
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
 CONNECT_SECONDS = 10.0
 
@@ -85,6 +89,12 @@ def on_cluster(
     ArchiveError
         If the scheduler does not answer.
     """
+    if is_exposed(scheduler):
+        _LOGGER.warning(
+            "--scheduler %s: not encrypted, and not on this computer; whoever reaches a Dask"
+            " scheduler or worker runs programs there: use tls://, as in docs/archives.md",
+            scheduler,
+        )
     try:
         client = distributed.Client(scheduler, timeout=CONNECT_SECONDS)
     except (OSError, ValueError) as error:
@@ -103,6 +113,18 @@ def on_cluster(
                 yield Outcome(futures[future].source, failure=f"on the cluster: {failed!r}")
             else:
                 yield Outcome(**json.loads(future.result()))
+
+
+def is_exposed(address: str) -> bool:
+    """Return whether the address of a scheduler is neither encrypted nor loopback."""
+    scheme, _, place = address.rpartition("://")
+    host = urlsplit(f"//{place}").hostname or ""
+    if scheme in {"tls", "wss", "inproc"}:
+        return False
+    try:
+        return not ip_address(host).is_loopback
+    except ValueError:
+        return host != "localhost"
 
 
 class _Worker:

@@ -15,7 +15,7 @@ from tui.cli.options import CsvOption, JsonOption, ModelsOption, with_estimate_o
 @examples(
     "huddle archive recordings/ --jobs 4 --out figures",
     "huddle archive recordings/ --stretch day --segment 100s --store slow",
-    "huddle archive day-*.h5 --scheduler tcp://10.0.0.1:8786 --store /shared/archive",
+    "huddle archive day-*.h5 --scheduler tls://10.0.0.1:8786 --store /shared/archive",
     "huddle archive --store recordings/huddle-archive --band 1:20 --json - --csv days.csv",
 )
 @with_logging

@@ -16,7 +16,7 @@ import pytest
 
 from daq.archive.answers import answer
 from daq.archive.density import LOWEST_DB, Density
-from daq.archive.execution import carried_out
+from daq.archive.execution import carried_out, is_exposed
 from daq.archive.sources import recordings_in, sort
 from daq.archive.spectra_file import SpectraFile, SpectraWriter
 from daq.archive.store import PLAN_FILE, Store
@@ -309,3 +309,21 @@ def test_percentiles_of_the_density() -> None:
     assert density.percentile(0.5)[0, 0] == LOWEST_DB + 101.5
     assert density.percentile(0.9)[0, 1] == pytest.approx(LOWEST_DB + 100.6)
     assert np.isnan(density.percentile(0.5)[0, 1])  # most of them have no level
+
+
+@pytest.mark.parametrize(
+    ("address", "exposed"),
+    [
+        ("tcp://127.0.0.1:8786", False),
+        ("127.0.0.1:8786", False),
+        ("tcp://[::1]:8786", False),
+        ("tcp://localhost:8786", False),
+        ("tls://10.0.0.1:8786", False),
+        ("tcp://10.0.0.1:8786", True),
+        ("host:8786", True),
+        ("tcp://localhost.example.org:8786", True),
+        ("ws://192.168.1.2:80", True),
+    ],
+)
+def test_a_scheduler_in_the_open_is_named(address: str, *, exposed: bool) -> None:
+    assert is_exposed(address) is exposed

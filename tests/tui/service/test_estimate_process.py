@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import subprocess
 import sys
 
 import pytest
 
 from tests.waiting import limit
+from tui.service.processes.finish import OOM_SCORE
 from tui.service.processes.steps import FinishFailedError, outcome_of
 
 OUTCOME = (
@@ -27,6 +29,18 @@ async def test_an_estimate_without_progress_is_ended() -> None:
     with pytest.raises(FinishFailedError, match="made no progress for"):
         await outcome_of(process, silence=limit(0.3))
     assert process.returncode != 0
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="of the Linux kernel")
+def test_an_estimate_dies_before_a_recorder() -> None:
+    program = (
+        "from tui.service.processes.finish import die_first; die_first();"
+        " print(open('/proc/self/oom_score_adj').read())"
+    )
+    said = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    ).stdout
+    assert int(said) == OOM_SCORE
 
 
 async def test_points_are_no_outcome() -> None:

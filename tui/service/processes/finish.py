@@ -9,6 +9,7 @@ be killed at any moment and started again: it changes nothing that it has change
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import sys
@@ -43,6 +44,8 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
 
 
+OOM_SCORE = 800
+"""Of 1000: an estimate can be made again, a recording cannot."""
 _OF_DISK = {
     *(errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EMFILE, errno.ENFILE),
 }
@@ -289,8 +292,15 @@ class _Heartbeat:
             sys.stdout.flush()
 
 
+def die_first() -> None:
+    """Have the kernel end this process before any other of the service if memory runs out."""
+    with contextlib.suppress(OSError):  # not Linux
+        Path("/proc/self/oom_score_adj").write_text(str(OOM_SCORE), encoding="ascii")
+
+
 def main() -> None:
     """Finish what the argument says; print the outcome."""
+    die_first()
     configure(style=LogFormat.JSON)
     found = json.loads(sys.argv[1])
     request = Request(**found | {"bands": tuple((low, high) for low, high in found["bands"])})
