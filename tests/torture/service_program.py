@@ -48,6 +48,11 @@ class FastClock(SystemTime):
         passed = (time.time() - found["began"]) * found["rate"]
         return datetime.fromtimestamp(found["shows"] + found["set_by"] + passed, UTC)
 
+    def elapsed(self) -> float:
+        """Return seconds of this clock, however it is set."""
+        found = json.loads(self._path.read_text(encoding="utf-8"))
+        return float((time.time() - found["began"]) * found["rate"])
+
     async def sleep(self, seconds: float, wake: asyncio.Event) -> None:
         """Let seconds of this clock pass."""
         await super().sleep(seconds / self.rate, wake)

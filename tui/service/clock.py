@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 from typing import TYPE_CHECKING, Protocol
 
 from daq.acquisition.schedule import utc_now
@@ -19,6 +20,10 @@ class Clock(Protocol):
         """Return the time, in UTC."""
         ...
 
+    def elapsed(self) -> float:
+        """Return seconds of a clock that is never set, and goes on while the computer sleeps."""
+        ...
+
     async def sleep(self, seconds: float, wake: asyncio.Event) -> None:
         """Let seconds pass, or fewer if the event is set."""
         ...
@@ -30,6 +35,11 @@ class SystemTime:
     def now(self) -> datetime:
         """Return the time, in UTC."""
         return utc_now()
+
+    def elapsed(self) -> float:
+        """Return seconds of a clock that is never set, and goes on while the computer sleeps."""
+        boot = getattr(time, "CLOCK_BOOTTIME", None)  # Linux
+        return time.monotonic() if boot is None else time.clock_gettime(boot)
 
     async def sleep(self, seconds: float, wake: asyncio.Event) -> None:
         """Let seconds pass, or fewer if the event is set."""

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 _LOGGER = logging.getLogger(__name__)
 MAX_SLEEP = 30.0
 """Seconds between two readings of the clock, which may be set."""
+STEP = 1.0
+"""Seconds by which the clock is set at least: runs are then planned again."""
 MAX_ATTEMPTS = 5
 """Estimates of a run that may end without an outcome: one that kills its process is given up."""
 RETRY = 2.0
@@ -94,6 +96,8 @@ class Service:
         self._unsaved: dict[str, Run] = {}
         self._windows: asyncio.Queue[Run] = asyncio.Queue()
         self._estimates: asyncio.Queue[Run] = asyncio.Queue()
+        self._offset = 0.0  # of the clock against one that is never set
+        self._inherited: dict[str, Run] = {}
         self._checked: tuple[int, int] | None = None
         self._repeats: set[asyncio.Task[None]] = set()
         self.recording: Run | None = None
@@ -132,6 +136,7 @@ class Service:
             If the database cannot be used at the start.
         """
         self._check_database()
+        self._offset = self._clock.now().timestamp() - self._clock.elapsed()
         self._take_up()
         recorder = asyncio.create_task(self._record_windows())
         estimator = asyncio.create_task(self._estimate_runs())
@@ -172,6 +177,7 @@ class Service:
                 self._miss(run, OFF)
             else:
                 self._planned[run.key] = run
+        self._inherited = dict(self._planned)
         if planned and min(run.due for run in planned) < now - GRACE:
             self._miss_all(min(run.due for run in planned), now)
         self._plan()
@@ -186,10 +192,7 @@ class Service:
         for key in [key for key in self._planned if key not in runs]:
             run = self._planned.pop(key)
             if run.due > now:
-                try:
-                    self._store.forget_planned(run)
-                except StoreError as error:
-                    _LOGGER.error("%s", error)  # noqa: TRY400 - its message says all
+                self._forget(run)
             else:  # it became due while the bench file was read
                 runs[key] = run
         for key, run in runs.items():
@@ -202,6 +205,7 @@ class Service:
             self._wake.clear()
             if self._wants_reload:
                 self._load_again()
+            self._notice_step()
             self._check_database()
             self._write_unsaved()
             run, now = self.next_run, self._clock.now()
@@ -216,6 +220,31 @@ class Service:
             else:
                 self._begin(run)
             self._plan()
+
+    def _notice_step(self) -> None:
+        """Plan again if the clock was set: what was due in between was never due.
+
+        Only runs that an earlier service had planned are reported as missed.
+        """
+        offset = self._clock.now().timestamp() - self._clock.elapsed()
+        step, self._offset = offset - self._offset, offset
+        if abs(step) < STEP:
+            return
+        now = self._clock.now()
+        _LOGGER.warning("the clock was set by %+.1f s; the runs are planned again", step)
+        for run in list(self._planned.values()):
+            if run.due < now - GRACE:
+                self._forget(self._planned.pop(run.key))
+        for run in self._inherited.values():
+            if run.due < now - GRACE and run.key not in self._known:
+                self._miss(run, OFF)
+        self._plan()
+
+    def _forget(self, run: Run) -> None:
+        try:
+            self._store.forget_planned(run)
+        except StoreError as error:
+            _LOGGER.error("%s", error)  # noqa: TRY400 - its message says all
 
     def _begin(self, run: Run) -> None:
         """Have a run recorded, unless another one is in its way for too long."""

@@ -81,6 +81,7 @@ class Window:
         self._folder, self._min_free, self._shortest = folder, min_free, shortest
         self.status: dict[str, Any] | None = None
         """Latest status that the recorder reported of itself and its sensors; None before."""
+        self._ends_at = 0.0
         self.progressed_at: float | None = None
         """Time of the event loop at which the recorder last made progress; None before."""
 
@@ -92,17 +93,18 @@ class Window:
         Run
             In the state `ESTIMATING` or `FAILED`; in `RECORDING` where the service is to end.
         """
+        self._ends_at = self._clock.elapsed() + min(self._planned_rest(run), run.duration)
         recorder = self._left_over(run)
         if recorder is None and run.parts:
             if self._is_complete(run):
                 return self._recorded(run)
             run = run.because(STOPPED if STOPPED in run.reason else INTERRUPTED)
-        wait, begun = RETRY, self._clock.now()
+        wait, begun = RETRY, self._clock.elapsed()
         while True:
             if recorder is None:
                 if self._stop.is_set():
                     return run
-                if self._rest(run) < (self._shortest if run.parts else 0.0):
+                if self._rest() < (self._shortest if run.parts else 0.0):
                     break
                 run, recorder = self._started(run)
             if recorder is not None:
@@ -116,7 +118,10 @@ class Window:
                     break
                 run = run.because(text)
                 self._save(run)
-                if not self._existing(run) and self._clock.now() - begun > START:
+                if (
+                    not self._existing(run)
+                    and self._clock.elapsed() - begun > START.total_seconds()
+                ):
                     break  # the devices, the bench file or the disk let no recording begin
             run = await self._pause(run, wait)
             wait = min(2 * wait, MAX_RETRY)
@@ -125,7 +130,11 @@ class Window:
     def _left_over(self, run: Run) -> Recorder | None:
         return self._steps.running(run.parts[-1]) if run.parts else None
 
-    def _rest(self, run: Run) -> float:
+    def _rest(self) -> float:
+        """Return the seconds that are left, however the clock of the computer is set."""
+        return self._ends_at - self._clock.elapsed()
+
+    def _planned_rest(self, run: Run) -> float:
         end = run.window_end
         return 0.0 if end is None else (end - self._clock.now()).total_seconds()
 
@@ -135,14 +144,14 @@ class Window:
             part = self._steps.new_part(self._clock.now())
             run = replace(run, parts=(*run.parts, part))
             self._save(run)
-            return run, self._steps.start(part, max(1.0, self._rest(run)), run.until)
+            return run, self._steps.start(part, max(1.0, self._rest()), run.until)
         except (HuddleError, OSError) as error:
             return run.because(f"no recorder: {error}"), None
 
     async def _followed(self, recorder: Recorder) -> tuple[_End, str]:
         """Wait for the end of a recorder; end it where it must."""
         stalled = ""
-        known, since = None, self._clock.now()
+        known, since = None, self._clock.elapsed()
         while not await recorder.ends_within(LOOK_INTERVAL):
             if self._stop.is_set():
                 await recorder.stop()
@@ -152,9 +161,9 @@ class Window:
                 return _End.EARLY, f"recording closed at {_size(free)} of free space"
             self.status = await recorder.status()
             if self.status is not None and self.status["elapsed"] != known:
-                known, since = self.status["elapsed"], self._clock.now()
+                known, since = self.status["elapsed"], self._clock.elapsed()
                 self.progressed_at = asyncio.get_running_loop().time()
-            elif self._clock.now() - since > STALL:
+            elif self._clock.elapsed() - since > STALL.total_seconds():
                 stalled = f"the recorder made no progress for {STALL.total_seconds():.0f} s"
                 _LOGGER.error("%s; it is killed", stalled)
                 recorder.kill()
@@ -166,10 +175,10 @@ class Window:
         """Wait before the rest is recorded, as long as the disk is full."""
         is_logged = False
         while True:
-            await self._clock.sleep(min(seconds, max(0.0, self._rest(run))), self._stop)
+            await self._clock.sleep(min(seconds, max(0.0, self._rest())), self._stop)
             free = free_space(self._folder)
             is_full = free is not None and free < self._min_free
-            if not is_full or self._stop.is_set() or self._rest(run) <= self._shortest:
+            if not is_full or self._stop.is_set() or self._rest() <= self._shortest:
                 return run
             if not is_logged:
                 _LOGGER.warning("%s of free space; the recording waits for more", _size(free or 0))

@@ -56,6 +56,10 @@ class VirtualClock(SystemTime):
         elapsed = timedelta(seconds=asyncio.get_running_loop().time())
         return self.start + self.set_by + elapsed
 
+    def elapsed(self) -> float:
+        """Return the time of the event loop."""
+        return asyncio.get_running_loop().time()
+
 
 @dataclass
 class FakeRecorder:

@@ -12,7 +12,6 @@ import pytest
 
 from daq.errors import BenchFileError, FileFault
 from tests.tui.service.bench_files import HOURLY, START, Place, bench_of
-from tui.service.planning import MAX_MISSED
 from tui.service.processes.finish import Outcome
 from tui.service.processes.steps import FinishFailedError
 from tui.service.records.run_state import NEXT, Run, RunState, WrongStateError
@@ -343,7 +342,7 @@ async def test_a_clock_set_back_repeats_no_run(tmp_path: Path) -> None:
     assert place.states() == [("13:00", "done"), ("14:00", "due")]
 
 
-async def test_a_clock_set_forward_by_years_reports_a_few_misses(tmp_path: Path) -> None:
+async def test_a_clock_set_forward_by_years_has_missed_nothing(tmp_path: Path) -> None:
     place = Place(tmp_path)
     service = place.service()
     task = asyncio.create_task(service.run())
@@ -352,9 +351,54 @@ async def test_a_clock_set_forward_by_years_reports_a_few_misses(tmp_path: Path)
     await asyncio.sleep(1.3 * HOUR)
     service.request_stop()
     await task
-    states = [state for _, state in place.states()]
-    assert states == ["missed"] * (MAX_MISSED + 1) + ["done", "due"]
-    assert "all others until" in place.store.runs()[MAX_MISSED].reason
+    assert [state for _, state in place.states()] == ["done", "due"]
+
+
+async def test_a_clock_ahead_at_the_start_and_then_set_right(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    place.clock.set_by += timedelta(days=3)
+    service = place.service()
+    task = asyncio.create_task(service.run())
+    await asyncio.sleep(60)
+    place.clock.set_by -= timedelta(days=3)
+    await asyncio.sleep(1.3 * HOUR)
+    service.request_stop()
+    await task
+    assert place.states() == [("13:00", "done"), ("14:00", "due")]
+    assert place.store.runs()[0].due.date() == place.clock.start.date()
+
+
+@pytest.mark.parametrize("days", [-3, 3])
+async def test_a_step_within_a_window_does_not_change_its_length(tmp_path: Path, days: int) -> None:
+    place = Place(tmp_path)
+    service = place.service()
+    task = asyncio.create_task(service.run())
+    await asyncio.sleep(HOUR + 100)  # in the window of 13:00, which takes ten minutes
+    place.clock.set_by += timedelta(days=days)
+    place.steps.is_stuck = False
+    await asyncio.sleep(700)
+    service.request_stop()
+    await task
+    done = [run for run in place.store.runs() if run.state is RunState.DONE]
+    assert len(done) == 1
+    assert [seconds for _, seconds in place.steps.started] == [600]
+    assert "missed" not in {state for _, state in place.states()}
+
+
+async def test_a_run_planned_by_an_earlier_service_is_missed_once_the_clock_is_right(
+    tmp_path: Path,
+) -> None:
+    place = Place(tmp_path)
+    await place.serve(60)  # plans 13:00
+    place.clock.set_by -= timedelta(days=3)  # off for a while; behind at the next start
+    service = place.service()
+    task = asyncio.create_task(service.run())
+    await asyncio.sleep(60)
+    place.clock.set_by += timedelta(days=3, hours=2)
+    await asyncio.sleep(60)
+    service.request_stop()
+    await task
+    assert place.states() == [("13:00", "missed"), ("15:00", "due")]
 
 
 async def test_no_run_starts_on_a_full_disk_and_a_running_one_is_closed(
