@@ -130,12 +130,22 @@ def verify_recordings(sources: Sequence[Path], *, json: str | None) -> None:
         state = report.get("error") or (f"damaged: {damaged}" if damaged else "intact")
         if "fatal" in report:
             state = f"damaged: {report['fatal']}"
-        found.append((path, state))
+        found.append((path, state, report.get("root_sha256") or None))
         for_people(json).print(f"{path}: {state.removeprefix(f'{path}: ')}", soft_wrap=True)
-    bad = [path.name for path, state in found if state != "intact"]
+    bad = [path.name for path, state, _ in found if state != "intact"]
     write_json(
         json,
-        {"recordings": [{"path": str(p), "intact": s == "intact", "state": s} for p, s in found]},
+        {
+            "recordings": [
+                {
+                    "path": str(path),
+                    "intact": state == "intact",
+                    "state": state,
+                    "root_sha256": root,
+                }
+                for path, state, root in found
+            ]
+        },
     )
     if bad:
         raise RecordingError(f"{len(bad)} of {len(found)} recordings are damaged or lost")

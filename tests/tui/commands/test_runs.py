@@ -86,6 +86,7 @@ def test_pinned_by_recording_or_time(place: Path) -> None:
 def test_verify_walks_what_is_kept(place: Path) -> None:
     found = json.loads(huddle("verify", str(place), "--json", "-"))["recordings"]
     assert [entry["intact"] for entry in found] == [True]
+    assert [len(entry["root_sha256"]) for entry in found] == [64]
     path = place.parent / "recordings" / "a.h5"
     with h5py.File(path) as file:
         chunk = file["sensors/a/samples"].id.get_chunk_info(0)
