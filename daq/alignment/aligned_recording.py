@@ -281,17 +281,7 @@ class AlignedRecording:
         for number, delay in zip(numbers, frame_delays(), strict=True):
             sources[number].frame_delay = float(delay)
         if self._at_face_value:
-            is_one = len({source.clock_name for source in sources}) == 1
-            for source in sources:
-                rate = source.record.sampling_rate
-                source.clock = nominal(
-                    source.record.name,
-                    ClockSource.NOMINAL_RATE,
-                    end_sample=source.end_sample,
-                    sampling_rate=rate,
-                    first=round(source.arrivals.start * rate),
-                    residual=0.0 if is_one else math.nan,
-                )
+            self._set_nominal_clocks()
             return
         together = len({source.clock_name for source in sources}) == 1 and not any(
             source.device_utc or source.polled for source in sources
@@ -333,6 +323,20 @@ class AlignedRecording:
             for source in sources:
                 if not source.polled:
                     _check_rate(self._recording.path, source)
+
+    def _set_nominal_clocks(self) -> None:
+        """Set every clock to its nominal rate."""
+        is_one = len({source.clock_name for source in self._sources}) == 1
+        for source in self._sources:
+            rate = source.record.sampling_rate
+            source.clock = nominal(
+                source.record.name,
+                ClockSource.NOMINAL_RATE,
+                end_sample=source.end_sample,
+                sampling_rate=rate,
+                first=round(source.arrivals.start * rate),
+                residual=0.0 if is_one else math.nan,
+            )
 
     def refresh(self) -> None:
         """Read newly committed blocks, and set every clock."""

@@ -196,7 +196,7 @@ class Run:
             entry=str(record["entry"]),
             due=due,
             duration=float(record["duration"]),
-            target_cov=record["target_cov"],
+            until=EndCondition.of_text(record["until"] or ""),
             queue=bool(record["queue"]),
             state=RunState.DONE,
             reason=str(record["reason"]),
