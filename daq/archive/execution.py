@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from types import ModuleType
 
 _LOGGER = logging.getLogger(__name__)
-_ONE_THREAD = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
 CONNECT_SECONDS = 10.0
 
 
@@ -136,14 +135,12 @@ class _Worker:
         self._start()
 
     def _start(self) -> None:
-        environment = dict.fromkeys(_ONE_THREAD, "1") | os.environ
         self._process = subprocess.Popen(
             python_command("daq.archive.worker"),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
             encoding="utf-8",
-            env=environment,
         )
 
     def run(self, task: Task) -> Outcome:

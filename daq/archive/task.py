@@ -17,6 +17,7 @@ import numpy as np
 from daq.archive.plan import Plan
 from daq.archive.spectra_file import Described, Origin, SpectraWriter
 from daq.errors import HuddleError
+from daq.estimation.blas_threads import one_blas_thread
 from daq.estimation.diagnosis import synchronisation
 from daq.estimation.segments.clipping import clipped_columns
 from daq.estimation.segments.segment_pass import Pass, still_for_a_while
@@ -66,6 +67,7 @@ def software_version() -> str:
     return version("huddle-bench")
 
 
+@one_blas_thread()
 def run(text: str) -> str:
     """Carry out a task, given as JSON; returns the outcome as JSON.
 

@@ -24,6 +24,7 @@ import numpy as np
 
 from daq.bench.units import canonical
 from daq.errors import CannotAlignError
+from daq.estimation.blas_threads import one_blas_thread
 from daq.estimation.equalisation import (
     FILTER_SEGMENTS,
     FOUND_FROM,
@@ -174,6 +175,7 @@ class Estimation:
         end = last.n_seen * welch.hop + welch.segment_length + 2 * last.reach
         return (end - last.aligned.n_available) / welch.sampling_rate
 
+    @one_blas_thread()
     def update(self, progress: Progress | None = None) -> bool:
         """Take what has been committed since; return whether there was a new segment.
 
@@ -220,6 +222,7 @@ class Estimation:
             self._next_review = min([math.ceil(_REVIEW * seen), *awaited])
         return seen > before
 
+    @one_blas_thread()
     def finish(self, progress: Progress | None = None) -> Snapshot:
         """Return the one result: the same while the recording was followed and afterwards.
 
@@ -340,6 +343,7 @@ class Estimation:
         self._equalisation.prove([piece for piece in pieces if piece[2] > 0])
         self._filter()
 
+    @one_blas_thread()
     def snapshot(self) -> Snapshot:
         """Return the estimate from the segments taken so far."""
         return self._snapshots.build(self._recordings, self._passes, final=False)

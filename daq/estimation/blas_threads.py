@@ -1,0 +1,39 @@
+"""One thread of linear algebra while an estimate runs.
+
+The matrices are small: further threads of BLAS save no time, and wait for work in loops that cost a
+processor each. The command sets environment variables before it imports numpy; a script that
+imports huddle has numpy already.
+"""
+
+from __future__ import annotations
+
+import threading
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from threadpoolctl import ThreadpoolController
+
+if TYPE_CHECKING:
+    from collections.abc import Generator
+
+_lock = threading.Lock()
+_limits: list[Any] = []  # of the estimates that run: the process has one number of threads for all
+
+
+@contextmanager
+def one_blas_thread() -> Generator[None]:
+    """Limit BLAS to one thread; also a decorator.
+
+    The first of several estimates at a time sets the limit, and the last one restores the number
+    that was before.
+    """
+    with _lock:
+        first = _limits[0] if _limits else ThreadpoolController().limit(limits=1, user_api="blas")
+        _limits.append(first)
+    try:
+        yield
+    finally:
+        with _lock:
+            limit = _limits.pop()
+            if not _limits:
+                limit.restore_original_limits()
