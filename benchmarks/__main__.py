@@ -7,6 +7,7 @@ import os
 import pkgutil
 import sys
 import time
+import traceback
 from typing import TYPE_CHECKING
 
 import benchmarks
@@ -42,7 +43,7 @@ def _figure(value: float) -> str:
 
 
 def main(names: list[str]) -> int:
-    """Run the named benchmarks, or all; 1 if a promise is missed."""
+    """Run the named benchmarks, or all; 1 if a promise is missed or a benchmark fails."""
     modules = [
         module.name
         for module in pkgutil.iter_modules(benchmarks.__path__)
@@ -55,7 +56,12 @@ def main(names: list[str]) -> int:
     missed = False
     for name in modules:
         begin = time.perf_counter()
-        rows: list[Row] = importlib.import_module(f"benchmarks.{name}").run()
+        try:
+            rows: list[Row] = importlib.import_module(f"benchmarks.{name}").run()
+        except Exception:  # noqa: BLE001 - the others are measured whatever one does
+            print(f"{name}: FAILED\n{traceback.format_exc()}", flush=True)
+            missed = True
+            continue
         print(f"{name} ({time.perf_counter() - begin:.0f} s)\n{table(rows)}\n", flush=True)
         missed |= any(row.reached is False for row in rows)
     return int(missed)

@@ -156,23 +156,25 @@ def answers(terminal: Terminal, *, apart: float, n_keys: int = N_KEYS) -> list[f
     return found
 
 
-def case(size: tuple[int, int], baud: int | None = None, *, n_keys: int = N_KEYS) -> list[Row]:
-    """Measure the application at one size and on one line."""
+def case(
+    size: tuple[int, int], baud: int | None = None, *, n_keys: int = N_KEYS, share: float = 1.0
+) -> list[Row]:
+    """Measure the application at one size and on one line, for a share of the usual time."""
     what = f"{size[0]}×{size[1]}" + (f" at {baud} baud" if baud else "")
     slow = baud is not None
     with opened(size, baud) as terminal:
-        idle, _ = rates(terminal, 10)
+        idle, _ = rates(terminal, 10 * share)
         terminal.press("p")
         terminal.wait_for("last 10 s")
         time.sleep(3)
-        live, live_cpu = rates(terminal, 15)
+        live, live_cpu = rates(terminal, 15 * share)
         terminal.press("s")
         terminal.wait_for("start a test")
         time.sleep(1)
         terminal.press("\r")
         terminal.wait_for("power spectral density")
-        time.sleep(SETTLED)
-        running, cpu = rates(terminal, 30)
+        time.sleep(SETTLED * share)
+        running, cpu = rates(terminal, 30 * share)
         delays = answers(terminal, apart=4.0 if slow else 0.7, n_keys=n_keys)
     median, ninth = np.quantile(delays, [0.5, 0.9])
     cpu_most = 15.0
@@ -192,6 +194,8 @@ def case(size: tuple[int, int], baud: int | None = None, *, n_keys: int = N_KEYS
     ]
 
 
-def run() -> list[Row]:
+def run(*, smallest: bool = False) -> list[Row]:
     """Measure the application on a wide screen, on a usual one, and on a serial line."""
+    if smallest:
+        return case(USUAL, n_keys=2, share=0.1)
     return [*case(WIDE), *case(USUAL), *case(USUAL, SERIAL, n_keys=15)]

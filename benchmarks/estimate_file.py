@@ -1,28 +1,27 @@
 """The estimate from the file: decompression, alignment, spectra, noise; diagnosis; the command.
 
-Two kinds of file: as the recorder leaves it, in chunks of one to two seconds, and as it is
-imported, in chunks of 4096 rows. Ratios are of wall times within one run; notes give the
-processor's time, all threads together, which says more where the machine is shared, and what of
-it no reader can save: inflating, and the imports.
+Three kinds of file: as the recorder leaves it, in chunks of one to two seconds; as it is imported,
+in chunks of 4096 rows, by one clock; and a real import from `.npz`, whose sensors have clocks of
+their own and stated times. Ratios are of processor times within one run, all threads and processes
+together. Notes give what no reader can save: inflating, and the imports.
 """
 
 from __future__ import annotations
 
-import resource
+import os
 import subprocess
 import sys
 import tempfile
-import time
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import h5py
 import numpy as np
 import scipy.fft
 from isal import isal_zlib
 
-from benchmarks.row import Row
+from benchmarks.row import Row, least_work
 from daq.alignment.resampling import resample
 from daq.bench.model import Channel
 from daq.estimation.estimation import Estimation, estimate
@@ -32,12 +31,11 @@ from daq.recording.array_writer import BLOCK_ROWS, ArrayWriter
 from daq.recording.file_format import SensorLayout
 from daq.results.store import store_results
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
 RATE, LENGTH, HOURS = 200, 2000, 3
 SLOW_RATE, SLOW_LENGTH, SLOW_HOURS = 40, 400, 24
 REPEATS = 3
+SHORT = 0.05
+"""Hours of the smallest form."""
 MEMORY = """
 import sys
 from benchmarks.row import peak_memory
@@ -48,29 +46,24 @@ print(peak_memory())
 """
 
 
-@dataclass(frozen=True, slots=True)
-class Cost:
-    """Least wall and processor time of some repetitions, in seconds."""
-
-    wall: float
-    work: float
-
-
-def run() -> list[Row]:
+def run(*, smallest: bool = False) -> list[Row]:
     """Measure what a recording costs, with one clock and with three."""
+    repeats = 1 if smallest else REPEATS
     with tempfile.TemporaryDirectory() as folder:
         return [
-            *_three_hours(Path(folder)),
-            *_a_day(Path(folder)),
+            *_three_hours(Path(folder), SHORT if smallest else HOURS, repeats),
+            *_a_day(Path(folder), SHORT if smallest else SLOW_HOURS, repeats),
         ]
 
 
-def _three_hours(folder: Path) -> list[Row]:
-    samples = sensor_samples(HOURS)
+def _three_hours(folder: Path, hours: float, repeats: int) -> list[Row]:
+    what = f"{hours:g} h × 9 × {RATE} Hz"
+    samples = sensor_samples(hours)
     recorded = recorded_file(folder / "recorded.h5", samples)
     imported = recorded_file(folder / "imported.h5", samples, chunk_rows=BLOCK_ROWS)
+    stated = imported_file(folder / "stated.h5", samples)
     ppm = (0.0, 15.0, -20.0)
-    free = recorded_file(folder / "free.h5", sensor_samples(HOURS, ppm=ppm), ppm=ppm)
+    free = recorded_file(folder / "free.h5", sensor_samples(hours, ppm=ppm), ppm=ppm)
     frames = np.lib.stride_tricks.sliding_window_view(samples, LENGTH, axis=0)[:: LENGTH // 2]
     window = np.hanning(LENGTH)
 
@@ -79,127 +72,115 @@ def _three_hours(folder: Path) -> list[Row]:
             scipy.fft.rfft(frames[first : first + 24] * window, axis=-1)
 
     settings = Settings()
-    ffts, of_recorded_noise, of_imported_noise, with_diagnosis, from_free = _least(
+    ffts, of_recorded_noise, of_imported_noise, with_diagnosis, from_free = least_work(
         bare,
         lambda: _noise(recorded, settings),
         lambda: _noise(imported, settings),
         lambda: estimate([recorded], settings),
         lambda: estimate([free], settings),
+        repeats=repeats,
     )
-    of_recorded, of_imported, start = _least(
-        lambda: _command(recorded),
-        lambda: _command(imported),
-        lambda: _run("-c", "import tui.commands.estimate"),
-        repeats=2,
-    )
-    (loop,) = _least(lambda: _csd_loop(samples), repeats=1)
-    (rectangular,) = _least(
-        lambda: _command(imported, "--window", "rectangular", "--overlap", "0"), repeats=2
-    )
-    (rectangular_loop,) = _least(lambda: _csd_loop(samples, window="boxcar", noverlap=0), repeats=1)
-    snapshot = estimate([recorded], Settings(methods=("all",)))
-    (stored,) = _least(lambda: store_results(recorded, snapshot))
-    rows = []
-    for kind, path, cost, command in (
-        ("recorded", recorded, of_recorded_noise, of_recorded),
-        ("imported", imported, of_imported_noise, of_imported),
+    (start,) = least_work(lambda: _run("-c", "import tui.commands.estimate"), repeats=repeats)
+    rows = [
+        Row(
+            f"{what} {kind}, one clock: matrix and noise against the bare FFTs",
+            cost / ffts,
+            "×",
+            at_most=4.0,
+            note=f"{cost:.2f} s, of which inflating alone {_inflating(path):.2f} s",
+        )
+        for kind, path, cost in (
+            ("recorded", recorded, of_recorded_noise),
+            ("imported", imported, of_imported_noise),
+        )
+    ]
+    for name, options, of_loop in (
+        ("Hann, 50 %", (), {}),
+        (
+            "rectangular, no overlap",
+            ("--window", "rectangular", "--overlap", "0"),
+            {"window": "boxcar", "noverlap": 0},
+        ),
     ):
+        (loop,) = least_work(partial(_csd_loop, samples, **of_loop), repeats=1)
+        files = {"recorded": recorded, "imported": imported, "imported, times stated": stated}
+        commands = least_work(
+            *(partial(_command, path, *options) for path in files.values()), repeats=repeats
+        )
         rows += [
             Row(
-                f"3 h × 9 × 200 Hz {kind}, one clock: matrix and noise against the bare FFTs",
-                cost.wall / ffts.wall,
-                "×",
-                at_most=4.0,
-                note=f"{cost.wall:.2f} s; work {cost.work / ffts.work:.1f} ×, {cost.work:.2f} s, of"
-                f" which inflating alone {_inflating(path).work:.2f} s",
-            ),
-            Row(
-                f"csd loop in memory against the whole command, {kind}",
-                loop.wall / command.wall,
+                f"{what} {kind}, {name}: csd loop in memory against the whole command",
+                loop / command,
                 "×",
                 at_least=5.0,
-                note=f"{command.wall:.2f} s; work {loop.work / command.work:.1f} ×,"
-                f" {command.work:.2f} s, of which imports {start.work:.2f} s",
-            ),
+                note=f"{command:.2f} s, of which imports {start:.2f} s",
+            )
+            for kind, command in zip(files, commands, strict=True)
         ]
+    snapshot = estimate([recorded], Settings(methods=("all",)))
+    (stored,) = least_work(lambda: store_results(recorded, snapshot), repeats=repeats)
     return [
         *rows,
         Row(
-            "csd loop in memory against the whole command, imported, rectangular, no overlap",
-            rectangular_loop.wall / rectangular.wall,
+            f"{what} recorded, one clock: with diagnosis, against the bare FFTs",
+            with_diagnosis / ffts,
             "×",
-            at_least=5.0,
-            note=f"{rectangular.wall:.2f} s; work {rectangular_loop.work / rectangular.work:.1f} ×,"
-            f" {rectangular.work:.2f} s",
+            note=f"{with_diagnosis:.2f} s",
         ),
         Row(
-            "3 h × 9 × 200 Hz recorded, one clock: with diagnosis, against the bare FFTs",
-            with_diagnosis.wall / ffts.wall,
+            f"{what}, three clocks refined, against the bare FFTs",
+            from_free / ffts,
             "×",
-            note=f"{with_diagnosis.wall:.2f} s; work {with_diagnosis.work / ffts.work:.1f} ×",
+            at_most=10.0,
+            note=f"{from_free:.2f} s",
         ),
         Row(
-            "3 h × 9 × 200 Hz, three clocks refined, against the bare FFTs",
-            from_free.wall / ffts.wall,
-            "×",
-            note=f"{from_free.wall:.2f} s, two passes with resampling",
-        ),
-        Row(
-            "3 h × 9 × 200 Hz: results of all methods into the recording, against its estimate",
-            stored.wall / of_recorded_noise.wall,
+            f"{what}: results of all methods into the recording, against its estimate",
+            stored / of_recorded_noise,
             "×",
             at_most=0.5,
-            note=f"{stored.wall:.2f} s",
+            note=f"{stored:.2f} s",
         ),
-        Row("memory of an estimate, 3 h", _memory(recorded), "MB", at_most=250.0),
-        Row("memory of an estimate, three clocks, 3 h", _memory(free), "MB", at_most=250.0),
+        Row(f"memory of an estimate, {hours:g} h", _memory(recorded), "MB", at_most=250.0),
+        Row(
+            f"memory of an estimate, three clocks, {hours:g} h",
+            _memory(free),
+            "MB",
+            at_most=250.0,
+        ),
     ]
 
 
-def _a_day(folder: Path) -> list[Row]:
-    samples = sensor_samples(SLOW_HOURS, rate=SLOW_RATE)
+def _a_day(folder: Path, hours: float, repeats: int) -> list[Row]:
+    samples = sensor_samples(hours, rate=SLOW_RATE)
     recorded = recorded_file(folder / "day.h5", samples, rate=SLOW_RATE)
     imported = recorded_file(
         folder / "day-imported.h5", samples, rate=SLOW_RATE, chunk_rows=BLOCK_ROWS
     )
     channels = np.ascontiguousarray(samples.T.astype(float))
-    spectra, of_recorded, of_imported = _least(
+    _mlab(channels[:, :SLOW_LENGTH])  # imports it
+    spectra, of_recorded, of_imported = least_work(
         lambda: _mlab(channels),
         lambda: _command(recorded, "--method", "three-channel"),
         lambda: _command(imported, "--method", "three-channel"),
-        repeats=2,
+        repeats=repeats,
     )
     rows = [
         Row(
-            f"24 h × 9 × 40 Hz {kind}: the whole command against mlab.csd, 18 spectra in memory",
-            command.wall / spectra.wall,
+            f"{hours:g} h × 9 × {SLOW_RATE} Hz {kind}: the whole command"
+            " against mlab.csd, 18 spectra in memory",
+            command / spectra,
             "×",
             at_most=0.6,
-            note=f"{command.wall:.2f} s; work {command.work / spectra.work:.2f} ×,"
-            f" {command.work:.2f} s, of which inflating alone {_inflating(path).work:.2f} s",
+            note=f"{command:.2f} s, of which inflating alone {_inflating(path):.2f} s",
         )
         for kind, path, command in (
             ("recorded", recorded, of_recorded),
             ("imported", imported, of_imported),
         )
     ]
-    return [*rows, Row("memory of an estimate, 24 h", _memory(recorded), "MB", at_most=250.0)]
-
-
-def _least(*actions: Callable[[], object], repeats: int = REPEATS) -> list[Cost]:
-    """Return the least cost of each action, taken in turns, its processes included."""
-    costs: list[list[Cost]] = [[] for _ in actions]
-    for _ in range(repeats):
-        for found, action in zip(costs, actions, strict=True):
-            begin = time.perf_counter(), _work()
-            action()
-            found.append(Cost(time.perf_counter() - begin[0], _work() - begin[1]))
-    return [Cost(min(c.wall for c in each), min(c.work for c in each)) for each in costs]
-
-
-def _work() -> float:
-    of_processes = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return time.process_time() + of_processes.ru_utime + of_processes.ru_stime
+    memory = _memory(recorded)
+    return [*rows, Row(f"memory of an estimate, {hours:g} h", memory, "MB", at_most=250.0)]
 
 
 def sensor_samples(
@@ -262,6 +243,21 @@ def recorded_file(
     return path
 
 
+def imported_file(path: Path, samples: np.ndarray) -> Path:
+    """Import the samples from a `.npz`, which states when its first sample was taken."""
+    arrays = path.with_suffix(".npz")
+    np.savez(
+        arrays,
+        sampling_rate=RATE,
+        start_time="2026-09-21T14:13:20",
+        a=samples[:, :3],
+        b=samples[:, 3:6],
+        c=samples[:, 6:],
+    )
+    _run("-m", "tui", "import", str(arrays), "--out", str(path))
+    return path
+
+
 def _noise(path: Path, settings: Settings) -> None:
     """Estimate the noise and nothing else."""
     with Estimation([path], settings) as estimation:
@@ -269,7 +265,7 @@ def _noise(path: Path, settings: Settings) -> None:
         estimation.snapshot()
 
 
-def _inflating(path: Path) -> Cost:
+def _inflating(path: Path) -> float:
     """Return what inflating takes for all samples of a recording, one stream after the other."""
     streams = []
     with h5py.File(path, "r") as file:
@@ -282,7 +278,7 @@ def _inflating(path: Path) -> Cost:
         for stream in streams:
             isal_zlib.decompress(stream)
 
-    return _least(inflate, repeats=2)[0]
+    return least_work(inflate, repeats=2)[0]
 
 
 def _command(path: Path, *options: str) -> None:
@@ -291,8 +287,9 @@ def _command(path: Path, *options: str) -> None:
 
 
 def _run(*arguments: str) -> str:
+    kept = {key: text for key, text in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     return subprocess.run(
-        [sys.executable, *arguments], check=True, capture_output=True, text=True
+        [sys.executable, *arguments], check=True, capture_output=True, text=True, env=kept
     ).stdout
 
 

@@ -30,7 +30,7 @@ PATIENCE = 1800.0
 """Seconds."""
 
 
-def play(path: Path) -> None:
+def play(path: Path, hours: float, played_in: float) -> None:
     """Write the recording: one motion, and three sensors with clocks of their own."""
     rng = np.random.default_rng(0)
     axes = tuple(Channel(name=axis, sensitivity=1e5) for axis in "xyz")
@@ -40,7 +40,7 @@ def play(path: Path) -> None:
     counts = {sensor: (1e5 * samples).astype(np.int32) for sensor, samples in felt.items()}
     start = HostTime(10**12, 1_790_000_000 * 10**9)
     writer = RecordingWriter.create(path, sensors=layouts, created=start)
-    began, n_samples = time.monotonic(), HOURS * 3600 * RATE
+    began, n_samples = time.monotonic(), round(hours * 3600) * RATE
     for first in range(0, n_samples, BLOCK):
         for sensor, all_counts in counts.items():
             ns = round(((first + BLOCK) / RATE + rng.exponential(1e-3)) * 1e9)
@@ -51,15 +51,18 @@ def play(path: Path) -> None:
             writer.append(Block(sensor, first, part, at, flags=flags))
         if (first + BLOCK) % COMMITTED == 0:
             writer.commit()
-            time.sleep(max(0.0, began + PLAYED_IN * first / n_samples - time.monotonic()))
+            time.sleep(max(0.0, began + played_in * first / n_samples - time.monotonic()))
     writer.close()
 
 
-def run() -> list[Row]:
+def run(*, smallest: bool = False) -> list[Row]:
     """Return the peaks of the command and the application, from the first minute to the result."""
+    hours, played_in = (0.2, 10.0) if smallest else (HOURS, PLAYED_IN)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "day.h5"
-        with subprocess.Popen(python_command("benchmarks.following", str(path))):
+        with subprocess.Popen(
+            python_command("benchmarks.following", str(path), str(hours), str(played_in))
+        ):
             while not path.exists():
                 time.sleep(LOOK)
             terminal = Terminal(path, WIDE, None)
@@ -67,7 +70,7 @@ def run() -> list[Row]:
             terminal.wait_for("neither passed nor failed", timeout=PATIENCE)
             peaks["tui"] = _peak(terminal.process.pid)
             terminal.close()
-    day = f"{HOURS} h × 9 × {RATE} Hz"
+    day = f"{hours:g} h × 9 × {RATE} Hz"
     return [
         Row(f"huddle {command} of {day}: memory", peak, "MB", at_most=250.0, note="peak")
         for command, peak in peaks.items()
@@ -91,4 +94,4 @@ def _peak(pid: int) -> float:
 
 
 if __name__ == "__main__":
-    play(Path(sys.argv[1]))
+    play(Path(sys.argv[1]), *map(float, sys.argv[2:]))

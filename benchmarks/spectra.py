@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from functools import partial
 
 import numpy as np
 import scipy.fft
 from scipy import signal
 
-from benchmarks.row import Row, fastest, least_work
+from benchmarks.row import Row, least_work
 from estimator.diagnostics.shared_noise import shared_noise
 from estimator.likelihood.dimension import bands
 from estimator.likelihood.factor_analysis import maximise
@@ -19,6 +20,7 @@ from estimator.spectra.equaliser import design
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 
 RATE, LENGTH, HOURS = 200, 2000, 3
+REPEATS = 7
 TRIAXIAL = (3, 3, 3)
 
 # The peak of the program itself: getrusage would count its parent before the exec.
@@ -33,16 +35,24 @@ settings = WelchSettings(200.0, 2000)
 chunk = np.random.default_rng(0).standard_normal((120_000, 9))
 starts = np.arange(0, len(chunk) - 1999, settings.hop)
 spectra = CrossSpectra(settings, 9)
-for _ in range(6 * int(sys.argv[1])):
+for _ in range(round(6 * float(sys.argv[1]))):
     spectra.add(chunk, starts)
 self_noise("three-sensor", spectra.csm(), dims=(3, 3, 3), n_effective=spectra.n_effective)
 print(peak_memory())
 """
 
 
-def run() -> list[Row]:
+def run(*, smallest: bool = False) -> list[Row]:
     """Measure every row of the design's table that is the estimator's alone."""
-    return [*_speed(), *_beside(), *_memory(), *_live()]
+    n_samples = round((0.05 if smallest else HOURS) * 3600 * RATE)
+    few, many = (0.1, 0.2) if smallest else (4.0, 24.0)
+    repeats = 1 if smallest else REPEATS
+    return [
+        *_speed(n_samples, repeats),
+        *_beside(n_samples, repeats),
+        *_memory(few, many),
+        *_live(repeats),
+    ]
 
 
 def _records(n_sensors: int, n_samples: int, snr: float = 1e4) -> np.ndarray:
@@ -53,8 +63,9 @@ def _records(n_sensors: int, n_samples: int, snr: float = 1e4) -> np.ndarray:
     return np.concatenate(turned, axis=1) + 0.01 * rng.standard_normal((n_samples, 3 * n_sensors))
 
 
-def _speed() -> list[Row]:
-    samples = _records(3, HOURS * 3600 * RATE)
+def _speed(n_samples: int, repeats: int) -> list[Row]:
+    samples = _records(3, n_samples)
+    span = f"{n_samples / RATE / 3600:g} h"
     rows = []
     for name, settings in (
         ("Hann, 50 % overlap", WelchSettings(RATE, LENGTH)),
@@ -90,27 +101,29 @@ def _speed() -> list[Row]:
                     LENGTH - settings.hop,
                 )
 
-        ours, bare_time = fastest(estimate, bare, repeats=7)
-        (pairs,) = fastest(one_row_of_pairs, repeats=1)
-        work = least_work(estimate) / least_work(bare)
-        title = f"9×9 matrix and three-sensor estimate, 3 h at 200 Hz, {name}"
+        ours, bare_time = least_work(estimate, bare, repeats=repeats)
+        (pairs,) = least_work(one_row_of_pairs, repeats=1)
+        title = f"9×9 matrix and three-sensor estimate, {span} at 200 Hz, {name}"
         rows += [
-            Row(title, ours / bare_time, "× bare rfft", at_most=1.2, note="two threads"),
-            Row(title, work, "× bare rfft", note="processor time of both threads"),
+            Row(title, ours / bare_time, "× bare rfft", at_most=1.2),
             Row(title, 9 * pairs / ours, "× faster than the csd loop", at_least=50),
         ]
     csm = result["spectra"].csm()
-    three, likelihood = (
-        least_work(lambda m=method: self_noise(m, csm, dims=TRIAXIAL, n_effective=1080.0))  # type: ignore[misc]  # mypy cannot infer a lambda's default
-        for method in ("three-sensor", "maximum-likelihood")
+    three, likelihood = least_work(
+        *(
+            partial(self_noise, method, csm, dims=TRIAXIAL, n_effective=1080.0)
+            for method in ("three-sensor", "maximum-likelihood")
+        ),
+        repeats=repeats,
     )
     title = "maximum likelihood, 1001 frequencies × 9 channels"
     return [*rows, Row(title, likelihood / three, "× three-sensor", at_most=10)]
 
 
-def _beside() -> list[Row]:
+def _beside(n_samples: int, repeats: int) -> list[Row]:
     """Measure equalisation and score tests against one three-sensor estimate: processor time."""
-    samples = _records(3, HOURS * 3600 * RATE)
+    samples = _records(3, n_samples)
+    span = f"{n_samples / RATE / 3600:g} h"
     settings = WelchSettings(RATE, LENGTH)
     starts = np.arange(0, len(samples) - LENGTH + 1, settings.hop)
     grid = settings.frequencies
@@ -129,7 +142,7 @@ def _beside() -> list[Row]:
         for first in range(0, len(samples) - step, step):
             filters.apply(samples[first : first + step + 2 * filters.reach])
 
-    one = least_work(estimate)
+    (one,) = least_work(estimate, repeats=repeats)
     csm, n = result["spectra"].csm()[1:-1], result["spectra"].n_effective
     maximum = maximise(csm, 3)
     number = bands(grid[1:-1])
@@ -138,10 +151,10 @@ def _beside() -> list[Row]:
     def score() -> None:
         shared_noise(maximum, separate, dims=TRIAXIAL, n_effective=n, neighbours=HANN_HALF)
 
-    filtering, scoring = least_work(equalise), least_work(score)
+    filtering, scoring = least_work(equalise, score, repeats=repeats)
     return [
         Row(
-            "equalisation of one sensor and score tests, 3 h × 9 × 200 Hz",
+            f"equalisation of one sensor and score tests, {span} × 9 × 200 Hz",
             (filtering + scoring) / one,
             "× three-sensor estimate",
             at_most=1.0,
@@ -150,19 +163,24 @@ def _beside() -> list[Row]:
     ]
 
 
-def _memory() -> list[Row]:
+def _memory(few: float, many: float) -> list[Row]:
     peaks = [
         float(subprocess.check_output([sys.executable, "-c", STREAM, str(hours)]))
-        for hours in (4, 24)
+        for hours in (few, many)
     ]
     return [
-        Row("memory of an estimate of 24 h × 9 × 200 Hz, streamed", peaks[1], "MB", at_most=250),
+        Row(
+            f"memory of an estimate of {many:g} h × 9 × 200 Hz, streamed",
+            peaks[1],
+            "MB",
+            at_most=250,
+        ),
         # the peak depends on whether both threads' buffers stand at the same time
-        Row("the same, over that of 4 h", peaks[1] / peaks[0], "×", at_most=1.5),
+        Row(f"the same, over that of {few:g} h", peaks[1] / peaks[0], "×", at_most=1.5),
     ]
 
 
-def _live() -> list[Row]:
+def _live(repeats: int) -> list[Row]:
     settings = WelchSettings(RATE, LENGTH)
     rows = []
     for method, snr, share in (
@@ -182,7 +200,7 @@ def _live() -> list[Row]:
             spectra.add(samples[-LENGTH:], np.array([0]))
             self_noise(method, spectra.csm(), dims=(3,) * 5, n_effective=spectra.n_effective)
 
-        seconds = least_work(update)
+        (seconds,) = least_work(update, repeats=repeats)
         rows.append(
             Row(
                 f"live update, five triaxial sensors, SNR {snr:g}, {method}",

@@ -1,0 +1,55 @@
+"""Every benchmark runs in its smallest form, and a failed one does not keep the others from it."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import pkgutil
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+
+import benchmarks
+from benchmarks.__main__ import main, table
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from benchmarks.row import Row
+
+OF_PROCESSES = {"application", "command_start", "estimate_file", "following", "recorder"}
+"""Benchmarks that run whole processes: they take long."""
+NAMES = sorted({module.name for module in pkgutil.iter_modules(benchmarks.__path__)})
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.long if name in OF_PROCESSES else ())
+        for name in NAMES
+        if name not in {"__main__", "row"}
+    ],
+)
+def test_each_runs_in_its_smallest_form(name: str) -> None:
+    rows: list[Row] = importlib.import_module(f"benchmarks.{name}").run(smallest=True)
+    assert rows
+    assert all(math.isfinite(row.measured) for row in rows)
+    assert all(row.what in table(rows) for row in rows)
+
+
+def test_one_that_fails_does_not_keep_others_from_running(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "fails.py").write_text("def run():\n    raise NameError('packets')\n")
+    runs = "from benchmarks.row import Row\ndef run():\n    return [Row('speed', 2.0, 'x')]\n"
+    (tmp_path / "runs.py").write_text(runs)
+    monkeypatch.setattr(benchmarks, "__path__", [*benchmarks.__path__, str(tmp_path)])
+    try:
+        assert main(["fails", "runs"]) == 1
+    finally:
+        for name in ("fails", "runs"):
+            sys.modules.pop(f"benchmarks.{name}", None)
+    shown = capsys.readouterr().out
+    assert "NameError: packets" in shown
+    assert "speed" in shown
