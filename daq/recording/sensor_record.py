@@ -208,7 +208,7 @@ class SensorRecord:
                 " committed"
             )
         try:
-            return rows.read(first_row, last_row)
+            return rows.read(first_row, last_row, self.n_samples)
         except (OSError, RuntimeError) as error:
             raise RecordingError(
                 f"{self._samples.file.filename}: sensor {self.name!r} is damaged between rows"

@@ -10,6 +10,7 @@ Fletcher-32 that HDF5 appends, over the compressed bytes, adds nothing and is no
 
 from __future__ import annotations
 
+import threading
 from typing import TYPE_CHECKING, Any
 
 import h5py
@@ -23,7 +24,7 @@ except ModuleNotFoundError:  # the extra "fast" is not installed
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_KEPT_BYTES = 1 << 20  # cache of the last read: short recordings are read several times
+_KEPT_BYTES = 1 << 20  # of the last read: short recordings are read several times
 _PIPELINE = (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32)
 
 
@@ -44,30 +45,51 @@ class ChunkedRows:
         self._n_bytes = int(np.prod(dataset.chunks)) * self._dtype.itemsize
         created = dataset.id.get_create_plist()
         filters = tuple(created.get_filter(n)[0] for n in range(created.get_nfilters()))
-        self._last: tuple[int, NDArray[Any]] = (0, np.empty((0, *columns), self._dtype))
+        self._kept: tuple[int, NDArray[Any]] = (0, np.empty((0, *columns), self._dtype))
+        self._lock = threading.Lock()
         self._direct = filters == _PIPELINE and tuple(columns) == dataset.shape[1:]
 
-    def read(self, first_row: int, last_row: int) -> NDArray[Any]:
+    def read(self, first_row: int, last_row: int, n_rows: int) -> NDArray[Any]:
         """Return rows, ``last_row`` not included.
+
+        Whoever reads forwards has each chunk decompressed once: rows of the last read, and of the
+        chunk in which it ended, are kept. Threads that read neighbouring rows wait for each other.
+
+        Parameters
+        ----------
+        first_row, last_row : int
+        n_rows : int
+            Rows of the dataset that do not change any more.
 
         Raises
         ------
         OSError, RuntimeError
             If the file is damaged at these rows.
         """
-        # For parts of a chunk HDF5 is used, which caches the chunk.
-        if self._direct and last_row - first_row >= self._length:
-            kept_from, kept = self._last
-            if kept_from <= first_row and last_row <= kept_from + len(kept):
-                return kept[first_row - kept_from : last_row - kept_from]
-            rows = self._decompressed(first_row, last_row)
-            if rows is not None:
-                return rows
+        if self._direct:
+            with self._lock:
+                begin, kept = self._kept
+                if begin <= first_row and last_row <= begin + len(kept):
+                    return kept[first_row - begin : last_row - begin]
+                whole = (begin + len(kept)) // self._length * self._length - begin
+                known, low = kept[:0], first_row // self._length * self._length
+                if 0 <= first_row - begin < whole:
+                    known, low = kept[first_row - begin : whole], first_row
+                # For parts of a chunk HDF5 is used, which caches the chunk.
+                if len(known) or last_row - first_row >= self._length:
+                    rows = self._decompressed(known, low, last_row, n_rows)
+                    if rows is not None:
+                        return rows[first_row - low : last_row - low]
         return np.asarray(self._dataset[first_row:last_row])
 
-    def _decompressed(self, first_row: int, last_row: int) -> NDArray[Any] | None:
-        """Return rows, or None if HDF5 must read them."""
-        start = first_row // self._length * self._length
+    def _decompressed(
+        self, known: NDArray[Any], low: int, last_row: int, n_rows: int
+    ) -> NDArray[Any] | None:
+        """Return rows from ``low`` on, the first of which are known; None if HDF5 must read them.
+
+        The rows after the known ones begin a chunk.
+        """
+        start = low + len(known)
         fetch, corner, n_bytes = self._dataset.id.read_direct_chunk, self._corner, self._n_bytes
         try:
             stored = [fetch((row, *corner)) for row in range(start, last_row, self._length)]
@@ -79,13 +101,17 @@ class ChunkedRows:
             return None
         if any(len(chunk) != n_bytes for chunk in chunks):
             return None
-        shuffled = np.frombuffer(b"".join(chunks), np.uint8)
-        shuffled = shuffled.reshape(len(chunks), self._dtype.itemsize, -1)
-        whole = np.empty((len(chunks), shuffled.shape[2], self._dtype.itemsize), np.uint8)
-        for place in range(self._dtype.itemsize):
+        size = self._dtype.itemsize
+        shuffled = np.frombuffer(b"".join(chunks), np.uint8).reshape(len(chunks), size, -1)
+        rows = np.empty((len(known) + len(chunks) * self._length, *known.shape[1:]), self._dtype)
+        rows[: len(known)] = known
+        whole = rows[len(known) :].view(np.uint8).reshape(len(chunks), -1, size)
+        for place in range(size):
             whole[:, :, place] = shuffled[:, place]
-        rows = whole.view(self._dtype).reshape(-1, *self._dataset.shape[1:])[: last_row - start]
+        rows = rows[: n_rows - low]
         rows.flags.writeable = False
-        if rows.nbytes <= _KEPT_BYTES:
-            self._last = start, rows
-        return rows[first_row - start :]
+        # The next read begins in a chunk that is not in these rows, or in the rows that are kept.
+        excess = rows.nbytes - _KEPT_BYTES
+        dropped = -(-excess // (rows.nbytes // len(rows))) if excess > 0 else 0
+        self._kept = low + dropped, rows[dropped:].copy() if dropped else rows
+        return rows

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import zlib
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
 import pytest
 
+from daq.recording.chunks import chunk_reader
 from daq.recording.chunks.chunk_reader import ChunkedRows
 
 if TYPE_CHECKING:
@@ -52,7 +55,7 @@ def test_rows_equal_those_read_by_hdf5(tmp_path: Path, dtype: str, n_columns: in
     with h5py.File(tmp_path / "f.h5", "r") as file:
         reader = ChunkedRows(file["rows"])
         for first, last in [(0, 257), (0, 80), (9, 91), (10, 250), (173, 257), (256, 257), (5, 5)]:
-            found = reader.read(first, last)
+            found = reader.read(first, last, N_ROWS)
             assert found.dtype == rows.dtype
             np.testing.assert_array_equal(found, rows[first:last])
 
@@ -65,7 +68,7 @@ def test_datasets_with_other_filters_are_read(tmp_path: Path, options: dict[str,
         options = {}
     write(tmp_path / "f.h5", rows, **options)
     with h5py.File(tmp_path / "f.h5", "r") as file:
-        np.testing.assert_array_equal(ChunkedRows(file["rows"]).read(3, 250), rows[3:250])
+        np.testing.assert_array_equal(ChunkedRows(file["rows"]).read(3, 250, N_ROWS), rows[3:250])
 
 
 def test_a_damaged_byte_is_always_detected(tmp_path: Path) -> None:
@@ -82,7 +85,7 @@ def test_a_damaged_byte_is_always_detected(tmp_path: Path) -> None:
         path.write_bytes(damaged)
         with h5py.File(path, "r") as file:
             try:
-                found = ChunkedRows(file["rows"]).read(0, N_ROWS)
+                found = ChunkedRows(file["rows"]).read(0, N_ROWS, N_ROWS)
             except OSError:
                 refused += 1
             else:
@@ -96,12 +99,72 @@ def test_repeated_reads_use_a_bounded_cache(tmp_path: Path) -> None:
     write(tmp_path / "f.h5", rows[:135])  # ends within a chunk, and grows
     with h5py.File(tmp_path / "f.h5", "r+") as file:
         reader = ChunkedRows(file["rows"])
-        first = reader.read(12, 135)
-        again = reader.read(20, 130)
+        first = reader.read(12, 135, 135)
+        again = reader.read(20, 130, 135)
         assert np.shares_memory(first, again)
         np.testing.assert_array_equal(again, rows[20:130])
         assert not again.flags.writeable
         file["rows"].resize((N_ROWS, 3))
         file["rows"][135:] = rows[135:]
-        np.testing.assert_array_equal(reader.read(20, 139), rows[20:139])
-        np.testing.assert_array_equal(reader.read(0, N_ROWS), rows)
+        np.testing.assert_array_equal(reader.read(20, 139, N_ROWS), rows[20:139])
+        np.testing.assert_array_equal(reader.read(0, N_ROWS, N_ROWS), rows)
+
+
+def count_of_inflated(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
+    """Return a list to which every chunk is added when it is inflated."""
+    found: list[bytes] = []
+    library: Any = chunk_reader.__dict__["inflater"]
+
+    def decompress(content: bytes, bits: int, n_bytes: int) -> bytes:
+        found.append(content)
+        inflated: bytes = library.decompress(content, bits, n_bytes)
+        return inflated
+
+    counted = SimpleNamespace(
+        decompress=decompress, MAX_WBITS=library.MAX_WBITS, error=library.error
+    )
+    monkeypatch.setattr(chunk_reader, "inflater", counted)
+    return found
+
+
+@pytest.mark.parametrize("kept_bytes", [1 << 20, 1 << 10])
+@pytest.mark.parametrize(("length", "overlap"), [(90, 0), (90, 7), (90, 50), (41, 20)])
+def test_overlapping_reads_inflate_each_chunk_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, length: int, overlap: int, kept_bytes: int
+) -> None:
+    rows = ramp("<i4", 3)
+    write(tmp_path / "f.h5", rows)
+    inflated = count_of_inflated(monkeypatch)
+    monkeypatch.setattr(chunk_reader, "_KEPT_BYTES", kept_bytes)
+    with h5py.File(tmp_path / "f.h5", "r") as file:
+        reader = ChunkedRows(file["rows"])
+        for first in range(0, N_ROWS - overlap, length - overlap):
+            last = min(first + length, N_ROWS)
+            np.testing.assert_array_equal(reader.read(first, last, N_ROWS), rows[first:last])
+    assert len(inflated) == -(-N_ROWS // LENGTH)
+
+
+def test_threads_that_read_neighbours_inflate_each_chunk_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = ramp("<i4", 3)
+    write(tmp_path / "f.h5", rows)
+    inflated = count_of_inflated(monkeypatch)
+    with h5py.File(tmp_path / "f.h5", "r") as file, ThreadPoolExecutor(2) as pool:
+        reader = ChunkedRows(file["rows"])
+        reader.read(0, 60, N_ROWS)
+        two = [pool.submit(reader.read, 50, 130, N_ROWS) for _ in range(2)]
+        for each in two:
+            np.testing.assert_array_equal(each.result(), rows[50:130])
+    assert len(inflated) == -(-130 // LENGTH)
+
+
+@pytest.mark.parametrize("later", [136, 180, 250])
+def test_rows_after_those_that_are_final_are_read_again(tmp_path: Path, later: int) -> None:
+    rows = ramp("<i4", 3)
+    write(tmp_path / "f.h5", np.concatenate([rows[:135], -rows[135:]]))
+    with h5py.File(tmp_path / "f.h5", "r+") as file:
+        reader = ChunkedRows(file["rows"])
+        reader.read(0, 130, 135)  # rows of its last chunk are still to be written
+        file["rows"][135:] = rows[135:]
+        np.testing.assert_array_equal(reader.read(120, later, N_ROWS), rows[120:later])
