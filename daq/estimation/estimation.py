@@ -243,11 +243,8 @@ class Estimation:
             each.aligned.refresh()
             if each.n_seen and not each.aligned.is_exact:
                 self._passes[number] = self._pass(each.recording)
-            self._passes[number].doubt_stated_times()
-        is_exact = all(each.aligned.is_exact for each in self._passes)
-        if not (is_exact and self._equalisation.is_settled):
-            self._equalisation.reset()
-        self._filter()
+            if not self._passes[number].shows_drifts:
+                self._passes[number].doubt_stated_times()
         check_span(self._passes, self.settings)
         total = sum(each.n_complete for each in self._passes)
         done = self.n_seen
@@ -262,6 +259,29 @@ class Estimation:
             nonlocal total
             total += n
 
+        self._take_all(count, repeat)
+        doubted = [each for each in self._passes if each.shows_drifts]
+        if any([each.doubt_stated_times() for each in doubted]):  # noqa: C419 - of all of them
+            repeat(done - self.n_seen)
+            self._equalisation.reset()
+            self._take_all(count, repeat)
+        snapshot = self._snapshots.build(self._recordings, self._passes, final=True)
+        if not any(np.isfinite(each.noise_psd).any() for each in snapshot.results.values()):
+            why = why_nothing(
+                self._recordings, self._passes, snapshot, segment=self.settings.segment
+            )
+            raise NoResultError(why, snapshot)
+        return snapshot
+
+    def _take_all(self, count: Callable[[int], None], repeat: Callable[[int], None]) -> None:
+        """Take every segment, by the clocks and the filters that follow from all of them.
+
+        `count` and `repeat` are those of `Pass.finish`.
+        """
+        is_exact = all(each.aligned.is_exact for each in self._passes)
+        if not (is_exact and self._equalisation.is_settled):
+            self._equalisation.reset()
+        self._filter()
         is_long = all(each.n_complete >= FILTER_SEGMENTS + PROOF_SEGMENTS for each in self._passes)
         if is_exact and is_long and not self._equalisation.is_settled:
             self._find_filters(count)  # before all segments are taken: most are taken once
@@ -275,13 +295,6 @@ class Estimation:
             for each in self._passes:
                 each.advance(count)
                 keep_few([one.single for one in self._passes])
-        snapshot = self._snapshots.build(self._recordings, self._passes, final=True)
-        if not any(np.isfinite(each.noise_psd).any() for each in snapshot.results.values()):
-            why = why_nothing(
-                self._recordings, self._passes, snapshot, segment=self.settings.segment
-            )
-            raise NoResultError(why, snapshot)
-        return snapshot
 
     def _open_continuations(self) -> None:
         for recording in tuple(self._recordings):

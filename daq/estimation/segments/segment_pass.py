@@ -18,7 +18,7 @@ from daq.estimation.segments.flatline import FlatlineDetector, stands_still
 from daq.estimation.segments.gap_bridge import GapBridge
 from daq.estimation.segments.newest_samples import NewestSamples
 from daq.estimation.segments.read_ahead import read_ahead
-from daq.estimation.segments.stated_times import compare
+from daq.estimation.segments.stated_times import agree, compare
 from daq.estimation.segments.usable_samples import surrounded, whole_segments
 from estimator.spectra.multiresolution import MultiResolution
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
@@ -357,8 +357,19 @@ class Pass:
         if self._delays.has_begun:
             self.aligned.set_clocks()
 
+    @property
+    def shows_drifts(self) -> bool:
+        """Whether the segments, once taken, can show that no stated UTC drifts."""
+        return self.single is not None
+
     def doubt_stated_times(self) -> bool:
         """Return whether stated UTC was found to drift only now; then all begins again."""
+        sensors = self.aligned.stated
+        if len(sensors) > 1 and self.single is not None and self._settings.clocks == "refined":
+            n_effective = self._all.n_effective if len(self.single) else 0.0
+            if agree(self.aligned, self.single, self.kept_at, self.welch, n_effective=n_effective):
+                self.aligned.compare_stated(dict.fromkeys(sensors, 0.0), sensors[0])
+                return False
         drift = compare(self.aligned, self._settings, self.welch)
         if drift:
             self.restart()

@@ -8,6 +8,12 @@ measured, not predicted: waves that cross the bench in changing directions add t
 Where the motion is weak, some delays are those of false peaks: up to 32 samples away, with small
 predicted deviations. Delays far from the others of their part are left out, and so are parts with
 one or two. Where many are false, nothing can be said.
+
+Reading these pieces costs more than the estimate of an imported file. The spectra of single
+segments that a pass keeps show in most recordings that nothing drifts (`agree`): one prediction for
+the whole recording must hold in each of its parts, but for the delay that its noise explains. Only
+where that cannot be said are pieces read. A drift that these spectra miss is less than twice their
+error; with it, the noise is high by less than one part in the number of bins.
 """
 
 from __future__ import annotations
@@ -28,10 +34,12 @@ if TYPE_CHECKING:
 
     from daq.alignment.aligned_recording import AlignedRecording
     from daq.estimation.settings import Settings
+    from estimator.spectra.segment_spectra import SegmentSpectra
     from estimator.spectra.welch import WelchSettings
 
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
+    ComplexArray = NDArray[np.complex128]
     Delays = tuple[FloatArray, FloatArray, FloatArray]
 
 _PIECES = 40  # lengths of a piece in the recording, at least where it is short
@@ -52,6 +60,9 @@ _BLIND = 4.0  # samples of scatter within parts: most peaks are false. Drifts le
 _SCATTERS = 3.0  # times the predicted scatter: the times of single blocks are wrong
 _GROWTH = 0.5  # of the stretch whose clocks are set, from one setting to the next
 _STEP = 16  # pieces that are measured in between
+_AGREE = 25.0  # χ² of 7 degrees of freedom: 8e-4. More is no news yet: pieces are measured then
+_TURNED = 8.0  # standard deviations of the χ² of all phases: neighbouring frequencies depend
+_COARSE = 0.05  # samples; standard error of a part: above, one phase may be that of two delays
 
 
 def compare(aligned: AlignedRecording, settings: Settings, welch: WelchSettings) -> bool:
@@ -83,6 +94,88 @@ def compare(aligned: AlignedRecording, settings: Settings, welch: WelchSettings)
         return False
     _follow(aligned, welch, most=settings.bridge, longest=longest)
     return True
+
+
+def agree(
+    aligned: AlignedRecording,
+    single: SegmentSpectra,
+    at: IntArray,
+    welch: WelchSettings,
+    *,
+    n_effective: float,
+) -> bool:
+    """Return whether spectra of single segments show that no stated UTC drifts.
+
+    False where they show a drift or cannot tell: weak motion, parts of the recording without
+    segments, or times that are not those of a nominal rate, of which single ones may be wrong.
+
+    Parameters
+    ----------
+    aligned : AlignedRecording
+    single : SegmentSpectra
+    at : int64, shape (n_segments,)
+        Grid samples at which these segments begin.
+    welch : WelchSettings
+    n_effective : float
+        Independent averages in all segments of the pass.
+    """
+    sensors = aligned.stated
+    if any(aligned.clocks[n].ppm or aligned.clocks[n].wander_ppm for n in sensors):
+        return False
+    edges = np.cumsum([0, *aligned.dims])
+    part = np.minimum(at * _PARTS // max(aligned.n_available, 1), _PARTS - 1)
+    n_first = int(edges[sensors[0] + 1] - edges[sensors[0]])
+    if np.bincount(part, minlength=_PARTS).min() < max(_FEWEST, n_first):
+        return False
+    spectra = single.values().astype(np.complex128).transpose(1, 0, 2)
+    omega = 2 * np.pi * single.bins * welch.sampling_rate / welch.segment_length
+    independent = min(1.0, n_effective / len(at))
+    x0, *others = (spectra[:, :, edges[n] : edges[n + 1]] for n in sensors)
+    for xj in others:
+        crossed, energy, spurious = _met(x0, xj, part)
+        info = 2 * independent * (omega**2 @ (energy - spurious))
+        if not (info > (welch.sampling_rate / _COARSE) ** 2).all():
+            return False
+        delays = 2 * independent * (omega @ crossed) / info
+        delays -= info @ delays / info.sum()
+        # A jump by samples turns phases round, and their slope may be that of no delay.
+        turned = 2 * independent * crossed**2 / energy
+        excess = turned.sum() - turned.size
+        if not (info @ delays**2 < _AGREE and excess < _TURNED * math.sqrt(2 * turned.size)):
+            return False
+    return True
+
+
+def _met(
+    x0: ComplexArray, xj: ComplexArray, part: IntArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return how a sensor's prediction in each part meets what was measured.
+
+    Parameters
+    ----------
+    x0, xj : complex128, shape (n_freqs, n_segments, n_channels)
+        Spectra of the reference and of the sensor.
+    part : int64, shape (n_segments,)
+
+    Returns
+    -------
+    crossed, energy : float64, shape (n_freqs, n_parts)
+        Imaginary part of the products of the prediction and the spectra, and the power of the
+        prediction, over the power that is not predicted.
+    spurious : float64, shape (n_parts,)
+        Of this power, the mean that noise adds to any prediction.
+    """
+    n = len(part)
+    adjoint = x0.conj().transpose(0, 2, 1)
+    # Least squares of xj on x0: P^T, for spectra in rows.
+    predicted = x0 @ (np.linalg.pinv(adjoint @ x0, hermitian=True) @ (adjoint @ xj))
+    power, left = (np.mean(each.real**2 + each.imag**2, axis=1) for each in (xj, xj - predicted))
+    noise = np.maximum(left, 1e-12 * power)
+    weight = np.where(noise > 0, 1.0, 0.0) / np.where(noise > 0, noise, 1.0)
+    of_part = (part[:, None] == np.arange(_PARTS)).astype(np.float64)
+    crossed = np.einsum("fp,fsp,fsp->fs", weight, xj.conj(), predicted).imag @ of_part
+    energy = np.einsum("fp,fsp,fsp->fs", weight, predicted.conj(), predicted).real @ of_part
+    return crossed, energy, x0.shape[2] * xj.shape[2] / n * of_part.sum(axis=0)
 
 
 def _drifts(

@@ -12,7 +12,7 @@ import pytest
 
 from daq.alignment.stated_utc import take_drift
 from daq.estimation.estimation import Estimation, estimate
-from daq.estimation.segments.stated_times import drift_of
+from daq.estimation.segments.stated_times import compare, drift_of
 from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
 from daq.results.band_summary import channel_means
@@ -25,6 +25,9 @@ from tui.studies.synthesis import synthesise
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from daq.alignment.aligned_recording import AlignedRecording
+    from estimator.spectra.welch import WelchSettings
 
 SETTINGS = Settings(segment=2.0, methods=("three-sensor",))
 RATE, SECONDS, NOISE = 50.0, 480.0, 1e-6  # unit²/Hz
@@ -286,3 +289,66 @@ def test_exact_times_of_sensors_in_weak_motion_do_not_drift(tmp_path: Path, seed
     with Recording.open(path) as recording:
         snapshot = estimate([recording], SETTINGS)
     assert not any(clock.drifts or clock.corrected for clock in snapshot.clocks)
+
+
+def pieces_are_read(
+    path: Path, monkeypatch: pytest.MonkeyPatch, settings: Settings = SETTINGS
+) -> bool:
+    """Return whether an estimate reads pieces of the recording, to measure delays in them."""
+    read: list[bool] = []
+
+    def compared(aligned: AlignedRecording, settings: Settings, welch: WelchSettings) -> bool:
+        read.append(True)
+        return compare(aligned, settings, welch)
+
+    monkeypatch.setattr("daq.estimation.segments.segment_pass.compare", compared)
+    estimate([path], settings)
+    return bool(read)
+
+
+@pytest.mark.parametrize("snr", [10.0, 1e3, 1e5])
+@pytest.mark.parametrize("window", ["hann", "rectangular"])
+def test_times_that_agree_are_not_read_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, snr: float, window: str
+) -> None:
+    path = write(tmp_path / "r.h5", huddle(snr, (0.0, 0.0, 0.0)))
+    settings = replace(SETTINGS, window=window, overlap=0.5 if window == "hann" else 0.0)
+    assert not pieces_are_read(path, monkeypatch, settings)
+
+
+def delayed(counts: np.ndarray, n_samples: float) -> np.ndarray:
+    """Return samples that lag, the last of which are now the first."""
+    spectrum = np.fft.rfft(counts, axis=0)
+    turns = np.arange(len(spectrum)) * n_samples / len(counts)
+    spectrum *= np.exp(-2j * np.pi * turns)[:, None]
+    return np.round(np.fft.irfft(spectrum, len(counts), axis=0)).astype(np.int32)
+
+
+@pytest.mark.parametrize("segment", [2.0, 10.0])
+@pytest.mark.parametrize("n_samples", [0.01, 0.2, 3.0, 17.0])
+def test_steps_of_any_size_are_looked_at_closely(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_samples: float, segment: float
+) -> None:
+    sensors = huddle(1e3, (0.0, 0.0, 0.0))
+    counts = sensors["c"].counts
+    counts[15_000:] = delayed(counts, n_samples)[15_000:]
+    path = write(tmp_path / "r.h5", sensors)
+    assert pieces_are_read(path, monkeypatch, replace(SETTINGS, segment=segment))
+
+
+@pytest.mark.parametrize("ppm", [0.3, 3.0, 60.0, 500.0])
+def test_drifts_of_any_rate_are_looked_at_closely(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ppm: float
+) -> None:
+    path = write(tmp_path / "r.h5", huddle(1e4, (0.0, 0.0, ppm)))
+    assert pieces_are_read(path, monkeypatch)
+
+
+def test_weak_motion_and_parts_without_segments_are_looked_at_closely(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    weak = huddle(0.01, (0.0, 0.0, 0.0))
+    assert pieces_are_read(write(tmp_path / "weak.h5", weak), monkeypatch)
+    gaps = huddle(1e4, (0.0, 0.0, 0.0))
+    gaps["b"].gaps = tuple((first, first + 5) for first in range(6000, 24_000, 60))
+    assert pieces_are_read(write(tmp_path / "gaps.h5", gaps), monkeypatch)
