@@ -202,6 +202,20 @@ def _sensors(
     return sensors
 
 
+def _as_counts(array: NDArray[Any]) -> NDArray[Any]:
+    """Return whole numbers as int32 where they fit; other numbers as they are.
+
+    Scripts store counts as int64 or float64, which take longer to read and more of the disk.
+    """
+    if np.can_cast(array.dtype, np.int32) or array.size == 0:
+        return array
+    limits = np.iinfo(np.int32)
+    if not (limits.min <= array.min() and array.max() <= limits.max):  # nor where one is NaN
+        return array
+    counts = array.astype(np.int32)
+    return counts if np.array_equal(counts, array) else array
+
+
 def _sensor(
     path: Path, name: str, array: NDArray[Any], rate: float, start_utc_ns: int
 ) -> ForeignSensor:
@@ -212,7 +226,7 @@ def _sensor(
             f"{path}: sensor {name!r}: expected numbers of shape (n_samples, n_channels), "
             f"found {array.dtype} of shape {array.shape}"
         )
-    stretches = finite_stretches(array, start_utc_ns=start_utc_ns, sampling_rate=rate)
+    stretches = finite_stretches(_as_counts(array), start_utc_ns=start_utc_ns, sampling_rate=rate)
     if not stretches:
         raise ImportFormatError(f"{path}: sensor {name!r} holds no samples")
     channels = tuple(str(number) for number in range(1, array.shape[1] + 1))

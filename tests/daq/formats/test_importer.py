@@ -72,6 +72,33 @@ def test_samples_times_and_bench_survive(tmp_path: Path) -> None:
         np.testing.assert_array_equal(samples[:, :2], arrays["A"] / [2.0, 4.0])
 
 
+@pytest.mark.parametrize(
+    ("given", "odd_one", "stored"),
+    [
+        ("<i2", 7, "<i2"),
+        ("<i8", -(2**31), "<i4"),
+        ("<i8", 2**31, "<i8"),
+        ("<u4", 2**31 - 1, "<i4"),
+        ("<u4", 2**31, "<u4"),
+        ("<f4", 2**24, "<i4"),
+        ("<f8", 2**31 - 1, "<i4"),
+        ("<f8", -(2**31) - 1, "<f8"),
+        ("<f8", 0.5, "<f8"),
+    ],
+)
+def test_whole_numbers_are_stored_as_int32_where_they_fit(
+    tmp_path: Path, given: str, odd_one: float, stored: str
+) -> None:
+    counts = np.arange(140_000).reshape(-1, 2).astype(given)
+    counts[69_000, 1] = odd_one
+    np.savez(tmp_path / "a.npz", sampling_rate=50.0, A=counts)
+    import_files([tmp_path / "a.npz"], tmp_path / "a.h5")
+    with Recording.open(tmp_path / "a.h5") as recording:
+        sensor = recording.sensor("A")
+        assert sensor.dtype == np.dtype(stored)
+        np.testing.assert_array_equal(sensor.counts(), counts)
+
+
 def test_a_gap_stays_a_gap_of_its_length(tmp_path: Path) -> None:
     rows = [f"{k / 10:.1f},{k},{-k}" for k in range(1000) if not 300 <= k < 317]
     (tmp_path / "a.csv").write_text("time,A.X [m/s],B.X [m/s]\n" + "\n".join(rows) + "\n")
