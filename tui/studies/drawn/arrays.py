@@ -72,6 +72,8 @@ class Scene:
         Corner frequency of the low-pass of sensor B, in Hz.
     lag : int
         Of sensor C, in samples.
+    lean : float
+        By which axes of sensors with one channel are off, rms, in degrees: they feel motion across.
     """
 
     n_sensors: int
@@ -86,6 +88,7 @@ class Scene:
     n_directions: int
     corner: float | None
     lag: int
+    lean: float
 
 
 def draw_scene(rng: np.random.Generator) -> Scene:
@@ -104,6 +107,7 @@ def draw_scene(rng: np.random.Generator) -> Scene:
         n_directions=int(rng.choice([d, d, d, 1])),
         corner=float(rng.uniform(10, 40)) if rng.random() < LOW_PASS else None,
         lag=int(rng.random() < LAGS),
+        lean=float(rng.uniform(0.1, 1.0)) if d == 1 else 0.0,
     )
 
 
@@ -112,14 +116,18 @@ def simulate(scene: Scene, rng: np.random.Generator) -> tuple[dict[str, FloatArr
     n, d = round(scene.seconds * RATE), scene.n_channels
     of_motion, of_noise = scene.colours
 
-    def coloured(colour: float) -> FloatArray:
+    def coloured(colour: float, d: int = d) -> FloatArray:
         white = rng.standard_normal((n + SETTLING, d)) * np.sqrt(1 - colour**2)
         return np.asarray(lfilter([1], [1, -colour], white, axis=0)[SETTLING:])
 
     motion = coloured(of_motion) * np.where(np.arange(d) >= scene.n_directions, 0.1, 1.0)[::-1]
+    across = coloured(of_motion, 2)
     samples, deviations = {}, []
     for name in "ABCDE"[: scene.n_sensors]:
         seen = motion @ _turn(scene, rng) * (1 + scene.gains * rng.standard_normal(d))
+        if scene.lean:
+            lean = np.radians(scene.lean) / np.sqrt(2) * rng.standard_normal(2)
+            seen = seen + (across @ lean)[:, None]
         if name == "B" and scene.corner is not None:
             pole = np.exp(-2 * np.pi * scene.corner / RATE)
             seen = lfilter([1 - pole], [1, -pole], seen, axis=0)
