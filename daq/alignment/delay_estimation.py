@@ -195,9 +195,11 @@ class DelayEstimator:
         `power` is the sum of the products of x0.
         """
         tau, spread = np.zeros(x0.shape[1]), np.full(x0.shape[1], np.inf)
-        for _ in range(_FIRST_ITERATIONS):
+        for number in range(_FIRST_ITERATIONS):
             frame = _Frame.of(x0, self._advanced(xj, tau), power)
-            tau, spread = self._delays(frame, x0, xj)
+            # At first P is a mean over unknown delays, and its peaks are low.
+            is_last = number == _FIRST_ITERATIONS - 1
+            tau, spread = self._delays(frame, x0, xj, doubt_cycles=is_last)
             tau = np.where(np.isfinite(spread), tau, 0.0)
             tau -= tau.mean()
         return tau, spread
@@ -246,9 +248,12 @@ class DelayEstimator:
         return np.asarray(spectra * _turn(self.omega, tau)[:, :, None])
 
     def _delays(
-        self, frame: _Frame, x0: ComplexArray, xj: ComplexArray
+        self, frame: _Frame, x0: ComplexArray, xj: ComplexArray, *, doubt_cycles: bool = True
     ) -> tuple[FloatArray, FloatArray]:
-        """Measure delays in a frame, shapes (n_segments,): the maxima of J."""
+        """Measure delays in a frame, shapes (n_segments,): the maxima of J.
+
+        `doubt_cycles`: whether peaks that are equal but for noise count as equal.
+        """
         omega = self.omega
         response, left = _prediction(frame)
         weight = np.linalg.inv(left)
@@ -267,7 +272,7 @@ class DelayEstimator:
             share = np.maximum(1 - spurious / informative.mean(), 0.0)
             std = np.sqrt(kappa / (2 * informative)) / share
             alike = _ALIKE * np.sqrt(kappa / total) / share
-        alike = np.minimum(np.nan_to_num(alike, nan=1.0), 1.0)
+        alike = np.minimum(np.nan_to_num(alike, nan=1.0), 1.0) * doubt_cycles
         tau, is_one = self._peak(crossed, alike)
         met = (crossed * _turn(omega, tau)).real.sum(axis=0)
         # R is an estimate too: correct by the mean of an inverse Wishart matrix.
