@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from estimator.errors import EstimatorError, UnknownMethodError
+from estimator.levels.bound import unpredicted
 from estimator.levels.pooled import pooled_noise, unresolved_blocks
 from estimator.likelihood.maximum_likelihood import maximum_likelihood
 from estimator.self_noise.coherency import coherency
@@ -25,7 +26,7 @@ __all__ = ["METHODS", "Flag", "Method", "SelfNoise", "self_noise"]
 
 
 SMOOTH = 400.0
-"""Averages on which the course of the power in a block rests."""
+"""Averages on which the course of the noise in a block rests."""
 AT_ZERO = 0.05
 """Share of a block's bins at which the likelihood is largest at zero noise, from which neighbours
 count."""
@@ -131,22 +132,28 @@ def _shared(dims: tuple[int, ...]) -> int:
     return sorted(dims)[-3] if len(dims) > 2 else 0
 
 
-def _smooth(psd: FloatArray, block: IntArray, n_effective: float) -> FloatArray:
-    """Return the scale of every channel: its mean in a block, times the course of all channels.
+def _scale(psd: FloatArray, rest: FloatArray, block: IntArray, n_effective: float) -> FloatArray:
+    """Return the unit of every channel at every bin, shape (n_bins, n_channels).
 
-    The channels of a block keep their ratios, so that directions do not turn. The course rests on
-    `SMOOTH` averages: the scale of a bin's own power would make its noise too high. Of arrays of
-    shape (n_bins, n_channels).
+    The mean of the channel in its block, times the course of the noise in the block, common to all
+    channels: their ratios stay, so that directions do not turn. In units of a bin's own power,
+    noise would vary where motion does, and would be too high with few averages. `rest` is what the
+    other sensors do not predict, of which `SMOOTH` averages are taken together.
     """
     first = np.flatnonzero(np.diff(block, prepend=-1))
     count = np.diff(first, append=len(block))
-    mean = (np.add.reduceat(psd, first) / count[:, None])[block]
-    course = (psd / mean).mean(axis=1)
+
+    def mean(each: FloatArray) -> FloatArray:
+        return np.asarray((np.add.reduceat(each, first) / count[:, None])[block])
+
+    course = (rest / mean(rest)).mean(axis=1)
     half = int(SMOOTH / n_effective / 2)
     begin = np.maximum(np.arange(len(psd)) - half, first[block])
     end = np.minimum(np.arange(len(psd)) + half + 1, (first + count)[block])
     total = np.concatenate([[0.0], np.cumsum(course)])
-    return np.asarray(mean * ((total[end] - total[begin]) / (end - begin))[:, None])
+    smooth = (total[end] - total[begin]) / (end - begin)
+    smooth = np.where(np.isfinite(smooth) & (smooth > 0), smooth, 1.0)
+    return mean(psd) * smooth[:, None]
 
 
 def _with_neighbours(
@@ -182,7 +189,12 @@ def _with_neighbours(
     steps = [np.diff(each[rows], prepend=-1) != 0 for each in (blocks, n_dims)]
     number = np.cumsum(steps[0] | steps[1]) - 1
     psd = given.psd[rows[:, None], columns]
-    scale = _smooth(psd, number, n_effective)
+    rest, _ = unpredicted(
+        given.matrix[rows[:, None, None], columns[:, None], columns],
+        dims=live,
+        n_effective=np.full(len(rows), n_effective),
+    )
+    scale = _scale(psd, rest * psd, number, n_effective)
     amplitude = np.sqrt(psd / scale)
     matrix = given.matrix[rows[:, None, None], columns[:, None], columns]
     matrix = matrix * amplitude[:, :, None] * amplitude[:, None, :]

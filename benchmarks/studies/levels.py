@@ -52,8 +52,8 @@ class Scene:
         Directions in which the motion is 1000 times stronger.
     ripple : float
         By which responses vary over frequency.
-    colour : float
-        Of the motion: coefficient of first-order autoregression.
+    colour, noise_colour : float
+        Of motion and noise: coefficients of first-order autoregression.
     window : str
     overlap : float
     """
@@ -67,6 +67,7 @@ class Scene:
     strong: int = 0
     ripple: float = 0.0
     colour: float = 0.0
+    noise_colour: float = 0.0
     window: str = "rectangular"
     overlap: float = 0.0
 
@@ -83,6 +84,11 @@ SCENES = (
     Scene("one 30 dB quieter, SNR 0.3", 0.3, noise=(1e-3, 1, 1)),
     Scene("one 30 dB quieter, SNR 30", 30.0, noise=(1e-3, 1, 1)),
     Scene("coloured motion, SNR 0.3", 0.3, colour=0.95),
+    Scene("coloured motion, SNR 30", 30.0, colour=0.98, window="hann", overlap=0.5),
+    *(
+        Scene(f"coloured noise, SNR {snr:g}", snr, noise_colour=0.9, window="hann", overlap=0.5)
+        for snr in (0.3, 30)
+    ),
     # Hann: unequal responses leak at the edges of rectangular windows, which is not the subject
     *(
         Scene(
@@ -116,7 +122,17 @@ def samples(scene: Scene, axes: FloatArray, rng: np.random.Generator) -> FloatAr
         late = scene.ripple * rng.choice([-1.0, 1.0]) * rng.uniform(0.5, 1.0)
         seen[:, channel] = lfilter([1.0, late], [1.0], seen[:, channel])
     levels = np.resize(np.asarray(scene.noise, float), scene.n_sensors).repeat(scene.n_channels)
-    return (seen + np.sqrt(levels) * rng.standard_normal((n, p)))[200:]
+    noise: FloatArray = rng.standard_normal((n, p)) * np.sqrt(1 - scene.noise_colour**2)
+    noise = lfilter([1.0], [1.0, -scene.noise_colour], noise, axis=0)
+    return (seen + np.sqrt(levels) * noise)[200:]
+
+
+def true_psd(scene: Scene, frequency: FloatArray) -> FloatArray:
+    """Return the PSD of the noise of each channel, shape (n_freqs, n_channels)."""
+    levels = np.resize(np.asarray(scene.noise, float), scene.n_sensors).repeat(scene.n_channels)
+    a = scene.noise_colour
+    shape = (1 - a**2) / np.abs(1 - a * np.exp(-2j * np.pi * frequency)) ** 2
+    return np.asarray(2 * shape[:, None] * levels)
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +156,8 @@ def study(scene: Scene, n_draws: int, *, seed: int = 17) -> Found:
     correlation = bin_correlation(window, settings.hop)
     n_effective = effective_averages(window, settings.hop, scene.n_segments)
     frequency = settings.frequencies
-    truth = 2 * np.resize(np.asarray(scene.noise, float), scene.n_sensors).repeat(scene.n_channels)
+    psd = true_psd(scene, frequency)
+    truth = np.add.reduceat(psd[: EDGES[-1]], EDGES[:-1]) / np.diff(EDGES)[:, None]
     dims = (scene.n_channels,) * scene.n_sensors
     inner = slice(int(EDGES[0]), int(EDGES[-1]))
     bands, bins, joint, width, passed, failed, quiet = ([] for _ in range(7))
@@ -161,19 +178,20 @@ def study(scene: Scene, n_draws: int, *, seed: int = 17) -> Found:
         found = band_levels(noise.noise_psd, noise.cumulants, EDGES, correlation)
         low, high = found.interval()
         bands.append((low <= truth) & (truth <= high))
-        bins.append((noise.low <= truth)[inner] & (truth <= noise.high)[inner])
+        bins.append((noise.low <= psd)[inner] & (psd <= noise.high)[inner])
         strict = found.interval(BONFERRONI)
         joint.append(np.all((strict[0] <= truth) & (truth <= strict[1])))
         factor = 10 ** (JUDGED_DB / 10)
         passed.append(np.all(strict[1] <= factor * truth))
         failed.append(np.any(strict[0] >= truth / factor, axis=0).all())
-        quiet.append((high / truth)[:, truth == truth.min()])
-        if not scene.ripple and not scene.colour and len(set(scene.noise)) == 1:
+        quiet.append((high / truth)[:, truth[0] == truth[0].min()])
+        plain = not (scene.ripple or scene.colour or scene.noise_colour)
+        if plain and len(set(scene.noise)) == 1:
             power = np.where(np.arange(axes.shape[1]) < scene.strong, 1e3, 1.0) * scene.snr * 2
-            csm = ((axes * power) @ axes.T + np.diag(truth)).astype(complex)[None]
+            csm = ((axes * power) @ axes.T + np.diag(truth[0])).astype(complex)[None]
             worth = np.array([_worth(b, correlation) for b in np.diff(EDGES)])
             bound = np.concatenate(
-                [cramer_rao_cov(csm, truth[None], n_effective=n_effective * w) for w in worth]
+                [cramer_rao_cov(csm, truth[:1], n_effective=n_effective * w) for w in worth]
             )
             ends = interval(np.ones_like(bound), like_psd(np.ones_like(bound), bound), NORMAL_95)
             known = np.isfinite(high) & np.isfinite(ends[1])

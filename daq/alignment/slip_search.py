@@ -114,7 +114,7 @@ def _seen(source: SensorSource, reference: SensorSource) -> _Seen:
     )
     least = min(1 / rate, 1 / reference.record.sampling_rate)
     found: list[Step] = []
-    for number in np.unique(epoch):
+    for number in sorted(set(epoch.tolist())):  # np.unique loads numpy.ma
         mine = np.flatnonzero((epoch == number) & ~counted)
         some = mine[np.isfinite(std[mine])]
         found += steps(when[some], late[some], std[some], least=least)

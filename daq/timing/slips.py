@@ -152,7 +152,7 @@ def steps(at: FloatArray, late: FloatArray, std: FloatArray, *, least: float) ->
     slope = np.diff(late) / wide
     half = _SLOPES // 2
     padded = np.pad(slope, half, mode="reflect" if len(slope) > half else "edge")
-    usual = np.median(np.lib.stride_tricks.sliding_window_view(padded, _SLOPES), axis=1)
+    usual = np.sort(np.lib.stride_tricks.sliding_window_view(padded, _SLOPES), axis=1)[:, half]
     rest = (slope - usual) * wide
     noise = np.maximum(1.4826 * median(np.abs(rest)), np.hypot(std[1:], std[:-1]))
     odd = np.flatnonzero(np.abs(rest) > np.maximum(_CERTAIN * noise, least / 20))

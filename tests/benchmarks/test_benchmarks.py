@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 
 OF_PROCESSES = {"application", "command_start", "estimate_file", "following", "recorder"}
 """Benchmarks that run whole processes: they take long."""
-NAMES = sorted({module.name for module in pkgutil.iter_modules(benchmarks.__path__)})
+NAMES = sorted(
+    {module.name for module in pkgutil.iter_modules(benchmarks.__path__) if not module.ispkg}
+)
 
 
 @pytest.mark.parametrize(

@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import json
 from dataclasses import fields
-from datetime import datetime
+from datetime import UTC, datetime
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from daq.bench.estimate_settings import table_keys
 from daq.results.band_summary import band_of, channel_means, data_means
@@ -139,7 +137,8 @@ def provenance(
 
 
 def _instant(utc_ns: int) -> str:
-    return f"{np.datetime64(utc_ns, 'ns')}Z"
+    whole, rest = divmod(utc_ns, 1_000_000_000)
+    return f"{datetime.fromtimestamp(whole, tz=UTC):%Y-%m-%dT%H:%M:%S}.{rest:09d}Z"
 
 
 def _recording(source: Source) -> dict[str, Any]:

@@ -129,9 +129,11 @@ def levels(test: str, snapshot: Snapshot, settings: Settings) -> Iterator[Level]
         data = data_means(snapshot, (low, high))
         rows = {BOUND: [*zip(mean, lower, upper, strict=True)]}
         for method, noise in snapshot.results.items():
-            rows[method] = [
-                (each.mean[0], each.low[0], each.high[0])
-                for each in channel_means(noise, snapshot, settings, (low, high))
+            means = channel_means(noise, snapshot, settings, (low, high))
+            rows[method] = [  # what the method itself says: huddle withdraws what is above a bound
+                (each.mean[0], each.scatter[0][0], each.scatter[1][0])
+                for each in means
+                if each.scatter is not None
             ]
         for method, row in rows.items():
             for column, (label, (value, least, most)) in enumerate(

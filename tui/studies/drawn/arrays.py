@@ -160,7 +160,7 @@ FALSE: dict[type[Advice], Callable[[Scene], bool]] = {
     Rotated: lambda scene: scene.turned == "parallel",
     UnequalResponses: lambda scene: not scene.lag and scene.corner is None,
     NoSharedMotion: lambda _: True,
-    ModelMisfit: lambda scene: not scene.lag and scene.corner is None,
+    ModelMisfit: lambda scene: not scene.lag and scene.corner is None and not scene.lean,
     SharedNoise: lambda scene: not scene.lag and scene.corner is None,
 }
 """Kinds of advice, and in which scenes they are wrong."""

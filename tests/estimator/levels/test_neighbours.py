@@ -1,0 +1,50 @@
+"""Directions from neighbouring frequencies, where motion or noise varies much between them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from estimator.levels.bands import band_levels
+from estimator.levels.pooled import blocks_of
+from estimator.methods import self_noise
+
+if TYPE_CHECKING:
+    from estimator.types import ComplexArray
+
+
+@pytest.mark.parametrize("steep", ["motion", "noise"])
+def test_neighbours_count_rightly_where_levels_fall_within_a_block(steep: str) -> None:
+    """In units of each bin's own power the noise is up to 8 dB too high where the motion ends."""
+    rng = np.random.default_rng(31)
+    n, n_freqs = 74.0, 240
+    frequency = 0.1 * np.arange(1, n_freqs + 1, dtype=np.float64)
+    if steep == "motion":  # ends within a tenth of an octave
+        edge = np.clip((frequency - 10.0) / 0.7, 0.0, 1.0)
+        level, noise = 1e4 * np.cos(np.pi / 2 * edge) ** 2, np.ones(n_freqs)
+    else:  # from below the motion to above it
+        level, noise = np.full(n_freqs, 0.3), (frequency / 8.0) ** -3.0
+    turned = np.concatenate([np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in range(3)])
+    means = []
+    for _ in range(6):
+        motion = np.sqrt(level / 2)[:, None, None] * _complex(rng, (n_freqs, int(n), 3))
+        own = np.sqrt(noise / 2)[:, None, None] * _complex(rng, (n_freqs, int(n), 9))
+        x = motion @ turned.T + own
+        csm = np.einsum("fnp,fnq->fpq", x, x.conj()) / n
+        found = self_noise(
+            "three-sensor", csm, dims=(3, 3, 3), n_effective=n, blocks=blocks_of(frequency)
+        )
+        edges = np.array([40, 60, 75, 90, 110, 140, 180, 239])
+        held = band_levels(found.noise_psd, found.cumulants, edges, np.ones(1))
+        low, high = held.interval()
+        true = (np.add.reduceat(noise[:-1], edges[:-1]) / np.diff(edges))[:, None]
+        means.append((held.mean / true, (low <= true) & (high >= true)))
+    found_over_true, covered = (np.array(each) for each in zip(*means, strict=True))
+    np.testing.assert_allclose(np.median(found_over_true, axis=(0, 2)), 1.0, atol=0.08)
+    assert covered.mean() > 0.9
+
+
+def _complex(rng: np.random.Generator, shape: tuple[int, ...]) -> ComplexArray:
+    return rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
