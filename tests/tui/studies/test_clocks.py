@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from daq.errors import CannotAlignError
 from daq.estimation.diagnosis import residuals as residuals_between
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
@@ -153,17 +154,13 @@ def test_device_utc_and_host_times_meet_though_the_hosts_utc_is_off(
     assert snapshot.start_utc_ns > 0
 
 
-@pytest.mark.long
-def test_a_rate_that_is_off_by_one_per_cent_is_followed(tmp_path: Path) -> None:
-    table = free_running(snr=1e4, duration=120.0, seed=8).to_dict()
+def test_a_rate_that_is_off_by_one_per_cent_is_refused(tmp_path: Path) -> None:
+    """No clock of a device is: the rate in the bench file is wrong, or samples are lost."""
+    table = free_running(snr=1e4, duration=40.0, seed=8).to_dict()
     table["sensors"]["B"]["clock"] |= {"ppm": -1e4}
-    scenario = Scenario.from_dict(table)
-    snapshot = estimate([synthesise(tmp_path / "r.h5", scenario, duration=120.0)])
-    assert snapshot.clocks[1].ppm == pytest.approx(-1e4, abs=2.0)  # and a step of 2 ppm
-    assert residuals(snapshot, scenario).max() < 2e-6
-    noise = snapshot.results["three-sensor"].noise_psd
-    band = (snapshot.frequency > 5) & (snapshot.frequency < 88)  # 0.45 of 198 Hz is 89
-    assert noise[band].mean(axis=0) == pytest.approx(1e-13, rel=0.03)
+    path = synthesise(tmp_path / "r.h5", Scenario.from_dict(table), duration=40.0)
+    with pytest.raises(CannotAlignError, match="'B' sent 198 samples per second"):
+        estimate([path])
 
 
 @pytest.mark.long
@@ -183,7 +180,7 @@ def test_where_the_resampler_damps_nothing_is_said(tmp_path: Path) -> None:
     path = synthesise(
         tmp_path / "r.h5", Scenario.from_dict(table, sampling_rate=200.0), duration=100.0
     )
-    snapshot = estimate([path])
+    snapshot = estimate([path], Settings(methods=("three-sensor",)))
     beyond = snapshot.frequency > 90.0  # 0.45 of 200 Hz
     noise = snapshot.results["three-sensor"].noise_psd
     assert np.isnan(noise[beyond]).all()
