@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.errors import InsufficientDataError, InvalidMatrixError
+from estimator.levels.pooled import blocks_of
 from estimator.likelihood.factor_analysis import max_factors, maximise
 from estimator.likelihood.goodness_of_fit import HANN_HALF, BandTest, ModelTest, model_test, pool
 from estimator.likelihood.maximum_likelihood import standard_error
@@ -104,34 +105,9 @@ class BandDimension:
         return not self.accepted and self.test.p_value < MISFIT_LEVEL
 
 
-def bands(frequency: FloatArray, *, per_octave: int = 3, least: int = MIN_BINS) -> IntArray:
-    """Divide frequencies into bands of constant ratio with at least `least` frequencies each.
-
-    Parameters
-    ----------
-    frequency : float64, shape (n_freqs,)
-        Hz, ascending; zero belongs to the first band.
-    per_octave : int
-    least : int
-        Minimum number of frequencies per band; the last band also gets the remainder.
-
-    Returns
-    -------
-    int64, shape (n_freqs,)
-        Index of the band, from 0, non-decreasing.
-    """
-    first = [0]
-    while True:
-        begin = first[-1]
-        f = max(float(frequency[begin]), float(frequency[min(1, len(frequency) - 1)]) / 2)
-        end = int(np.searchsorted(frequency, f * 2 ** (1 / per_octave), side="left"))
-        end = max(end, begin + least)
-        if len(frequency) - end < least:
-            break
-        first.append(end)
-    number = np.zeros(len(frequency), np.int64)
-    number[first[1:]] = 1
-    return np.cumsum(number)
+def bands(frequency: FloatArray) -> IntArray:
+    """Return the band of every frequency: a third of an octave, `MIN_BINS` frequencies at least."""
+    return blocks_of(frequency, least=MIN_BINS)
 
 
 def choose_dimension(
