@@ -349,7 +349,8 @@ def _is_across(
     if not isinstance(advice, SharedNoise) or advice.band is None or not any(axes):
         return False
     low, high = advice.band
-    snr = np.nanmax([b.snr for b in bands if b.low <= high and b.high >= low], axis=0)
+    # NaN, which explains nothing, of channels without a signal
+    snr = np.fmax.reduce([b.snr for b in bands if b.low <= high and b.high >= low])
     most = snr * np.repeat(across(axes), dims)
     return all(
         abs(amount) <= max(most[one], most[other])

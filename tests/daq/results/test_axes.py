@@ -82,3 +82,15 @@ def test_tolerances_as_text_and_in_the_bench_file() -> None:
     assert table == {"": 0.2, "B": 0.05}
     with pytest.raises(ValueError, match="from 0 to 45 degrees"):
         from_text("axis_tolerance", ["-1"])
+
+
+def test_a_dead_channel_neither_warns_nor_explains_noise_that_others_share() -> None:
+    rng = np.random.default_rng(1)
+    motion, shared = 10 * rng.standard_normal(30_000), 0.7 * rng.standard_normal(30_000)
+    samples = {
+        f"s{n}": (motion + rng.standard_normal(30_000) + (shared if n < 2 else 0.0))[:, None]
+        for n in range(4)
+    } | {"s4": np.zeros((30_000, 1))}
+    settings = Settings(segment=2.0, methods=("three-sensor",))
+    snapshot = estimate([recording_of_arrays(samples, RATE)], settings)  # warnings are errors
+    assert any(isinstance(each, SharedNoise) for each in snapshot.diagnostics.advice)
