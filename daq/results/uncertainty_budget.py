@@ -72,7 +72,7 @@ class Budget:
     def dof(self) -> float:
         """Effective degrees of freedom (Welch and Satterthwaite)."""
         total = sum(each.relative**4 / each.dof for each in self.components)
-        return self.combined**4 / total if total > 0 else _MANY
+        return self.combined**4 / total if 0 < total < math.inf else _MANY
 
     @property
     def k(self) -> float:

@@ -359,3 +359,13 @@ def test_columns_that_do_not_fit_follow_below_with_the_names() -> None:
     assert side_by_side(widths, 79, n_keys=2) == [[0, 1, 2, 3, 4]]
     assert side_by_side(widths, 78, n_keys=2) == [[0, 1, 2, 3], [0, 1, 4]]
     assert side_by_side(widths, 10, n_keys=2) == [[0, 1, 2], [0, 1, 3], [0, 1, 4]]
+
+
+def test_what_is_not_known_has_an_infinite_uncertainty() -> None:
+    parts = (
+        Component("estimate", "A", "normal", 0.1, 100.0),
+        Component("misfit", "B", "rectangular", math.inf),
+    )
+    budget = Budget("A", "X", "noise", 1.0, 2.0, 1e-12, parts, 0.95)
+    assert math.isinf(budget.expanded)
+    assert budget.k == pytest.approx(1.96, abs=0.01)
