@@ -34,7 +34,7 @@ html_theme_options = {"secondary_sidebar_items": ["page-toc"], "show_prev_next":
 html_show_copyright = False
 html_show_sourcelink = False
 html_extra_path = [
-    "../tui/resources/result-1.schema.json",
+    "../tui/resources/result-2.schema.json",
     "../tui/resources/archive-1.schema.json",
 ]
 

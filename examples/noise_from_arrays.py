@@ -38,8 +38,8 @@ x = result["B", "X"]
 at_10_hz = np.argmin(np.abs(x.frequency - 10))
 print(f"{x!r}: {x.noise_psd[at_10_hz]:.2e} ({x.unit})²/Hz at 10 Hz")
 
-print("What is wrong with the test, or may be:")
-for advice in result.advice:
-    print("-", advice)
+print("Facts about the test, the worst first:")
+for each in result.facts:
+    print(each.line)
 
 result.plot().savefig("noise.svg")

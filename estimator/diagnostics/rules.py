@@ -56,6 +56,7 @@ LARGE_ERROR = 0.5
 """Error, as a fraction of the noise, from which an estimate is wrong."""
 SMALL_ERROR = 0.05
 """Error, as a fraction of the noise, below which it is harmless."""
+_NEARLY_SINGULAR = 30.0  # condition number; the scatter of smaller ones is no surprise
 
 
 def advise(
@@ -348,7 +349,7 @@ def _dimensions(
             n_channels=full,
             condition=max(b.condition for b in run),
         )
-    limit = float(np.sqrt(n_effective))
+    limit = max(_NEARLY_SINGULAR, float(np.sqrt(n_effective)))
     for run in _runs(bands, lambda band: band.dimension >= full and band.condition > limit):
         yield NearlySingular(
             level=Level.NOTE, band=_span(run), condition=max(b.condition for b in run)

@@ -25,8 +25,8 @@ from tests.acceptance import fault_script
 from tests.acceptance.run_bench import command, served
 from tests.acceptance.sample_accounting import Account, Log, accounts
 from tui.commands.demo import compare
-from tui.output.formatting import interval, level
 from tui.simulation.devices import scenario_of
+from tui.wording.formatting import interval, level
 
 if TYPE_CHECKING:
     from daq.bench.model import Bench

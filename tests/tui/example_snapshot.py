@@ -33,6 +33,7 @@ from estimator.diagnostics.advice import NoSharedMotion
 from estimator.diagnostics.diagnose import Diagnostics, diagnose
 from estimator.diagnostics.kinds import Level
 from estimator.methods import self_noise
+from tui.wording.facts import known
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -373,3 +374,8 @@ class ProgressCallback:
         del settings, verdict
         self.told.append(f"save {path.name} {len(snapshot.channels)}")
         return (path.with_suffix(".csv"), path.with_suffix(".json"))
+
+
+def said(snapshot: Snapshot, settings: Settings | None = None) -> list[str]:
+    """Return the sentences on all facts of a snapshot."""
+    return [str(each) for each in known(snapshot, settings)]

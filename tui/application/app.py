@@ -18,7 +18,7 @@ from tui.application.messages import RecordingOpened
 from tui.application.plan import TestPlan
 from tui.application.reference import can_open
 from tui.application.state import TITLES, VIEWS
-from tui.output.formatting import clock_time
+from tui.wording.formatting import clock_time
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -48,10 +48,10 @@ from tui.application.themes import (
     SafeColours,
 )
 from tui.application.view import View
-from tui.output.advice.alerts import alert
-from tui.output.advice.sentences import Names
-from tui.output.verdict_text import WORDS
 from tui.runs.catalogue import delete_recording
+from tui.wording.alerts import alert
+from tui.wording.findings import Names
+from tui.wording.verdict_text import WORDS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

@@ -12,8 +12,8 @@ from textual.widgets import Static
 
 from tui.application.dialogs import TextScreen, help_text
 from tui.application.state import TITLES, VIEWS
-from tui.output.formatting import clock_time
-from tui.output.verdict_text import STYLES, WORDS
+from tui.wording.formatting import clock_time
+from tui.wording.verdict_text import STYLES, WORDS
 
 if TYPE_CHECKING:
     from textual.app import ComposeResult

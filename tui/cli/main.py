@@ -98,9 +98,12 @@ def messages(error: BaseException) -> Iterator[str]:
         yield from (str(error) or type(error).__name__).splitlines()
         loaded = sys.modules.get("daq.estimation.snapshot")
         if loaded is not None and isinstance(error, loaded.NoResultError):
-            from tui.output.advice.diagnostics import problems  # noqa: PLC0415 - seldom needed
+            from tui.wording.facts import known  # noqa: PLC0415 - seldom needed
 
-            yield from problems(error.snapshot)
+            refused = error.snapshot.refused  # in the message already
+            for each in known(error.snapshot):
+                if each.needs_action and each.fact.method not in refused:
+                    yield str(each)
 
 
 app = typer.Typer(

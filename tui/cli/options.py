@@ -80,7 +80,10 @@ EndOption: TypeAlias = Annotated[
     typer.Option("--end", metavar="T", help="End of the time span to estimate, as --start."),
 ]
 DiagnosticsOption: TypeAlias = Annotated[
-    bool, typer.Option("--diagnostics", help="Print the complete diagnosis of the test, by band.")
+    bool,
+    typer.Option(
+        "--details", "--diagnostics", help="Print the complete diagnosis of the test, by band."
+    ),
 ]
 SpeedOption: TypeAlias = Annotated[
     float | None,

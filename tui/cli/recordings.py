@@ -28,7 +28,7 @@ from tui.cli.options import (
     "huddle estimate night.h5",
     "huddle estimate night.h5 --method all --band 1:20",
     "huddle estimate night.h5 --segment 60s --overlap 0.75 --json - --csv noise.csv",
-    "huddle estimate night.h5 --octaves --dimension auto --diagnostics",
+    "huddle estimate night.h5 --octaves --dimension auto --details",
     "huddle estimate night.h5 --noise-parameters",
 )
 @with_estimate_options

@@ -19,7 +19,6 @@ from daq.bench.masks.mask_file import masks_named
 from daq.errors import ArchiveError, HuddleError
 from daq.estimation.segments.segment_pass import Pass
 from daq.recording.reader import Recording
-from tui.output.advice.diagnostics import summary
 from tui.output.archive.document import archive_document, days_csv
 from tui.output.archive.tables import (
     course_table,
@@ -36,10 +35,10 @@ from tui.output.console import (
 )
 from tui.output.exit_codes import ExitCode
 from tui.output.extras import load, require
-from tui.output.formatting import several
-from tui.output.results import remarks as result_remarks
-from tui.output.results import result_table, result_title, widened_by
+from tui.output.results import averages_line, result_table, result_title
 from tui.runs.estimate_settings import settings_for
+from tui.wording.facts import known
+from tui.wording.formatting import several
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -109,12 +108,9 @@ def archive_recordings(
     screen = for_people(json, csv)
     screen.print(result_title(found.pooled, settings))
     screen.print(result_table(found.pooled, settings))
-    for line in (
-        *result_remarks(found.pooled),
-        *widened_by(found.pooled, settings),
-        *summary(found.pooled),
-    ):
-        screen.print(line)
+    screen.print(averages_line(found.pooled))
+    for each in known(found.pooled, settings):
+        screen.print(each.line)
     screen.print(course_title(found))
     screen.print(course_table(found))
     for line in remarks(found, time_zone):

@@ -10,7 +10,6 @@ from rich.text import Text
 
 from daq.results.calibration import calibrate
 from tui.commands.estimate import estimated
-from tui.output.advice.diagnostics import problems
 from tui.output.calibration import (
     LEGEND,
     angle_table,
@@ -23,7 +22,7 @@ from tui.output.calibration import (
 )
 from tui.output.console import check_places, for_people, hint, write_json
 from tui.output.json_document import calibration_document
-from tui.output.results import wrong_times
+from tui.wording.facts import known
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -59,8 +58,11 @@ def calibrate_recordings(
     if noise:
         _show(screen, "Noise, by the calibrated sensitivities", noise_rows(found, snapshot.unit))
         _show(screen, "Budget of the noise PSD, relative", budget_table(noise))
-    for line in (LEGEND, *remarks(found, snapshot), *wrong_times(snapshot), *problems(snapshot)):
+    for line in (LEGEND, *remarks(found, snapshot)):
         screen.print(line)
+    for each in known(snapshot):
+        if each.needs_action:
+            screen.print(str(each))
     write_json(json, calibration_document(found, snapshot))
     hint(f"To sign: huddle report {files[0]}")
 

@@ -20,9 +20,9 @@ from daq.host_clock import SystemClock
 from daq.transport.serial_ports import stable_path
 from tui.commands.drivers import print_others, summaries
 from tui.output.console import check_places, console, for_people, write_json, write_text
-from tui.output.formatting import signed
 from tui.output.json_values import plain
 from tui.simulation.host_time import host_time
+from tui.wording.formatting import signed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

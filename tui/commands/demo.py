@@ -27,10 +27,10 @@ from estimator.levels.contributions import Source
 from tui.commands.run import result_of
 from tui.output.console import check_places, for_people, notices, write_json
 from tui.output.exit_codes import ExitCode
-from tui.output.formatting import level, level_with_error
 from tui.runs.interrupt import defer_interrupt
 from tui.runs.recorder_process import RecorderProcess
 from tui.simulation.devices import scenario_of, simulated
+from tui.wording.formatting import level, level_with_error
 
 if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot

@@ -16,7 +16,6 @@ from daq.results.noise_parameters import noise_parameters as parameters_of
 from daq.results.noise_parameters import quantisation_shares
 from daq.results.sources import sources
 from estimator.decision.verdict import Verdict
-from tui.output.advice.diagnostics import details, summary
 from tui.output.console import (
     check_places,
     for_people,
@@ -26,6 +25,8 @@ from tui.output.console import (
     write_json,
     write_text,
 )
+from tui.output.diagnosis import details
+from tui.output.exit_codes import ExitCode
 from tui.output.json_document import document
 from tui.output.noise_parameters import (
     allan_table,
@@ -34,12 +35,13 @@ from tui.output.noise_parameters import (
     sheet_table,
     term_table,
 )
-from tui.output.results import curves_csv, remarks, result_table, result_title, widened_by
-from tui.output.verdict_text import EXIT_CODES, STYLES, headline, limit_line, not_judged, what_to_do
+from tui.output.results import averages_line, curves_csv, result_table, result_title
 from tui.runs.estimate_settings import settings_of
+from tui.wording.facts import brief, known
+from tui.wording.verdict_text import STYLES, headline, limit_line, not_judged, what_to_do
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     from rich.console import Console
@@ -50,6 +52,12 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from daq.results.decision.verdict import TestVerdict
     from daq.results.noise_parameters import ChannelNoise
+
+EXIT_CODES: Mapping[Verdict, ExitCode] = {
+    Verdict.PASS: ExitCode.DONE,
+    Verdict.FAIL: ExitCode.LIMIT_NOT_MET,
+    Verdict.NOT_DECIDED: ExitCode.NOT_DECIDED,
+}
 
 
 def estimate_recordings(
@@ -157,14 +165,14 @@ def show_result(
     screen = for_people(json, csv)
     table = result_table(snapshot, settings)  # refuses a band without frequencies
     screen.print(result_title(snapshot, settings))
+    screen.print(averages_line(snapshot))
     screen.print(table)
-    for line in (*remarks(snapshot), *widened_by(snapshot, settings)):
-        screen.print(line)
     for line in quantisation_notes(snapshot.channels, quantisation_shares(snapshot, settings)):
         screen.print(line)
     if parameters is not None:
         _show_parameters(screen, parameters, snapshot.unit)
-    for part in details(snapshot) if diagnostics else summary(snapshot):
+    facts = known(snapshot, settings)
+    for part in details(snapshot, facts) if diagnostics else brief(facts):
         screen.print(part)
     found = judge(bench, snapshot, settings)
     if json is not None:

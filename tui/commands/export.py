@@ -12,8 +12,8 @@ from daq.results.sources import sources
 from tui.commands.estimate import estimated
 from tui.notebook.curve_files import WRITERS, write_curves
 from tui.output.console import for_people, write_json
-from tui.output.formatting import several
 from tui.output.json_document import provenance
+from tui.wording.formatting import several
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

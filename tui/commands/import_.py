@@ -16,8 +16,8 @@ from daq.formats.importer import import_files
 from daq.formats.sources import Selection
 from tui.output.console import for_people, notices, write_json
 from tui.output.exit_codes import ExitCode
-from tui.output.formatting import several, utc
 from tui.runs.estimate_settings import chosen
+from tui.wording.formatting import several, utc
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -21,8 +21,8 @@ from daq.python_process import python_command
 from daq.recording.storage.names import recording_path
 from daq.transport.wire_log import logging_to
 from tui.output.console import notices, write_json
-from tui.output.formatting import clock_time, roughly, several
 from tui.simulation.host_time import host_time
+from tui.wording.formatting import clock_time, roughly, several
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

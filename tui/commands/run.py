@@ -30,11 +30,11 @@ from tui.commands.estimate import exit_with, show_result
 from tui.commands.report import checked, write_report
 from tui.output.console import check_places, for_people, hint, progress
 from tui.output.exit_codes import ExitCode
-from tui.output.formatting import clock_time, time_left
-from tui.output.results import live_remarks
 from tui.runs.estimate_settings import check_fit, chosen
 from tui.runs.interrupt import defer_interrupt
 from tui.runs.recorder_process import RecorderProcess
+from tui.wording.facts import why_no_estimate
+from tui.wording.formatting import clock_time, time_left
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -220,7 +220,7 @@ class _Run:
         if snapshot.closed:
             return
         self._bar.estimated(snapshot, settings)
-        reason = " ".join(live_remarks(snapshot))
+        reason = why_no_estimate(snapshot)
         if reason and not self._says_why:
             self._says_why = True
             _LOGGER.warning("%s", reason)

@@ -13,11 +13,11 @@ from daq.results.decision.limits import judge
 from daq.results.precision import precision
 from tui.commands.estimate import exit_with, show_result
 from tui.output.console import console, finite, write_text
-from tui.output.formatting import clock_time, time_left
 from tui.output.json_document import verdict_document
 from tui.output.json_values import plain
-from tui.output.results import live_remarks
 from tui.runs.estimate_settings import settings_for
+from tui.wording.facts import why_no_estimate
+from tui.wording.formatting import clock_time, time_left
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -93,7 +93,7 @@ class _Lines:
 
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
         before, self.last = self.last, snapshot
-        reason = " ".join(live_remarks(snapshot))
+        reason = why_no_estimate(snapshot)
         if reason and not self._says_why:
             self._says_why = True
             if self._json is None:

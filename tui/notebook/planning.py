@@ -28,8 +28,8 @@ from estimator.spectra.windows import get_window
 from tui.notebook.options import settings_of
 from tui.notebook.text import rendered
 from tui.notebook.waves import Waves, waves_across
-from tui.output.formatting import percent, signed
 from tui.simulation.devices import scenario_of
+from tui.wording.formatting import percent, signed
 
 if TYPE_CHECKING:
     import os

@@ -11,7 +11,7 @@ from daq.bench.durations import format_duration
 from daq.errors import WrongSettingError
 from daq.recording.reader import Recording
 from tui.notebook.estimates import PathLike, estimate
-from tui.output.formatting import several, utc
+from tui.wording.formatting import several, utc
 
 if TYPE_CHECKING:
     from datetime import datetime

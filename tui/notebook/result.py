@@ -12,6 +12,7 @@ from daq.errors import WrongSettingError
 from daq.results.band_summary import band_of, channel_means
 from estimator.levels.bands import band_edges
 from tui.notebook import text
+from tui.wording.facts import known
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     )
     from estimator.self_noise.result import SelfNoise
     from estimator.types import ComplexArray, FloatArray, IntArray
+    from tui.wording.facts import Known
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -204,14 +206,17 @@ class Result:
         return self.snapshot.diagnostics
 
     @property
-    def advice(self) -> tuple[str, ...]:
-        """What is wrong with the test, or may be, and what to do; worst first."""
-        return text.advice(self.snapshot)
+    def facts(self) -> tuple[Known, ...]:
+        """What is known of the test beyond its numbers, the worst first.
+
+        Each has its typed ``fact`` with numbers, and its ``words``; ``str()`` gives sentences.
+        """
+        return known(self.snapshot, self.settings)
 
     @property
-    def remarks(self) -> tuple[str, ...]:
-        """What the estimate rests on: segments, gaps, clocks, frequencies without an estimate."""
-        return text.remarks(self.snapshot, self.settings)
+    def advice(self) -> tuple[str, ...]:
+        """The facts that invalidate or delay the result, and what to do, in sentences."""
+        return tuple(str(each) for each in self.facts if each.needs_action)
 
     @property
     def _noise(self) -> SelfNoise:

@@ -11,8 +11,8 @@ from rich.text import Text
 
 from estimator.errors import BandError
 from tui.output import results
-from tui.output.advice import diagnostics
-from tui.output.formatting import level, level_with_error
+from tui.wording.facts import brief, known
+from tui.wording.formatting import level, level_with_error
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,14 +31,12 @@ def result(snapshot: Snapshot, settings: Settings) -> str:
     try:
         parts: list[RenderableType] = [
             results.result_title(snapshot, settings),
+            Text(results.averages_line(snapshot)),
             results.result_table(snapshot, settings),
         ]
     except BandError as error:
-        return rendered([Text(f"Self-noise: {error}"), Text(results.remarks(snapshot)[0])])
-    widened = results.widened_by(snapshot, settings)
-    parts += map(Text, (results.remarks(snapshot)[0], *results.wrong_times(snapshot), *widened))
-    if advice(snapshot):
-        parts.append(Text("advice on the test: print(*result.advice, sep='\\n')"))
+        return rendered([Text(f"Self-noise: {error}"), Text(results.averages_line(snapshot))])
+    parts += map(Text, brief(known(snapshot, settings), "print(*result.facts, sep='\\n')"))
     return rendered(parts)
 
 
@@ -65,16 +63,6 @@ def band(
         f" ({labels[0].unit})²/Hz, with its 95 % interval"
     )
     return rendered([Text(title), table])
-
-
-def advice(snapshot: Snapshot) -> tuple[str, ...]:
-    """Return the diagnosis in sentences."""
-    return tuple(diagnostics.summary(snapshot))
-
-
-def remarks(snapshot: Snapshot, settings: Settings) -> tuple[str, ...]:
-    """Return the remarks below the table."""
-    return (*results.remarks(snapshot), *results.widened_by(snapshot, settings))
 
 
 def rendered(parts: Sequence[RenderableType]) -> str:

@@ -9,7 +9,7 @@ from daq.bench.units import decibels
 from daq.results.clock_effect import relative_time
 from daq.results.uncertainty_budget import student_quantile
 from daq.timing.clock_model import RelativeTime
-from tui.output.formatting import signed, span
+from tui.wording.formatting import signed, span
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

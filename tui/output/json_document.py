@@ -1,6 +1,6 @@
 """A finished estimate, or a calibration, as the JSON that ``--json`` writes.
 
-docs/json.md describes it for people, ``tui/resources/result-1.schema.json`` for programs.
+docs/json.md describes it for people, ``tui/resources/result-2.schema.json`` for programs.
 """
 
 from __future__ import annotations
@@ -14,13 +14,14 @@ from typing import TYPE_CHECKING, Any
 from daq.bench.estimate_settings import table_keys
 from daq.results.band_summary import band_of, channel_means, data_means
 from daq.results.clock_effect import relative_time
+from daq.results.facts import Fact, Finding
 from estimator.diagnostics.advice import Advice
 from estimator.diagnostics.shared_noise import MAX_CHANNELS
 from estimator.self_noise.result import Flag
-from tui.output.advice.sentences import Names, explain
 from tui.output.calibration import channels_of
 from tui.output.json_values import plain
 from tui.output.noise_parameters import noise_parameters_document
+from tui.wording.facts import known
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -36,8 +37,9 @@ if TYPE_CHECKING:
     from daq.results.sources import Source
     from estimator.responses.calibration import SensorCalibration
     from estimator.responses.derived_quantities import Value
+    from tui.wording.facts import Known
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 """Rises when a key is removed or changes its meaning; new keys do not change it."""
 
 
@@ -101,6 +103,7 @@ def document(
     }
     whole |= documents[0] if len(documents) == 1 else {"results": documents}
     whole |= verdict_document(verdict)
+    whole["facts"] = facts_document(known(snapshot, settings))
     whole["band_means"] = _band_means(snapshot, settings)
     if noise_parameters is not None:
         whole["noise_parameters"] = plain(noise_parameters_document(noise_parameters))
@@ -305,11 +308,10 @@ def _diagnostics(snapshot: Snapshot) -> dict[str, Any]:
 
 
 def _diagnosis(found: Diagnosis, snapshot: Snapshot) -> dict[str, Any]:
-    sensors, names = snapshot.sensor_names, Names.of(snapshot)
+    sensors = snapshot.sensor_names
     return {
         "bands": found.bands,
         "responses": found.responses,
-        "advice": [_advice(each, names) for each in found.advice],
         "shared_noise_searched": len(snapshot.channels) <= MAX_CHANNELS,
         "stability": found.stability,
         "n_factors": found.n_factors,
@@ -318,21 +320,50 @@ def _diagnosis(found: Diagnosis, snapshot: Snapshot) -> dict[str, Any]:
     }
 
 
-def _advice(advice: Advice, names: Names) -> dict[str, Any]:
-    words = explain(advice, names)
-    common = {field.name for field in fields(Advice)}
+def facts_document(facts: Sequence[Known]) -> list[dict[str, Any]]:
+    """Return what is known of a test beyond its numbers, the worst first."""
+    return [
+        {
+            "kind": fact.name,
+            "rank": fact.rank,
+            "sensors": list(fact.sensors),
+            "channels": list(fact.channels),
+            "band_hz": fact.band,
+            "time_utc_ns": fact.time_utc_ns,
+            "method": fact.method or None,
+            "numbers": _numbers(fact),
+            "line": words.line,
+            "explanation": words.explanation,
+            "action": words.action or None,
+        }
+        for fact, words in facts
+    ]
+
+
+def _numbers(fact: Fact) -> dict[str, Any]:
+    """Return the fields of a fact beyond those of all; findings with theirs."""
+    if isinstance(fact, Finding):
+        return {"findings": [_finding(each) for each in fact.findings]}
+    common = {each.name for each in fields(Fact)}
+    return {
+        each.name: plain(getattr(fact, each.name))
+        for each in fields(fact)
+        if each.name not in common
+    }
+
+
+def _finding(advice: Advice) -> dict[str, Any]:
+    common = {each.name for each in fields(Advice)}
     return {
         "kind": advice.kind,
         "level": advice.level,
-        "sensors": advice.sensors,
-        "band": advice.band,
-        "text": words.text,
+        "sensors": list(advice.sensors),
+        "band_hz": advice.band,
         "numbers": {
-            field.name: getattr(advice, field.name)
-            for field in fields(advice)
-            if field.name not in common
+            each.name: plain(getattr(advice, each.name))
+            for each in fields(advice)
+            if each.name not in common
         },
-        "remedy": words.remedy,
     }
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from daq.results.noise_parameters import QUANTISATION_SHARE, Outcome, Quantity
 from estimator.noise_parameters.fit import Term
-from tui.output.formatting import level, percent, span
+from tui.wording.formatting import level, percent, span
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -8,19 +8,20 @@ from typing import TYPE_CHECKING
 from daq.bench.durations import format_duration
 from daq.results.band_summary import band_of
 from daq.results.decision.limits import judge
-from tui.output.formatting import span
 from tui.report.calibration import calibration_section
 from tui.report.evidence import (
-    advice_section,
     alignment_section,
     clocks_section,
     events_section,
+    facts_section,
     model_test_section,
 )
 from tui.report.noise import limits_section, noise_section, verdict
 from tui.report.parameters import parameters_section
 from tui.report.parts import Facts, Paragraph, Part, Report, Section, Signatures, Table
 from tui.report.wording import is_known, local_time, plain_number, utc_time
+from tui.wording.facts import known
+from tui.wording.formatting import span
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -77,12 +78,12 @@ def report_of(
         sentence = Paragraph(text, "bad" if sentence.tone == "bad" else "doubtful")
     sections = [
         _test_section(found),
+        facts_section(known(snapshot, settings)),
         _sensors_section(snapshot, found),
         limits_section(snapshot, judged),
         noise_section(snapshot, settings, bench, models),
         parameters_section(snapshot, settings, bench),
         calibration_section(snapshot, settings, bench),
-        advice_section(snapshot),
         model_test_section(snapshot, settings),
         alignment_section(snapshot),
         clocks_section(snapshot, settings),

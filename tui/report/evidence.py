@@ -12,12 +12,9 @@ from daq.bench.units import decibels
 from daq.protocols.block import EventKind
 from daq.results.band_summary import band_of
 from daq.results.clock_effect import effect_by_sensor, grade, reference, residuals
+from daq.results.facts import Rank
 from estimator.diagnostics.advice import NoSharedMotion
 from estimator.likelihood.goodness_of_fit import rejected_below
-from tui.output.advice.diagnostics import summary, why_untested
-from tui.output.formatting import several, span, utc
-from tui.output.results import faulty_channels, left_out, not_searched, wrong_times
-from tui.output.vocabulary import clock_source
 from tui.report.figures.drift import drift_plot
 from tui.report.figures.model_test import model_test_plot
 from tui.report.parts import Items, Paragraph, Part, Section, Table
@@ -28,9 +25,12 @@ from tui.report.wording import (
     scientific,
     share,
 )
+from tui.wording.facts import MARKS, NOTHING_TO_DO, RANKS
+from tui.wording.formatting import several, span, utc
+from tui.wording.vocabulary import clock_source
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
@@ -39,9 +39,15 @@ if TYPE_CHECKING:
     from estimator.diagnostics.band import BandDiagnosis
     from estimator.diagnostics.relative_response import RelativeResponse
     from tui.report.parts import Tone
+    from tui.wording.facts import Known
 
 LISTED = 40
 """Most lines of the list of what happened; with more, those of one kind go together."""
+TONES: Mapping[Rank, Tone] = {
+    Rank.INVALIDATES: "bad",
+    Rank.DELAYS: "doubtful",
+    Rank.TO_KNOW: "plain",
+}
 _USUAL = {EventKind.STARTED, EventKind.CONNECTED, EventKind.STOPPED, EventKind.MARK}
 
 
@@ -50,7 +56,7 @@ def model_test_section(snapshot: Snapshot, settings: Settings) -> Section:
     title = "Model test: do the sensors share one motion?"
     found = snapshot.diagnostics.diagnosis
     if found is None or snapshot.diagnostics.untested is not None:
-        return Section(title, (Paragraph(why_untested(snapshot), "doubtful"),))
+        return Section(title, (Paragraph("Not tested: see the facts.", "doubtful"),))
     tested = [band for band in found.bands if math.isfinite(band.test.p_value)]
     rejected = rejected_below(band.test for band in tested)
 
@@ -192,7 +198,6 @@ def clocks_section(snapshot: Snapshot, settings: Settings) -> Section:
         if tone == "bad":
             text += " Give the sensors one clock, or record longer for their rates to be known."
         parts.append(Paragraph(text, tone))
-    parts += [Paragraph(text, "doubtful") for text in wrong_times(snapshot)]
     left, against = residuals(snapshot), reference(snapshot)
     rows = [
         _clock_row(
@@ -229,16 +234,7 @@ def events_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
     """Return what happened while recording, and which segments were used."""
     text = f"{several(snapshot.n_segments, 'segment')} used"
     text += f" ({snapshot.n_effective:.0f} effective averages)."
-    if snapshot.n_dropped:
-        text += f" {several(snapshot.n_dropped, 'segment')} excluded{left_out(snapshot)}."
-    else:
-        text += " None excluded."
     parts: list[Part] = [Paragraph(text)]
-    for sensor in snapshot.sensors:
-        if sensor.n_gaps:
-            gaps = several(sensor.n_gaps, "gap")
-            missing = several(sensor.n_missing, "sample")
-            parts.append(Paragraph(f"{sensor.name}: {gaps}, {missing} missing.", "doubtful"))
     logged_events = [each for source in found for each in source.logged_events]
     if not logged_events:
         parts.append(Paragraph("The recordings hold no events.", "quiet"))
@@ -271,12 +267,16 @@ def events_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
     return Section("What happened", tuple(parts))
 
 
-def advice_section(snapshot: Snapshot) -> Section:
-    """Return what to know and to do."""
-    lines = [*faulty_channels(snapshot), *not_searched(snapshot), *summary(snapshot)]
-    if not lines:
-        return Section("Advice", (Paragraph("Nothing to remark."),))
-    return Section("Advice", (Items(tuple(map(Paragraph, lines))),))
+def facts_section(facts: Sequence[Known]) -> Section:
+    """Return what is known of the test beyond its numbers, the worst first."""
+    items = tuple(
+        Paragraph(f"{MARKS[each.fact.rank]} {each}", TONES[each.fact.rank]) for each in facts
+    )
+    parts: list[Part] = [Items(items)] if items else []
+    if not any(each.needs_action for each in facts):
+        parts.insert(0, Paragraph(NOTHING_TO_DO, "good"))
+    legend = ", ".join(f"{MARKS[rank]} {words}" for rank, words in RANKS.items())
+    return Section("Facts", (*parts, Paragraph(f"{legend}.", "quiet")))
 
 
 def _ratio(band: BandDiagnosis) -> float:

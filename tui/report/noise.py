@@ -12,13 +12,12 @@ from daq.results.partners import without_partners
 from daq.results.precision import channel_covs
 from estimator.decision.verdict import Verdict
 from estimator.self_noise.result import Flag
-from tui.output.formatting import NOT_KNOWN, level_with_error, span
-from tui.output.results import flagged, unresolved, widened_by
-from tui.output.verdict_text import WORDS, headline, margin, not_judged, what_to_do
-from tui.output.vocabulary import FLAG_WORDS, PARTNER_WORDS
 from tui.report.figures.curves import noise_plots
-from tui.report.parts import Items, Paragraph, Part, Section, Table
+from tui.report.parts import Paragraph, Part, Section, Table
 from tui.report.wording import decibel, plain_number, scientific
+from tui.wording.formatting import NOT_KNOWN, level_with_error, span
+from tui.wording.verdict_text import WORDS, headline, margin, not_judged, what_to_do
+from tui.wording.vocabulary import FLAG_WORDS, PARTNER_WORDS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -95,20 +94,14 @@ def noise_section(
     if not snapshot.results:
         return Section("Self-noise", (Paragraph("Nothing can be said yet.", "doubtful"),))
     parts: list[Part] = [_band_table(snapshot, settings)]
-    notes = [line for method in snapshot.results for line in flagged(snapshot, method)]
-    notes += [line for method in snapshot.results for line in unresolved(snapshot, method)]
-    notes += widened_by(snapshot, settings)
-    notes += [f"{method}: {why}" for method, why in snapshot.refused.items()]
     parts += [
         Paragraph(
-            "The 95 % interval is that of the mean over the band, with all that widens it (below, "
-            "from 1 % of the noise on). What is known of the sensitivities comes on top. "
-            "SNR: power of the motion over that of the noise.",
+            "The 95 % interval is that of the mean over the band, with all that widens it (see "
+            "the facts, from 1 % of the noise on). What is known of the sensitivities comes on "
+            "top. SNR: power of the motion over that of the noise.",
             "quiet",
         )
     ]
-    if notes:
-        parts.append(Items(tuple(Paragraph(line, "doubtful") for line in notes)))
     octaves = _octave_table(snapshot, settings)
     if octaves is not None:
         parts.append(octaves)

@@ -14,8 +14,9 @@ from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
 from daq.results.band_summary import levels
+from daq.results.facts import ClockNotUnderstood, SamplesUncounted
+from tests.daq.clock_facts import clock_facts
 from tests.known_clocks import NOISE, Oscillator, Scene, growing, record, seconds_of
-from tui.output.results import wrong_times
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -56,7 +57,7 @@ def test_the_stated_residual_of_a_good_clock_is_that_of_its_filter(
     scene = Scene(snr=snr, seconds=300.0)
     snapshot, truth = estimated(tmp_path, scene)
     assert all(clock.is_understood for clock in snapshot.clocks)
-    assert not wrong_times(snapshot)
+    assert not clock_facts(snapshot)
     stated = np.array(list(snapshot.diagnostics.synchronisation.residual.values()))[1:]
     real = truth.residual(snapshot)[1:]
     assert (stated > real / 2).all()
@@ -71,9 +72,10 @@ def test_samples_lost_all_the_time_are_not_taken_for_a_fast_clock(tmp_path: Path
     assert [clock.is_understood for clock in snapshot.clocks] == [True, False, True]
     _, holds = errors(snapshot, scene)
     assert holds.all()
-    (line,) = wrong_times(snapshot)
-    assert "The clock of B (−985 ppm) is not understood" in line
-    assert "lost or repeated without being counted" in line
+    (fact,) = clock_facts(snapshot)
+    assert isinstance(fact, ClockNotUnderstood)
+    assert fact.sensors == ("B",)
+    assert fact.ppm == pytest.approx(-985, abs=1)
 
 
 LATER = 150.0
@@ -116,8 +118,9 @@ def test_samples_lost_without_being_counted_are_found_and_corrected(
     assert (residual > truth.residual(snapshot) / 3)[1:].all()  # 0.4 with other rates, of 1 µs
     assert (residual < 1e-4).all()
     name = "ABC"[next(iter(lost))]
-    (line,) = wrong_times(snapshot)
-    assert line.startswith(f"{name} {'lost' if min(lost.values()) > 0 else 'repeated'}")
+    (fact,) = clock_facts(snapshot)
+    assert isinstance(fact, SamplesUncounted)
+    assert (fact.sensors, fact.slips) == ((name,), (slip,))
 
 
 def test_a_sample_lost_every_minute_is_found_every_time(tmp_path: Path) -> None:
@@ -127,7 +130,9 @@ def test_a_sample_lost_every_minute_is_found_every_time(tmp_path: Path) -> None:
     assert [slip.n_samples for slip in snapshot.clocks[1].slips] == [1, 1, 1, 1]
     error, holds = errors(snapshot, scene)
     assert_right(error, holds)
-    assert "B lost 4 samples between 01:01:00" in wrong_times(snapshot)[0]
+    (fact,) = clock_facts(snapshot)
+    assert fact.sensors == ("B",)
+    assert fact.slips == snapshot.clocks[1].slips
 
 
 def test_a_sample_lost_near_the_end_is_part_of_the_residual(tmp_path: Path) -> None:

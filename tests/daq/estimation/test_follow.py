@@ -19,12 +19,13 @@ from daq.estimation.follow import (
     follow,
 )
 from daq.estimation.segments import memory
+from daq.results.facts import NotInLiveEstimate
+from daq.results.known_facts import facts_of
 from daq.results.sources import sources
 from estimator.errors import InsufficientDataError
 from tests.daq.estimation.follow_observer import Goes, Noted, Process
 from tests.daq.recording.sending_bench import Bench
 from tests.tui.example_snapshot import SETTINGS, growing
-from tui.output.results import live_remarks
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -208,7 +209,9 @@ def test_more_sensors_than_memory_allows_wait_for_the_result(
     live, last = noted.snapshots
     assert live.sensor_names == ("A", "B")
     assert live.not_estimated == ("C",)
-    assert live_remarks(live)[0].startswith("Live estimate of the first 2 of 3 sensors")
+    (left_out,) = [each for each in facts_of(live) if isinstance(each, NotInLiveEstimate)]
+    assert left_out.sensors == ("C",)
+    assert left_out.n_all == 3
     assert result is last
     assert last.not_estimated == ()
     np.testing.assert_array_equal(last.csm, estimate([writer.path], SETTINGS).csm)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -16,11 +15,12 @@ from daq.estimation.segments.stated_times import compare, drift_of
 from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
 from daq.results.band_summary import channel_means
+from daq.results.facts import StatedTimesUnchecked
 from daq.timing.clock_model import ClockSource
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
 from tests.daq.alignment.recordings import Sensor, blocks, create, write
-from tui.output.results import wrong_times
+from tests.daq.clock_facts import clock_facts
 from tui.studies.synthesis import synthesise
 
 if TYPE_CHECKING:
@@ -72,7 +72,9 @@ def test_sensors_whose_stated_times_drift_are_aligned_by_the_motion(
         assert clock.source is ClockSource.DEVICE_UTC
         drift = abs(ppm) * 1e-6 * SECONDS / np.sqrt(12)
         assert clock.corrected == pytest.approx(drift, rel=0.1, abs=1e-9)
-    assert re.search(r"of a, .*: b by 1[34]. µs rms, c by 2[78]. µs", wrong_times(snapshot)[0])
+    (fact,) = clock_facts(snapshot)
+    assert fact.reference == "a"
+    assert fact.corrected == pytest.approx({"b": 138e-6, "c": 276e-6}, rel=0.05)
 
 
 def test_drift_is_found_where_every_segment_has_a_gap(tmp_path: Path) -> None:
@@ -102,16 +104,17 @@ def test_a_first_sensor_without_the_motion_is_not_the_reference(tmp_path: Path) 
     ratio = found.noise_psd[BAND, 1:].mean(axis=0) / (1e12 * NOISE)
     assert np.abs(ratio - 1).max() < 0.1
     assert snapshot.diagnostics.synchronisation.reference == "a"
-    drifting, unchecked = wrong_times(snapshot)
-    assert "against those of a" in drifting
-    assert unchecked.startswith("The times that 0 states could not be compared")
+    drifting, unchecked = clock_facts(snapshot)
+    assert drifting.reference == "a"
+    assert isinstance(unchecked, StatedTimesUnchecked)
+    assert unchecked.sensors == ("0",)
 
 
 def test_a_drift_that_segments_are_too_short_for_widens_the_intervals(tmp_path: Path) -> None:
     path = write(tmp_path / "r.h5", huddle(0.8, (0.0, 60.0, -60.0)))
     short, longer = (estimate([path], replace(SETTINGS, segment=each)) for each in (1.0, 10.0))
     assert [clock.drifts for clock in short.clocks] == [False, True, True]
-    assert "Those of b and c could not be corrected" in wrong_times(short)[0]
+    assert set(clock_facts(short)[0].uncorrected) == {"b", "c"}
     assert [clock.drifts for clock in longer.clocks] == [False, False, False]
     for snapshot in (short, longer):
         means = channel_means(snapshot.results["three-sensor"], snapshot, SETTINGS, (1.0, 20.0))
@@ -135,7 +138,7 @@ def test_what_is_said_of_times_is_that_of_all_recordings(tmp_path: Path) -> None
         sensor.start = 1000.0
     drifting = write(tmp_path / "1.h5", huddle(1e4, PPM))
     snapshot = estimate([drifting, write(tmp_path / "2.h5", later)], SETTINGS)
-    assert re.search(r"c by 2[78]. µs", wrong_times(snapshot)[0])
+    assert clock_facts(snapshot)[0].corrected["c"] == pytest.approx(276e-6, rel=0.05)
 
 
 def test_a_few_seconds_are_said_not_to_be_compared(tmp_path: Path) -> None:
@@ -143,7 +146,9 @@ def test_a_few_seconds_are_said_not_to_be_compared(tmp_path: Path) -> None:
     for sensor in sensors.values():
         sensor.counts = sensor.counts[:1500]
     snapshot = estimate([write(tmp_path / "r.h5", sensors)], SETTINGS)
-    assert wrong_times(snapshot)[0].startswith("The times that b and c state could not be")
+    (fact,) = clock_facts(snapshot)
+    assert isinstance(fact, StatedTimesUnchecked)
+    assert fact.sensors == ("b", "c")
 
 
 def test_stated_times_that_agree_with_the_motion_are_used_as_they_are(tmp_path: Path) -> None:
@@ -152,7 +157,7 @@ def test_stated_times_that_agree_with_the_motion_are_used_as_they_are(tmp_path: 
     nominal = estimate([path], replace(SETTINGS, clocks="nominal"))
     assert [(clock.corrected, clock.residual) for clock in snapshot.clocks] == 3 * [(0.0, 0.0)]
     assert np.array_equal(snapshot.csm, nominal.csm)
-    assert not wrong_times(snapshot)
+    assert not clock_facts(snapshot)
 
 
 @pytest.mark.parametrize(("ppm", "every"), [(PPM, 3000), ((*PPM, 0.0), 600)])

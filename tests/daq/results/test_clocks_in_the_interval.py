@@ -14,10 +14,10 @@ from daq.estimation.snapshot_diagnostics import CLOCK_FACTOR, Synchronisation
 from daq.results.band_summary import channel_means
 from estimator.methods import self_noise
 from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot
-from tui.output.formatting import level_with_error
 from tui.output.results import result_table
 from tui.studies.clocks import free_running
 from tui.studies.synthesis import Latency, synthesise
+from tui.wording.formatting import level_with_error
 
 if TYPE_CHECKING:
     from pathlib import Path

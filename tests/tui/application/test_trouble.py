@@ -25,7 +25,7 @@ from tests.tui.example_snapshot import (
 )
 from tui.application.app import HuddleApp
 from tui.application.messages import ErrorReported, Progress, SnapshotReady, StatusUpdated
-from tui.output.formatting import clock_time
+from tui.wording.formatting import clock_time
 
 if TYPE_CHECKING:
     from pathlib import Path

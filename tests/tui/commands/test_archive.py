@@ -97,7 +97,7 @@ def test_the_archive_beside_the_recordings_answers_what_the_estimate_says(
         for key in ("noise_psd", "noise_psd_low", "noise_psd_high"):
             a, b = (np.array(each[key], dtype=float) for each in (one, other))
             np.testing.assert_allclose(a, b, rtol=1e-9)
-    registry = Registry().with_resource("result-1.schema.json", Resource.from_contents(RESULT))
+    registry = Registry().with_resource("result-2.schema.json", Resource.from_contents(RESULT))
     assert found.keys() == SCHEMA["properties"].keys()
     Draft202012Validator(strict(SCHEMA), registry=registry).validate(found)
     assert found["days"]["date"] == ["2026-08-31", "2026-09-01"]

@@ -192,7 +192,7 @@ def test_names_with_punctuation_are_printed_as_they_are(tmp_path: Path) -> None:
     reversed_ = f"{label[5]} has the opposite polarity to {label[2]}"
     assert f"{reversed_}, {label[8]} has the opposite polarity to {label[5]}: no bias" in words
     assert f"All of these have {names[1]} in common" in words
-    long = " ".join(huddle("estimate", str(out), "--segment", "1s", "--diagnostics").split())
+    long = " ".join(huddle("estimate", str(out), "--segment", "1s", "--details").split())
     assert f"{names[0]} → {names[1]}" in long
     assert f"warning: {reversed_}: no bias" in long
 

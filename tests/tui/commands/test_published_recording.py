@@ -155,7 +155,7 @@ def test_the_report_shows_the_angles_and_where_the_model_test_fails(
     failing = [band for band in found["bands"] if band["test"]["p_value"] < 0.01]
     assert any(band["low"] < 0.3 < band["high"] for band in failing)  # the microseism
     assert [pair["horizontal_deg"] for pair in found["responses"]] == pytest.approx(shown, abs=1e-3)
-    long = huddle("estimate", str(tst), *options, "--diagnostics")
+    long = huddle("estimate", str(tst), *options, "--details")
     assert "XX.TST5.00 → XX.TST5.10" in long
 
 

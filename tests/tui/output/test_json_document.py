@@ -20,16 +20,20 @@ def test_advice_has_its_kind_its_numbers_and_its_words() -> None:
     change[5, 5] = -1
     found = json.loads(json.dumps(finite(document(diagnosed(change), SETTINGS))))
     diagnostics = found["results"][0]["diagnostics"]
-    polarity = [each for each in diagnostics["advice"] if each["kind"] == "reversed-polarity"]
-    assert [(a["sensors"], a["numbers"]) for a in polarity] == [
+    by_kind = {
+        fact["numbers"]["findings"][0]["kind"]: fact
+        for fact in found["facts"]
+        if fact["kind"] == "finding"
+    }
+    polarity = by_kind["reversed-polarity"]
+    assert [(a["sensors"], a["numbers"]) for a in polarity["numbers"]["findings"]] == [
         ([0, 1], {"channel": 5, "counterpart": 2}),
         ([1, 2], {"channel": 8, "counterpart": 5}),
     ]
-    assert polarity[0]["level"] == "warning"
-    assert polarity[0]["text"].startswith("B.Z has the opposite polarity to A.Z")
-    assert polarity[0]["remedy"].endswith(".")
-    assert set(polarity[0]) == {"kind", "level", "sensors", "band", "text", "numbers", "remedy"}
-    (rotated, *_) = [each for each in diagnostics["advice"] if each["kind"] == "rotated"]
+    assert (polarity["rank"], polarity["sensors"]) == ("delays", ["A", "B", "C"])
+    assert polarity["line"].startswith("B.Z has the opposite polarity to A.Z")
+    assert polarity["action"].endswith(".")
+    (rotated, *_) = by_kind["rotated"]["numbers"]["findings"]
     assert set(rotated["numbers"]) == {"angle_deg", "horizontal_deg", "error_deg"}
     assert diagnostics["n_factors"] == 3
     assert diagnostics["untested"] is None

@@ -83,7 +83,7 @@ def test_the_schema_is_one_itself() -> None:
 def test_the_schema_refuses_what_is_wrong(written: Written) -> None:
     validator = Draft202012Validator(SCHEMA)
     for change in (
-        {"schema_version": 2},
+        {"schema_version": 1},
         {"verdict": "passed"},
         {"channels": [{"sensor": "A"}]},
         {"recordings": [written.document["recordings"][0] | {"sha256": "none"}]},

@@ -16,6 +16,7 @@ from daq.bench.units import decibels
 from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics, Synchronisation
 from daq.results.band_summary import levels
 from daq.results.decision.limits import judge
+from daq.results.facts import IntervalsWidened
 from daq.results.noise_budget import noise_budgets
 from estimator.levels.bands import band_edges
 from estimator.levels.contributions import Source
@@ -23,9 +24,10 @@ from tests.tui.example_snapshot import SETTINGS, demo_bench, made_snapshot
 from tui.application.test_view.curves import noise_curve
 from tui.notebook.result import Result
 from tui.output.json_document import _band_means
-from tui.output.results import result_table, widened_by
+from tui.output.results import result_table
 from tui.report.noise import noise_section
-from tui.report.parts import Items, Table
+from tui.report.parts import Table
+from tui.wording.facts import known
 
 if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
@@ -129,10 +131,8 @@ def test_table_report_json_notebook_curve_verdict_and_budget_have_the_same_ends(
 
 
 def test_what_widens_an_interval_is_named_with_its_size(snapshot: Snapshot) -> None:
-    lines = widened_by(snapshot, THIRD)
-    parts = noise_section(snapshot, THIRD, None).parts
-    notes = [each.text for part in parts if isinstance(part, Items) for each in part.entries]
-    assert all(line in notes for line in lines)
+    facts = known(snapshot, THIRD)
+    lines = [str(each) for each in facts if isinstance(each.fact, IntervalsWidened)]
     if snapshot.axis_tolerances:
         (line,) = lines
         assert "clocks (up to" in line

@@ -19,8 +19,9 @@ from tests.tui.report.written_report import Reported, Words, tables, texts_of
 from tui.cli.main import app
 from tui.output.json_document import result_document
 from tui.report.contents import report_of
-from tui.report.evidence import advice_section
+from tui.report.evidence import facts_section
 from tui.report.figures.drift import without_line
+from tui.wording.facts import known
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -161,13 +162,13 @@ def test_the_report_and_json_say_that_shared_noise_was_not_searched_for(
 ) -> None:
     snapshot = estimate([reported.recording])
     plain, searched = (
-        advice_section(snapshot),
+        facts_section(known(snapshot)),
         result_document(snapshot, next(iter(snapshot.results))),
     )
-    for module in ("results", "json_document"):
-        monkeypatch.setattr(f"tui.output.{module}.MAX_CHANNELS", 2)
-    words = "noise that two channels share is not searched for among more than 2 channels"
-    assert words in str(advice_section(snapshot))
+    for module in ("daq.results.known_facts", "tui.output.json_document"):
+        monkeypatch.setattr(f"{module}.MAX_CHANNELS", 2)
+    words = "Noise that two channels share is not searched for among more than 2 channels"
+    assert words in str(facts_section(known(snapshot)))
     assert words not in str(plain)
     assert searched["diagnostics"]["shared_noise_searched"] is True
     assert (

@@ -16,9 +16,9 @@ from daq.estimation.settings import Settings
 from daq.timing.clock_model import ClockSource, ClockState
 from sim_devices.world.scenario import Scenario
 from tui.cli.main import app
-from tui.output.results import remarks
 from tui.studies.clocks import free_running, residuals, study
 from tui.studies.synthesis import Latency, synthesise
+from tui.wording.facts import known
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -185,7 +185,7 @@ def test_where_the_resampler_damps_nothing_is_said(tmp_path: Path) -> None:
     noise = snapshot.results["three-sensor"].noise_psd
     assert np.isnan(noise[beyond]).all()
     assert np.isfinite(noise[1:][~beyond[1:]]).all()
-    said = "\n".join(remarks(snapshot))
+    said = "\n".join(each.line for each in known(snapshot))
     assert "no estimate above 90 Hz" in said
     assert "not finite" not in said
     found = snapshot.diagnostics.diagnosis

@@ -12,7 +12,7 @@ from daq.acquisition.before_test.findings import Problem
 from daq.acquisition.before_test.preflight import check_before_test, is_complete
 from tui.application.bench_view.traces import trace
 from tui.application.columns import columns, width_of
-from tui.output.formatting import listed, readings
+from tui.wording.formatting import listed, readings
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

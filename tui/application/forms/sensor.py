@@ -15,7 +15,7 @@ from daq.drivers.registry import driver_names, driver_type
 from daq.errors import BenchFileError, HuddleError
 from daq.transport.serial_ports import serial_ports
 from tui.application.forms.form import Field, Form
-from tui.output.formatting import listed
+from tui.wording.formatting import listed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from rich.text import Text
 
-from tui.output.formatting import clock_time
-from tui.output.verdict_text import STYLES, WORDS
+from tui.wording.formatting import clock_time
+from tui.wording.verdict_text import STYLES, WORDS
 
 if TYPE_CHECKING:
     from tui.runs.catalogue import Entry

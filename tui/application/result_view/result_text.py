@@ -15,10 +15,11 @@ from daq.results.partners import without_partners
 from daq.results.precision import channel_covs, precision
 from tui.application.dialogs import item
 from tui.application.test_view.panels import alerts, known_to
-from tui.output.advice.diagnostics import summary
-from tui.output.formatting import clock_time, level, level_with_error, percent, signed
-from tui.output.results import remarks, widened_by
-from tui.output.verdict_text import (
+from tui.output.results import averages_line
+from tui.wording.facts import MARKS as MARKS_OF_RANKS
+from tui.wording.facts import NOTHING_TO_DO, known
+from tui.wording.formatting import clock_time, level, level_with_error, percent, signed
+from tui.wording.verdict_text import (
     MARKS,
     STYLES,
     headline,
@@ -28,7 +29,7 @@ from tui.output.verdict_text import (
     what_to_do,
     worst_by_channel,
 )
-from tui.output.vocabulary import PARTNER_WORDS
+from tui.wording.vocabulary import PARTNER_WORDS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -57,10 +58,11 @@ def result(state: State, *, width: int) -> RenderableType:
     if snapshot.results:
         parts += [_channels(state, snapshot, settings, width=width)]
         parts += [*_notes(state, snapshot, settings), ""]
-    parts += [
-        item(line)
-        for line in (*remarks(snapshot), *widened_by(snapshot, settings), *summary(snapshot))
-    ]
+    facts = known(snapshot, settings)
+    if not any(each.needs_action for each in facts):
+        parts.append(item(NOTHING_TO_DO))
+    parts += [item(f"{MARKS_OF_RANKS[each.fact.rank]} {each}") for each in facts]
+    parts.append(item(averages_line(snapshot)))
     if path is not None:
         parts += ["", Text.assemble(("recording  ", MUTED), str(path.resolve()))]
     return Group(*parts)

@@ -13,7 +13,7 @@ from tui.application.test_view.channels import channel_table
 from tui.application.test_view.plot import DriftPlot, PsdPlot
 from tui.application.test_view.plotted import Choice, curves, plot_title, read_out, unit_of
 from tui.application.view import TALL
-from tui.output.formatting import clock_time
+from tui.wording.formatting import clock_time
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

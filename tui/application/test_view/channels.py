@@ -13,9 +13,9 @@ from daq.results.band_summary import band_of, data_means
 from daq.results.partners import without_partners
 from daq.results.precision import channel_covs
 from tui.application.test_view.panels import MUTED, grouped
-from tui.output.formatting import level, level_with_error, percent, signed
-from tui.output.verdict_text import MARKS, STYLES, worst_by_channel
-from tui.output.vocabulary import PARTNER_WORDS
+from tui.wording.formatting import level, level_with_error, percent, signed
+from tui.wording.verdict_text import MARKS, STYLES, worst_by_channel
+from tui.wording.vocabulary import PARTNER_WORDS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

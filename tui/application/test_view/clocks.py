@@ -21,7 +21,7 @@ from daq.results.clock_effect import (
 )
 from daq.timing.clock_model import ClockSource
 from tui.application.test_view.curves import Line
-from tui.output.vocabulary import clock_source
+from tui.wording.vocabulary import clock_source
 
 if TYPE_CHECKING:
     from daq.estimation.settings import Settings

@@ -9,11 +9,10 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.protocols.block import EventKind
-from tui.application.dialogs import item
 from tui.application.test_view.panels import grouped, state
-from tui.output.advice.diagnostics import details as diagnosis_details
-from tui.output.formatting import clock_time, utc
-from tui.output.results import left_out
+from tui.output.diagnosis import details as diagnosis_details
+from tui.wording.facts import known
+from tui.wording.formatting import clock_time, utc
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -34,9 +33,8 @@ def details(
     parts += [Text(f"sensors, since {utc(now.started_utc_ns)}", HEADER), _sensors(now)]
     if snapshot is not None and settings is not None:
         parts += ["", Text("segments", HEADER), _segments(snapshot, settings)]
-        parts += [item(f"{method}: {why}") for method, why in snapshot.refused.items()]
         parts += ["", Text("diagnosis", HEADER)]
-        parts += diagnosis_details(snapshot)
+        parts += diagnosis_details(snapshot, known(snapshot, settings))
     parts += ["", Text("events, latest first", HEADER), _events(now)]
     return Group(*parts)
 
@@ -64,7 +62,7 @@ def _segments(snapshot: Snapshot, settings: Settings) -> Text:
         f"{settings.overlap:.0%} overlap), worth {snapshot.n_effective:.0f} independent averages"
     )
     if snapshot.n_dropped:
-        text += f"; {snapshot.n_dropped} excluded{left_out(snapshot)}"
+        text += f"; {snapshot.n_dropped} excluded"
     return Text(text)
 
 

@@ -13,16 +13,15 @@ from rich.text import Text
 from daq.bench.units import decibels
 from daq.recording.sensor_state import SensorState
 from daq.results.band_summary import band_of, channel_means
+from daq.results.facts import Rank
+from daq.results.known_facts import WITHOUT_ESTIMATE
 from daq.results.partners import without_partners
 from daq.results.precision import precision
-from estimator.diagnostics.kinds import Level
-from tui.output.advice.alerts import alert
-from tui.output.advice.sentences import Names
-from tui.output.formatting import clock_time, percent, roughly, several, signed, time_left
-from tui.output.results import faulty_channels, live_remarks
-from tui.output.verdict_text import STYLES as STYLES_OF_VERDICTS
-from tui.output.verdict_text import headline, record_for
-from tui.output.vocabulary import FLAG_WORDS, PARTNER_WORDS, STATE_ALERTS, WITHOUT_ESTIMATE
+from tui.wording.facts import known
+from tui.wording.formatting import clock_time, percent, roughly, several, signed, time_left
+from tui.wording.verdict_text import STYLES as STYLES_OF_VERDICTS
+from tui.wording.verdict_text import headline, record_for
+from tui.wording.vocabulary import FLAG_WORDS, PARTNER_WORDS, STATE_ALERTS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -304,18 +303,10 @@ def _overdue_alert(sensor: SensorStatus, now: RecordingStatus) -> str:
 
 
 def findings(snapshot: Snapshot, *, width: int) -> list[Text]:
-    """Return what the diagnosis has found wrong with the test, a line each, the worst first."""
-    styles = {Level.PROBLEM: "bold #ff6b6b", Level.WARNING: "yellow"}
-    names = Names.of(snapshot)
-    found = [
-        (alert(each, names), styles[each.level])
-        for each in snapshot.diagnostics.advice
-        if each.level in styles
-    ]
-    faulty = [(line, styles[Level.PROBLEM]) for line in faulty_channels(snapshot)]
-    unusable = [(line, styles[Level.PROBLEM]) for line in live_remarks(snapshot)]
-    whole = [*unusable, *found[:1], *faulty, *found[1:]]
-    lines = [Text(f"▲ {words}", style) for words, style in whole]
+    """Return the facts that invalidate or delay the result, a line each, the worst first."""
+    styles = {Rank.INVALIDATES: "bold #ff6b6b", Rank.DELAYS: "yellow"}
+    needed = [each for each in known(snapshot) if each.needs_action]
+    lines = [Text(each.line, styles[each.fact.rank]) for each in needed]
     for line in lines:
         line.truncate(width, overflow="ellipsis")
     return lines

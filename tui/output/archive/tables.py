@@ -11,7 +11,7 @@ from rich.text import Text
 
 from daq.archive.changes import MIN_DAYS
 from daq.bench.units import decibels
-from tui.output.formatting import percent, several, signed, span
+from tui.wording.formatting import percent, several, signed, span
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

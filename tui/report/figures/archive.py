@@ -18,8 +18,8 @@ from daq.archive.density import HIGHEST_DB, LOWEST_DB
 from daq.bench.units import levels_db
 from tui.output.archive.tables import day_text
 from tui.output.console import write_whole
-from tui.output.formatting import span
 from tui.report.figures import drawing
+from tui.wording.formatting import span
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

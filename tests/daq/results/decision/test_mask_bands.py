@@ -15,7 +15,7 @@ from estimator.decision.verdict import Obstacle, Verdict
 from estimator.self_noise.result import SelfNoise
 from tests.daq.results.decision.benches import MASK, verdict_on
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
-from tui.output.verdict_text import not_judged
+from tui.wording.verdict_text import not_judged
 
 
 def test_a_mask_outside_the_spectrum_decides_nothing() -> None:

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 from estimator.diagnostics.kinds import Level
 from estimator.diagnostics.misfit import DisturbedSegments, NoiseChanges, SharedNoise
-from tui.output.advice.alerts import alert
-from tui.output.advice.sentences import Explanation, explain, where
-from tui.output.formatting import listed, percent, several
+from tui.wording.alerts import alert
+from tui.wording.findings import Explanation, explain, where
+from tui.wording.formatting import listed, percent, several
 
 if TYPE_CHECKING:
-    from tui.output.advice.sentences import Names
+    from tui.wording.findings import Names
 
 
 @explain.register(SharedNoise)

@@ -27,7 +27,7 @@ from estimator.diagnostics.advice import (
 )
 from estimator.diagnostics.kinds import Level
 from estimator.diagnostics.misfit import DisturbedSegments, NoiseChanges, SharedNoise
-from tui.output.advice.sentences import Names
+from tui.wording.findings import Names
 
 BAND = (2.0, 8.0)
 MISFIT = ModelMisfit(

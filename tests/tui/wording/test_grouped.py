@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from daq.results.facts import Finding, Rank
 from estimator.diagnostics.advice import (
     Advice,
     NearlySingular,
     WeakMotion,
 )
 from estimator.diagnostics.kinds import Level
-from tests.tui.output.advice.advice_examples import (
+from tests.tui.wording.advice_examples import (
     BAND,
     EXAMPLES,
     FEW,
@@ -25,8 +26,9 @@ from tests.tui.output.advice.advice_examples import (
     SKEWED,
     names,
 )
-from tui.output.advice.sentences import explain
-from tui.output.advice.summary import summarise
+from tui.wording.facts import word
+from tui.wording.findings import explain
+from tui.wording.grouped import together
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -36,16 +38,17 @@ if TYPE_CHECKING:
 def test_alone_in_a_summary_it_is_what_it_is_alone(advice: Advice, words: Sequence[str]) -> None:
     del words
     who = names("a", "b", "c")
-    assert summarise([advice], who) == [str(explain(advice, who))]
+    fact = Finding(rank=Rank.TO_KNOW, findings=(advice,))
+    assert str(word(fact, who)) == str(explain(advice, who))
 
 
 def test_bands_that_fail_are_one_line_the_worst_first() -> None:
     worse = replace(MISFIT, band=(10.0, 20.0), worst_statistic=9.0, worst_band=(12.0, 15.0))
     worse = replace(worse, unexplained=0.2, error=2.0)
-    (line,) = summarise([MISFIT, worse], names("a", "b", "c"))
+    line = str(together([MISFIT, worse], names("a", "b", "c")))
     assert line.startswith("The model test fails at 10–20 Hz (9), 2–8 Hz (4): one common motion")
     assert "It is largest at 12–15 Hz. Up to 20 % of the noise is unexplained." in line
-    (line,) = summarise([FEW, replace(FEW, band=(10.0, 20.0))], names("a", "b", "c"))
+    line = str(together([FEW, replace(FEW, band=(10.0, 20.0))], names("a", "b", "c")))
     assert "2–8 Hz (4), 10–20 Hz (4): one motion of 1 dimension does not explain" in line
     assert "Omit --dimension" in line
 
@@ -57,32 +60,32 @@ def test_pairs_of_one_kind_are_one_line() -> None:
     def all_pairs(advice: Advice) -> list[Advice]:
         return [replace(advice, sensors=pair) for pair in pairs]
 
-    (line,) = summarise(all_pairs(replace(ROTATED, horizontal_deg=float("nan"))), who)
+    line = str(together(all_pairs(replace(ROTATED, horizontal_deg=float("nan"))), who))
     assert line.startswith(
         "Sensors are rotated against each other (a–b 4.120°, a–c 4.120°, b–c 4.120°): no bias"
     )
     turned = [replace(ROTATED, angle_deg=5.0, horizontal_deg=-4.95, sensors=(0, 1))]
     tilted = replace(ROTATED, angle_deg=8.5, horizontal_deg=3.0, sensors=(0, 2))
-    (line,) = summarise([*turned, replace(turned[0], sensors=(1, 2))], who)
+    line = str(together([*turned, replace(turned[0], sensors=(1, 2))], who))
     assert line.startswith(
         "Sensors are rotated against each other in the horizontal plane (a–b −4.950°, b–c −4.950°):"
     )
-    (line,) = summarise([*turned, tilted], who)
+    line = str(together([*turned, tilted], who))
     assert line.startswith(
         "Sensors are rotated against each other (a–b 5.000°, a–c 8.500°; in the horizontal plane "
         "a–b −4.950°, a–c 3.000°): no bias"
     )
-    (line,) = summarise(all_pairs(LEADS), who)
+    line = str(together(all_pairs(LEADS), who))
     assert line.startswith("Sensors lag each other (a–b −20 ms, a–c −20 ms, b–c −20 ms): their")
-    (line,) = summarise(all_pairs(SKEWED), who)
+    line = str(together(all_pairs(SKEWED), who))
     assert line.startswith(
         "Channels deviate from a right angle (a–b 5.7°, a–c 5.7°, b–c 5.7°), or have unequal gains"
     )
-    (line,) = summarise(all_pairs(GAIN), who)
+    line = str(together(all_pairs(GAIN), who))
     assert line.startswith("Gains differ (a–b 1.050, a–c 1.050, b–c 1.050): no bias")
     assert "in common" not in line  # no sensor is part of all three pairs
     singular = [NearlySingular(level=Level.NOTE, band=b, condition=99.0) for b in (BAND, (9.0, 10))]
-    (line,) = summarise(singular, who)
+    line = str(together(singular, who))
     assert "nearly singular at 2–8 Hz, 9–10 Hz: one direction" in line
 
 
@@ -92,7 +95,7 @@ def test_of_very_many_pairs_the_worst_are_listed() -> None:
         replace(ROTATED, sensors=pair, angle_deg=float(n), horizontal_deg=float("nan"))
         for n, pair in enumerate(combinations(range(15), 2))
     ]
-    (line,) = summarise(advice, names(*sensors))
+    line = str(together(advice, names(*sensors)))
     assert line.startswith(
         "Sensors are rotated against each other (S13–S14 104.000°, S12–S14 103.000°"
     )
@@ -102,4 +105,4 @@ def test_of_very_many_pairs_the_worst_are_listed() -> None:
 
 def test_kinds_without_a_common_form_are_said_one_by_one() -> None:
     weak = [WeakMotion(level=Level.NOTE, band=b, snr=0.3) for b in (BAND, (9.0, 10.0))]
-    assert len(summarise(weak, names("a", "b", "c"))) == 2
+    assert str(together(weak, names("a", "b", "c"))).count("weaker than the rest") == 2

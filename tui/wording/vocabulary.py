@@ -107,16 +107,6 @@ SOURCE_WORDS: Mapping[Source, str] = {
 }
 """What widens an interval beyond its scatter."""
 
-WITHOUT_ESTIMATE = (
-    Flag.DEAD_CHANNEL
-    | Flag.DUPLICATE
-    | Flag.NOT_FINITE
-    | Flag.INVALID
-    | Flag.SINGULAR
-    | Flag.NO_COUNTERPART
-)
-"""Flags of frequencies that have no estimate."""
-
 
 def clock_source(clock: ClockState, *, short: bool = False) -> str:
     """Return the source of the times of a sensor's samples."""

@@ -3,5 +3,5 @@
 Chosen by the type of the advice; never parsed. Tables of numbers are in `tui.output`.
 """
 
-from tui.output.advice import differences as differences  # registers its sentences
-from tui.output.advice import misfit as misfit  # likewise
+from tui.wording import differences as differences  # registers its sentences
+from tui.wording import misfit as misfit  # likewise

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import pytest
 
+from daq.results.known_facts import WITHOUT_ESTIMATE
 from estimator.self_noise.result import Flag
-from tests.tui.example_snapshot import SETTINGS, made_now, made_snapshot
+from tests.tui.example_snapshot import SETTINGS, made_now, made_snapshot, said
 from tui.application.test_view.panels import noise_in_band, sensor_table
 from tui.application.test_view.plotted import Choice
 from tui.output.console import console
-from tui.output.results import remarks
-from tui.output.vocabulary import FLAG_WORDS, WITHOUT_ESTIMATE
+from tui.wording.vocabulary import FLAG_WORDS
 
 
 def test_every_flag_has_words_of_its_own() -> None:
@@ -34,9 +34,9 @@ def test_table_and_remarks_take_their_words_from_one_place(flag: Flag) -> None:
     means = noise_in_band(snapshot, SETTINGS, choice)
     table = sensor_table(made_now(), snapshot, SETTINGS, choice, means=means, width=150)
     screen = console()
-    with screen.capture() as said:
+    with screen.capture() as shown:
         screen.print(table, width=150)
     without = bool(flag & WITHOUT_ESTIMATE)
-    assert (f"Y {FLAG_WORDS[flag].short}" in said.get()) == without
+    assert (f"Y {FLAG_WORDS[flag].short}" in shown.get()) == without
     line = f"three-sensor: B.Y: {FLAG_WORDS[flag].long}, at all frequencies"
-    assert (line in remarks(snapshot)) == (without or flag is Flag.NOT_CONVERGED)
+    assert (line in said(snapshot)) == (without or flag is Flag.NOT_CONVERGED)

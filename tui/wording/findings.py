@@ -22,7 +22,7 @@ from estimator.diagnostics.advice import (
     WeakMotion,
 )
 from estimator.diagnostics.kinds import Level
-from tui.output.formatting import listed, percent, ratio, span
+from tui.wording.formatting import listed, percent, ratio, span
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from estimator.diagnostics.kinds import AdviceKind
-from tests.tui.output.advice.advice_examples import EXAMPLES, MISFIT, names
-from tui.output.advice.sentences import explain
+from tests.tui.wording.advice_examples import EXAMPLES, MISFIT, names
+from tui.wording.findings import explain
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

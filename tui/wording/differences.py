@@ -15,11 +15,11 @@ from estimator.diagnostics.advice import (
     UnequalResponses,
 )
 from estimator.diagnostics.kinds import Level
-from tui.output.advice.sentences import Explanation, explain, where
-from tui.output.formatting import listed, percent, ratio, signed
+from tui.wording.findings import Explanation, explain, where
+from tui.wording.formatting import listed, percent, ratio, signed
 
 if TYPE_CHECKING:
-    from tui.output.advice.sentences import Names
+    from tui.wording.findings import Names
 
 EFFECT_OF_ROTATION = (
     "no bias in the three-sensor or maximum likelihood estimate, but motion leaks into a "

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 from estimator.decision.comparison import MIN_AVERAGES
 from estimator.decision.decision_time import LIKELY
 from estimator.decision.verdict import Obstacle, Verdict
-from tui.output.exit_codes import ExitCode
-from tui.output.formatting import level, listed, roughly, several, signed
+from tui.wording.formatting import level, listed, roughly, several, signed
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -21,11 +20,6 @@ WORDS: Mapping[Verdict, str] = {
     Verdict.PASS: "PASS",
     Verdict.FAIL: "FAIL",
     Verdict.NOT_DECIDED: "NOT DECIDED",
-}
-EXIT_CODES: Mapping[Verdict, ExitCode] = {
-    Verdict.PASS: ExitCode.DONE,
-    Verdict.FAIL: ExitCode.LIMIT_NOT_MET,
-    Verdict.NOT_DECIDED: ExitCode.NOT_DECIDED,
 }
 STYLES: Mapping[Verdict, str] = {
     Verdict.PASS: "bold green",

@@ -18,25 +18,26 @@ from estimator.diagnostics.advice import (
     SwappedChannels,
     TooFewDimensions,
 )
-from tui.output.advice.differences import (
+from tui.wording.differences import (
     EFFECT_OF_DELAY,
     EFFECT_OF_ROTATION,
     EFFECT_OF_SKEW,
     followers,
     opposite,
 )
-from tui.output.advice.sentences import (
+from tui.wording.findings import (
     EFFECT_OF_FEW_DIMENSIONS,
+    Explanation,
     Names,
     effect_of_misfit,
     explain,
     model,
     where,
 )
-from tui.output.formatting import degrees, signed, span
+from tui.wording.formatting import degrees, signed, span
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Sequence
     from typing import TypeVar
 
     Pairwise = TypeVar("Pairwise", bound=Advice)
@@ -49,20 +50,13 @@ _FAULTS_OF_ONE = (Delay, Gain, NotOrthogonal, ReversedPolarity, SwappedChannels)
 """Faults of one sensor, which appear in each pair with it."""
 
 
-def summarise(advice: Iterable[Advice], names: Names) -> list[str]:
-    """Return advice as sentences, one line for each kind where possible."""
-    kinds: dict[type[Advice], list[Advice]] = {}
-    for each in advice:
-        kinds.setdefault(type(each), []).append(each)
-    lines = []
-    for found in kinds.values():
-        text = _together(*found, names=names) if len(found) > 1 else ""
-        if text:
-            remedy = explain(found[0], names).remedy
-            lines.append(" ".join(part for part in (text, _common(found, names), remedy) if part))
-        else:
-            lines += [str(explain(each, names)) for each in found]
-    return lines
+def together(found: Sequence[Advice], names: Names) -> Explanation:
+    """Return several findings of one kind as sentences, and their remedy."""
+    text = _together(*found, names=names)
+    if not text:
+        return Explanation(" ".join(str(explain(each, names)) for each in found))
+    both = " ".join(part for part in (text, _common(found, names)) if part)
+    return Explanation(both, explain(found[0], names).remedy)
 
 
 def _common(found: Sequence[Advice], names: Names) -> str:

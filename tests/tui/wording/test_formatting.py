@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from tui.output.formatting import readings
+from tui.wording.formatting import readings
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,496 @@
+"""What is known of a test beyond its numbers: one class per kind of fact, with numbers.
+
+`daq.results.known_facts` makes facts, `tui.wording` words them, and renderers only place the words.
+The findings of the estimator (`estimator.diagnostics.advice`) become facts as `Finding`.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+from estimator.diagnostics.kinds import Level
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from daq.timing.clock_model import LostCount
+    from estimator.diagnostics.advice import Advice
+    from estimator.diagnostics.kinds import Untested
+    from estimator.levels.contributions import Source
+    from estimator.likelihood.dimension import BandDimension
+    from estimator.self_noise.result import Flag
+    from estimator.spectra.segment_rejection import Reason
+
+
+class Rank(enum.StrEnum):
+    """What a fact does to the result, the worst first."""
+
+    INVALIDATES = "invalidates"
+    """Numbers in its scope are wrong, may be wrong by any amount, or are missing."""
+    DELAYS = "delays"
+    """The result is less certain than it can be, or is decided later."""
+    TO_KNOW = "to-know"
+    """The result holds; readers should know the fact."""
+
+
+RANK_OF_LEVEL: Mapping[Level, Rank] = {
+    Level.PROBLEM: Rank.INVALIDATES,
+    Level.WARNING: Rank.DELAYS,
+    Level.NOTE: Rank.TO_KNOW,
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fact:
+    """A fact about a test; each kind is a subclass.
+
+    Attributes
+    ----------
+    name : str
+        Name of the kind, in JSON.
+    rank : Rank
+    sensors, channels : tuple of str
+        Those concerned, channels as in ``A.X``; both empty for all.
+    band : (float, float) or None
+        Hz; None for all frequencies.
+    time_utc_ns : (int, int) or None
+        From when to when, in ns since 1970; None for the whole test.
+    method : str
+        The method concerned; empty for all.
+    """
+
+    name: ClassVar[str]
+    rank: Rank
+    sensors: tuple[str, ...] = ()
+    channels: tuple[str, ...] = ()
+    band: tuple[float, float] | None = None
+    time_utc_ns: tuple[int, int] | None = None
+    method: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding(Fact):
+    """Findings of one kind of the estimator, worst first.
+
+    Attributes
+    ----------
+    findings : tuple of Advice
+        All of one class. Their sensors and channels are positions from 0.
+    """
+
+    name: ClassVar[str] = "finding"
+    findings: tuple[Advice, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MethodRefused(Fact):
+    """A method gives no result.
+
+    Attributes
+    ----------
+    reason : str
+        A sentence of the estimator's error.
+    """
+
+    name: ClassVar[str] = "method-refused"
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WithoutEstimate(Fact):
+    """Frequencies of `channels` have no valid estimate by `method`.
+
+    Attributes
+    ----------
+    flag : Flag
+    most, n_frequencies : int
+        Frequencies of the worst channel that are concerned, and all frequencies.
+    """
+
+    name: ClassVar[str] = "without-estimate"
+    flag: Flag
+    most: int
+    n_frequencies: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoSegmentUsable(Fact):
+    """No segment can be used.
+
+    Attributes
+    ----------
+    segment : float
+        Its length, s.
+    reason : Reason
+        Why most are excluded.
+    longest : float
+        Longest stretch of the sensor without a gap, s.
+    """
+
+    name: ClassVar[str] = "no-segment-usable"
+    segment: float
+    reason: Reason
+    longest: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NotInLiveEstimate(Fact):
+    """A live estimate leaves out `sensors` to limit its memory; `n_all` are recorded."""
+
+    name: ClassVar[str] = "not-in-live-estimate"
+    n_all: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorLost(Fact):
+    """A sensor sent nothing from `time_utc_ns` on.
+
+    Attributes
+    ----------
+    missing : float
+        Seconds to the end of the test.
+    never_seen : bool
+        Whether it sent nothing at all.
+    """
+
+    name: ClassVar[str] = "sensor-lost"
+    missing: float
+    never_seen: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BlocksDamaged(Fact):
+    """Blocks of a sensor in the file have wrong checksums, and are excluded as gaps."""
+
+    name: ClassVar[str] = "blocks-damaged"
+    n_blocks: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SamplesMissing(Fact):
+    """A sensor has gaps."""
+
+    name: ClassVar[str] = "samples-missing"
+    n_gaps: int
+    n_samples: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SegmentsExcluded(Fact):
+    """Segments are excluded.
+
+    Attributes
+    ----------
+    n_segments : int
+    reasons : mapping of Reason to int
+    transients_by_octave : tuple of (float, float, int)
+        Lowest and highest frequency (Hz), and segments with transients, where each octave has its
+        own segments.
+    """
+
+    name: ClassVar[str] = "segments-excluded"
+    n_segments: int
+    reasons: Mapping[Reason, int]
+    transients_by_octave: tuple[tuple[float, float, int], ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GapsBridged(Fact):
+    """Segments with gaps are used, with windows that are zero in the gaps.
+
+    Attributes
+    ----------
+    n_segments : int
+    lost : float
+        Mean share of the energy of a segment that gaps take.
+    leakage : float
+        Mean share of the noise that comes from other frequencies, in intervals already.
+    """
+
+    name: ClassVar[str] = "gaps-bridged"
+    n_segments: int
+    lost: float
+    leakage: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OctaveSegments(Fact):
+    """Low octaves have longer segments; `only_one` where there are too few samples for them.
+
+    Attributes
+    ----------
+    longest : float
+        Length of the longest segments, s.
+    n_effective : float
+        Effective averages of these.
+    below : float
+        Highest frequency with these, Hz.
+    only_one : bool
+    """
+
+    name: ClassVar[str] = "octave-segments"
+    longest: float
+    n_effective: float
+    below: float
+    only_one: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChannelsClipped(Fact):
+    """Samples are at the end of the range: the noise of these channels is too high.
+
+    Attributes
+    ----------
+    shares : tuple of float
+        Share of the samples of each channel.
+    """
+
+    name: ClassVar[str] = "channels-clipped"
+    shares: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChannelsStoodStill(Fact):
+    """Channels had a constant count for a while.
+
+    Attributes
+    ----------
+    seconds : tuple of float
+        How long, for each channel.
+    """
+
+    name: ClassVar[str] = "channels-stood-still"
+    seconds: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClocksFitted(Fact):
+    """The times of samples come from clocks fitted to their arrivals.
+
+    Attributes
+    ----------
+    ppm : tuple of float
+        Rate of each sensor's clock against nominal.
+    error : float
+        Largest remaining error between them, s rms.
+    """
+
+    name: ClassVar[str] = "clocks-fitted"
+    ppm: tuple[float, ...]
+    error: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatedTimesDrift(Fact):
+    """The UTC that sensors state drifts against the motion.
+
+    Attributes
+    ----------
+    corrected, uncorrected : mapping of str to float
+        Drift of each sensor, s rms.
+    left : float
+        Error after the correction, s rms; NaN without one.
+    reference : str
+        The sensor against which the motion shows it; empty if none.
+    """
+
+    name: ClassVar[str] = "stated-times-drift"
+    corrected: Mapping[str, float]
+    uncorrected: Mapping[str, float]
+    left: float
+    reference: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatedTimesUnchecked(Fact):
+    """The UTC that sensors state could not be compared with the motion."""
+
+    name: ClassVar[str] = "stated-times-unchecked"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SamplesUncounted(Fact):
+    """A sensor lost or repeated samples without counting them; its count was corrected."""
+
+    name: ClassVar[str] = "samples-uncounted"
+    slips: tuple[LostCount, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClockNotUnderstood(Fact):
+    """The delays measured from the motion do not lie on a sensor's clock.
+
+    Attributes
+    ----------
+    ppm : float
+    error : float
+        s rms.
+    """
+
+    name: ClassVar[str] = "clock-not-understood"
+    ppm: float
+    error: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RatesNominal(Fact):
+    """Samples are taken to be at their nominal rates; no interval includes that error."""
+
+    name: ClassVar[str] = "rates-nominal"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClocksMayExplain(Fact):
+    """Clocks are so little known that findings may come from them alone; `error` in s rms."""
+
+    name: ClassVar[str] = "clocks-may-explain"
+    error: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoEstimateAbove(Fact):
+    """There is no estimate in `band`, where resampling attenuates."""
+
+    name: ClassVar[str] = "no-estimate-above"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelUntested(Fact):
+    """Whether one common motion explains the averages was not tested.
+
+    Attributes
+    ----------
+    why : Untested
+    n_effective : float
+    n_channels, n_factors : int
+    dims : tuple of int
+    """
+
+    name: ClassVar[str] = "model-untested"
+    why: Untested
+    n_effective: float
+    n_channels: int
+    n_factors: int
+    dims: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelPasses(Fact):
+    """The model test passes in all bands."""
+
+    name: ClassVar[str] = "model-passes"
+    n_factors: int
+    dims: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DimensionsChosen(Fact):
+    """The dimensions of the motion were chosen by band.
+
+    Attributes
+    ----------
+    choices : tuple of BandDimension
+        Accepted choices with an unusual dimension; empty if all are usual.
+    usual : int
+        The usual dimension.
+    elsewhere : bool
+        Whether bands with the usual dimension remain.
+    """
+
+    name: ClassVar[str] = "dimensions-chosen"
+    choices: tuple[BandDimension, ...]
+    usual: int
+    elsewhere: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DimensionsUnexplained(Fact):
+    """No dimension that the sensors allow explains the averages in `bands` (Hz)."""
+
+    name: ClassVar[str] = "dimensions-unexplained"
+    bands: tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DimensionsUndetermined(Fact):
+    """More dimensions explain the averages in `bands` (Hz), but are not told from noise."""
+
+    name: ClassVar[str] = "dimensions-undetermined"
+    bands: tuple[tuple[float, float], ...]
+    usual: int
+    n_sensors: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SharedNoiseNotSearched(Fact):
+    """Noise that two channels share is not searched for among so many channels."""
+
+    name: ClassVar[str] = "shared-noise-not-searched"
+    n_channels: int
+    most: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SteadinessNotTested(Fact):
+    """Whether the noise changes during the recording is not tested; `causes` are why."""
+
+    name: ClassVar[str] = "steadiness-not-tested"
+    causes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LikeChannelsAssumed(Fact):
+    """The two-channel method assumes parallel like channels with known gains."""
+
+    name: ClassVar[str] = "like-channels-assumed"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DirectionsPooled(Fact):
+    """Directions of the motion come from neighbouring frequencies, at `n` of `n_frequencies`."""
+
+    name: ClassVar[str] = "directions-pooled"
+    n: int
+    n_frequencies: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ValuesBelowZero(Fact):
+    """Values of the noise PSD are at or below zero, `n` of `n_values`."""
+
+    name: ClassVar[str] = "values-below-zero"
+    n: int
+    n_values: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IntervalsWidened(Fact):
+    """What intervals of the table include beside scatter.
+
+    Attributes
+    ----------
+    shares : mapping of Source to float
+        Largest share of the noise; NaN without limit.
+    """
+
+    name: ClassVar[str] = "intervals-widened"
+    shares: Mapping[Source, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TargetMissed(Fact):
+    """The wanted precision is not reached.
+
+    Attributes
+    ----------
+    cov, target : float
+    total : float or None
+        Seconds of recording that reach the target.
+    """
+
+    name: ClassVar[str] = "target-missed"
+    cov: float
+    target: float
+    total: float | None

@@ -1,0 +1,441 @@
+"""The facts of an estimate, made here once from its snapshot."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.results.band_summary import band_of, channel_means, highest_known
+from daq.results.clock_effect import reference
+from daq.results.facts import (
+    RANK_OF_LEVEL,
+    BlocksDamaged,
+    ChannelsClipped,
+    ChannelsStoodStill,
+    ClockNotUnderstood,
+    ClocksFitted,
+    ClocksMayExplain,
+    DimensionsChosen,
+    DimensionsUndetermined,
+    DimensionsUnexplained,
+    DirectionsPooled,
+    Fact,
+    Finding,
+    GapsBridged,
+    IntervalsWidened,
+    LikeChannelsAssumed,
+    MethodRefused,
+    ModelPasses,
+    ModelUntested,
+    NoEstimateAbove,
+    NoSegmentUsable,
+    NotInLiveEstimate,
+    OctaveSegments,
+    Rank,
+    RatesNominal,
+    SamplesMissing,
+    SamplesUncounted,
+    SegmentsExcluded,
+    SensorLost,
+    SharedNoiseNotSearched,
+    StatedTimesDrift,
+    StatedTimesUnchecked,
+    SteadinessNotTested,
+    TargetMissed,
+    ValuesBelowZero,
+    WithoutEstimate,
+)
+from daq.results.precision import precision
+from daq.timing.clock_model import ClockSource
+from estimator.diagnostics.advice import (
+    Copies,
+    Delay,
+    Gain,
+    ModelMisfit,
+    NoSharedMotion,
+    NoSignal,
+    TooFewDimensions,
+    TooFewSensors,
+)
+from estimator.diagnostics.kinds import Untested
+from estimator.diagnostics.shared_noise import MAX_CHANNELS
+from estimator.errors import BandError
+from estimator.self_noise.result import Flag
+from estimator.spectra.segment_rejection import Reason
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import SensorTotals, Snapshot
+    from estimator.diagnostics.advice import Advice
+    from estimator.levels.contributions import Source
+
+LEAST_SHARE = 0.01
+"""Share of the noise from which a contribution to an interval is a fact."""
+WITHOUT_ESTIMATE = (
+    Flag.DEAD_CHANNEL
+    | Flag.DUPLICATE
+    | Flag.NOT_FINITE
+    | Flag.INVALID
+    | Flag.SINGULAR
+    | Flag.NO_COUNTERPART
+)
+"""Flags of frequencies that have no estimate."""
+_NO_FLAG = Flag(0)
+_LIKE_A_CLOCK = Delay | Gain | ModelMisfit | NoSharedMotion
+"""Findings that unknown clocks alone can bring about."""
+_TURN = 0.3  # rad at the highest frequency: 9 % of the motion is taken for noise there
+
+
+def facts_of(snapshot: Snapshot, settings: Settings | None = None) -> tuple[Fact, ...]:
+    """Return all facts of an estimate, the worst rank first.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+    settings : Settings or None
+        The snapshot was made with. Without, facts that depend on a band or a target are left out.
+    """
+    found = [
+        *_findings(snapshot),
+        *_recording(snapshot),
+        *_segments(snapshot),
+        *_channels(snapshot),
+        *_clocks(snapshot),
+        *_model(snapshot),
+        *_methods(snapshot),
+    ]
+    if settings is not None:
+        found += _precision(snapshot, settings)
+    ranks = list(Rank)
+    return tuple(sorted(found, key=lambda fact: ranks.index(fact.rank)))
+
+
+def _findings(snapshot: Snapshot) -> Iterator[Fact]:
+    """Yield the findings of the diagnosis, those of one kind together."""
+    kinds: dict[type[Advice], list[Advice]] = {}
+    for each in snapshot.diagnostics.advice:
+        kinds.setdefault(type(each), []).append(each)
+    ranks, names = list(Rank), snapshot.sensor_names
+    for found in kinds.values():
+        concerned = sorted({sensor for each in found for sensor in each.sensors})
+        bands = [each.band for each in found]
+        known = [band for band in bands if band is not None]
+        yield Finding(
+            rank=min((RANK_OF_LEVEL[each.level] for each in found), key=ranks.index),
+            sensors=tuple(names[sensor] for sensor in concerned)
+            if all(each.sensors for each in found)
+            else (),
+            band=(min(low for low, _ in known), max(high for _, high in known))
+            if known and len(known) == len(bands)
+            else None,
+            findings=tuple(found),
+        )
+
+
+def _recording(snapshot: Snapshot) -> Iterator[Fact]:
+    """Yield what the recordings lack."""
+    for sensor in snapshot.sensors:
+        if sensor.is_lost:
+            yield _lost(snapshot, sensor)
+        if sensor.n_damaged:
+            yield BlocksDamaged(rank=Rank.DELAYS, sensors=(sensor.name,), n_blocks=sensor.n_damaged)
+        if sensor.n_gaps:
+            yield SamplesMissing(
+                rank=Rank.TO_KNOW,
+                sensors=(sensor.name,),
+                n_gaps=sensor.n_gaps,
+                n_samples=sensor.n_missing,
+            )
+    if left_out := snapshot.not_estimated:
+        n_all = len(snapshot.sensor_names) + len(left_out)
+        yield NotInLiveEstimate(rank=Rank.TO_KNOW, sensors=tuple(left_out), n_all=n_all)
+
+
+def _lost(snapshot: Snapshot, sensor: SensorTotals) -> SensorLost:
+    start = snapshot.start_utc_ns
+    end = start + round(snapshot.elapsed * 1e9)
+    last_seen = [each.last_seen for each in snapshot.sensors if math.isfinite(each.last_seen)]
+    end = max([end, *(round(seconds * 1e9) for seconds in last_seen)])
+    never = not math.isfinite(sensor.last_seen)
+    since = start if never else round(sensor.last_seen * 1e9)
+    return SensorLost(
+        rank=Rank.DELAYS,
+        sensors=(sensor.name,),
+        time_utc_ns=(since, end),
+        missing=max(0.0, (end - since) * 1e-9),
+        never_seen=never,
+    )
+
+
+def _segments(snapshot: Snapshot) -> Iterator[Fact]:
+    """Yield which segments are excluded, and which are used in an unusual way."""
+    why = snapshot.no_segment
+    if why is not None:
+        yield NoSegmentUsable(
+            rank=Rank.INVALIDATES,
+            sensors=(why.sensor,) if why.reason is Reason.GAP else (),
+            segment=why.segment,
+            reason=why.reason,
+            longest=why.longest,
+        )
+    disturbed = tuple(
+        (octave.low, octave.high, octave.left_out[Reason.TRANSIENT])
+        for octave in snapshot.octaves
+        if octave.left_out.get(Reason.TRANSIENT)
+    )
+    if snapshot.n_dropped or disturbed:
+        yield SegmentsExcluded(
+            rank=Rank.TO_KNOW,
+            n_segments=snapshot.n_dropped,
+            reasons={reason: count for reason, count in snapshot.left_out.items() if count},
+            transients_by_octave=disturbed,
+        )
+    if snapshot.bridged is not None:
+        yield GapsBridged(
+            rank=Rank.TO_KNOW,
+            n_segments=snapshot.bridged.n_segments,
+            lost=snapshot.bridged.lost,
+            leakage=float(np.nanmean(np.abs(snapshot.bridged.leakage[1:-1]))),
+        )
+    if snapshot.octaves:
+        lowest = snapshot.octaves[0]
+        yield OctaveSegments(
+            rank=Rank.TO_KNOW,
+            longest=lowest.segment,
+            n_effective=lowest.n_effective,
+            below=lowest.high,
+            only_one=lowest is snapshot.octaves[-1],
+        )
+
+
+def _channels(snapshot: Snapshot) -> Iterator[Fact]:
+    """Yield channels whose samples are wrong."""
+    names = [label.name for label in snapshot.channels]
+    clipped, still = snapshot.diagnostics.clipped, snapshot.diagnostics.stood_still
+    if clipped:
+        yield ChannelsClipped(
+            rank=Rank.INVALIDATES,
+            channels=tuple(names[column] for column in clipped),
+            shares=tuple(clipped.values()),
+        )
+    if still:
+        yield ChannelsStoodStill(
+            rank=Rank.INVALIDATES,
+            channels=tuple(names[column] for column in still),
+            seconds=tuple(still.values()),
+        )
+
+
+def _clocks(snapshot: Snapshot) -> Iterator[Fact]:
+    """Yield how the times of samples are known, and where they are wrong or may be."""
+    clocks, left = snapshot.clocks, snapshot.diagnostics.synchronisation.residual
+    fitted = [clock for clock in clocks if clock.source is ClockSource.ARRIVAL_TIMES]
+    if fitted:
+        yield ClocksFitted(
+            rank=Rank.TO_KNOW,
+            sensors=tuple(clock.sensor for clock in fitted),
+            ppm=tuple(clock.ppm for clock in fitted),
+            error=max(left.get(clock.sensor, math.nan) for clock in fitted),
+        )
+    wrong = [clock for clock in clocks if clock.corrected and not clock.drifts]
+    lost = [clock for clock in clocks if clock.drifts]
+    if wrong or lost:
+        after = [each.residual if lost else left.get(each.sensor, math.nan) for each in wrong]
+        yield StatedTimesDrift(
+            rank=Rank.INVALIDATES if lost else Rank.DELAYS,
+            sensors=tuple(clock.sensor for clock in (*wrong, *lost)),
+            corrected={clock.sensor: clock.corrected for clock in wrong},
+            uncorrected={clock.sensor: clock.residual for clock in lost},
+            left=max(after, default=math.nan),
+            reference=reference(snapshot) or "",
+        )
+    if unchecked := tuple(clock.sensor for clock in clocks if clock.unchecked):
+        yield StatedTimesUnchecked(rank=Rank.DELAYS, sensors=unchecked)
+    for clock in clocks:
+        if clock.slips:
+            yield SamplesUncounted(
+                rank=Rank.DELAYS,
+                sensors=(clock.sensor,),
+                slips=tuple(clock.slips),
+                time_utc_ns=(clock.slips[0].utc_ns, clock.slips[-1].utc_ns),
+            )
+        if not clock.is_understood:
+            yield ClockNotUnderstood(
+                rank=Rank.INVALIDATES,
+                sensors=(clock.sensor,),
+                ppm=clock.ppm,
+                error=clock.residual,
+            )
+    if nominal := tuple(clock.sensor for clock in clocks if math.isnan(clock.residual)):
+        yield RatesNominal(rank=Rank.DELAYS, sensors=nominal)
+    if any(isinstance(each, _LIKE_A_CLOCK) for each in snapshot.diagnostics.advice):
+        omega = 2 * math.pi * highest_known(snapshot)
+        loose = {sensor: late for sensor, late in left.items() if omega * late > _TURN}
+        if loose:
+            yield ClocksMayExplain(
+                rank=Rank.DELAYS, sensors=tuple(loose), error=max(loose.values())
+            )
+
+
+def _model(snapshot: Snapshot) -> Iterator[Fact]:
+    """Yield what the model test and the choice of dimensions say."""
+    diagnostics = snapshot.diagnostics
+    found, choices = diagnostics.diagnosis, diagnostics.dimensions
+    failing = found is not None and any(
+        isinstance(each, ModelMisfit | NoSharedMotion | TooFewDimensions) for each in found.advice
+    )
+    more = any(each.n_factors > each.usual for each in choices)
+    if diagnostics.untested is not None:
+        named = found is not None and any(isinstance(each, TooFewSensors) for each in found.advice)
+        if not named:
+            yield _untested(snapshot, diagnostics.untested)
+    elif (
+        found is not None
+        and not failing
+        and not more
+        and all(clock.is_understood for clock in snapshot.clocks)
+    ):
+        yield ModelPasses(rank=Rank.TO_KNOW, n_factors=found.n_factors, dims=snapshot.dims)
+    if not choices:
+        return
+    biased = [(each.low, each.high) for each in choices if each.is_biased]
+    unknown = [each for each in choices if each.is_undetermined and not each.is_biased]
+    unusual = tuple(each for each in choices if each.accepted and each.n_factors != each.usual)
+    if biased:
+        yield DimensionsUnexplained(rank=Rank.INVALIDATES, bands=tuple(biased))
+    if unknown:
+        yield DimensionsUndetermined(
+            rank=Rank.INVALIDATES,
+            bands=tuple((each.low, each.high) for each in unknown),
+            usual=unknown[0].usual,
+            n_sensors=unknown[0].n_sensors,
+        )
+    elsewhere = len(unusual) + len(biased) + len(unknown) < len(choices)
+    if unusual or elsewhere:
+        yield DimensionsChosen(
+            rank=Rank.TO_KNOW, choices=unusual, usual=choices[0].usual, elsewhere=elsewhere
+        )
+
+
+def _untested(snapshot: Snapshot, why: Untested) -> ModelUntested:
+    """Return why the model was not tested."""
+    found = snapshot.diagnostics.diagnosis
+    return ModelUntested(
+        rank=Rank.TO_KNOW if why is Untested.UNFINISHED else Rank.DELAYS,
+        why=why,
+        n_effective=snapshot.n_effective,
+        n_channels=len(snapshot.channels),
+        n_factors=max(snapshot.dims) if found is None else found.n_factors,
+        dims=snapshot.dims,
+    )
+
+
+def _methods(snapshot: Snapshot) -> Iterator[Fact]:
+    """Yield what the methods assume, and where they give nothing."""
+    advice, found = snapshot.diagnostics.advice, snapshot.diagnostics.diagnosis
+    limit, highest = highest_known(snapshot), float(snapshot.frequency[-1])
+    if limit < highest:
+        yield NoEstimateAbove(rank=Rank.TO_KNOW, band=(limit, highest))
+    if (n := len(snapshot.channels)) > MAX_CHANNELS:
+        yield SharedNoiseNotSearched(rank=Rank.TO_KNOW, n_channels=n, most=MAX_CHANNELS)
+    causes = (
+        ("--octaves", bool(snapshot.octaves)),
+        ("--reject", bool(snapshot.left_out.get(Reason.TRANSIENT))),
+        ("segments with gaps", snapshot.bridged is not None),
+    )
+    if found is not None and found.stability is None and any(holds for _, holds in causes):
+        names = tuple(name for name, holds in causes if holds)
+        yield SteadinessNotTested(rank=Rank.TO_KNOW, causes=names)
+    if "two-channel" in snapshot.results:
+        yield LikeChannelsAssumed(rank=Rank.TO_KNOW, method="two-channel")
+    named = any(isinstance(each, NoSignal | Copies) for each in advice)  # once for all methods
+    hidden = Flag.DEAD_CHANNEL | Flag.DUPLICATE if named else Flag(0)
+    alone = any(isinstance(each, NoSharedMotion) for each in advice)
+    for method, noise in snapshot.results.items():
+        yield from without_estimate(snapshot, method, besides=hidden)
+        pooled = ((noise.flags[1:-1] & Flag.POOLED) != 0).any(axis=1)
+        if pooled.any() and not alone:  # a longer recording would not help sensors alone
+            frequency = snapshot.frequency[1:-1][pooled]
+            yield DirectionsPooled(
+                rank=Rank.TO_KNOW,
+                method=method,
+                band=(float(frequency[0]), float(frequency[-1])),
+                n=int(pooled.sum()),
+                n_frequencies=len(pooled),
+            )
+        values = noise.noise_psd[1:-1]
+        if n := int(np.sum(values <= 0)):
+            yield ValuesBelowZero(rank=Rank.TO_KNOW, method=method, n=n, n_values=values.size)
+    rank = Rank.DELAYS if snapshot.results else Rank.INVALIDATES
+    for method, reason in snapshot.refused.items():
+        yield MethodRefused(rank=rank, method=method, reason=reason)
+
+
+def without_estimate(
+    snapshot: Snapshot, method: str, *, besides: Flag = _NO_FLAG
+) -> Iterator[WithoutEstimate]:
+    """Yield channels with frequencies without a valid estimate; flags in ``besides`` are left out.
+
+    Above the highest frequency that is known, that is one fact of its own.
+    """
+    flags = snapshot.results[method].flags[snapshot.frequency <= highest_known(snapshot)]
+    for flag in Flag:
+        if not flag & (WITHOUT_ESTIMATE | Flag.NOT_CONVERGED) & ~besides:
+            continue
+        counts = ((flags[1:-1] & flag) != 0).sum(axis=0)
+        if counts.any():
+            n_freqs = len(flags[1:-1])
+            whole = bool(counts.max() == n_freqs) and bool(flag & WITHOUT_ESTIMATE)
+            yield WithoutEstimate(
+                rank=Rank.INVALIDATES if whole else Rank.DELAYS,
+                method=method,
+                channels=tuple(
+                    label.name
+                    for label, count in zip(snapshot.channels, counts, strict=True)
+                    if count
+                ),
+                flag=flag,
+                most=int(counts.max()),
+                n_frequencies=n_freqs,
+            )
+
+
+def _precision(snapshot: Snapshot, settings: Settings) -> Iterator[Fact]:
+    """Yield what widens the intervals of the table, and whether the wanted precision is reached."""
+    for method in snapshot.results:
+        if shares := widening(snapshot, settings, method):
+            rank = Rank.TO_KNOW
+            yield IntervalsWidened(rank=rank, method=method, shares=shares)
+    if not snapshot.closed:
+        return
+    try:
+        reached = precision(snapshot, settings)
+    except BandError:
+        return
+    if reached.target is not None and math.isfinite(reached.cov) and not reached.is_reached:
+        yield TargetMissed(
+            rank=Rank.DELAYS, cov=reached.cov, target=reached.target, total=reached.total
+        )
+
+
+def widening(snapshot: Snapshot, settings: Settings, method: str) -> dict[Source, float]:
+    """Return what intervals of a method include beside scatter, as shares of the noise.
+
+    The largest share of a channel, from `LEAST_SHARE` on.
+    """
+    try:
+        band = band_of(settings, snapshot)
+    except BandError:
+        return {}
+    most: dict[Source, float] = {}
+    for mean in channel_means(snapshot.results[method], snapshot, settings, band):
+        level = abs(float(mean.mean[0]))
+        for source, (below, above) in mean.parts.items():
+            share = max(float(below[0]), float(above[0])) / level if level else math.nan
+            if share >= LEAST_SHARE:
+                most[source] = max(most.get(source, 0.0), share)
+    return most

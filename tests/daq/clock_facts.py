@@ -1,0 +1,28 @@
+"""The facts of an estimate on times that are wrong, or may be."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from daq.results.facts import (
+    ClockNotUnderstood,
+    RatesNominal,
+    SamplesUncounted,
+    StatedTimesDrift,
+    StatedTimesUnchecked,
+)
+from daq.results.known_facts import facts_of
+
+if TYPE_CHECKING:
+    from typing import Any
+
+    from daq.estimation.snapshot import Snapshot
+
+_WRONG = (
+    ClockNotUnderstood | RatesNominal | SamplesUncounted | StatedTimesDrift | StatedTimesUnchecked
+)
+
+
+def clock_facts(snapshot: Snapshot) -> list[Any]:
+    """Return the facts on times, the worst first; each test knows which kind it expects."""
+    return [fact for fact in facts_of(snapshot) if isinstance(fact, _WRONG)]

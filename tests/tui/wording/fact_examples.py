@@ -1,0 +1,88 @@
+"""One fact of each kind."""
+
+from __future__ import annotations
+
+from daq.results import facts
+from daq.results.facts import Fact, Rank
+from daq.timing.clock_model import LostCount
+from estimator.diagnostics.kinds import Untested
+from estimator.levels.contributions import Source
+from estimator.self_noise.result import Flag
+from estimator.spectra.segment_rejection import Reason
+from tests.tui.wording.advice_examples import MISFIT
+
+A, NOON = ("A",), 1_700_000_000_000_000_000
+
+EXAMPLES: tuple[Fact, ...] = (
+    facts.Finding(rank=Rank.INVALIDATES, findings=(MISFIT,)),
+    facts.MethodRefused(rank=Rank.DELAYS, method="two-channel", reason="channels differ"),
+    facts.WithoutEstimate(
+        rank=Rank.DELAYS,
+        method="three-sensor",
+        channels=("A.X",),
+        flag=Flag.SINGULAR,
+        most=3,
+        n_frequencies=9,
+    ),
+    facts.NoSegmentUsable(
+        rank=Rank.INVALIDATES, sensors=A, segment=10.0, reason=Reason.GAP, longest=4.0
+    ),
+    facts.NotInLiveEstimate(rank=Rank.TO_KNOW, sensors=A, n_all=3),
+    facts.SensorLost(
+        rank=Rank.DELAYS,
+        sensors=A,
+        time_utc_ns=(NOON, NOON + 397 * 10**9),
+        missing=397.0,
+        never_seen=False,
+    ),
+    facts.BlocksDamaged(rank=Rank.DELAYS, sensors=A, n_blocks=2),
+    facts.SamplesMissing(rank=Rank.TO_KNOW, sensors=A, n_gaps=2, n_samples=40),
+    facts.SegmentsExcluded(rank=Rank.TO_KNOW, n_segments=3, reasons={Reason.CLIPPED: 3}),
+    facts.GapsBridged(rank=Rank.TO_KNOW, n_segments=4, lost=0.02, leakage=0.01),
+    facts.OctaveSegments(
+        rank=Rank.TO_KNOW, longest=80.0, n_effective=12.0, below=1.0, only_one=False
+    ),
+    facts.ChannelsClipped(rank=Rank.INVALIDATES, channels=("A.X",), shares=(0.046,)),
+    facts.ChannelsStoodStill(rank=Rank.INVALIDATES, channels=("A.X",), seconds=(30.0,)),
+    facts.ClocksFitted(rank=Rank.TO_KNOW, sensors=A, ppm=(4.5,), error=2e-6),
+    facts.StatedTimesDrift(
+        rank=Rank.INVALIDATES,
+        sensors=("A", "B"),
+        corrected={"A": 1e-4},
+        uncorrected={"B": 2e-4},
+        left=3e-6,
+        reference="C",
+    ),
+    facts.StatedTimesUnchecked(rank=Rank.DELAYS, sensors=A),
+    facts.SamplesUncounted(
+        rank=Rank.DELAYS,
+        sensors=A,
+        slips=(LostCount(NOON, 1.0, 1),),
+        time_utc_ns=(NOON, NOON),
+    ),
+    facts.ClockNotUnderstood(rank=Rank.INVALIDATES, sensors=A, ppm=-985.0, error=1e-3),
+    facts.RatesNominal(rank=Rank.DELAYS, sensors=A),
+    facts.ClocksMayExplain(rank=Rank.DELAYS, sensors=A, error=7e-3),
+    facts.NoEstimateAbove(rank=Rank.TO_KNOW, band=(90.0, 100.0)),
+    facts.ModelUntested(
+        rank=Rank.DELAYS,
+        why=Untested.TOO_FEW_AVERAGES,
+        n_effective=7.0,
+        n_channels=9,
+        n_factors=3,
+        dims=(3, 3, 3),
+    ),
+    facts.ModelPasses(rank=Rank.TO_KNOW, n_factors=3, dims=(3, 3, 3)),
+    facts.DimensionsChosen(rank=Rank.TO_KNOW, choices=(), usual=3, elsewhere=True),
+    facts.DimensionsUnexplained(rank=Rank.INVALIDATES, bands=((1.0, 2.0), (2.0, 4.0))),
+    facts.DimensionsUndetermined(rank=Rank.INVALIDATES, bands=((1.0, 2.0),), usual=3, n_sensors=5),
+    facts.SharedNoiseNotSearched(rank=Rank.TO_KNOW, n_channels=120, most=96),
+    facts.SteadinessNotTested(rank=Rank.TO_KNOW, causes=("--octaves",)),
+    facts.LikeChannelsAssumed(rank=Rank.TO_KNOW, method="two-channel"),
+    facts.DirectionsPooled(
+        rank=Rank.TO_KNOW, method="three-sensor", band=(10.0, 20.0), n=21, n_frequencies=199
+    ),
+    facts.ValuesBelowZero(rank=Rank.TO_KNOW, method="three-sensor", n=5, n_values=900),
+    facts.IntervalsWidened(rank=Rank.TO_KNOW, method="three-sensor", shares={Source.CLOCKS: 0.05}),
+    facts.TargetMissed(rank=Rank.DELAYS, cov=0.2, target=0.1, total=7200.0),
+)

@@ -1,0 +1,151 @@
+"""Every kind of fact has words, and every renderer shows every kind by the same words."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+import huddle
+from daq.estimation.snapshot import Bridged
+from daq.results import facts, known_facts
+from daq.results.facts import BlocksDamaged, Fact, Finding, GapsBridged, Rank
+from daq.results.sources import sources
+from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot
+from tests.tui.night_recording import record
+from tests.tui.wording.fact_examples import EXAMPLES
+from tui.application.result_view.result_text import result
+from tui.application.state import State
+from tui.application.test_view.panels import findings
+from tui.output.console import finite
+from tui.output.diagnosis import details
+from tui.output.json_document import document
+from tui.report.contents import report_of
+from tui.wording.facts import MOST_LINES, Known, brief, known, word
+from tui.wording.findings import Names
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daq.estimation.snapshot import Snapshot
+
+NAMES = Names.of(made_snapshot())
+
+
+def kinds(base: type[Fact] = Fact) -> set[type[Fact]]:
+    """Return all kinds; of a class with slots, not the one that it was made from."""
+    children = {each for each in base.__subclasses__() if getattr(facts, each.__name__) is each}
+    return children | {each for child in children for each in kinds(child)}
+
+
+def test_every_kind_has_an_example_and_a_name_of_its_own() -> None:
+    assert {type(each) for each in EXAMPLES} == kinds()
+    assert len({each.name for each in kinds()}) == len(kinds())
+
+
+@pytest.mark.parametrize("fact", EXAMPLES, ids=lambda fact: str(fact.name))
+def test_words_are_a_line_and_sentences(fact: Fact) -> None:
+    words = word(fact, NAMES)
+    assert not words.line.endswith(".")
+    assert "\n" not in words.line
+    assert "nan" not in str(words)
+    assert len(words.line) <= 140, words.line
+    if fact.rank is not Rank.TO_KNOW and not isinstance(fact, Finding):
+        assert words.explanation[0].isupper() or words.explanation.startswith(fact.method)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("facts") / "night.h5")
+
+
+@pytest.mark.parametrize("fact", EXAMPLES, ids=lambda fact: str(fact.name))
+def test_every_renderer_shows_every_kind(
+    fact: Fact, recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Console, application, report, JSON and notebook take their facts from one function."""
+    snapshot = diagnosed()
+    monkeypatch.setattr("tui.wording.facts.facts_of", lambda *_: (fact,))
+    words = word(fact, Names.of(snapshot))
+    shown = {
+        "console": printed(*details(snapshot, known(snapshot))),
+        "application": printed(result(state_of(snapshot), width=160)),
+        "report": " ".join(str(report_of(snapshot, SETTINGS, sources([recorded]))).split()),
+        "notebook": " ".join(map(str, known(snapshot))),
+    }
+    for renderer, text in shown.items():
+        assert squeezed(words.explanation) in squeezed(text), renderer
+        assert squeezed(words.action) in squeezed(text), renderer
+    (entry,) = json.loads(json.dumps(finite(document(snapshot, SETTINGS)["facts"])))
+    assert entry["kind"] == fact.name
+    assert entry["rank"] == fact.rank
+    assert (entry["line"], entry["explanation"]) == (words.line, words.explanation)
+    live = [line.plain for line in findings(snapshot, width=400)]
+    if fact.rank is Rank.TO_KNOW:
+        assert live == []
+        assert brief(known(snapshot)) == ["Nothing to do. 1 fact: --details shows all"]
+    else:
+        (line,) = live
+        assert line.endswith(words.line)
+        assert brief(known(snapshot)) == [line]
+
+
+def test_a_notebook_has_the_facts_of_the_result() -> None:
+    model = huddle.simulate("fig9", duration="1min")
+    found = huddle.self_noise(model, fs=model.fs, segment="2s")
+    assert [each.fact.name for each in found.facts] == [
+        each.name for each in known_facts.facts_of(found.snapshot, found.settings)
+    ]
+    assert set(found.advice) <= {str(each) for each in found.facts}
+
+
+def test_below_a_table_there_are_at_most_three_lines_the_worst_first() -> None:
+    ranks = {rank: number for number, rank in enumerate(Rank)}
+    ordered = sorted(EXAMPLES, key=lambda each: ranks[each.rank])
+    found = [Known(each, word(each, NAMES)) for each in ordered]
+    for n in range(1, len(found) + 1):
+        lines = brief(found[:n])
+        assert 1 <= len(lines) <= MOST_LINES
+        assert lines[0].startswith("✗")
+    assert lines[-1] == f"· {len(found) - 2} more facts: --details shows all"
+    assert brief([]) == ["Nothing to do."]
+
+
+def test_bridged_gaps_and_damaged_blocks_are_facts_of_the_result() -> None:
+    """The signed report said "None excluded" where gaps were bridged, and nothing of damage."""
+    snapshot = made_snapshot()
+    leakage = np.full((len(snapshot.frequency), len(snapshot.channels)), -0.01)
+    damaged = tuple(replace(each, n_damaged=2) for each in snapshot.sensors[:1])
+    bridged = known_facts.facts_of(
+        replace(
+            snapshot,
+            sensors=(*damaged, *snapshot.sensors[1:]),
+            bridged=Bridged(n_segments=3, lost=0.02, leakage=leakage),
+        )
+    )
+    (blocks,) = [each for each in bridged if isinstance(each, BlocksDamaged)]
+    assert (blocks.sensors, blocks.n_blocks) == (("A",), 2)
+    (gaps,) = [each for each in bridged if isinstance(each, GapsBridged)]
+    assert gaps.n_segments == 3
+    assert gaps.leakage == pytest.approx(0.01)
+
+
+def state_of(snapshot: Snapshot) -> State:
+    return replace(State(name="bench"), snapshot=snapshot, settings=SETTINGS)
+
+
+def printed(*parts: object) -> str:
+    screen = Console(width=160, record=True, file=io.StringIO())
+    for part in parts:
+        screen.print(part)
+    return screen.export_text()
+
+
+def squeezed(text: str) -> str:
+    """Return text without blanks: renderers wrap it."""
+    return "".join(text.split())

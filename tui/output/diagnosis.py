@@ -1,0 +1,142 @@
+"""The diagnosis of a test: its findings, or all of it."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from rich.table import Table
+from rich.text import Text
+
+from estimator.diagnostics.advice import (
+    Delay,
+    Gain,
+    ModelMisfit,
+    NoSharedMotion,
+)
+from estimator.spectra.segment_rejection import Reason
+from tui.wording.facts import RANKS
+from tui.wording.findings import Names
+from tui.wording.formatting import degrees, ratio, signed
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rich.console import RenderableType
+
+    from daq.estimation.snapshot import Snapshot
+    from daq.estimation.snapshot_diagnostics import (
+        Diagnosis,
+    )
+    from estimator.diagnostics.stability import Stability
+    from tui.wording.facts import Known
+
+_LEGEND = (
+    "Coherence: the lowest between like channels of two sensors. Condition: condition number of "
+    "the cross-spectral matrix between two sensors, of the worst pair; 1 is best. Dimension: of "
+    "the motion. SNR: motion over noise, lowest and highest of all channels. Model test: its "
+    "statistic over its expectation, 1 if one common motion explains the averages; p: "
+    "probability of a statistic this large by chance."
+)
+_LIKE_A_CLOCK = Delay | Gain | ModelMisfit | NoSharedMotion
+"""Advice that unknown clocks alone can bring about."""
+_TURN = 0.3  # rad at the highest frequency: 9 % of the motion is taken for noise there
+
+
+def details(snapshot: Snapshot, facts: Sequence[Known]) -> list[RenderableType]:
+    """Return the diagnosis of every band and pair of sensors, and all facts in full."""
+    found = snapshot.diagnostics.diagnosis
+    listed_facts: list[RenderableType] = [
+        Text(f"{RANKS[fact.rank]}: {words}") for fact, words in facts
+    ]
+    if found is None:
+        return listed_facts
+    parts: list[RenderableType] = [_heading("Common motion by band"), _bands(found), Text(_LEGEND)]
+    if found.responses:
+        pairs = _pairs(found, snapshot.sensor_names)
+        parts += [_heading("Orientation, gain and delay of the sensors"), pairs]
+    if snapshot.octaves:
+        parts += [_heading("Segments of each octave"), _octaves(snapshot)]
+    names = Names.of(snapshot)
+    if found.stability is not None:
+        between, table = _repeatability(found.stability, names)
+        parts += [_heading(f"Repeatability of the noise between {between}"), table]
+    return [*parts, _heading("Facts"), *listed_facts]
+
+
+def _heading(text: str) -> Text:
+    return Text(text, style="bold")
+
+
+def _table(*columns: str) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for name in columns:
+        table.add_column(name, justify="left" if name == "sensors" else "right")
+    return table
+
+
+def _bands(found: Diagnosis) -> Table:
+    table = _table("band (Hz)", "coherence", "condition", "dimension", "SNR", "model test", "p")
+    for band in found.bands:
+        known = [float(value) for value in band.snr if math.isfinite(value)]
+        statistic = band.test.statistic / band.test.degrees if band.test.degrees else math.nan
+        table.add_row(
+            f"{band.low:.3g}–{band.high:.3g}",
+            _known(band.coherence, ".4f"),
+            _known(band.condition, ".3g"),
+            _known(band.dimension, ".0f"),
+            f"{ratio(min(known))}…{ratio(max(known))}" if known else "?",
+            _known(statistic, ".3f"),
+            _known(band.test.p_value, ".2g"),
+        )
+    return table
+
+
+def _known(value: float, spec: str) -> str:
+    return "?" if math.isnan(value) else signed(value, spec)
+
+
+def _octaves(snapshot: Snapshot) -> Table:
+    table = _table("octave (Hz)", "segment", "segments", "excluded: gap", "transient", "averages")
+    for octave in snapshot.octaves:
+        table.add_row(
+            f"{octave.low:.3g}–{octave.high:.3g}",
+            f"{octave.segment:.4g} s",
+            str(octave.n_segments),
+            str(octave.left_out.get(Reason.GAP, 0)),
+            str(octave.left_out.get(Reason.TRANSIENT, 0)),
+            f"{octave.n_effective:.0f}",
+        )
+    return table
+
+
+def _repeatability(found: Stability, names: Names) -> tuple[str, Table]:
+    """Return what is compared, and the scatter of each channel's noise beside that of steady noise.
+
+    Recordings where there are several, parts of the recording otherwise.
+    """
+    scatter = found.parts if found.runs is None else found.runs
+    table = _table("band (Hz)", *names.channels, "if steady")
+    for low, high, deviation, expected in zip(
+        found.low, found.high, scatter.deviation, scatter.typically_expected, strict=True
+    ):
+        numbers = [*deviation.tolist(), float(expected)]
+        cells = ["?" if math.isnan(each) else f"{100 * each:.1f} %" for each in numbers]
+        table.add_row(f"{low:.3g}–{high:.3g}", *cells)
+    what = "parts of the recording" if found.runs is None else "recordings"
+    return f"{scatter.n_parts} {what} (standard deviation)", table
+
+
+def _pairs(found: Diagnosis, names: Sequence[str]) -> Table:
+    table = _table("sensors", "rotation", "horizontal", "±", "gains", "delay", "not orthogonal")
+    for pair in found.responses:
+        table.add_row(
+            Text(f"{names[pair.first]} → {names[pair.second]}"),
+            degrees(pair.rotation_deg),
+            degrees(pair.horizontal_deg),
+            degrees(pair.angle_error_deg),
+            " ".join(f"{gain:.4f}" for gain in pair.gains),
+            "?" if math.isnan(pair.delay) else f"{signed(pair.delay * 1e6, '.1f')} µs",
+            f"{pair.nonorthogonality_deg:.2f}°",
+        )
+    return table

@@ -1,0 +1,634 @@
+"""Facts in words: a line, an explanation, an action. Chosen by the type of the fact; never parsed.
+
+All renderers (tables, application, report, JSON, notebook) take their sentences from `word`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import singledispatch
+from typing import TYPE_CHECKING, NamedTuple
+
+from daq.results.facts import (
+    BlocksDamaged,
+    ChannelsClipped,
+    ChannelsStoodStill,
+    ClockNotUnderstood,
+    ClocksFitted,
+    ClocksMayExplain,
+    DimensionsChosen,
+    DimensionsUndetermined,
+    DimensionsUnexplained,
+    DirectionsPooled,
+    Fact,
+    Finding,
+    GapsBridged,
+    IntervalsWidened,
+    LikeChannelsAssumed,
+    MethodRefused,
+    ModelPasses,
+    ModelUntested,
+    NoEstimateAbove,
+    NoSegmentUsable,
+    NotInLiveEstimate,
+    OctaveSegments,
+    Rank,
+    RatesNominal,
+    SamplesMissing,
+    SamplesUncounted,
+    SegmentsExcluded,
+    SensorLost,
+    SharedNoiseNotSearched,
+    StatedTimesDrift,
+    StatedTimesUnchecked,
+    SteadinessNotTested,
+    TargetMissed,
+    ValuesBelowZero,
+    WithoutEstimate,
+)
+from daq.results.known_facts import facts_of
+from estimator.diagnostics.kinds import Untested
+from estimator.spectra.segment_rejection import Reason
+from tui.wording.alerts import alert
+from tui.wording.findings import Names, explain, model
+from tui.wording.formatting import clock_time, listed, percent, roughly, several, signed, span
+from tui.wording.grouped import together
+from tui.wording.vocabulary import FLAG_WORDS, REASONS, SOURCE_WORDS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from estimator.likelihood.dimension import BandDimension
+
+MARKS: Mapping[Rank, str] = {Rank.INVALIDATES: "✗", Rank.DELAYS: "▲", Rank.TO_KNOW: "·"}
+RANKS: Mapping[Rank, str] = {
+    Rank.INVALIDATES: "invalidates the result",
+    Rank.DELAYS: "delays the result",
+    Rank.TO_KNOW: "to know",
+}
+MOST_LINES = 3
+"""Below a table."""
+NOTHING_TO_DO = "Nothing to do."
+
+
+@dataclass(frozen=True, slots=True)
+class Wording:
+    """A fact in words.
+
+    Attributes
+    ----------
+    line : str
+        What is wrong where, and what to do, as short as possible; without a full stop.
+    explanation : str
+        The fact and its effect, in whole sentences.
+    action : str
+        What to do, in whole sentences; empty if nothing can or need be done.
+    """
+
+    line: str
+    explanation: str
+    action: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.explanation} {self.action}" if self.action else self.explanation
+
+
+@singledispatch
+def word(fact: Fact, names: Names) -> Wording:
+    """Return the words for a fact.
+
+    Raises
+    ------
+    TypeError
+        No words are registered for its type.
+    """
+    raise TypeError(f"{type(fact).__name__}: no words for this kind of fact to {names}")
+
+
+class Known(NamedTuple):
+    """A fact and its words."""
+
+    fact: Fact
+    words: Wording
+
+    @property
+    def needs_action(self) -> bool:
+        """Whether the result is wrong or delayed."""
+        return self.fact.rank is not Rank.TO_KNOW
+
+    @property
+    def line(self) -> str:
+        """The line behind the mark of its rank."""
+        return f"{MARKS[self.fact.rank]} {self.words.line}"
+
+    def __str__(self) -> str:
+        return str(self.words)
+
+
+def known(snapshot: Snapshot, settings: Settings | None = None) -> tuple[Known, ...]:
+    """Return all facts of an estimate with their words, the worst rank first."""
+    names = Names.of(snapshot)
+    return tuple(Known(fact, word(fact, names)) for fact in facts_of(snapshot, settings))
+
+
+def why_no_estimate(snapshot: Snapshot) -> str:
+    """Return why a live estimate has no segment or leaves sensors out; empty where it does not."""
+    names = Names.of(snapshot)
+    reasons = NoSegmentUsable | NotInLiveEstimate
+    found = [fact for fact in facts_of(snapshot) if isinstance(fact, reasons)]
+    return " ".join(str(word(fact, names)) for fact in found)
+
+
+def brief(facts: Sequence[Known], more: str = "--details shows all") -> list[str]:
+    """Return at most three lines: the worst facts, and how many more there are.
+
+    Parameters
+    ----------
+    facts : sequence of Known
+        Worst rank first.
+    more : str
+        How to see all facts.
+    """
+    needed = [each for each in facts if each.needs_action]
+    shown = needed if len(needed) <= MOST_LINES and len(needed) == len(facts) else needed[:2]
+    lines = [each.line for each in shown]
+    left = len(facts) - len(shown)
+    rest = (
+        f"{several(left, 'more fact', 'more facts') if lines else several(left, 'fact')}: {more}"
+        if left
+        else ""
+    )
+    if not needed:
+        return [f"{NOTHING_TO_DO} {rest}".rstrip()]
+    return [*lines, f"{MARKS[Rank.TO_KNOW]} {rest}"] if rest else lines
+
+
+@word.register(Finding)
+def _finding(fact: Finding, names: Names) -> Wording:
+    first = fact.findings[0]
+    if len(fact.findings) == 1:
+        words = explain(first, names)
+        return Wording(alert(first, names), words.text, words.remedy)
+    line = alert(first, names)
+    if (more := len(fact.findings) - 1) > 0:
+        line += f" (and {more} more like this)"
+    words = together(fact.findings, names)
+    return Wording(line, words.text, words.remedy)
+
+
+@word.register(MethodRefused)
+def _refused(fact: MethodRefused, names: Names) -> Wording:
+    del names
+    return Wording(f"{fact.method}: {fact.reason}", f"{fact.method}: {fact.reason}")
+
+
+@word.register(WithoutEstimate)
+def _without(fact: WithoutEstimate, names: Names) -> Wording:
+    del names
+    who, words = ", ".join(fact.channels), FLAG_WORDS[fact.flag]
+    whole = fact.most == fact.n_frequencies
+    at = "all frequencies" if whole else f"{fact.most} of {fact.n_frequencies} frequencies"
+    text = f"{fact.method}: {who}: {words.long}, at {at}"
+    return Wording(text, text)
+
+
+@word.register(NoSegmentUsable)
+def _no_segment(fact: NoSegmentUsable, names: Names) -> Wording:
+    del names
+    head = f"No segment of {fact.segment:g} s can be used:"
+    if fact.reason is Reason.GAP:
+        text = f"{head} {listed(fact.sensors)} has at most {fact.longest:.2g} s without a gap."
+        do = "Check its cable, lower its sampling rate, or choose a shorter --segment."
+    elif fact.reason is Reason.CLIPPED:
+        text = f"{head} samples are clipped."
+        do = "Choose a larger range, reduce the motion, or keep them (--no-reject)."
+    else:
+        text = f"{head} there are transients."
+        do = "Wait for a quieter time, or leave out --reject."
+    return Wording(f"{text} {do}".rstrip("."), text, do)
+
+
+@word.register(NotInLiveEstimate)
+def _not_live(fact: NotInLiveEstimate, names: Names) -> Wording:
+    del names
+    n = fact.n_all - len(fact.sensors)
+    text = f"Live estimate of the first {n} of {fact.n_all} sensors, to limit its memory."
+    return Wording(text.rstrip("."), text, "The result has all; so has huddle estimate.")
+
+
+@word.register(SensorLost)
+def _lost(fact: SensorLost, names: Names) -> Wording:
+    del names
+    sensor, do = listed(fact.sensors), "Check its power and its cable, and record again."
+    if fact.never_seen:
+        return Wording(
+            f"{sensor} sent nothing: check power and cable", f"{sensor} sent nothing.", do
+        )
+    since = 0 if fact.time_utc_ns is None else fact.time_utc_ns[0]
+    text = f"{sensor} was lost {clock_time(fact.missing)} before the end"
+    return Wording(
+        f"{text}: check power and cable",
+        f"{text}, at {_time_of_day(since)} UTC. Segments after that are excluded.",
+        do,
+    )
+
+
+@word.register(BlocksDamaged)
+def _damaged(fact: BlocksDamaged, names: Names) -> Wording:
+    del names
+    text = (
+        f"{listed(fact.sensors)}: {several(fact.n_blocks, 'block')} of the file damaged (wrong"
+        " checksum) and excluded"
+    )
+    return Wording(text, f"{text}.", "huddle repair --check counts all of them.")
+
+
+@word.register(SamplesMissing)
+def _missing(fact: SamplesMissing, names: Names) -> Wording:
+    del names
+    text = (
+        f"{listed(fact.sensors)}: {several(fact.n_gaps, 'gap')}, "
+        f"{several(fact.n_samples, 'sample')} missing"
+    )
+    return Wording(text, f"{text}.")
+
+
+@word.register(SegmentsExcluded)
+def _excluded(fact: SegmentsExcluded, names: Names) -> Wording:
+    del names
+    parts = []
+    if fact.n_segments:
+        if len(fact.reasons) == 1:
+            why = " " + REASONS[next(iter(fact.reasons))]
+        else:
+            counts = [f"{count} {REASONS[reason]}" for reason, count in fact.reasons.items()]
+            why = ": " + ", ".join(counts)
+        parts.append(f"{several(fact.n_segments, 'segment')} excluded{why}")
+    if fact.transients_by_octave:
+        each = ", ".join(
+            f"{count} at {low:.3g}–{high:.3g} Hz" for low, high, count in fact.transients_by_octave
+        )
+        parts.append(f"segments with transients excluded: {each}")
+    text = "; ".join(parts)
+    return Wording(text, f"{text[0].upper()}{text[1:]}.")
+
+
+@word.register(GapsBridged)
+def _bridged(fact: GapsBridged, names: Names) -> Wording:
+    del names
+    text = (
+        f"{several(fact.n_segments, 'segment')} with gaps used by windows that are zero in them"
+        f" ({percent(fact.lost)} of the signal)"
+    )
+    return Wording(
+        text,
+        f"{text}. Noise of other frequencies in them: {percent(fact.leakage)} of the noise on"
+        " average, in the intervals.",
+    )
+
+
+@word.register(OctaveSegments)
+def _octaves(fact: OctaveSegments, names: Names) -> Wording:
+    del names
+    if fact.only_one:
+        text = "octaves: too few samples for longer segments at lower frequencies"
+    else:
+        text = (
+            f"octaves below have longer segments, up to {fact.longest:.4g} s"
+            f" ({fact.n_effective:.0f} effective averages) below {fact.below:.3g} Hz"
+        )
+    return Wording(text, f"{text[0].upper()}{text[1:]}.")
+
+
+@word.register(ChannelsClipped)
+def _clipped(fact: ChannelsClipped, names: Names) -> Wording:
+    del names
+    each = zip(fact.channels, fact.shares, strict=True)
+    who = ", ".join(f"{name} ({100 * share:.2g} %)" for name, share in each)
+    return Wording(
+        f"{who} clipped, so the noise is too high: use a larger range, or less motion",
+        f"Clipped: {who} of the samples are at the largest or smallest count of the range: the "
+        "noise of these channels is too high.",
+        "Use a larger range, or less motion.",
+    )
+
+
+@word.register(ChannelsStoodStill)
+def _stood_still(fact: ChannelsStoodStill, names: Names) -> Wording:
+    del names
+    each = zip(fact.channels, fact.seconds, strict=True)
+    who = ", ".join(f"{name} (for {seconds:.2g} s)" for name, seconds in each)
+    return Wording(
+        f"{who} had a constant count, so the noise is too high: exclude that time (--reject)",
+        f"Temporarily dead: {who} had a constant count. The motion missing there counts as noise.",
+        "Exclude that time (--reject; --start and --end for minutes), and check the cable and the "
+        "power supply.",
+    )
+
+
+@word.register(ClocksFitted)
+def _fitted(fact: ClocksFitted, names: Names) -> Wording:
+    del names
+    rates = zip(fact.sensors, fact.ppm, strict=True)
+    each = ", ".join(f"{sensor} {signed(ppm, '+.1f')} ppm" for sensor, ppm in rates)
+    error = "an unknown error" if math.isnan(fact.error) else f"about {_us(fact.error)}"
+    text = f"Clocks {each}, aligned to {error}"
+    return Wording(text, f"{text}.")
+
+
+@word.register(StatedTimesDrift)
+def _drift(fact: StatedTimesDrift, names: Names) -> Wording:
+    del names
+    drifts = {**fact.corrected, **fact.uncorrected}
+    by = ", ".join(f"{sensor} by {_us(size)} rms" for sensor, size in drifts.items())
+    against = f" against those of {fact.reference}" if fact.reference else ""
+    head = f"Stated times drift{against}"
+    text = f"{head}, as the motion shows: {by}."
+    line = f"{head}: {by}; check that the clocks are synchronised"
+    if fact.corrected:
+        who = f"Those of {listed(list(fact.corrected))}" if fact.uncorrected else "They"
+        text += f" {who} were corrected to within about {_us(fact.left)}."
+    if fact.uncorrected:
+        text += f" Those of {listed(list(fact.uncorrected))} could not be corrected: the motion is"
+        text += " too weak for so short segments."
+    do = "Check whether the clocks were synchronised, or whether waves changed direction."
+    return Wording(line, text, f"Choose longer segments. {do}" if fact.uncorrected else do)
+
+
+@word.register(StatedTimesUnchecked)
+def _unchecked(fact: StatedTimesUnchecked, names: Names) -> Wording:
+    del names
+    verb = "states" if len(fact.sensors) == 1 else "state"
+    text = f"The times that {listed(fact.sensors)} {verb} could not be compared with the motion"
+    return Wording(
+        f"{text}: record longer, or with more motion",
+        f"{text}: it is too weak, or the recording too short. If they drift, the noise is wrong by"
+        " a share of the motion.",
+        "Record longer, or with more motion.",
+    )
+
+
+@word.register(SamplesUncounted)
+def _uncounted(fact: SamplesUncounted, names: Names) -> Wording:
+    del names
+    slips, sensor = fact.slips, listed(fact.sensors)
+    total = sum(abs(slip.n_samples) for slip in slips)
+    verbs = {slip.n_samples > 0 for slip in slips}
+    verb = "lost or repeated" if len(verbs) > 1 else "lost" if verbs == {True} else "repeated"
+    first, last = (_time_of_day(slips[at].utc_ns) for at in (0, -1))
+    when = f"at about {first} UTC"
+    if len(slips) > 1:
+        when = f"between {first} and {last} UTC, {len(slips)} times,"
+    text = (
+        f"{sensor} {verb} {several(total, 'sample')} {when} without counting"
+        f" {'it' if total == 1 else 'them'}"
+    )
+    return Wording(
+        f"{text}: check the logger's buffers and cable",
+        f"{text}. Its count was corrected, and the segments around are excluded.",
+        "Check the buffers and the cable of the logger, and the load of its computer.",
+    )
+
+
+@word.register(ClockNotUnderstood)
+def _not_understood(fact: ClockNotUnderstood, names: Names) -> Wording:
+    del names
+    head = f"The clock of {listed(fact.sensors)} ({signed(fact.ppm, '+.0f')} ppm) is not understood"
+    return Wording(
+        f"{head} (off by {_us(fact.error)} rms): check for lost samples, and the rate",
+        f"{head}: its samples are off by about {_us(fact.error)} rms. The intervals include this"
+        " error, and limits are not decided.",
+        "Check whether samples are lost or repeated without being counted (buffers, cable, the"
+        " logger's software), and the sampling rate.",
+    )
+
+
+@word.register(RatesNominal)
+def _nominal(fact: RatesNominal, names: Names) -> Wording:
+    del names
+    text = f"The samples of {listed(fact.sensors)} are taken to be at their nominal rate"
+    return Wording(
+        f"{text}; intervals do not include its error",
+        f"{text}. If it is not exact, the noise is too high or too low; intervals and budgets do "
+        "not include this error.",
+    )
+
+
+@word.register(ClocksMayExplain)
+def _may_explain(fact: ClocksMayExplain, names: Names) -> Wording:
+    del names
+    clocks, verb = ("clock", "is") if len(fact.sensors) == 1 else ("clocks", "are")
+    head = f"The {clocks} of {listed(fact.sensors)} {verb} known to about {fact.error * 1e3:.2g} ms"
+    return Wording(
+        f"{head} only: give the sensors one clock",
+        f"{head} only. Lags, missing motion or a misfit may come from that alone.",
+        "Give the sensors one clock, see that connections are not lost, or record with more"
+        " motion.",
+    )
+
+
+@word.register(NoEstimateAbove)
+def _above(fact: NoEstimateAbove, names: Names) -> Wording:
+    del names
+    limit = math.nan if fact.band is None else fact.band[0]
+    text = f"no estimate above {limit:.4g} Hz, where resampling attenuates"
+    return Wording(text, f"{text[0].upper()}{text[1:]}.")
+
+
+_WHY_UNTESTED = {
+    Untested.UNFINISHED: "The diagnosis follows with the first segments.",
+    Untested.NO_SEGMENTS: "The model test needs averages, and the recording has no segment.",
+    Untested.TOO_FEW_SENSORS: "The model test needs three sensors with a signal of their own.",
+    Untested.TOO_FEW_AVERAGES: "The model test needs more averages ({n:.0f} so far) than channels "
+    "({channels}).",
+    Untested.TOO_FEW_CHANNELS: "The model test is not possible: {model} explains any signals of so "
+    "few channels.",
+    Untested.SINGULAR: "The model test is not possible: at no frequency is the cross-spectral "
+    "matrix finite and regular.",
+}
+
+
+@word.register(ModelUntested)
+def _untested(fact: ModelUntested, names: Names) -> Wording:
+    del names
+    text = _WHY_UNTESTED[fact.why].format(
+        n=fact.n_effective, channels=fact.n_channels, model=model(fact.n_factors, fact.dims)
+    )
+    do = "Record longer." if fact.why is Untested.TOO_FEW_AVERAGES else ""
+    return Wording(text.rstrip("."), text, do)
+
+
+@word.register(ModelPasses)
+def _passes(fact: ModelPasses, names: Names) -> Wording:
+    del names
+    return Wording(
+        "The model test passes in all bands",
+        f"The model test passes in all bands: {model(fact.n_factors, fact.dims)} explains what the "
+        "sensors have in common.",
+    )
+
+
+@word.register(DimensionsChosen)
+def _chosen(fact: DimensionsChosen, names: Names) -> Wording:
+    del names
+    lines = _gradients([choice for choice in fact.choices if choice.gradients])
+    lines += [_choice(choice) for choice in fact.choices if not choice.gradients]
+    if fact.elsewhere:
+        where = "Elsewhere" if fact.choices else "In all bands"
+        lines.append(f"{where} the motion has all {fact.usual} dimensions.")
+    if not fact.choices:
+        return Wording(lines[0].rstrip("."), lines[0])
+    found = sorted({choice.n_factors for choice in fact.choices})
+    numbers = f"{found[0]}" if len(found) == 1 else f"{found[0]} to {found[-1]}"
+    bands = _bands([(choice.low, choice.high) for choice in fact.choices])
+    line = f"At {bands} Hz the motion has {numbers} dimensions, not {fact.usual}"
+    return Wording(line, " ".join(lines))
+
+
+def _gradients(choices: Sequence[BandDimension]) -> list[str]:
+    """Return the bands that gradients of the motion explain, and their cost in precision."""
+    if not choices:
+        return []
+    low, high = (f"{pick(each.cov for each in choices):.2g}" for pick in (min, max))
+    usual = max(each.usual_cov for each in choices)
+    return [
+        (
+            f"At {_bands([(each.low, each.high) for each in choices])} Hz the motion and its "
+            "gradients across the bench explain the averages; the"
+            f" c.o.v. of one frequency is {low if low == high else f'{low} to {high}'} instead of"
+            f" {usual:.2g}."
+        )
+    ]
+
+
+def _choice(choice: BandDimension) -> str:
+    """Return an unusual dimension, and its cost in precision."""
+    price = f"the c.o.v. of one frequency is {choice.cov:.2g}"
+    if math.isfinite(choice.usual_cov):
+        price += f" instead of {choice.usual_cov:.2g}"
+    at = f"At {span(choice.low, choice.high)}"
+    if choice.n_factors < choice.usual:
+        return f"{at} the motion has {choice.n_factors} of {choice.usual} dimensions; {price}."
+    return (
+        f"{at} the sensors do not share one motion of {choice.usual} dimensions; "
+        f"{choice.n_factors} dimensions explain the averages; {price}."
+    )
+
+
+def _bands(bands: Sequence[tuple[float, float]]) -> str:
+    """Return bands, neighbours taken together."""
+    spans: list[tuple[float, float]] = []
+    for low, high in bands:
+        if spans and low - spans[-1][1] < (high - low) / 4:
+            spans[-1] = (spans[-1][0], high)
+        else:
+            spans.append((low, high))
+    return ", ".join(f"{low:.3g}–{high:.3g}" for low, high in spans)
+
+
+@word.register(DimensionsUnexplained)
+def _unexplained(fact: DimensionsUnexplained, names: Names) -> Wording:
+    del names
+    head = f"At {_bands(fact.bands)} Hz no dimension that these sensors allow explains the averages"
+    text = f"{head}: the noise estimate is biased there."
+    do = "Put the sensors closer together, or use more sensors."
+    return Wording(f"{head}: put the sensors closer together", text, do)
+
+
+@word.register(DimensionsUndetermined)
+def _undetermined(fact: DimensionsUndetermined, names: Names) -> Wording:
+    del names
+    head = (
+        f"At {_bands(fact.bands)} Hz the sensors do not share one motion of {fact.usual} dimensions"
+    )
+    return Wording(
+        f"{head}: use six sensors, or put them closer together",
+        f"{head}. More dimensions explain the averages, but {fact.n_sensors} sensors cannot tell "
+        "them from noise: the noise estimate may be wrong by any amount.",
+        "Use six sensors, or put them closer together.",
+    )
+
+
+@word.register(SharedNoiseNotSearched)
+def _not_searched(fact: SharedNoiseNotSearched, names: Names) -> Wording:
+    del names
+    text = (
+        f"noise that two channels share is not searched for among more than {fact.most} channels,"
+        f" to limit the memory; these are {fact.n_channels}"
+    )
+    return Wording(text, f"{text[0].upper()}{text[1:]}.")
+
+
+@word.register(SteadinessNotTested)
+def _steadiness(fact: SteadinessNotTested, names: Names) -> Wording:
+    del names
+    text = (
+        f"whether the noise changes during the recording is not tested with {listed(fact.causes)}"
+    )
+    return Wording(text, f"{text[0].upper()}{text[1:]}: the intervals hold for steady noise.")
+
+
+@word.register(LikeChannelsAssumed)
+def _parallel(fact: LikeChannelsAssumed, names: Names) -> Wording:
+    del names
+    text = (
+        f"{fact.method}: assumes that like channels are parallel and have equal gains, or those "
+        "given by --gain"
+    )
+    return Wording(text, f"{text}.")
+
+
+@word.register(DirectionsPooled)
+def _pooled(fact: DirectionsPooled, names: Names) -> Wording:
+    del names
+    at = "" if fact.band is None else f" ({fact.band[0]:.3g} to {fact.band[1]:.3g} Hz)"
+    text = (
+        f"{fact.method}: single frequencies do not resolve the motion at {fact.n} of"
+        f" {fact.n_frequencies}{at}"
+    )
+    return Wording(text, f"{text}; its directions are taken from neighbouring frequencies there.")
+
+
+@word.register(ValuesBelowZero)
+def _below_zero(fact: ValuesBelowZero, names: Names) -> Wording:
+    del names
+    text = (
+        f"{fact.method}: {fact.n} of {fact.n_values} values {'is' if fact.n == 1 else 'are'} at or"
+        " below zero"
+    )
+    return Wording(text, f"{text}.")
+
+
+@word.register(IntervalsWidened)
+def _widened(fact: IntervalsWidened, names: Names) -> Wording:
+    del names
+    parts = [
+        SOURCE_WORDS[source]
+        + (f" (up to {percent(share)})" if math.isfinite(share) else " (without limit)")
+        for source, share in fact.shares.items()
+    ]
+    text = f"{fact.method}: beside scatter, the intervals include {listed(parts)}"
+    return Wording(text, f"{text}.")
+
+
+@word.register(TargetMissed)
+def _target(fact: TargetMissed, names: Names) -> Wording:
+    del names
+    text = f"The noise is known to {percent(fact.cov)}, wanted {percent(fact.target)}"
+    if fact.total is None:
+        return Wording(f"{text}: record longer", f"{text}.", "Record longer.")
+    long = roughly(fact.total)
+    return Wording(f"{text}: record for {long} in all", f"{text}.", f"Record for {long} in all.")
+
+
+def _us(seconds: float) -> str:
+    value = seconds * 1e6
+    return f"{value:.0f} µs" if value > 10 else f"{value:.1f} µs"
+
+
+def _time_of_day(utc_ns: int) -> str:
+    return f"{datetime.fromtimestamp(utc_ns // 10**9, UTC):%H:%M:%S}"
