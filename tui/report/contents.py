@@ -6,6 +6,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING
 
 from daq.bench.durations import format_duration
+from daq.bench.estimate_settings import OPTIONS, table_keys
 from daq.results.band_summary import band_of
 from daq.results.decision.limits import judge
 from tui.report.calibration import calibration_section
@@ -19,13 +20,14 @@ from tui.report.evidence import (
 from tui.report.noise import limits_section, noise_section, verdict
 from tui.report.parameters import parameters_section
 from tui.report.parts import Facts, Paragraph, Part, Report, Section, Signatures, Table
-from tui.report.wording import is_known, local_time, plain_number, utc_time
+from tui.report.wording import is_known, local_time, utc_time
 from tui.wording.facts import known
 from tui.wording.formatting import span
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from daq.bench.estimate_settings import Option
     from daq.bench.masks.mask import Mask
     from daq.bench.model import Channel
     from daq.estimation.settings import Settings
@@ -38,11 +40,6 @@ _STATES = {
     "growing": "still being written",
     "continued": "refused by the disk and continued in another file",
     "left open": "not closed: its recorder was killed",
-}
-_CLOCKS = {
-    "refined": "from arrival times and the common motion",
-    "arrivals": "from arrival times alone",
-    "nominal": "from the nominal rates",
 }
 
 
@@ -189,31 +186,21 @@ def _response(channel: Channel) -> str:
 
 
 def _settings_section(snapshot: Snapshot, settings: Settings) -> Section:
+    """Return every option of the estimate, and what follows from them."""
     rate = 2 * float(snapshot.frequency[-1])
-    low, high = band_of(settings, snapshot)
     rows = [
-        ("Method", ", ".join(snapshot.results) or ", ".join(settings.methods)),
+        ("Methods", ", ".join(snapshot.results) or ", ".join(settings.methods)),
         ("Time used", _time_used(snapshot, settings)),
         ("Common grid", f"{rate:.10g} Hz"),
-        ("Segment", f"{settings.segment:g} s ({settings.segment * rate:.0f} samples)"),
-        ("Overlap", f"{100 * settings.overlap:g} %"),
-        ("Window", settings.window),
-        ("Detrend", settings.detrend),
         ("Frequency resolution", f"{1 / settings.segment:.4g} Hz between frequencies"),
         ("Segments used", f"{snapshot.n_segments}, n = {snapshot.n_effective:.1f} effective"),
-        ("Small-sample bias", "removed" if settings.correct else "left in"),
-        ("Segments excluded", _rejection(settings)),
-        ("Clocks", _CLOCKS[settings.clocks]),
-        ("Band of the tables", span(low, high)),
+        ("Band of the tables", span(*band_of(settings, snapshot))),
         ("Unit", f"{snapshot.unit}; PSD one-sided, in ({snapshot.unit})²/Hz"),
     ]
-    if settings.dimension is not None:
-        rows.append(("Dimension of the motion", str(settings.dimension)))
-    if settings.gains:
-        gains = ", ".join(f"{name} {gain:g}" for name, gain in settings.gains.items())
-        rows.append(("Known gains", gains))
-    if settings.target_cov is not None:
-        rows.append(("Wanted c.o.v.", plain_number(settings.target_cov, "g")))
+    rows += [
+        (f"[estimate] {key}", _option(OPTIONS[name], getattr(settings, name)))
+        for key, name in table_keys().items()
+    ]
     parts: list[Part] = [Facts(tuple(rows))]
     if snapshot.octaves:
         parts.append(
@@ -243,9 +230,11 @@ def _time_used(snapshot: Snapshot, settings: Settings) -> str:
     return text
 
 
-def _rejection(settings: Settings) -> str:
-    if settings.reject is None:
-        return "those with gaps or at the end of a sensor's range"
-    if settings.reject:
-        return "those with gaps, at the end of a sensor's range, or with transients"
-    return "those with gaps"
+def _option(option: Option, value: object) -> str:
+    """Return the value of an option as in the bench file."""
+    if value is None or value == {}:
+        return "not given"
+    if option.is_switch:
+        return "yes" if value else "no"
+    text = option.text(value)
+    return text if isinstance(text, str) else ", ".join(text)
