@@ -11,20 +11,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from benchmarks.row import Row
+from daq.devices.epson import commands
+from daq.devices.epson.burst import BurstDecoder
+from daq.devices.epson.commands import BurstFormat
+from daq.devices.guralp import brp, gcf
+from daq.devices.guralp.decoders import SerialDecoder
+from daq.devices.labjack import packets, stream
+from daq.devices.labjack.packets import Packet
+from daq.devices.labjack.stream import StreamDecoder
+from daq.devices.modbus import rtu
+from daq.devices.modbus.fifo_protocol import FifoDecoder
+from daq.devices.modbus.registers_protocol import RegisterDecoder, RegisterMap
+from daq.devices.text.decoder import TextDecoder
+from daq.devices.text.format import RASPBERRY_SHAKE
 from daq.protocols.block import HostTime
-from daq.protocols.epson import commands
-from daq.protocols.epson.burst import BurstDecoder
-from daq.protocols.epson.commands import BurstFormat
-from daq.protocols.guralp import brp, gcf
-from daq.protocols.guralp.decoders import SerialDecoder
-from daq.protocols.labjack import packets, stream
-from daq.protocols.labjack.packets import Packet
-from daq.protocols.labjack.stream import StreamDecoder
-from daq.protocols.modbus import rtu
-from daq.protocols.modbus.fifo import FifoDecoder
-from daq.protocols.modbus.registers import RegisterDecoder, RegisterMap
-from daq.protocols.text.decoder import TextDecoder
-from daq.protocols.text.format import RASPBERRY_SHAKE
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -24,14 +24,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from benchmarks.row import Row, peak_memory
-from daq.acquisition.recorder import run as record
 from daq.bench.loading import parse
 from daq.bench.model import Bench, Channel, Sensor
+from daq.devices.epson import commands
 from daq.estimation.estimation import Estimation
 from daq.estimation.follow import COMMIT_INTERVAL, SHORTEST_INTERVAL
 from daq.estimation.settings import Settings
-from daq.protocols.epson import commands
 from daq.python_process import python_command
+from daq.recorder.recorder import run as record
 from daq.recording.repair import verify
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ async def play(n_sensors: int, sampling_rate: float) -> None:
     from sim_devices.devices.interface import ChannelSpec, DeviceSpec, Line  # noqa: PLC0415
     from sim_devices.faults import LineFaults  # noqa: PLC0415
     from sim_devices.server import serve  # noqa: PLC0415  (only the process that plays them)
-    from sim_devices.server.world_clock import WorldClock  # noqa: PLC0415
+    from sim_devices.server.serve import WorldClock  # noqa: PLC0415
 
     serve.MIN_INTERVAL = SEND_INTERVAL
     clock = WorldClock(time.monotonic_ns())

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.row import Row, least_work
-from daq.alignment.resampling import reach, resample
+from daq.clocks.resampling import reach, resample
 
 LENGTH = 8000
 PPM = 20.0

@@ -11,7 +11,7 @@ import scipy.fft
 from scipy import signal
 
 from benchmarks.row import Row, least_work
-from estimator.diagnostics.shared_noise import shared_noise
+from estimator.checks.shared_noise import shared_noise
 from estimator.likelihood.dimension import bands
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.goodness_of_fit import HANN_HALF

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.diagnostics.shared_motion import CanonicalCoherence
+from estimator.checks.shared_motion import CanonicalCoherence
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.likelihood.fisher import covariance, cramer_rao_cov, efficiency
 from estimator.methods import METHODS, self_noise

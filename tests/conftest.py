@@ -29,7 +29,7 @@ USGS_RECORDING = "usgs-tst-huddle"
 FIRST = (
     "tests/acceptance/",
     "tests/tui/commands/test_run.py",
-    "tests/daq/drivers/test_conformance",
+    "tests/daq/devices/test_conformance",
     "tests/tui/",
     "tests/examples/",
     "tests/torture/",

@@ -11,13 +11,13 @@ import numpy as np
 from pydantic import BaseModel
 
 from daq.bench.model import Bench, Channel, Sensor
-from daq.drivers.interface import DEFAULT_PATIENCE, DeviceInformation
+from daq.devices.interface import DEFAULT_PATIENCE, DeviceInformation
 from daq.protocols.block import Block, Event, HostTime
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
 
-    from daq.drivers.interface import DriverType
+    from daq.devices.interface import DriverType
     from daq.host_clock import HostClock
 
 RATE = 100.0

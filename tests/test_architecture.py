@@ -31,7 +31,7 @@ def test_package_roots_import_nothing(package: str) -> None:
 def test_estimator_loads_no_input_or_output() -> None:
     loaded = modules_after(
         "import estimator.methods, estimator.spectra.welch,"
-        " estimator.likelihood.maximum_likelihood, estimator.diagnostics.diagnose"
+        " estimator.likelihood.maximum_likelihood, estimator.checks.diagnose"
     )
     assert not loaded & {"h5py", "serial", "pymodbus", "textual", "matplotlib", "daq", "tui"}
 

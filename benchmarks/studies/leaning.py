@@ -13,7 +13,7 @@ from importlib import resources
 import numpy as np
 
 from daq.bench.model import Limit
-from daq.drivers.bench_file import parse
+from daq.devices.bench_file import parse
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.bench.model import Sensor
-    from daq.drivers.interface import DriverType
+    from daq.devices.interface import DriverType
     from daq.protocols.block import Block, Event
 
 LIMIT = 60.0

@@ -30,12 +30,12 @@ import numpy as np
 import pytest
 from pydantic import BaseModel
 
-from daq.acquisition.block_checks import BlockValidator
-from daq.acquisition.connection import patience_of
 from daq.errors import DeviceError, NoAnswerError, NotConnectedError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, Event, EventKind
 from daq.protocols.errors import RemoteProtocolError
+from daq.recorder.block_checks import BlockValidator
+from daq.recorder.connection import patience_of
 from daq.transport.address import host_and_port
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.model import Sensor
-    from daq.drivers.interface import DriverType
+    from daq.devices.interface import DriverType
     from daq.protocols.block import HostTime
 
 LIMIT = 60.0

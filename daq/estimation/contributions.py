@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.estimation.settings import DIMENSIONS
-from estimator.diagnostics.advice import ModelMisfit, TooFewDimensions
-from estimator.diagnostics.kinds import Level
-from estimator.diagnostics.misfit import SharedNoise
+from estimator.checks.advice import ModelMisfit, TooFewDimensions
+from estimator.checks.kinds import Level
+from estimator.checks.misfit import SharedNoise
 from estimator.levels.axes import across
 from estimator.levels.contributions import Contribution, Source, contribution, widened
 from estimator.levels.interval import NORMAL_95

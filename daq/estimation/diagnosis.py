@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.clocks.clock_model import RelativeTime
 from daq.estimation.noise_estimates import neighbours
 from daq.estimation.snapshot_diagnostics import (
     CLOCK_FACTOR,
@@ -18,11 +19,10 @@ from daq.estimation.snapshot_diagnostics import (
     SnapshotDiagnostics,
     Synchronisation,
 )
-from daq.timing.clock_model import RelativeTime
-from estimator.diagnostics.advice import Advice, Delay, Gain, ModelMisfit
-from estimator.diagnostics.diagnose import Diagnostics, diagnose
-from estimator.diagnostics.kinds import Level, Untested
-from estimator.diagnostics.misfit import SharedNoise
+from estimator.checks.advice import Advice, Delay, Gain, ModelMisfit
+from estimator.checks.diagnose import Diagnostics, diagnose
+from estimator.checks.kinds import Level, Untested
+from estimator.checks.misfit import SharedNoise
 from estimator.errors import InsufficientDataError
 from estimator.levels.axes import across
 from estimator.responses.equalisation import leakage_advice
@@ -33,11 +33,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.model import Channel
+    from daq.clocks.clock_model import ClockState
     from daq.estimation.noise_estimates import Dimensions
     from daq.estimation.segments.segment_pass import Pass
-    from daq.timing.clock_model import ClockState
-    from estimator.diagnostics.band import BandDiagnosis
-    from estimator.diagnostics.stability import SegmentCourse
+    from estimator.checks.band import BandDiagnosis
+    from estimator.checks.stability import SegmentCourse
     from estimator.self_noise.result import SelfNoise
     from estimator.spectra.multiresolution import Band
 

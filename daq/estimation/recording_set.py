@@ -7,8 +7,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daq.alignment.aligned_recording import AlignedRecording
 from daq.bench.durations import format_duration
+from daq.clocks.aligned_recording import AlignedRecording
 from daq.errors import CannotAlignError, RecordingError, WrongSettingError
 from daq.recording.reader import Recording
 from daq.recording.storage.locking import is_being_written

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.estimation.noise_estimates import responses
-from estimator.diagnostics.stability import SegmentCourse
+from estimator.checks.stability import SegmentCourse
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

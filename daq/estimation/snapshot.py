@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from daq.clocks.clock_model import ClockState
     from daq.protocols.block import Event
     from daq.recording.interface import ReadableSensor
-    from daq.timing.clock_model import ClockState
     from estimator.self_noise.result import SelfNoise
     from estimator.spectra.multiresolution import Band
     from estimator.spectra.segment_rejection import Reason

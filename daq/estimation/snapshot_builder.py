@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.alignment.sensor_reader import main_columns
+from daq.clocks.sensor_reader import main_columns
 from daq.estimation.contributions import with_contributions
 from daq.estimation.diagnosis import (
     Findings,

@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.diagnostics.kinds import Untested
+from estimator.checks.kinds import Untested
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
-    from estimator.diagnostics.advice import Advice
-    from estimator.diagnostics.band import BandDiagnosis
-    from estimator.diagnostics.relative_response import RelativeResponse
-    from estimator.diagnostics.stability import Stability
+    from estimator.checks.advice import Advice
+    from estimator.checks.band import BandDiagnosis
+    from estimator.checks.relative_response import RelativeResponse
+    from estimator.checks.stability import Stability
     from estimator.likelihood.dimension import BandDimension
     from estimator.self_noise.result import SelfNoise
 
@@ -118,7 +118,7 @@ class FrequencyDiagnosis:
     Attributes
     ----------
     coherence, condition : float64, shape (n_freqs, n_pairs)
-        As in `estimator.diagnostics.diagnose.Diagnostics`, and so are `dimension` and `snr`.
+        As in `estimator.checks.diagnose.Diagnostics`, and so are `dimension` and `snr`.
     dimension : float64, shape (n_freqs,)
     snr : float64, shape (n_freqs, n_channels)
     statistic, degrees, p_value : float64, shape (n_freqs,)

@@ -2,7 +2,7 @@
 
 The rows are those of the first channel. A channel that is sampled at the same instants is shifted
 by whole rows. Another one, a fraction of a sample apart or with a clock of its own, is resampled
-(:mod:`daq.alignment.resampling`). Where a channel has no samples, the sensor has a gap.
+(:mod:`daq.clocks.resampling`). Where a channel has no samples, the sensor has a gap.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daq.alignment.resampling import reach, resample
+from daq.clocks.resampling import reach, resample
 from daq.errors import ImportFormatError
 from daq.formats.channel_runs import SAME_RATE, Run, runs_of, time_tolerance_ns
 from daq.formats.foreign_sensor import NS_PER_S, ForeignSensor, Stretch

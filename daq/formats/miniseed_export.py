@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daq.bench.response import AnalogPolesZeros, Fir, Gain, Iir, Measured, Response
+from daq.clocks.arrival_times import ArrivalTimes
 from daq.errors import RecordingError
 from daq.formats.foreign_sensor import NS_PER_S
 from daq.formats.readers.waveforms import load_obspy
 from daq.protocols.block import BlockFlag
-from daq.timing.arrival_times import ArrivalTimes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

@@ -8,17 +8,23 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
 from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 from daq.errors import ImportFormatError
 from daq.formats.assembly import assembled
 from daq.formats.channel_runs import SAME_RATE
 from daq.formats.foreign_sensor import FIRST_DATE_NS
-from daq.formats.readers.registry import parts_of
-from daq.formats.readers.sds import SCHEME, sds_files
-from daq.formats.traces import PartCache, pieces_of
+from daq.formats.readers.delimited.reader import read_delimited
+from daq.formats.readers.miniseed import is_miniseed, miniseed_parts
+from daq.formats.readers.npz import read_mat, read_npz
+from daq.formats.readers.tdms import tdms_parts
+from daq.formats.readers.vibration import read_uff, read_wav
+from daq.formats.readers.waveforms import waveform_parts
+from daq.formats.traces import FilePart, PartCache, pieces_of, traces_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -28,6 +34,107 @@ if TYPE_CHECKING:
     from daq.formats.traces import Part, Piece, Trace
 
     Progress: TypeAlias = Callable[[str], None]
+    from collections.abc import Callable
+
+    WholeFile: TypeAlias = Callable[[Path, float | None], Sequence[ForeignSensor]]
+
+SCHEME = "sds://"
+_N_FIELDS = 7
+_NS_PER_S = 1_000_000_000
+
+
+class Codes(Protocol):
+    """Which files are wanted; patterns of codes, and UTC in ns."""
+
+    @property
+    def networks(self) -> str:
+        """Pattern of network codes."""
+
+    @property
+    def stations(self) -> str:
+        """Pattern of station codes."""
+
+    @property
+    def locations(self) -> str:
+        """Pattern of location codes."""
+
+    @property
+    def start_ns(self) -> int | None:
+        """UTC of the start, if there is one."""
+
+    @property
+    def end_ns(self) -> int | None:
+        """UTC of the end, if there is one."""
+
+
+def sds_files(url: str, codes: Codes) -> Iterator[Path]:
+    """Yield the waveform files of an archive by channel and day.
+
+    Raises
+    ------
+    ImportFormatError
+        There is no such folder.
+    """
+    root = Path(url.removeprefix(SCHEME)).expanduser()
+    if not root.is_dir():
+        raise ImportFormatError(f"{url}: no such folder; expected sds://ROOT, with a folder a year")
+    first = None if codes.start_ns is None else _day(codes.start_ns) - timedelta(days=1)
+    last = None if codes.end_ns is None else _day(codes.end_ns - 1)
+    pattern = f"[0-9][0-9][0-9][0-9]/{codes.networks}/{codes.stations}/*.D/*"
+    found: list[tuple[str, datetime, Path]] = []
+    for path in root.glob(pattern):
+        fields = path.name.split(".")
+        if len(fields) != _N_FIELDS or not (fields[5].isdigit() and fields[6].isdigit()):
+            continue
+        if codes.locations != "*" and not Path(fields[2] or "--").match(codes.locations):
+            continue
+        day = datetime(int(fields[5]), 1, 1, tzinfo=UTC) + timedelta(days=int(fields[6]) - 1)
+        if (first is None or day >= first) and (last is None or day <= last):
+            found.append((".".join(fields[:4]), day, path))
+    yield from (path for *_, path in sorted(found))
+
+
+def _day(instant_ns: int) -> datetime:
+    when = datetime.fromtimestamp(instant_ns // _NS_PER_S, tz=UTC)
+    return when.replace(hour=0, minute=0, second=0)
+
+
+_UNIVERSAL = frozenset({".uff", ".unv", ".uf58", ".58"})
+_BY_SUFFIX: dict[str, WholeFile] = {
+    ".wav": read_wav,
+    ".npz": read_npz,
+    ".mat": read_mat,
+    ".csv": read_delimited,
+    ".tsv": read_delimited,
+    ".txt": read_delimited,
+    ".lvm": read_delimited,
+}
+
+
+def parts_of(path: Path, sampling_rate: float | None = None) -> Iterator[Part]:
+    """Yield the parts of a file; ``sampling_rate`` (Hz) is used where the file has none.
+
+    Raises
+    ------
+    ImportFormatError
+        It cannot be read.
+    """
+    whole = _BY_SUFFIX.get(path.suffix.lower())
+    if whole is not None:
+        yield FilePart(path, partial(_load, whole, sampling_rate))
+    elif path.suffix.lower() in _UNIVERSAL:
+        yield FilePart(path, read_uff)
+    elif path.suffix.lower() == ".tdms":
+        yield from tdms_parts(path, sampling_rate)
+    elif is_miniseed(path):
+        yield from miniseed_parts(path)
+    else:
+        yield from waveform_parts(path)
+
+
+def _load(read: WholeFile, sampling_rate: float | None, path: Path) -> list[Trace]:
+    return traces_of(read(path, sampling_rate))
+
 
 _LOGGER = logging.getLogger(__name__)
 _STATE_BANDS = "AO"

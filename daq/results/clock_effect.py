@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from daq.clocks.clock_model import RelativeTime
 from daq.results.band_summary import band_of, judged_method
-from daq.timing.clock_model import RelativeTime
 
 if TYPE_CHECKING:
     from daq.estimation.settings import Settings

@@ -1,7 +1,7 @@
 """What is known of a test beyond its numbers: one class per kind of fact, with numbers.
 
 `daq.results.known_facts` makes facts, `tui.wording` words them, and renderers only place the words.
-The findings of the estimator (`estimator.diagnostics.advice`) become facts as `Finding`.
+The findings of the estimator (`estimator.checks.advice`) become facts as `Finding`.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ import enum
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from estimator.diagnostics.kinds import Level
+from estimator.checks.kinds import Level
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from daq.timing.clock_model import LostCount
-    from estimator.diagnostics.advice import Advice
-    from estimator.diagnostics.kinds import Untested
+    from daq.clocks.clock_model import LostCount
+    from estimator.checks.advice import Advice
+    from estimator.checks.kinds import Untested
     from estimator.levels.contributions import Source
     from estimator.likelihood.dimension import BandDimension
     from estimator.self_noise.result import Flag

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.clocks.clock_model import ClockSource
 from daq.results.band_summary import band_of, channel_means, highest_known
 from daq.results.clock_effect import reference
 from daq.results.facts import (
@@ -48,8 +49,7 @@ from daq.results.facts import (
     WithoutEstimate,
 )
 from daq.results.precision import precision
-from daq.timing.clock_model import ClockSource
-from estimator.diagnostics.advice import (
+from estimator.checks.advice import (
     Copies,
     Delay,
     Gain,
@@ -59,8 +59,8 @@ from estimator.diagnostics.advice import (
     TooFewDimensions,
     TooFewSensors,
 )
-from estimator.diagnostics.kinds import Untested
-from estimator.diagnostics.shared_noise import MAX_CHANNELS
+from estimator.checks.kinds import Untested
+from estimator.checks.shared_noise import MAX_CHANNELS
 from estimator.errors import BandError
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
@@ -70,7 +70,7 @@ if TYPE_CHECKING:
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import SensorTotals, Snapshot
-    from estimator.diagnostics.advice import Advice
+    from estimator.checks.advice import Advice
     from estimator.levels.contributions import Source
 
 LEAST_SHARE = 0.01

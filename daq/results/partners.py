@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 from typing import TYPE_CHECKING
 
-from estimator.diagnostics.advice import NoSharedMotion
+from estimator.checks.advice import NoSharedMotion
 
 if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot

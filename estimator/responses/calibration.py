@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.diagnostics.relative_response import relative_response
+from estimator.checks.relative_response import relative_response
 from estimator.errors import InsufficientDataError
 from estimator.responses.derived_quantities import Value, with_errors
 from estimator.self_noise.coherency import other_channels, own_channels
@@ -257,7 +257,7 @@ def calibrate_sensor(
     Raises
     ------
     InsufficientDataError
-        As `estimator.diagnostics.relative_response.relative_response`.
+        As `estimator.checks.relative_response.relative_response`.
     """
     pair = _pair(
         csm,

@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daq.protocols.epson import commands
-from daq.protocols.epson.commands import BurstFormat, CommandDecoder, Read, Register, Write
+from daq.devices.epson import commands
+from daq.devices.epson.commands import BurstFormat, CommandDecoder, Read, Register, Write
 from sim_devices.devices.interface import NEVER, Line
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ import canopen
 import numpy as np
 from canopen import objectdictionary
 
-from daq.protocols.epson import can as protocol
+from daq.devices.epson import canopen as protocol
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

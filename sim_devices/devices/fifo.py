@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.protocols.modbus import rtu
-from daq.protocols.modbus.fifo import FIFO_REGISTER, MAX_WORDS, RATE_REGISTER
-from daq.protocols.modbus.rtu import RequestFinder
+from daq.devices.modbus import rtu
+from daq.devices.modbus.fifo_protocol import FIFO_REGISTER, MAX_WORDS, RATE_REGISTER
+from daq.devices.modbus.rtu import RequestFinder
 from sim_devices.devices.interface import NEVER, Line
 from sim_devices.devices.sampling import Samples, whole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from daq.protocols.modbus.rtu import Request
+    from daq.devices.modbus.rtu import Request
     from sim_devices.devices.interface import DeviceSpec, Source
 
 TURNAROUND = 0.001

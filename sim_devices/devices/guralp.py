@@ -1,11 +1,11 @@
 """A simulated Güralp digitizer: GCF over a serial line with block recovery, or a Scream server.
 
 Simulated functions: one stream per channel, in blocks that start on UTC
-(:mod:`daq.protocols.guralp.gcf`); numbered frames, sent one at a time at the line's rate, each with
+(:mod:`daq.devices.guralp.gcf`); numbered frames, sent one at a time at the line's rate, each with
 a wait of 150 ms for its acknowledgement, and repetition from a refused block on
-(:mod:`daq.protocols.guralp.brp`); blocks of status text. Alternatively: packets over UDP to the
+(:mod:`daq.devices.guralp.brp`); blocks of status text. Alternatively: packets over UDP to the
 client of the last minute and over TCP, and repetition of blocks by number
-(:mod:`daq.protocols.guralp.scream`).
+(:mod:`daq.devices.guralp.scream`).
 
 GPS keeps the sampling clock on UTC, independent of the scenario's clock. Not simulated: terminal
 commands, triggered streams, several taps, memory while disconnected.
@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.protocols.guralp import gcf, scream
-from daq.protocols.guralp.brp import Transmitter
-from daq.protocols.guralp.gcf import SampleBlock, StatusBlock, SystemId
-from daq.protocols.guralp.scream import Packet
+from daq.devices.guralp import gcf, scream
+from daq.devices.guralp.brp import Transmitter
+from daq.devices.guralp.gcf import SampleBlock, StatusBlock, SystemId
+from daq.devices.guralp.scream import Packet
 from sim_devices.devices.interface import NEVER, Line
 from sim_devices.devices.sampling import Samples, whole
 from sim_devices.errors import ScenarioError
@@ -31,7 +31,7 @@ from sim_devices.errors import ScenarioError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from daq.protocols.guralp.gcf import Width
+    from daq.devices.guralp.gcf import Width
     from sim_devices.devices.interface import DeviceSpec, Source
 
 FULL_SCALE = (1 << 23) - 1

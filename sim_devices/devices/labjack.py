@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.devices.labjack import registers as reg
+from daq.devices.labjack.packets import MAX_SAMPLES, encode_response
+from daq.devices.labjack.registers import Adu, Read
+from daq.devices.labjack.stream import SCAN_OVERLAP
 from daq.protocols.errors import RemoteProtocolError
-from daq.protocols.labjack import registers as reg
-from daq.protocols.labjack.packets import MAX_SAMPLES, encode_response
-from daq.protocols.labjack.registers import Adu, Read
-from daq.protocols.labjack.stream import SCAN_OVERLAP
 from sim_devices.devices.labjack_stream import CENTER, Columns, Stream
 from sim_devices.devices.sampling import Samples, whole
 

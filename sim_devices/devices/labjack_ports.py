@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from daq.devices.labjack import registers as reg
+from daq.devices.labjack.packets import Packet, encode_packet
+from daq.devices.labjack.registers import AduFinder
 from daq.protocols.errors import RemoteProtocolError
-from daq.protocols.labjack import registers as reg
-from daq.protocols.labjack.packets import Packet, encode_packet
-from daq.protocols.labjack.registers import AduFinder
 from sim_devices.devices.interface import NEVER, Line
 from sim_devices.devices.labjack import LabJack
 

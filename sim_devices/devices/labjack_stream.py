@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.protocols.labjack import registers as reg
-from daq.protocols.labjack.packets import Packet
-from daq.protocols.labjack.stream import (
+from daq.devices.labjack import registers as reg
+from daq.devices.labjack.packets import Packet
+from daq.devices.labjack.stream import (
     AUTO_RECOVER_ACTIVE,
     AUTO_RECOVER_END,
     AUTO_RECOVER_OVERFLOW,

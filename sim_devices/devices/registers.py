@@ -11,7 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pymodbus.constants import ExcCodes
 
-from daq.protocols.modbus.registers import PRESETS, WITMOTION_RATE, WITMOTION_UNLOCK, RegisterMap
+from daq.devices.modbus.registers_protocol import (
+    PRESETS,
+    WITMOTION_RATE,
+    WITMOTION_UNLOCK,
+    RegisterMap,
+)
 from sim_devices.devices.interface import Line
 from sim_devices.devices.modbus import ModbusEndpoint
 

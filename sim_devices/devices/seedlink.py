@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.protocols.seedlink.packets import (
+from daq.devices.seedlink.packets import (
     LINE_END,
     WRAP,
     Packet,
     Version,
     encode_packet,
 )
-from daq.protocols.seedlink.records import WaveRecord, encode_log, encode_record
+from daq.devices.seedlink.records import WaveRecord, encode_log, encode_record
 from sim_devices.devices.interface import NEVER, Line
 from sim_devices.devices.sampling import Samples, whole
 

@@ -1,7 +1,7 @@
 """A simulated device that sends delimited text: rows on a line, or datacast packets over UDP.
 
 The device sends the samples of its sensor in the format of its settings
-(:mod:`daq.protocols.text.decoder`): one row per sample, with time, counter, tag and checksum if the
+(:mod:`daq.devices.text.decoder`): one row per sample, with time, counter, tag and checksum if the
 format has them, or packets of 25 samples of a channel with the time of the first, like a Raspberry
 Shake. With the settings ``start`` and ``stop``, the device sends only between these commands.
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING
 
-from daq.protocols.text.format import (
+from daq.devices.text.format import (
     LILY,
     RASPBERRY_SHAKE,
     SINCE_START,

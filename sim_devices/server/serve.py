@@ -39,8 +39,9 @@ import asyncio
 import json
 import math
 import signal
+import time
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,13 +57,43 @@ from sim_devices.devices.interface import (
 )
 from sim_devices.faults import Fault, LineFaults, SampleFaults, parse
 from sim_devices.server.ports import DevicePort, make_port
-from sim_devices.server.world_clock import WorldClock
 from sim_devices.world.scenario import Scenario
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from sim_devices.server.paced_clock import PacedClock
+
+NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class WorldClock:
+    """World time from a monotonic clock that all processes of the bench share.
+
+    Attributes
+    ----------
+    epoch_ns : int
+        Instant of the monotonic clock at which world time is 0.
+    speed : float
+        World seconds that pass in one second.
+    monotonic_ns : callable
+        The monotonic clock: the system's, or :meth:`PacedClock.now_ns
+        <sim_devices.server.paced_clock.PacedClock.now_ns>`.
+    """
+
+    epoch_ns: int
+    speed: float = 1.0
+    monotonic_ns: Callable[[], int] = time.monotonic_ns
+
+    def now(self) -> float:
+        """Return the world time in s."""
+        return (self.monotonic_ns() - self.epoch_ns) / NS * self.speed
+
+    def monotonic(self, world_time: float) -> float:
+        """Return the instant of the monotonic clock, in s, of a world time."""
+        return self.epoch_ns / NS + world_time / self.speed
+
 
 FAMILIES = {
     "epson": "sim_devices.devices.epson:create",

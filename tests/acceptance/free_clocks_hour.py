@@ -32,7 +32,7 @@ from rich.console import Console
 from rich.table import Table
 
 from daq.bench.loading import dump
-from daq.drivers.bench_file import parse
+from daq.devices.bench_file import parse
 from daq.python_process import python_command
 from daq.recording.reader import Recording
 from sim_devices.world.world import World

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
-from daq.drivers.bench_file import load
+from daq.devices.bench_file import load
 from daq.python_process import python_command
 from tests.acceptance import fault_script
 from tests.waiting import limit

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from estimator.diagnostics import shared_noise, stability
-from estimator.diagnostics.diagnose import diagnose
-from estimator.diagnostics.shared_motion import CanonicalCoherence, is_coherent, seen_by_others
+from estimator.checks import shared_noise, stability
+from estimator.checks.diagnose import diagnose
+from estimator.checks.shared_motion import CanonicalCoherence, is_coherent, seen_by_others
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.maximum_likelihood import standard_error
 from estimator.self_noise import coherency

@@ -14,25 +14,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.devices.epson import commands
+from daq.devices.epson.burst import BurstDecoder
+from daq.devices.epson.commands import BurstFormat, CommandDecoder, Read
+from daq.devices.guralp import brp, gcf, scream
+from daq.devices.guralp.decoders import ScreamDecoder, SerialDecoder
+from daq.devices.labjack import packets
+from daq.devices.labjack.packets import Packet
+from daq.devices.labjack.registers import AduFinder
+from daq.devices.labjack.stream import StreamDecoder
+from daq.devices.modbus import rtu
+from daq.devices.modbus.fifo_protocol import FifoDecoder
+from daq.devices.modbus.registers_protocol import RegisterDecoder, RegisterMap
+from daq.devices.seedlink import packets as seedlink
+from daq.devices.seedlink.decoder import SeedLinkDecoder, Selection
+from daq.devices.seedlink.records import WaveRecord, encode_record
+from daq.devices.text.decoder import TextDecoder
+from daq.devices.text.format import RASPBERRY_SHAKE, TextFormat
 from daq.protocols.block import Block, Event, HostTime
-from daq.protocols.epson import commands
-from daq.protocols.epson.burst import BurstDecoder
-from daq.protocols.epson.commands import BurstFormat, CommandDecoder, Read
 from daq.protocols.errors import RemoteProtocolError
-from daq.protocols.guralp import brp, gcf, scream
-from daq.protocols.guralp.decoders import ScreamDecoder, SerialDecoder
-from daq.protocols.labjack import packets
-from daq.protocols.labjack.packets import Packet
-from daq.protocols.labjack.registers import AduFinder
-from daq.protocols.labjack.stream import StreamDecoder
-from daq.protocols.modbus import rtu
-from daq.protocols.modbus.fifo import FifoDecoder
-from daq.protocols.modbus.registers import RegisterDecoder, RegisterMap
-from daq.protocols.seedlink import packets as seedlink
-from daq.protocols.seedlink.decoder import SeedLinkDecoder, Selection
-from daq.protocols.seedlink.records import WaveRecord, encode_record
-from daq.protocols.text.decoder import TextDecoder
-from daq.protocols.text.format import RASPBERRY_SHAKE, TextFormat
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from daq.protocols.epson.commands import COUNTS_PER_G, FILTERS, NOT_ON_A370
+from daq.devices.epson.commands import COUNTS_PER_G, FILTERS, NOT_ON_A370
 from tests.devices import serving
 from tests.sim_devices.simulated_bench import device, spec
 

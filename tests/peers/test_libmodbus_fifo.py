@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from daq.bench.model import Channel, Sensor
-from daq.drivers.registry import driver_type
+from daq.devices.registry import driver_type
 from daq.protocols.block import BlockFlag
-from tests.daq.drivers.reading import record
+from tests.daq.devices.reading import record
 from tests.peers.libmodbus import build, ready, serial_cable
 
 if TYPE_CHECKING:

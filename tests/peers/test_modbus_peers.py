@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from daq.bench.model import Channel, Sensor
-from daq.drivers.registry import driver_type
+from daq.devices.registry import driver_type
 from daq.protocols.block import Block
 from sim_devices.world.world import World
 from tests.devices import host_clock, serving

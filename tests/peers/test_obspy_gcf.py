@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 
 from daq.bench.model import Channel, Sensor
-from daq.drivers.registry import driver_type
+from daq.devices.guralp import brp, gcf, scream
+from daq.devices.guralp.decoders import ScreamDecoder, SerialDecoder
+from daq.devices.guralp.gcf import SampleBlock
+from daq.devices.registry import driver_type
 from daq.protocols.block import Block, HostTime
-from daq.protocols.guralp import brp, gcf, scream
-from daq.protocols.guralp.decoders import ScreamDecoder, SerialDecoder
-from daq.protocols.guralp.gcf import SampleBlock
 from sim_devices.devices.guralp import Digitizer
 from sim_devices.devices.interface import ChannelSpec, DeviceSpec, Source
 from sim_devices.world.world import World
-from tests.daq.drivers.reading import record
+from tests.daq.devices.reading import record
 from tests.sim_devices.simulated_bench import scenario
 
 if TYPE_CHECKING:

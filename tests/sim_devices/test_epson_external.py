@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from daq.bench.driver_rules import Checking
-from daq.drivers.registry import driver_type
+from daq.devices.epson import commands
+from daq.devices.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
-from daq.protocols.epson import commands
 from daq.transport.ports import open_port
 from sim_devices.devices.interface import Source
 from sim_devices.server.serve import device_spec
 from sim_devices.world.scenario import Scenario
-from tests.daq.drivers.reading import record
+from tests.daq.devices.reading import record
 from tests.devices import host_clock, paced_clock, serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
 

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from daq.drivers.registry import driver_type
+from daq.devices.epson import commands
+from daq.devices.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, NotConnectedError, WrongDeviceError
 from daq.protocols.block import Block, BlockFlag
-from daq.protocols.epson import commands
 from daq.transport.ports import open_port
 from sim_devices.errors import ServeError
 from sim_devices.world.scenario import Scenario

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from daq.drivers.bench_file import parse as parse_bench
-from daq.drivers.registry import driver_type
+from daq.devices.bench_file import parse as parse_bench
+from daq.devices.epson import commands
+from daq.devices.registry import driver_type
 from daq.errors import BenchFileError, DeviceError, NoAnswerError, NotConnectedError
 from daq.protocols.block import Block, BlockFlag, Event
-from daq.protocols.epson import commands
 from sim_devices.devices.interface import ChannelSpec, DeviceSpec, Source
 from sim_devices.errors import ScenarioError
 from sim_devices.faults import LineFaults, SampleFaults, parse
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.bench.model import Sensor
-    from daq.drivers.interface import Session
+    from daq.devices.interface import Session
     from daq.host_clock import SystemClock
 
 pytestmark = pytest.mark.devices

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from daq.drivers.registry import driver_type
+from daq.devices.registry import driver_type
 from daq.protocols.block import Block, BlockFlag, Event
-from tests.daq.drivers.reading import reading, record
+from tests.daq.devices.reading import reading, record
 from tests.devices import serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
 

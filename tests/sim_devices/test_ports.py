@@ -14,8 +14,7 @@ import pytest
 from sim_devices.devices.interface import NEVER, Line
 from sim_devices.faults import LineFaults, parse
 from sim_devices.server.ports import PseudoTerminal
-from sim_devices.server.serve import Served
-from sim_devices.server.world_clock import WorldClock
+from sim_devices.server.serve import Served, WorldClock
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from daq.drivers.modbus.bus import open_bus
-from daq.drivers.registry import driver_type
+from daq.devices.modbus import rtu
+from daq.devices.modbus.bus import open_bus
+from daq.devices.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, NotConnectedError, WrongDeviceError
 from daq.protocols.block import Block, BlockFlag, Event
-from daq.protocols.modbus import rtu
 from tests.devices import device_at, host_clock, serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
 

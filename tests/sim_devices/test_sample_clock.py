@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sim_devices.world.sample_clock import SampleClock
 from sim_devices.world.tables import SensorClock, TemperatureCycle, TemperatureRamp, TemperatureStep
+from sim_devices.world.world import SampleClock
 
 RATE = 200.0
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.protocols.modbus import rtu
+from daq.devices.modbus import rtu
 from sim_devices.devices.fifo import FifoDevice
 from sim_devices.devices.guralp import create as create_guralp
 from sim_devices.devices.interface import Source

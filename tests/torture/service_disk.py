@@ -25,7 +25,7 @@ import numpy as np
 
 from daq.bench.loading import dump
 from daq.bench.tables.unattended import Schedule, ScheduledRun
-from daq.drivers.bench_file import parse
+from daq.devices.bench_file import parse
 from tests.torture.power_cuts import shim
 from tests.torture.service_kills import BEGIN, faults
 from tests.torture.service_program import FastClock

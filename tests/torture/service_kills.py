@@ -29,12 +29,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.acquisition.schedule import due_times
 from daq.bench.loading import dump
 from daq.bench.tables.unattended import Schedule, ScheduledRun, Storage
-from daq.drivers.bench_file import load, parse
+from daq.devices.bench_file import load, parse
 from daq.errors import HuddleError
 from daq.python_process import python_command
+from daq.recorder.schedule import due_times
 from tests.torture.service_checks import fault_of_recording, faults_of_results
 from tests.torture.service_program import FastClock
 from tui.service.records.run_state import RunState

@@ -29,7 +29,7 @@ import numpy as np
 
 from daq.bench.loading import dump
 from daq.bench.tables.unattended import Schedule, ScheduledRun, Storage
-from daq.drivers.bench_file import load, parse
+from daq.devices.bench_file import load, parse
 from daq.errors import HuddleError
 from tests.torture.power_cuts import MODELS, Operation, operations_of, replay, shim
 from tests.torture.service_checks import fault_of_recording, faults_of_results

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.acquisition.before_test.device_check import DiscoveredDevice
-from daq.drivers.bench_file import parse
-from daq.drivers.interface import DeviceInformation
+from daq.clocks.clock_model import ClockSource, ClockState
+from daq.devices.bench_file import parse
+from daq.devices.interface import DeviceInformation
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import ChannelLabel, SensorTotals, Snapshot
 from daq.estimation.snapshot_diagnostics import (
@@ -22,16 +22,16 @@ from daq.estimation.snapshot_diagnostics import (
     Synchronisation,
 )
 from daq.host_clock import SystemClock
+from daq.preflight.device_check import DiscoveredDevice
 from daq.protocols.block import Event, EventKind, HostTime
 from daq.recording.file_format import SensorLayout
 from daq.recording.monitor import RecordingStatus, SensorStatus
 from daq.recording.sensor_state import SensorState
 from daq.recording.storage.names import CONTINUES
 from daq.recording.writer import RecordingWriter
-from daq.timing.clock_model import ClockSource, ClockState
-from estimator.diagnostics.advice import NoSharedMotion
-from estimator.diagnostics.diagnose import Diagnostics, diagnose
-from estimator.diagnostics.kinds import Level
+from estimator.checks.advice import NoSharedMotion
+from estimator.checks.diagnose import Diagnostics, diagnose
+from estimator.checks.kinds import Level
 from estimator.methods import self_noise
 from tui.wording.facts import known
 

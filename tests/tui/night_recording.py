@@ -10,7 +10,7 @@ from daq.bench.loading import parse
 from daq.protocols.block import Event, HostTime
 from daq.recording.file_format import SensorLayout
 from daq.recording.writer import RecordingWriter
-from tests.daq.alignment.recordings import ORIGIN, Sensor, blocks
+from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -9,11 +9,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
-    from daq.acquisition.before_test.device_check import DiscoveredDevice
-    from daq.acquisition.before_test.preview import SensorPreview
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from daq.preflight.device_check import DiscoveredDevice
+    from daq.preflight.preview import SensorPreview
     from daq.results.decision.verdict import TestVerdict
     from tui.application.plan import TestPlan
 

@@ -7,9 +7,10 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
+from rich.segment import Segment
 from textual import on, work
 from textual.app import App, SystemCommand
-from textual.filter import Monochrome
+from textual.filter import LineFilter, Monochrome
 from textual.reactive import var
 
 from daq.errors import HuddleError
@@ -18,7 +19,6 @@ from daq.results.decision.limits import judge
 from estimator.errors import EstimatorError
 from tui.application.bench_view.view import BenchView
 from tui.application.dialogs import StopScreen
-from tui.application.harmless_lines import HarmlessLines
 from tui.application.messages import (
     BenchEdited,
     DeletionRequested,
@@ -57,8 +57,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
 
+    from textual.color import Color
     from textual.driver import Driver
-    from textual.filter import LineFilter
     from textual.screen import Screen
 
     from daq.bench.masks.mask import Mask
@@ -66,6 +66,35 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
     from tui.application.controls import Controls
+
+_CONTROLS = dict.fromkeys((*range(32), *range(127, 160)))
+
+
+class HarmlessLines(LineFilter):
+    """Removes control characters, which terminals obey and which take no cell of the screen.
+
+    Parameters
+    ----------
+    filters : sequence of LineFilter
+        What each line goes through afterwards; Textual makes a new line for each filter of its own.
+    """
+
+    def __init__(self, filters: Sequence[LineFilter]) -> None:
+        super().__init__()
+        self._filters = filters
+
+    def apply(self, segments: list[Segment], background: Color) -> list[Segment]:
+        """Return the segments without them."""
+        segments = [
+            segment
+            if segment.control or segment.text.isprintable()
+            else Segment(segment.text.translate(_CONTROLS), segment.style)
+            for segment in segments
+        ]
+        for each in self._filters:
+            segments = each.apply(segments, background)
+        return segments
+
 
 Outcome = TypeVar("Outcome")
 CURVE_GROWTH = 0.01  # of the segments, from which on curves change to the eye

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
     from textual.app import App
 
-    from daq.acquisition.before_test.preview import SensorPreview
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from daq.preflight.preview import SensorPreview
     from daq.recording.monitor import RecordingStatus
     from tui.application.state import Reference
     from tui.runs.catalogue import Entry

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 import typer
 from rich.table import Table
 
-from daq.acquisition.before_test.device_check import discover, probe_bench, search_description
 from daq.bench.durations import format_duration
 from daq.bench.editing import set_sensor_values
 from daq.bench.tables.toml_text import to_toml
-from daq.drivers.bench_file import load
+from daq.devices.bench_file import load
 from daq.errors import NoAnswerError
 from daq.host_clock import SystemClock
+from daq.preflight.device_check import discover, probe_bench, search_description
 from daq.transport.serial_ports import stable_path
 from tui.commands.drivers import print_others, summaries
 from tui.output.console import check_places, console, for_people, write_json, write_text
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from daq.acquisition.before_test.device_check import DiscoveredDevice, SensorCheck
     from daq.bench.model import Bench
     from daq.errors import DeviceError
+    from daq.preflight.device_check import DiscoveredDevice, SensorCheck
 
 
 def write_template(out: Path, *, force: bool) -> None:

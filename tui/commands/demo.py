@@ -18,7 +18,7 @@ from rich.text import Text
 from daq.bench.durations import format_duration
 from daq.bench.end_condition import EndCondition
 from daq.bench.loading import dump
-from daq.drivers.bench_file import parse
+from daq.devices.bench_file import parse
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.results.band_summary import band_of, data_means, levels

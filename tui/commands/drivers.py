@@ -7,7 +7,7 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.bench.driver_settings import settings_of
-from daq.drivers.registry import driver_names, driver_type
+from daq.devices.registry import driver_names, driver_type
 from daq.errors import DriverError
 from tui.output.console import console, for_people, write_json
 

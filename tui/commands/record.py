@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 
 from rich.live import Live
 
-from daq.acquisition.recorder import run
 from daq.bench.end_condition import NEVER, EndCondition
-from daq.drivers.bench_file import load
+from daq.devices.bench_file import load
 from daq.errors import WrongSettingError
 from daq.host_clock import SystemClock
 from daq.python_process import python_command
+from daq.recorder.recorder import run
 from daq.recording.storage.names import recording_path
 from daq.transport.wire_log import logging_to
 from tui.output.console import notices, write_json
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from daq.acquisition.recorder import RecorderStatus
+    from daq.recorder.recorder import RecorderStatus
 
 _LOGGER = logging.getLogger(__name__)
 GAP_INTERVAL = 60.0

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, TextColumn
 from daq.bench.durations import format_duration
 from daq.bench.end_condition import EndCondition
 from daq.bench.option_fit import shortest_duration
-from daq.drivers.bench_file import load
+from daq.devices.bench_file import load
 from daq.errors import HuddleError, RecordingError
 from daq.estimation.estimation import estimate
 from daq.estimation.follow import RecordingLeftOpenError, follow

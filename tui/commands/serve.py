@@ -10,20 +10,20 @@ import time
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from daq.acquisition.clock_trust import ClockTrust
-from daq.acquisition.schedule import all_due, utc_now
 from daq.bench.durations import format_duration
 from daq.bench.option_fit import shortest_duration
-from daq.drivers.bench_file import load
+from daq.devices.bench_file import load
 from daq.errors import BenchFileError, FileFault, HuddleError
 from daq.estimation.settings import Settings
+from daq.recorder.clock_trust import ClockTrust
+from daq.recorder.schedule import all_due, utc_now
 from tui.output.console import for_people, write_json, write_whole
 from tui.output.extras import require
 from tui.runs.estimate_settings import check_fit, chosen
 from tui.service.clock import SystemTime
 from tui.service.hooks import HookRunner
 from tui.service.metrics import ServiceMetrics
-from tui.service.notify import Notifier
+from tui.service.notify import Notifier, watchdog_interval
 from tui.service.processes.finish import options_table
 from tui.service.processes.locks import Lock
 from tui.service.processes.steps import ProcessSteps
@@ -31,7 +31,7 @@ from tui.service.records.places import file_name, service_lock
 from tui.service.records.storage import tidy
 from tui.service.records.store import RunStore, StoreError
 from tui.service.service import Service
-from tui.service.supervision import signs_of_life
+from tui.service.window import STALL
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -40,6 +40,46 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from tui.service.clock import Clock
     from tui.service.records.run_state import Run
+
+INTERVAL = 10.0
+"""Seconds between two signs of life, at most."""
+
+
+def is_alive(service: Service, at: float) -> bool:
+    """Whether a recorder, where one runs, has lately put samples on the disk.
+
+    Parameters
+    ----------
+    service : Service
+    at : float
+        Time of the event loop.
+    """
+    window = service.window
+    if window is None or window.progressed_at is None:
+        return True  # a recorder that starts is given up by its window
+    return at - window.progressed_at < 2 * STALL.total_seconds()
+
+
+def status_line(service: Service) -> str:
+    """Return what the service does, in a line."""
+    if service.recording is not None:
+        return f"recording run {service.recording.name}"
+    run = service.next_run
+    return "no run is planned" if run is None else f"next run: {run.name}"
+
+
+async def signs_of_life(service: Service, notifier: Notifier) -> None:
+    """Send ``READY`` and then ``WATCHDOG`` until cancelled."""
+    notifier.send("READY=1")
+    interval = min(INTERVAL, watchdog_interval() or INTERVAL)
+    loop = asyncio.get_running_loop()
+    while True:
+        lines = [f"STATUS={status_line(service)}"]
+        if is_alive(service, loop.time()):
+            lines.append("WATCHDOG=1")
+        notifier.send(*lines)
+        await asyncio.sleep(interval)
+
 
 _LOGGER = logging.getLogger(__name__)
 SHOWN = 5

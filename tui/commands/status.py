@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from daq.acquisition.schedule import utc_now
 from daq.bench.durations import format_duration
-from daq.drivers.bench_file import load
+from daq.devices.bench_file import load
+from daq.recorder.schedule import utc_now
 from tui.output.console import for_people, write_json
 from tui.output.exit_codes import ExitCode
 from tui.service.records.store import RunStore

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from daq.bench.masks.mask_file import masks_named
-from daq.drivers.bench_file import load
+from daq.devices.bench_file import load
 from daq.errors import BenchFileError, FileFault
 from daq.estimation.settings import Settings
 from daq.recording.reader import Recording

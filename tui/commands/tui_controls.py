@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from daq.acquisition.before_test.device_check import discover
-from daq.acquisition.before_test.preview import preview
 from daq.bench.editing import replace_file
-from daq.drivers.bench_file import parse
-from daq.errors import HuddleError
+from daq.devices.bench_file import parse
+from daq.errors import HuddleError, RecordingError
 from daq.host_clock import SystemClock
+from daq.preflight.device_check import discover
+from daq.preflight.preview import preview
 from daq.recording.control import ask
 from daq.recording.reader import Recording
-from daq.recording.storage.names import recording_path
+from daq.recording.storage.names import continuations, continued_name, recording_path
 from daq.results.sources import sources
 from daq.results.store import store_results
 from tui.commands.runs import RunNotFoundError, runs_named
@@ -30,7 +30,6 @@ from tui.output.extras import require
 from tui.output.json_document import document
 from tui.output.results import curves_csv
 from tui.runs.estimate_settings import settings_for
-from tui.runs.find_running import running_recording
 from tui.runs.recorder_process import RecorderProcess
 from tui.service.records.places import NoServiceError, Place
 from tui.simulation.host_time import host_time
@@ -39,15 +38,65 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
-    from daq.acquisition.before_test.device_check import DiscoveredDevice
-    from daq.acquisition.before_test.preview import SensorPreview
     from daq.bench.masks.mask import Mask
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from daq.preflight.device_check import DiscoveredDevice
+    from daq.preflight.preview import SensorPreview
     from daq.results.decision.verdict import TestVerdict
     from tui.application.controls import Preview
     from tui.application.plan import TestPlan
+
+LATEST = 3
+"""How many of the newest recordings are looked at."""
+
+
+def running_recording(bench: Bench) -> Path | None:
+    """Return the newest recording of this bench whose recorder answers: the first of its parts."""
+    folder = bench.recording_directory
+    if not folder.is_dir():
+        return None
+    files = sorted(folder.glob("*.h5"), key=lambda path: path.stat().st_mtime, reverse=True)
+    return next((first_part(path) for path in files[:LATEST] if _runs(path, bench.name)), None)
+
+
+def first_part(path: Path) -> Path:
+    """Return the first of the recordings that this one continues after disk errors.
+
+    Itself, if it continues none, or if the one that it continues is no longer in its folder.
+    """
+    with Recording.open(path) as recording:
+        continues = recording.continues
+    start = continued_name(path)
+    if not continues or start is None:
+        return path
+    parts = dict(_part(name) for name in (start, *continuations(start)) if name != path)
+    first = path
+    while continues in parts:
+        first, continues = parts.pop(continues)
+    return first
+
+
+def _part(path: Path) -> tuple[str, tuple[Path, str]]:
+    """Return the run_id of a recording, with its path and the run_id that it continues."""
+    try:
+        with Recording.open(path) as recording:
+            return recording.run_id, (path, recording.continues)
+    except RecordingError:  # there is none, or another file has such a name
+        return "", (path, "")
+
+
+def _runs(path: Path, name: str) -> bool:
+    try:
+        with Recording.open(path) as recording:
+            if recording.closed or recording.bench is None or recording.bench.name != name:
+                return False
+        ask(path, "status")
+    except HuddleError:
+        return False
+    return True
+
 
 COMPARISON_METHODS = ("three-sensor", "three-channel")
 """Cheap methods, shown for comparison with the chosen ones."""

@@ -12,7 +12,7 @@ import numpy as np
 from rich.table import Table
 
 from daq.bench.durations import format_duration
-from daq.drivers.bench_file import load
+from daq.devices.bench_file import load
 from daq.errors import WrongSettingError
 from daq.estimation.noise_estimates import responses
 from daq.estimation.settings import ROOM, ROOM_OF_ONE_CHANNEL, Settings

@@ -12,6 +12,7 @@ from daq.errors import WrongSettingError
 from daq.results.band_summary import band_of, channel_means
 from estimator.levels.bands import band_edges
 from tui.notebook import text
+from tui.output.extras import load
 from tui.wording.facts import known
 
 if TYPE_CHECKING:
@@ -31,6 +32,19 @@ if TYPE_CHECKING:
     from estimator.self_noise.result import SelfNoise
     from estimator.types import ComplexArray, FloatArray, IntArray
     from tui.wording.facts import Known
+
+
+def figure(snapshot: Snapshot, settings: Settings, bench: Bench | None, width: float) -> Figure:
+    """Return a figure with an axis for each channel, sensors below each other."""
+    pyplot = load("matplotlib.pyplot")
+    from tui.report.figures.curves import noise_plots  # noqa: PLC0415 - loads matplotlib
+    from tui.report.figures.drawing import look, stack, stack_height  # noqa: PLC0415
+
+    with look():
+        plots = noise_plots(snapshot, settings, bench)
+        drawn: Figure = pyplot.figure(figsize=(width, stack_height(plots)), facecolor="white")
+        stack(plots, drawn, margin=0.1)
+    return drawn
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -298,7 +312,7 @@ class Result:
         width : float
             Of the figure, in inches.
         """
-        from tui.notebook.figure import figure  # noqa: PLC0415 - loads matplotlib
+        from tui.notebook.result import figure  # noqa: PLC0415 - loads matplotlib
 
         return figure(self.snapshot, self.settings, self._bench, width)
 

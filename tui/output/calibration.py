@@ -6,9 +6,9 @@ import math
 from typing import TYPE_CHECKING
 
 from daq.bench.units import decibels
+from daq.clocks.clock_model import RelativeTime
 from daq.results.clock_effect import relative_time
 from daq.results.uncertainty_budget import student_quantile
-from daq.timing.clock_model import RelativeTime
 from tui.wording.formatting import signed, span
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 from rich.text import Text
 
-from estimator.diagnostics.advice import (
+from estimator.checks.advice import (
     Delay,
     Gain,
     ModelMisfit,
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot_diagnostics import (
         Diagnosis,
     )
-    from estimator.diagnostics.stability import Stability
+    from estimator.checks.stability import Stability
     from tui.wording.facts import Known
 
 _LEGEND = (

@@ -15,8 +15,8 @@ from daq.bench.estimate_settings import table_keys
 from daq.results.band_summary import band_of, channel_means, data_means
 from daq.results.clock_effect import relative_time
 from daq.results.facts import Fact, Finding
-from estimator.diagnostics.advice import Advice
-from estimator.diagnostics.shared_noise import MAX_CHANNELS
+from estimator.checks.advice import Advice
+from estimator.checks.shared_noise import MAX_CHANNELS
 from estimator.self_noise.result import Flag
 from tui.output.calibration import channels_of
 from tui.output.json_values import plain

@@ -13,7 +13,7 @@ from daq.protocols.block import EventKind
 from daq.results.band_summary import band_of
 from daq.results.clock_effect import effect_by_sensor, grade, reference, residuals
 from daq.results.facts import Rank
-from estimator.diagnostics.advice import NoSharedMotion
+from estimator.checks.advice import NoSharedMotion
 from estimator.likelihood.goodness_of_fit import rejected_below
 from tui.report.figures.drift import drift_plot
 from tui.report.figures.model_test import model_test_plot
@@ -32,12 +32,12 @@ from tui.wording.vocabulary import clock_source
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from daq.clocks.clock_model import ClockState
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.results.sources import LoggedEvent, Source
-    from daq.timing.clock_model import ClockState
-    from estimator.diagnostics.band import BandDiagnosis
-    from estimator.diagnostics.relative_response import RelativeResponse
+    from estimator.checks.band import BandDiagnosis
+    from estimator.checks.relative_response import RelativeResponse
     from tui.report.parts import Tone
     from tui.wording.facts import Known
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from daq.acquisition.retention import remove_run
 from daq.errors import HuddleError, RecordingError
+from daq.recorder.retention import remove_run
 from daq.recording.reader import Recording
 from daq.recording.storage.locking import is_being_written
 from daq.results.store import stored_verdict

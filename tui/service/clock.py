@@ -7,7 +7,7 @@ import contextlib
 import time
 from typing import TYPE_CHECKING, Protocol
 
-from daq.acquisition.schedule import utc_now
+from daq.recorder.schedule import utc_now
 
 if TYPE_CHECKING:
     from datetime import datetime

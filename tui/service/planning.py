@@ -11,7 +11,7 @@ from datetime import UTC, timedelta
 from itertools import islice, takewhile
 from typing import TYPE_CHECKING
 
-from daq.acquisition.schedule import all_due, due_times
+from daq.recorder.schedule import all_due, due_times
 from tui.service.records.run_state import Run
 
 if TYPE_CHECKING:

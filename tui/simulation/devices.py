@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from daq.bench.loading import dump
-from daq.drivers.bench_file import load, parse
+from daq.devices.bench_file import load, parse
 from daq.errors import BenchFileError, FileFault
 from sim_devices.errors import ScenarioError
 from sim_devices.faults import check

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.bench.model import Bench, Channel, Sensor
-from daq.drivers.bench_file import load
-from daq.drivers.registry import driver_type
+from daq.devices.bench_file import load
+from daq.devices.registry import driver_type
 from daq.protocols.block import EventKind, HostTime
 from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout

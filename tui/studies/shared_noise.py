@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.diagnostics.shared_noise import LEVEL, shared_noise
+from estimator.checks.shared_noise import LEVEL, shared_noise
 from estimator.likelihood.dimension import bands
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.score_test import pair_scores

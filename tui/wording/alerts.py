@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import singledispatch
 from typing import TYPE_CHECKING
 
-from estimator.diagnostics.advice import (
+from estimator.checks.advice import (
     Advice,
     Copies,
     Delay,
@@ -26,8 +26,8 @@ from estimator.diagnostics.advice import (
     UnequalResponses,
     WeakMotion,
 )
-from estimator.diagnostics.kinds import Level
-from estimator.diagnostics.misfit import NoiseChanges
+from estimator.checks.kinds import Level
+from estimator.checks.misfit import NoiseChanges
 from tui.wording.differences import followers, opposite
 from tui.wording.findings import explain, where
 from tui.wording.formatting import listed, percent

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from estimator.diagnostics.advice import (
+from estimator.checks.advice import (
     Delay,
     Gain,
     NotOrthogonal,
@@ -14,7 +14,7 @@ from estimator.diagnostics.advice import (
     SwappedChannels,
     UnequalResponses,
 )
-from estimator.diagnostics.kinds import Level
+from estimator.checks.kinds import Level
 from tui.wording.findings import Explanation, explain, where
 from tui.wording.formatting import listed, percent, ratio, signed
 

@@ -49,7 +49,7 @@ from daq.results.facts import (
     WithoutEstimate,
 )
 from daq.results.known_facts import facts_of
-from estimator.diagnostics.kinds import Untested
+from estimator.checks.kinds import Untested
 from estimator.spectra.segment_rejection import Reason
 from tui.wording.alerts import alert
 from tui.wording.findings import Names, explain, model

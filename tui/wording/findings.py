@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import singledispatch
 from typing import TYPE_CHECKING
 
-from estimator.diagnostics.advice import (
+from estimator.checks.advice import (
     Advice,
     Copies,
     MissingChannels,
@@ -21,7 +21,7 @@ from estimator.diagnostics.advice import (
     TooFewSensors,
     WeakMotion,
 )
-from estimator.diagnostics.kinds import Level
+from estimator.checks.kinds import Level
 from tui.wording.formatting import listed, percent, ratio, span
 
 if TYPE_CHECKING:

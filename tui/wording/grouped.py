@@ -6,7 +6,7 @@ import math
 from functools import singledispatch
 from typing import TYPE_CHECKING
 
-from estimator.diagnostics.advice import (
+from estimator.checks.advice import (
     Advice,
     Delay,
     Gain,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from estimator.diagnostics.kinds import Level
-from estimator.diagnostics.misfit import DisturbedSegments, NoiseChanges, SharedNoise
+from estimator.checks.kinds import Level
+from estimator.checks.misfit import DisturbedSegments, NoiseChanges, SharedNoise
 from tui.wording.alerts import alert
 from tui.wording.findings import Explanation, explain, where
 from tui.wording.formatting import listed, percent, several

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from daq.clocks.clock_model import ClockSource
 from daq.recording.sensor_state import SensorState
 from daq.results.partners import WithoutPartner
-from daq.timing.clock_model import ClockSource
 from estimator.levels.contributions import Source
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
@@ -15,7 +15,7 @@ from estimator.spectra.segment_rejection import Reason
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from daq.timing.clock_model import ClockState
+    from daq.clocks.clock_model import ClockState
 
 STATE_MEANINGS: Mapping[SensorState, str] = {
     SensorState.LIVE: "samples arrive",

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.alignment.delay_estimation import MIN_SEGMENTS, REFERENCES, DelayEstimator
+from daq.clocks.delay_estimation import MIN_SEGMENTS, REFERENCES, DelayEstimator
 from estimator.spectra.gap_window import gap_window, without_trend
 from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from daq.alignment.aligned_recording import AlignedRecording
+    from daq.clocks.aligned_recording import AlignedRecording
     from estimator.spectra.welch import WelchSettings
 
     FloatArray = NDArray[np.float64]

@@ -4,26 +4,24 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections import Counter
+from collections import Counter, deque
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from daq.alignment.aligned_recording import AlignedRecording
-from daq.alignment.growing_rows import GrowingRows
+from daq.clocks.aligned_recording import AlignedRecording
+from daq.clocks.growing_rows import GrowingRows
 from daq.estimation.segments.clipping import in_clipped_blocks
 from daq.estimation.segments.delay_measurement import DelayMeasurement
-from daq.estimation.segments.flatline import FlatlineDetector, stands_still
-from daq.estimation.segments.gap_bridge import GapBridge
-from daq.estimation.segments.newest_samples import NewestSamples
-from daq.estimation.segments.read_ahead import read_ahead
 from daq.estimation.segments.stated_times import agree, compare
-from daq.estimation.segments.usable_samples import surrounded, whole_segments
+from estimator.spectra.gap_window import Leakage, gap_window, without_trend
 from estimator.spectra.multiresolution import MultiResolution
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
 from estimator.spectra.segment_spectra import SegmentSpectra, kept_bins
 from estimator.spectra.welch import CrossSpectra, WelchSettings
+from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
@@ -34,9 +32,162 @@ if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.recording.interface import ReadableRecording
     from estimator.spectra.equaliser import Equaliser
-    from estimator.spectra.gap_window import Leakage
 
     FloatArray = NDArray[np.float64]
+    BoolArray = NDArray[np.bool_]
+    from collections.abc import Iterator
+
+
+def surrounded(usable: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+    """Return which samples, `reach` from either end, have usable ones as far as that around."""
+    return whole_segments(usable, np.arange(len(usable) - 2 * reach), 2 * reach + 1)
+
+
+def whole_segments(
+    usable: NDArray[np.bool_], starts: NDArray[np.int64], length: int
+) -> NDArray[np.bool_]:
+    """Return which segments have usable samples only."""
+    missing = np.concatenate([[0], np.cumsum(~usable)])
+    return np.asarray(missing[starts + length] == missing[starts])
+
+
+_Piece = TypeVar("_Piece")
+_Read = TypeVar("_Read")
+
+_READERS = 2  # pieces being read while one is worked on
+
+
+def read_ahead(read: Callable[[_Piece], _Read], pieces: Sequence[_Piece]) -> Iterator[_Read]:
+    """Read pieces in order, the next ones while the one before is worked on."""
+    if len(pieces) < 2:
+        yield from map(read, pieces)
+        return
+    with ThreadPoolExecutor(_READERS) as pool:
+        coming: deque[Future[_Read]] = deque()
+        for piece in pieces:
+            coming.append(pool.submit(read, piece))
+            if len(coming) > _READERS:
+                yield coming.popleft().result()
+        while coming:
+            yield coming.popleft().result()
+
+
+MOST_VALUES = 1 << 19
+"""Samples times channels that are kept at most: 4 MB."""
+
+
+class NewestSamples:
+    """Reads a recording's grid without reading twice what overlaps, as long as its clocks stay."""
+
+    def __init__(self, aligned: AlignedRecording) -> None:
+        self._aligned = aligned
+        self._begin = self._n_settings = 0
+        self._samples, self._valid = np.empty((0, 0)), np.empty(0, dtype=np.bool_)
+
+    def read(self, begin: int, end: int) -> tuple[FloatArray, BoolArray]:
+        """Return grid samples, and whether each is valid, as `AlignedRecording.read` does."""
+        known = self._begin + len(self._samples)
+        if self._n_settings == self._aligned.n_settings and self._begin <= begin < known <= end:
+            new, new_valid = self._aligned.read(known, end)
+            samples = np.concatenate([self._samples[begin - self._begin :], new])
+            valid = np.concatenate([self._valid[begin - self._begin :], new_valid])
+        else:
+            samples, valid = self._aligned.read(begin, end)
+        if samples.size <= MOST_VALUES:
+            self._begin, self._n_settings = begin, self._aligned.n_settings
+            self._samples, self._valid = samples.copy(), valid
+        return samples, valid
+
+
+class GapBridge:
+    """Spectra of segments with gaps, and what their windows bring in.
+
+    Parameters
+    ----------
+    welch : WelchSettings
+    n_channels : int
+    most : float
+        Share of a segment that gaps may take, with the ramps beside them.
+    """
+
+    def __init__(self, welch: WelchSettings, n_channels: int, *, most: float) -> None:
+        self._welch, self._most = welch, most
+        self.spectra = CrossSpectra(welch, n_channels, threads=1)
+        self.leakage = Leakage(get_window(welch.window, welch.segment_length))
+
+    def take(
+        self,
+        samples: FloatArray,
+        usable: NDArray[np.bool_],
+        clipped: NDArray[np.bool_] | None,
+        starts: NDArray[np.int64],
+    ) -> NDArray[np.int64]:
+        """Take the segments at `starts` that have short gaps and are not clipped; return which."""
+        length = self._welch.segment_length
+        segments, taken = [np.empty((0, samples.shape[1]))], []
+        for start in starts.tolist():
+            span = slice(start, start + length)
+            weight = gap_window(usable[span], length)
+            if np.count_nonzero(weight < 1) > self._most * length:
+                continue
+            if clipped is not None and (clipped[span] & usable[span]).any():
+                continue
+            segment = without_trend(samples[span], weight, self._welch.detrend)
+            segments.append(segment / np.sqrt(self.leakage.add(weight)))
+            taken.append(start)
+        self.spectra.add(np.concatenate(segments), np.arange(len(taken)) * length)
+        return np.array(taken, dtype=np.int64)
+
+
+_PARTS = 8  # of a hop, examined one by one
+_MIN_SAMPLES = 32  # samples of a part
+_STILL = 1e-12  # of its value: a channel that changes less is at rest but for rounding
+
+
+def stands_still(samples: FloatArray) -> NDArray[np.bool_]:
+    """Return which channels change no more than by rounding, along the first axis of `samples`."""
+    return np.asarray(np.ptp(samples, axis=0) <= _STILL * np.abs(samples[0]))
+
+
+class FlatlineDetector:
+    """How long each channel has stood still, hop by hop.
+
+    Parameters
+    ----------
+    hop : int
+        Samples from one segment to the next.
+    n_channels : int
+    sampling_rate : float
+        Hz.
+    """
+
+    def __init__(self, hop: int, n_channels: int, sampling_rate: float) -> None:
+        self._hop = hop
+        self._n_parts = max(1, min(_PARTS, hop // _MIN_SAMPLES))
+        self._length = hop // self._n_parts
+        self._seconds = hop / self._n_parts / sampling_rate
+        self._still = np.zeros(n_channels, dtype=np.int64)
+        self._seen = 0
+
+    def add(self, samples: FloatArray, usable: NDArray[np.bool_]) -> None:
+        """Look at whole hops of `samples`, shape (n_samples, n_channels), where all are usable."""
+        n_hops = len(samples) // self._hop
+        shape = (n_hops, self._hop, samples.shape[1])
+        parts = samples[: n_hops * self._hop].reshape(shape)[:, : self._n_parts * self._length]
+        parts = parts.reshape(n_hops * self._n_parts, self._length, -1)
+        hops = usable[: n_hops * self._hop].reshape(n_hops, self._hop)
+        used = hops[:, : self._n_parts * self._length].reshape(len(parts), -1)
+        whole = np.asarray(used.all(axis=1))
+        self._seen += int(whole.sum())
+        few = parts[:, :: max(1, self._length // 3)]  # of nearly all parts these tell enough
+        perhaps = (np.ptp(few, axis=1) <= _STILL * np.abs(few[:, 0])) & whole[:, None]
+        for number in np.flatnonzero(perhaps.any(axis=1)):
+            self._still += perhaps[number] & stands_still(parts[number])
+
+    def for_a_while(self) -> FloatArray:
+        """Return for how long each channel stood still, in seconds; 0 if most of the time."""
+        return np.where(2 * self._still < self._seen, self._still * self._seconds, 0.0)
+
 
 _VALUES_AT_ONCE = 1 << 18  # samples times channels read together: 2 MB
 OCTAVES = 12

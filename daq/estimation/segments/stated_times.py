@@ -24,15 +24,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.alignment.delay_estimation import REFERENCES, DelayEstimator
+from daq.clocks.delay_estimation import REFERENCES, DelayEstimator
+from daq.clocks.quantiles import median
 from daq.estimation.segments.delay_measurement import around_gaps
-from daq.timing.quantiles import median
 from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from daq.alignment.aligned_recording import AlignedRecording
+    from daq.clocks.aligned_recording import AlignedRecording
     from daq.estimation.settings import Settings
     from estimator.spectra.segment_spectra import SegmentSpectra
     from estimator.spectra.welch import WelchSettings

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import BaseModel, ConfigDict, PositiveInt
 
-from daq.drivers.interface import DeviceInformation
-from daq.drivers.port_rules import only
+from daq.devices.interface import DeviceInformation
+from daq.devices.port_rules import only
 from daq.errors import BenchFileError, DeviceError, FileFault, NoAnswerError, WrongDeviceError
 from daq.transport.ports import open_port
 from huddle_ax3.protocol import FRAME, RATES, Decoder
@@ -69,7 +69,7 @@ class AX3Session:
 
 
 class AX3Driver:
-    """See `daq.drivers.interface.DriverType`."""
+    """See `daq.devices.interface.DriverType`."""
 
     name = "ax3"
     summary = "AX3 triaxial accelerometers on a serial port or TCP (an example)"

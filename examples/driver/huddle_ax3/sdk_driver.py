@@ -6,9 +6,9 @@ import asyncio
 import contextlib
 from typing import TYPE_CHECKING
 
-from daq.drivers.blocking import BlockingSource, Samples
-from daq.drivers.interface import DeviceInformation
-from daq.drivers.port_rules import only, port_label
+from daq.devices.blocking import BlockingSource, Samples
+from daq.devices.interface import DeviceInformation
+from daq.devices.port_rules import only, port_label
 from daq.errors import NotConnectedError, WrongDeviceError
 from daq.transport.address import host_and_port
 from huddle_ax3.driver import AX3Driver
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class SdkDriver(AX3Driver):
-    """See `daq.drivers.interface.DriverType`."""
+    """See `daq.devices.interface.DriverType`."""
 
     name = "ax3-sdk"
     summary = "AX3 through its SDK (an example of a library that blocks)"

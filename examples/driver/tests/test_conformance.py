@@ -15,7 +15,7 @@ from daq.conformance.suite import DriverConformance, Sent, Served
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from daq.drivers.interface import DriverType
+    from daq.devices.interface import DriverType
 
 
 class TestAX3(DriverConformance):

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from daq.bench.driver_settings import settings_of
 from daq.bench.field_faults import field_faults
-from daq.drivers.registry import driver_names, driver_type
+from daq.devices.registry import driver_names, driver_type
 
 
 class Common(BaseModel):
@@ -66,7 +66,7 @@ def test_a_recorder_does_not_read_the_source_of_its_driver(name: str) -> None:
         "import inspect\n"
         "def refused(*_): raise AssertionError('read the source')\n"
         "inspect.getsource = inspect.getsourcelines = inspect.findsource = refused\n"
-        "from daq.drivers.registry import driver_type\n"
+        "from daq.devices.registry import driver_type\n"
         f"driver_type({name!r}).settings.model_fields"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -14,14 +14,14 @@ from pydantic import BaseModel, ConfigDict
 from daq.bench.durations import format_duration, parse_duration
 from daq.bench.loading import dump, load, parse
 from daq.bench.response import PolesZeros
-from daq.drivers import bench_file
+from daq.devices import bench_file
 from daq.errors import BenchFileError
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.bench.model import Bench
-    from daq.drivers.interface import DriverType
+    from daq.devices.interface import DriverType
 
 
 class _Settings(BaseModel):

@@ -13,7 +13,7 @@ from daq.bench.loading import load, parse
 from daq.bench.masks.mask import NOISE_MODELS, Mask
 from daq.bench.masks.mask_file import MaskFileError, masks_named, read_mask
 from daq.bench.units import DensityUnit
-from daq.drivers import bench_file
+from daq.devices import bench_file
 from daq.errors import BenchFileError, WrongSettingError
 
 DEMO = Path(__file__).parents[3] / "tui" / "resources" / "demo.toml"

@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from daq.archive.task import Task, run, software_version
 from daq.estimation.blas_threads import one_blas_thread
 from daq.estimation.estimation import Estimation
-from tests.daq.alignment.recordings import write
+from tests.daq.clocks.recordings import write
 from tests.daq.estimation.test_estimation import SETTINGS, huddle
 
 if TYPE_CHECKING:

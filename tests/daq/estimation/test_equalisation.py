@@ -13,11 +13,11 @@ from daq.bench.response import Fir, Measured, PolesZeros, Response
 from daq.estimation import equalisation, noise_estimates
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.settings import Settings
-from estimator.diagnostics.advice import UnequalResponses
+from estimator.checks.advice import UnequalResponses
 from estimator.methods import self_noise
 from sim_devices.world.scenario import Scenario
 from tests import known_clocks
-from tests.daq.alignment.recordings import Sensor, blocks, create, write
+from tests.daq.clocks.recordings import Sensor, blocks, create, write
 from tui.studies.synthesis import synthesise
 
 if TYPE_CHECKING:

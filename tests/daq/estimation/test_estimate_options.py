@@ -16,13 +16,13 @@ from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError
 from daq.protocols.block import BlockFlag
-from estimator.diagnostics.advice import Copies, Gain, NoSharedMotion, NoSignal, SwappedChannels
-from estimator.diagnostics.kinds import Untested
+from estimator.checks.advice import Copies, Gain, NoSharedMotion, NoSignal, SwappedChannels
+from estimator.checks.kinds import Untested
 from estimator.errors import InsufficientDataError
 from estimator.methods import Flag, self_noise
 from estimator.spectra.segment_rejection import Reason
 from estimator.spectra.welch import CrossSpectra, WelchSettings
-from tests.daq.alignment.recordings import Sensor, blocks, create, write
+from tests.daq.clocks.recordings import Sensor, blocks, create, write
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -19,7 +19,7 @@ from estimator.errors import InsufficientDataError
 from estimator.methods import self_noise
 from estimator.spectra.segment_rejection import Reason
 from estimator.spectra.welch import CrossSpectra, WelchSettings
-from tests.daq.alignment.recordings import ORIGIN, Sensor, blocks, counts, create, write
+from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, counts, create, write
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from daq.estimation import estimation as memory
 from daq.estimation.estimation import estimate
 from daq.estimation.follow import (
     COMMIT_INTERVAL,
@@ -18,7 +19,6 @@ from daq.estimation.follow import (
     RecordingLeftOpenError,
     follow,
 )
-from daq.estimation.segments import memory
 from daq.results.facts import NotInLiveEstimate
 from daq.results.known_facts import facts_of
 from daq.results.sources import sources

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.alignment.aligned_recording import AlignedRecording
+from daq.clocks.aligned_recording import AlignedRecording
 from daq.estimation.estimation import Estimation
-from daq.estimation.segments.newest_samples import NewestSamples
+from daq.estimation.segments.segment_pass import NewestSamples
 from daq.recording.reader import Recording
 from tests.daq.recording.sending_bench import Bench
 from tests.tui.example_snapshot import SETTINGS, growing
@@ -74,7 +74,7 @@ def test_what_overlaps_is_read_once_as_long_as_clocks_stay(tmp_path: Path) -> No
 def test_a_large_estimate_is_announced_before_it_starts(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("daq.estimation.segments.memory.LARGE", 1.0)
+    monkeypatch.setattr("daq.estimation.estimation.LARGE", 1.0)
     with growing(tmp_path / "run.h5") as writer:
         Bench(writer).send("ABC", 3)
         with Estimation([writer.path], SETTINGS):

@@ -8,9 +8,9 @@ import sys
 import numpy as np
 import pytest
 
-from daq.estimation.segments.memory import bytes_of
-from daq.timing.kalman import Observations, smooth
-from estimator.diagnostics.stability import SegmentCourse, stability
+from daq.clocks.kalman import Observations, smooth
+from daq.estimation.estimation import bytes_of
+from estimator.checks.stability import SegmentCourse, stability
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.goodness_of_fit import HANN_HALF
 from estimator.spectra.segment_spectra import SegmentSpectra
@@ -18,7 +18,7 @@ from tests.traced_memory import peak_of
 
 _AFTER_MANY_ARRAYS = """
 import numpy as np
-from daq.estimation.segments.freed_memory import FreedMemory
+from daq.estimation.follow import FreedMemory
 
 def resident() -> float:
     with open("/proc/self/statm") as file:

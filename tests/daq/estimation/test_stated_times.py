@@ -9,24 +9,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from daq.alignment.stated_utc import take_drift
+from daq.clocks.aligned_recording import take_drift
+from daq.clocks.clock_model import ClockSource
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.segments.stated_times import compare, drift_of
 from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
 from daq.results.band_summary import channel_means
 from daq.results.facts import StatedTimesUnchecked
-from daq.timing.clock_model import ClockSource
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
-from tests.daq.alignment.recordings import Sensor, blocks, create, write
 from tests.daq.clock_facts import clock_facts
+from tests.daq.clocks.recordings import Sensor, blocks, create, write
 from tui.studies.synthesis import synthesise
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from daq.alignment.aligned_recording import AlignedRecording
+    from daq.clocks.aligned_recording import AlignedRecording
     from estimator.spectra.welch import WelchSettings
 
 SETTINGS = Settings(segment=2.0, methods=("three-sensor",))

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from daq.alignment.aligned_recording import AlignedRecording
 from daq.bench.loading import parse
+from daq.clocks.aligned_recording import AlignedRecording
 from daq.errors import ImportFormatError, RecordingError
 from daq.formats.importer import import_files
 from daq.protocols.block import BlockFlag

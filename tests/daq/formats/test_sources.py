@@ -8,8 +8,8 @@ import numpy as np
 import pymseed
 import pytest
 
-from daq.alignment.aligned_recording import AlignedRecording
 from daq.bench.model import Channel
+from daq.clocks.aligned_recording import AlignedRecording
 from daq.errors import ImportFormatError
 from daq.formats.importer import import_files
 from daq.formats.memory import RecordingInMemory, SensorInMemory

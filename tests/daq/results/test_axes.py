@@ -10,7 +10,7 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
 from daq.results.band_summary import channel_means
-from estimator.diagnostics.misfit import SharedNoise
+from estimator.checks.misfit import SharedNoise
 from estimator.levels.axes import across
 
 RATE, SNR = 100.0, 5e4

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from daq.bench.model import Bench, Certificate, Channel
 from daq.bench.model import Sensor as BenchSensor
+from daq.clocks.clock_model import RelativeTime
 from daq.errors import WrongSettingError
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
@@ -21,9 +22,8 @@ from daq.formats.arrays import recording_of_arrays
 from daq.results.band_summary import judged_method
 from daq.results.calibration import calibrate
 from daq.results.uncertainty_budget import Budget, Component, student_quantile
-from daq.timing.clock_model import RelativeTime
 from estimator.responses.derived_quantities import Value
-from tests.daq.alignment.recordings import Sensor, write
+from tests.daq.clocks.recordings import Sensor, write
 from tui.cli.main import app
 from tui.commands.calibrate import side_by_side
 from tui.output.calibration import angle, remarks, sensitivity_table, with_error

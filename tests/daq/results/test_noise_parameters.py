@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from daq.drivers.bench_file import parse
+from daq.devices.bench_file import parse
 from daq.errors import BenchFileError
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings

@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 
 from daq.bench.model import Channel, Sensor
-from daq.drivers.epson.device import Configuration, Device
-from daq.drivers.epson.driver import EpsonSession
-from daq.drivers.interface import DeviceInformation
-from daq.drivers.registry import driver_type
+from daq.devices.epson import commands
+from daq.devices.epson.device import Configuration, Device
+from daq.devices.epson.driver import EpsonSession
+from daq.devices.interface import DeviceInformation
+from daq.devices.registry import driver_type
 from daq.errors import NotConnectedError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block
-from daq.protocols.epson import commands
 from daq.transport import address
 from daq.transport.address import host_and_port
 from daq.transport.ports import open_port

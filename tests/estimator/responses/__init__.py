@@ -1,1 +1,1 @@
-"""Tests of estimator.diagnostics."""
+"""Tests of estimator.checks."""

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from estimator.diagnostics.advice import Delay, ReversedPolarity
-from estimator.diagnostics.orientation import orientation
-from estimator.diagnostics.relative_response import relative_response
+from estimator.checks.advice import Delay, ReversedPolarity
+from estimator.checks.orientation import orientation
+from estimator.checks.relative_response import cycle_is_ambiguous, relative_response
 from estimator.responses.calibration import calibrate_sensor
-from estimator.spectra.delay_cycle import cycle_is_ambiguous
 
 if TYPE_CHECKING:
     from estimator.types import ComplexArray, FloatArray

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from estimator.diagnostics.kinds import Level
+from estimator.checks.kinds import Level
 from estimator.methods import self_noise
 from estimator.responses.edge_leakage import (
     band_shares,
@@ -24,7 +24,7 @@ from estimator.responses.equalisation import (
 from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:
-    from estimator.diagnostics.advice import UnequalResponses
+    from estimator.checks.advice import UnequalResponses
 
 DIMS = (3, 3, 3)
 T = 10.0

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 from textual.widgets import Static
 
+from daq.clocks.clock_model import ClockSource
 from daq.recording.sensor_state import SensorState
-from daq.timing.clock_model import ClockSource
 from estimator.self_noise.result import SelfNoise
 from tests.tui.application.screen_text import assert_looks_as_before, resized, screen_text
 from tests.tui.example_snapshot import (

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from daq.bench.loading import dump
-from daq.drivers.bench_file import load, parse
+from daq.devices.bench_file import load, parse
 from daq.estimation.settings import Settings
 from daq.recording.control import ask
 from daq.recording.reader import Recording

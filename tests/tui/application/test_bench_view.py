@@ -12,15 +12,14 @@ import pytest
 from rich.console import Console
 from textual.widgets import Input
 
-from daq.acquisition.before_test.preview import SensorPreview
-from daq.drivers.interface import DeviceInformation
+from daq.devices.interface import DeviceInformation
+from daq.preflight.preview import SensorPreview
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
 from tests.tui.application.test_app import NARROW, WIDE, shown
 from tests.tui.example_snapshot import ProgressCallback, demo_bench
 from tests.waiting import limit
 from tui.application.app import HuddleApp
-from tui.application.bench_view.sensors import channel_traces, sensors_of_bench
-from tui.application.bench_view.traces import trace
+from tui.application.bench_view.sensors import channel_traces, sensors_of_bench, trace
 from tui.application.state import State
 
 if TYPE_CHECKING:

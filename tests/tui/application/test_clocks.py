@@ -8,7 +8,7 @@ from importlib import resources
 import numpy as np
 import pytest
 
-from daq.drivers.bench_file import parse
+from daq.devices.bench_file import parse
 from daq.estimation.snapshot_diagnostics import (
     SnapshotDiagnostics,
     Synchronisation,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from daq.bench.model import Limit
-from daq.drivers.bench_file import parse
+from daq.devices.bench_file import parse
 from daq.errors import HuddleError
 from tests.tui.application.screen_text import resized, screen_text
 from tests.tui.application.test_app import NARROW, WIDE, ended, running, shown, view

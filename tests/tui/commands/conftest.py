@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from daq.bench.loading import dump
-from daq.drivers.bench_file import parse
+from daq.devices.bench_file import parse
 from tui.simulation.devices import simulated
 
 if TYPE_CHECKING:

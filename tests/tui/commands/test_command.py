@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from daq.acquisition.before_test.device_check import SensorCheck
-from daq.drivers.interface import DeviceInformation
+from daq.devices.interface import DeviceInformation
+from daq.preflight.device_check import SensorCheck
 from daq.python_process import python_command
 from sim_devices.world.paper_scenarios import SCENARIOS
 from tui.cli.help import subcommand
@@ -107,7 +107,7 @@ def test_an_estimate_loads_no_more_than_it_needs(tmp_path: Path) -> None:
         "with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()):"
         f" command.main(['estimate', {str(out)!r}, '--segment', '1s'])\n0"
     )
-    assert "estimator.diagnostics.diagnose" in loaded
+    assert "estimator.checks.diagnose" in loaded
     unwanted = {
         "scipy",
         "numpy.polynomial",

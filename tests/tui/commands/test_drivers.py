@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 from typer.testing import CliRunner
 
-from daq.drivers.bench_file import parse
-from daq.drivers.registry import driver_names, driver_type
+from daq.devices.bench_file import parse
+from daq.devices.registry import driver_names, driver_type
 from daq.errors import BenchFileError
 from tui.cli.main import app
 

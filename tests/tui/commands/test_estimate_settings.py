@@ -21,7 +21,7 @@ from daq.bench.estimate_settings import (
 )
 from daq.bench.option_fit import max_dimension
 from daq.bench.option_values import METHODS
-from daq.drivers.bench_file import parse
+from daq.devices.bench_file import parse
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from estimator.likelihood.factor_analysis import max_factors

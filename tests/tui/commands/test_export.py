@@ -24,7 +24,7 @@ from daq.formats.importer import import_files
 from daq.formats.miniseed_export import export_miniseed
 from daq.formats.readers.waveforms import load_obspy
 from daq.recording.reader import Recording
-from tests.daq.alignment.recordings import ORIGIN, Sensor, blocks, create
+from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, create
 from tests.daq.formats.test_sources import START, STEP, counts, write_records
 from tui.cli.main import app
 from tui.output.exit_codes import ExitCode

@@ -51,7 +51,7 @@ def test_json_is_all_there_is_on_standard_error(bench: Path, tmp_path: Path) -> 
     )
     entries = [json.loads(line) for line in done.stderr.splitlines()]
     loggers = {entry["logger"] for entry in entries}
-    assert {"daq.acquisition.recorder", "tui.commands.record"} <= loggers  # the recorder's process
+    assert {"daq.recorder.recorder", "tui.commands.record"} <= loggers  # the recorder's process
     connected = {entry["sensor"] for entry in entries if entry.get("kind") == "connected"}
     assert connected == {"A", "B", "C"}
     assert all(entry["time"].endswith("Z") for entry in entries)

@@ -12,7 +12,7 @@ from daq.estimation.estimation import Estimation
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError
 from estimator.spectra.segment_rejection import Reason
-from tests.daq.alignment.recordings import write_polled
+from tests.daq.clocks.recordings import write_polled
 from tui.application.test_view.panels import findings
 from tui.commands.watch import watch_recording
 

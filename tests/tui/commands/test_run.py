@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from daq.bench.end_condition import EndCondition
 from daq.bench.loading import dump
-from daq.drivers.bench_file import parse
+from daq.devices.bench_file import parse
 from daq.python_process import python_command
 from daq.recording.reader import Recording
 from daq.recording.repair import verify

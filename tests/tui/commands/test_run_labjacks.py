@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from daq.bench.loading import dump
-from daq.drivers.bench_file import parse
+from daq.devices.bench_file import parse
 from daq.errors import HuddleError
 from daq.protocols.block import BlockFlag
 from daq.recording.control import ask

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from daq.acquisition.schedule import utc_now
 from daq.bench.loading import dump
 from daq.bench.tables.unattended import Schedule, ScheduledRun
-from daq.drivers.bench_file import load, parse
+from daq.devices.bench_file import load, parse
 from daq.errors import BenchFileError, RecordingError
+from daq.recorder.schedule import utc_now
 from daq.recording.reader import Recording
 from tests.waiting import limit
 from tui.commands.serve import AlreadyServedError, accepted, serve

@@ -10,9 +10,9 @@ from rich.table import Table
 from rich.text import Text
 from typer.testing import CliRunner
 
-from daq.acquisition.block_writer import SensorProgress
-from daq.acquisition.recorder import RecorderStatus
 from daq.python_process import python_command
+from daq.recorder.block_writer import SensorProgress
+from daq.recorder.recorder import RecorderStatus
 from daq.recording.sensor_state import SensorState
 from tui.cli.main import app
 from tui.commands.record import progress_line

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimator.diagnostics.kinds import Untested
+from estimator.checks.kinds import Untested
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
 from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot

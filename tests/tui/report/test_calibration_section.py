@@ -11,7 +11,7 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
 from tui.output.calibration import share
-from tui.report.calibration import calibration_section
+from tui.report.contents import calibration_section
 from tui.report.parts import Facts, Paragraph, Table
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from daq.bench.masks.mask_file import masks_named
-from daq.drivers.bench_file import load
+from daq.devices.bench_file import load
 from tests.tui.night_recording import record
 from tests.tui.report.written_report import ROOT, Reported, Words
 from tui.cli.main import app

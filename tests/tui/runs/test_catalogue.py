@@ -14,7 +14,7 @@ from daq.results.decision.limits import judge
 from daq.results.store import store_results
 from estimator.decision.verdict import Verdict
 from tests.tui.example_snapshot import SETTINGS, demo_bench, growing, made_snapshot
-from tui.application.recordings_view.rows import about, verdict
+from tui.application.recordings_view.view import about, verdict
 from tui.runs.catalogue import catalogue, delete_recording
 
 if TYPE_CHECKING:

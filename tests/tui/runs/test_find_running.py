@@ -10,7 +10,7 @@ import pytest
 from daq.recording.reader import Recording
 from daq.recording.storage.names import continuation_names, continued_name
 from tests.tui.example_snapshot import growing
-from tui.runs.find_running import first_part
+from tui.commands.tui_controls import first_part
 
 
 def parts_in(folder: Path, *names: str) -> list[Path]:

@@ -17,7 +17,7 @@ import pytest
 from daq.bench.end_condition import EndCondition
 from daq.bench.loading import dump
 from daq.bench.model import Limit
-from daq.drivers.bench_file import parse
+from daq.devices.bench_file import parse
 from tests.daq.archive import months
 from tests.waiting import limit
 from tui.service.processes.finish import Outcome, Request

@@ -13,12 +13,12 @@ import pytest
 
 from daq.bench.tables.unattended import Metrics
 from tests.tui.service.bench_files import HOURLY, Place
+from tui.commands.serve import is_alive, signs_of_life
 from tui.output.logs.journal import JournalHandler
 from tui.output.logs.lines import fields_of
 from tui.service.hooks import HookRunner
 from tui.service.metrics import MetricsError, ServiceMetrics
 from tui.service.notify import Notifier, watchdog_interval
-from tui.service.supervision import is_alive, signs_of_life
 from tui.service.window import STALL
 
 if TYPE_CHECKING:

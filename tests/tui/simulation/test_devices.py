@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 from typer.testing import CliRunner
 
-from daq.drivers.bench_file import parse
+from daq.devices.bench_file import parse
 from daq.python_process import python_command
 from tests.waiting import limit
 from tui.cli.main import app

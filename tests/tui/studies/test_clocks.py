@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from daq.clocks.clock_model import ClockSource, ClockState
 from daq.errors import CannotAlignError
 from daq.estimation.diagnosis import residuals as residuals_between
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
-from daq.timing.clock_model import ClockSource, ClockState
 from sim_devices.world.scenario import Scenario
 from tui.cli.main import app
 from tui.studies.clocks import free_running, residuals, study

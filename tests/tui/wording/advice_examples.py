@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from estimator.diagnostics.advice import (
+from estimator.checks.advice import (
     Advice,
     Copies,
     Delay,
@@ -25,8 +25,8 @@ from estimator.diagnostics.advice import (
     UnequalResponses,
     WeakMotion,
 )
-from estimator.diagnostics.kinds import Level
-from estimator.diagnostics.misfit import DisturbedSegments, NoiseChanges, SharedNoise
+from estimator.checks.kinds import Level
+from estimator.checks.misfit import DisturbedSegments, NoiseChanges, SharedNoise
 from tui.wording.findings import Names
 
 BAND = (2.0, 8.0)

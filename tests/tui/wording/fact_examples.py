@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from daq.clocks.clock_model import LostCount
 from daq.results import facts
 from daq.results.facts import Fact, Rank
-from daq.timing.clock_model import LostCount
-from estimator.diagnostics.kinds import Untested
+from estimator.checks.kinds import Untested
 from estimator.levels.contributions import Source
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason

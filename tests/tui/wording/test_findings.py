@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from estimator.diagnostics.kinds import AdviceKind
+from estimator.checks.kinds import AdviceKind
 from tests.tui.wording.advice_examples import EXAMPLES, MISFIT, names
 from tui.wording.findings import explain
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from estimator.diagnostics.advice import (
+    from estimator.checks.advice import (
         Advice,
     )
 

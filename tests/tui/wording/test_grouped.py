@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import pytest
 
 from daq.results.facts import Finding, Rank
-from estimator.diagnostics.advice import (
+from estimator.checks.advice import (
     Advice,
     NearlySingular,
     WeakMotion,
 )
-from estimator.diagnostics.kinds import Level
+from estimator.checks.kinds import Level
 from tests.tui.wording.advice_examples import (
     BAND,
     EXAMPLES,

@@ -5,21 +5,95 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from rich.cells import cell_len
 from rich.style import Style
 from rich.text import Text
 
-from daq.acquisition.before_test.findings import Problem
-from daq.acquisition.before_test.preflight import check_before_test, is_complete
-from tui.application.bench_view.traces import trace
-from tui.application.columns import columns, width_of
+from daq.preflight.findings import Problem
+from daq.preflight.preflight import check_before_test, is_complete
+from tui.application.test_view.braille import DOTS, FIRST
 from tui.wording.formatting import listed, readings
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
-    from daq.acquisition.before_test.findings import Finding
-    from daq.acquisition.before_test.preview import SensorPreview
+    from numpy.typing import NDArray
+
+    from daq.preflight.findings import Finding
+    from daq.preflight.preview import SensorPreview
     from tui.application.state import State
+
+MUTED = "#9aa5b8"
+GAP = 2
+"""Blanks between columns."""
+
+
+def columns(
+    titles: Sequence[str], rows: Sequence[Sequence[Text]], *, right: Collection[str] = ()
+) -> Text:
+    """Return a header and a line for each row; columns are as wide as what is in them.
+
+    Parameters
+    ----------
+    titles : sequence of str
+    rows : sequence of sequence of Text
+        A cell for each title.
+    right : collection of str
+        Titles of columns that are aligned to the right.
+    """
+    widths = [
+        max([cell_len(title), *(row[n].cell_len for row in rows)]) for n, title in enumerate(titles)
+    ]
+    lines = Text(no_wrap=True, end="")
+    header = [Text(title, f"bold {MUTED}") for title in titles]
+    for number, cells in enumerate([header, *rows]):
+        line = Text()
+        for n, (cell, width) in enumerate(zip(cells, widths, strict=True)):
+            room = " " * (width - cell.cell_len)
+            if titles[n] in right:
+                line.append(room)
+            line.append_text(cell)
+            if n + 1 < len(widths):
+                line.append(" " * GAP if titles[n] in right else room + " " * GAP)
+        lines.append("\n" if number else "").append_text(line)
+    return lines
+
+
+def width_of(titles: Sequence[str], rows: Sequence[Sequence[Text]]) -> int:
+    """Return the columns that these take, with the gap to one more behind them."""
+    return sum(
+        max([cell_len(title), *(row[n].cell_len for row in rows)]) + GAP
+        for n, title in enumerate(titles)
+    )
+
+
+def trace(values: NDArray[np.float64], *, width: int) -> str:
+    """Return one row that shows the range of the values in each of its dot columns.
+
+    The scale is that of the values: their range is the height of the row. Constant values are a
+    line in the middle.
+    """
+    n_columns = 2 * width
+    if len(values) < 2 or width < 1:
+        return " " * max(width, 0)
+    edges = np.linspace(0, len(values), min(n_columns, len(values)) + 1).astype(int)
+    high = np.maximum.reduceat(values, edges[:-1])
+    low = np.minimum.reduceat(values, edges[:-1])
+    bottom, span = float(low.min()), float(np.ptp(values))
+    if span == 0:
+        first = last = np.full(len(high), 2)
+    else:
+        first, last = (
+            np.clip(np.floor((1 - (each - bottom) / span) * 4), 0, 3).astype(int)
+            for each in (high, low)
+        )
+    column = np.arange(n_columns)
+    at, row = column * len(high) // n_columns, np.arange(4)
+    is_set = (row >= first[at, None]) & (row <= last[at, None])
+    cells = (is_set * DOTS[column % 2]).sum(axis=1).reshape(width, 2).sum(axis=1)
+    text: bytes = (FIRST + cells).astype("<u2").tobytes()
+    return text.decode("utf-16-le")
+
 
 MUTED, GOOD, DOUBTFUL, BAD = "#9aa5b8", "green", "yellow", "bold #ff6b6b"
 LEAST_TRACE, WIDEST_TRACE = 12, 60  # columns

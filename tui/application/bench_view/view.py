@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from textual.app import ComposeResult
 
-    from daq.acquisition.before_test.preview import SensorPreview
+    from daq.preflight.preview import SensorPreview
     from tui.application.controls import Controls, Preview
     from tui.application.state import State
 

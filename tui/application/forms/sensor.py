@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 from textual import work
 
-from daq.acquisition.before_test.device_check import search_description
 from daq.bench.driver_settings import settings_of
 from daq.bench.editing import with_sensor
-from daq.drivers.bench_file import parse
-from daq.drivers.registry import driver_names, driver_type
+from daq.devices.bench_file import parse
+from daq.devices.registry import driver_names, driver_type
 from daq.errors import BenchFileError, HuddleError
+from daq.preflight.device_check import search_description
 from daq.transport.serial_ports import serial_ports
 from tui.application.forms.form import Field, Form
 from tui.wording.formatting import listed
@@ -20,8 +20,8 @@ from tui.wording.formatting import listed
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from daq.acquisition.before_test.device_check import DiscoveredDevice
     from daq.errors import FileFault
+    from daq.preflight.device_check import DiscoveredDevice
 
 SETTING = "setting-"
 """Before the name of a driver's setting, in the id of its field."""

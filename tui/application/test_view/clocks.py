@@ -9,6 +9,7 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
+from daq.clocks.clock_model import ClockSource
 from daq.results.clock_effect import (
     NEGLIGIBLE_EFFECT,
     NO_EFFECT,
@@ -19,14 +20,13 @@ from daq.results.clock_effect import (
     reference,
     residuals,
 )
-from daq.timing.clock_model import ClockSource
 from tui.application.test_view.curves import Line
 from tui.wording.vocabulary import clock_source
 
 if TYPE_CHECKING:
+    from daq.clocks.clock_model import ClockState
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
-    from daq.timing.clock_model import ClockState
 
 MUTED, GOOD, DOUBTFUL, BAD = "#9aa5b8", "green", "yellow", "bold #ff6b6b"
 STYLES = {"good": GOOD, "doubtful": DOUBTFUL, "bad": BAD}

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from estimator.diagnostics.advice import NoSharedMotion
-from estimator.diagnostics.kinds import Level
-from estimator.diagnostics.shared_motion import CanonicalCoherence, outsiders, shared_motion
+from estimator.checks.advice import NoSharedMotion
+from estimator.checks.kinds import Level
+from estimator.checks.shared_motion import CanonicalCoherence, outsiders, shared_motion
 
 if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot

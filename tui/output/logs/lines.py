@@ -36,7 +36,7 @@ _CONTROL = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160))} |
 
 
 class TextFormatter(logging.Formatter):
-    """``2026-11-21T03:00:00.123Z INFO daq.acquisition.recorder: message``."""
+    """``2026-11-21T03:00:00.123Z INFO daq.recorder.recorder: message``."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return one line, followed by the traceback of an error."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from daq.drivers.bench_file import load
+from daq.devices.bench_file import load
 from daq.errors import HuddleError
 from tui.service.records.store import NAME, RunStore
 

@@ -12,8 +12,8 @@ import shutil
 from datetime import timedelta
 from typing import TYPE_CHECKING
 
-from daq.acquisition.retention import remove_run
 from daq.errors import HuddleError, RecordingError
+from daq.recorder.retention import remove_run
 from daq.recording.storage.locking import is_being_written
 from tui.service.records.run_state import RunState
 

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
-from estimator.diagnostics.advice import (
+from estimator.checks.advice import (
     Advice,
     Delay,
     Gain,
@@ -26,7 +26,7 @@ from estimator.diagnostics.advice import (
     Rotated,
     UnequalResponses,
 )
-from estimator.diagnostics.misfit import SharedNoise
+from estimator.checks.misfit import SharedNoise
 from tui.studies.drawn.judged import METHODS, Judged
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
-    from estimator.diagnostics.advice import Advice
+    from estimator.checks.advice import Advice
     from estimator.types import FloatArray
 
 METHODS = ("three-sensor", "maximum-likelihood")

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
-from estimator.diagnostics.advice import (
+from estimator.checks.advice import (
     Delay,
     Gain,
     ModelMisfit,
@@ -23,7 +23,7 @@ from estimator.diagnostics.advice import (
     Rotated,
     UnequalResponses,
 )
-from estimator.diagnostics.misfit import NoiseChanges, SharedNoise
+from estimator.checks.misfit import NoiseChanges, SharedNoise
 from sim_devices.world.scenario import Scenario
 from tui.studies.drawn.judged import METHODS, Judged
 from tui.studies.synthesis import Latency, synthesise

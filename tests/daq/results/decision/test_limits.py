@@ -15,10 +15,10 @@ from daq.estimation.contributions import contributions
 from daq.estimation.snapshot_diagnostics import Synchronisation
 from daq.results.band_summary import channel_means
 from daq.results.decision.limits import judge
+from estimator.checks.advice import ModelMisfit
+from estimator.checks.kinds import Level
 from estimator.decision.comparison import MIN_AVERAGES
 from estimator.decision.verdict import Obstacle, Verdict
-from estimator.diagnostics.advice import ModelMisfit
-from estimator.diagnostics.kinds import Level
 from estimator.levels.contributions import Source
 from estimator.likelihood.dimension import BandDimension
 from estimator.likelihood.goodness_of_fit import BandTest

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-LOGGER = logging.getLogger("daq.acquisition.recorder")
+LOGGER = logging.getLogger("daq.recorder.recorder")
 STAMP = r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z"
 
 
@@ -63,7 +63,7 @@ def test_json_has_typed_fields(capsys: pytest.CaptureFixture[str]) -> None:
     assert re.fullmatch(STAMP, entry.pop("time"))
     assert entry == {
         "level": "warning",
-        "logger": "daq.acquisition.recorder",
+        "logger": "daq.recorder.recorder",
         "message": "A: 3 missing",
         "sensor": "A",
         "missing": 3,
@@ -124,7 +124,7 @@ def test_records_of_a_child_keep_time_and_fields(capsys: pytest.CaptureFixture[s
     entry = {
         "time": "2026-11-21T03:00:00.125Z",
         "level": "warning",
-        "logger": "daq.acquisition.block_writer",
+        "logger": "daq.recorder.block_writer",
         "message": "A stalled: 100 %",
         "sensor": "A",
         "name": "not a field",

@@ -1,5 +1,0 @@
-"""Checks of a bench before a test: replies of devices, and their latest samples.
-
-Reads devices and writes nothing. `daq.acquisition` has the code that runs during a recording; it
-does not import this package.
-"""

@@ -1,0 +1,1 @@
+"""When each sample was taken: clocks, and all sensors on one grid."""

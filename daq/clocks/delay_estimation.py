@@ -1,0 +1,397 @@
+"""Delays between sensors from their common motion, segment by segment.
+
+Theory of operation
+-------------------
+The averaged relative response ``P = S_j0 S_00^-1`` predicts sensor j from the reference sensor's
+channels, for any orientation, gain and response (the convention is ``S_pq = E[X_p conj(X_q)]``).
+The delay of sensor j against this prediction, within one segment, is the τ that maximises
+
+    J(τ) = Re Σ_f  (P X_0)^H  R^-1  X_j  exp(iωτ),      R = S_jj - P S_0j.
+
+This is least squares weighted by the residuals of the prediction: frequencies without coherent
+signal have no weight. The maximum is searched for on a grid and refined by Newton's method. Its
+variance is ``κ / (2 s² Σ ω² (P X_0)^H R^-1 P X_0)``, where κ accounts for the correlation of
+neighbouring frequencies by the window, and s is the share of the sum that is not noise of P.
+
+P is averaged over segments after correction of their delays. The first batch of segments does this
+by iteration and thereby defines a frame; later batches are measured in that frame, so that the
+delays of a recording are comparable. The frame's own delay is the one for which P is closest to
+real.
+
+The reference is the first sensor, unless another sensor shares the motion with more sensors.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import cache, lru_cache
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+
+from daq.clocks.quantiles import median
+from daq.clocks.resampling import USABLE
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    FloatArray = NDArray[np.float64]
+    BoolArray = NDArray[np.bool_]
+    IntArray = NDArray[np.int64]
+    ComplexArray = NDArray[np.complex128]
+
+_FIRST_ITERATIONS = 5
+_NEWTON_STEPS = 3
+MIN_SEGMENTS = 6
+"""Segments of the first batch for each channel of the reference: P is their mean."""
+_SHARED = 0.1  # samples; precision of delays in most segments, for sensors with common motion
+REFERENCES = 3
+"""Maximum number of sensors tried as reference, to bound the cost."""
+_ALIKE = 2.0  # standard deviations of its height, by which a peak may be lower than the highest
+_WEAK = 0.15  # share from which on noise may make any of several peaks the highest
+_SIGNIFICANT = 50.0  # 2 E / κ: a peak of seven standard deviations
+_LONGEST = 32.0  # samples, in both directions
+_CLEAR = 1.5  # ratio to the peak nearest zero: the peaks of one line are about equal
+_OUTSTANDING = 2.0  # ratio to all peaks within _LONGEST: noise reaches at most 1.5
+_FREQUENCIES_AT_ONCE = 1024
+_RIDGE = 1e-10  # fraction of the mean power: keeps matrices regular with a dead channel
+
+
+@dataclass(slots=True, eq=False)
+class _Frame:
+    """Spectral sums of one sensor and the reference, after correction of delays."""
+
+    reference: ComplexArray
+    crossed: ComplexArray
+    own: ComplexArray
+    n_segments: int
+
+    @classmethod
+    def of(cls, x0: ComplexArray, xj: ComplexArray, reference: ComplexArray | None = None) -> Self:
+        """Sum spectra (n_freqs, n_segments, n_channels); `reference` is S_00 if known."""
+        if reference is None:
+            reference = _products(x0, x0)
+        return cls(reference, _products(xj, x0), _products(xj, xj), x0.shape[1])
+
+    def add(self, other: _Frame) -> None:
+        """Add the sums of further segments."""
+        self.reference += other.reference
+        self.crossed += other.crossed
+        self.own += other.own
+        self.n_segments += other.n_segments
+
+
+@dataclass(slots=True, eq=False)
+class DelayEstimator:
+    """Measures the delays of sensors against one of them.
+
+    Attributes
+    ----------
+    sampling_rate : float
+        In Hz.
+    window : float64, shape (segment_length,)
+    columns : tuple of slice
+        Columns of the samples of each sensor, with the preferred reference first.
+    n_candidates : int
+        Sensors tried as reference.
+    """
+
+    sampling_rate: float
+    window: FloatArray
+    columns: tuple[slice, ...]
+    n_candidates: int = REFERENCES
+    _reference: int = 0
+    _frames: dict[int, _Frame] = field(default_factory=dict)
+
+    @property
+    def min_segments(self) -> int:
+        """Minimum number of segments in the batch that defines the frame."""
+        reference: slice = self.columns[0]
+        return MIN_SEGMENTS * int(reference.stop - reference.start)
+
+    @property
+    def has_frame(self) -> bool:
+        """Whether a batch has defined the frame."""
+        return bool(self._frames)
+
+    @property
+    def omega(self) -> FloatArray:
+        """Angular frequencies used, in rad/s, from the first above zero."""
+        length = len(self.window)
+        count = int(USABLE * length)
+        return np.arange(1.0, count + 1.0) * (2 * np.pi * self.sampling_rate / length)
+
+    def measure(self, samples: FloatArray, starts: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return each segment's delays and their standard deviations.
+
+        Parameters
+        ----------
+        samples : float64, shape (n_samples, n_channels)
+        starts : int64, shape (n_segments,)
+            First row of each segment.
+
+        Returns
+        -------
+        delays, std : float64, shape (n_segments, n_sensors)
+            In s; positive if the sensor lags the reference, whose delays are zero. NaN and infinity
+            if the coherent motion is too weak.
+        """
+        shape = (len(starts), len(self.columns))
+        delays, std = np.full(shape, np.nan), np.full(shape, np.inf)
+        if len(starts) == 0 or (not self.has_frame and len(starts) < self.min_segments):
+            return delays, std
+        sensors = self._spectra(samples, starts)
+        if self.has_frame:
+            x0 = sensors[self._reference]
+            found = {
+                number: self._delays(frame, x0, sensors[number])
+                for number, frame in self._frames.items()
+            }
+        else:
+            self._reference, found = self._with_reference(sensors)
+            x0 = sensors[self._reference]
+        delays[:, self._reference] = std[:, self._reference] = 0.0
+        for number, (tau, spread) in found.items():
+            frame, xj = self._frames.get(number), sensors[number]
+            known = np.isfinite(spread)
+            if frame is None or known.any():
+                used = known if known.any() else np.ones(len(starts), dtype=bool)
+                advanced = self._advanced(xj[:, used], np.where(known, tau, 0.0)[used])
+                new = _Frame.of(x0[:, used], advanced)
+                if frame is None:
+                    self._frames[number] = new
+                else:
+                    frame.add(new)
+            delays[:, number], std[:, number] = np.where(known, tau, np.nan), spread
+        return delays, std
+
+    def _with_reference(
+        self, sensors: list[ComplexArray]
+    ) -> tuple[int, dict[int, tuple[FloatArray, FloatArray]]]:
+        """Return the reference, and the others' delays and standard deviations against it."""
+        best: tuple[int, dict[int, tuple[FloatArray, FloatArray]]] = (0, {})
+        most = -1
+        for reference, x0 in enumerate(sensors[: self.n_candidates]):
+            power = _products(x0, x0)
+            found = {
+                number: self._first_delays(x0, xj, power)
+                for number, xj in enumerate(sensors)
+                if number != reference
+            }
+            spreads = [median(spread) for _, spread in found.values()]
+            n_shared = sum(spread * self.sampling_rate < _SHARED for spread in spreads)
+            if n_shared > most:
+                best, most = (reference, found), n_shared
+            if 2 * n_shared >= len(found):  # no other group of sensors is larger
+                break
+        return best
+
+    def _first_delays(
+        self, x0: ComplexArray, xj: ComplexArray, power: ComplexArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Measure delays and the frame of these segments, by iteration.
+
+        `power` is the sum of the products of x0.
+        """
+        tau, spread = np.zeros(x0.shape[1]), np.full(x0.shape[1], np.inf)
+        for number in range(_FIRST_ITERATIONS):
+            frame = _Frame.of(x0, self._advanced(xj, tau), power)
+            # At first P is a mean over unknown delays, and its peaks are low.
+            is_last = number == _FIRST_ITERATIONS - 1
+            tau, spread = self._delays(frame, x0, xj, doubt_cycles=is_last)
+            tau = np.where(np.isfinite(spread), tau, 0.0)
+            tau -= tau.mean()
+        return tau, spread
+
+    def frame_delays(self) -> FloatArray:
+        """Return the delay of each sensor's frame in s: without it, P is closest to real."""
+        delays = np.zeros(len(self.columns))
+        for number, frame in self._frames.items():
+            response, left = _prediction(frame)
+            # A rotation with gains is real: the phase of the sum of squares is twice the delay's.
+            squares = np.einsum("fpq,fpq->f", response, response)
+            size = np.einsum("fpq,fpq->f", response, response.conj()).real
+            own = np.einsum("fpp->f", frame.own).real / frame.n_segments
+            # Weight: the predicted share of the sensor, which noise does not increase.
+            with np.errstate(divide="ignore", invalid="ignore"):
+                weight = np.maximum(1 - np.einsum("fpp->f", left).real / own, 0.0)
+                turned = np.nan_to_num(weight * squares / size)  # zero without signal
+            delay = self._constant(turned) / 2
+            # Squares do not distinguish delays half a segment apart; responses do, by their sign.
+            other = delay - math.copysign(len(self.window) / 2 / self.sampling_rate, delay)
+            here, there = (self._met(response, weight, tau) for tau in (delay, other))
+            delays[number] = other if there > _OUTSTANDING * here else delay
+        return delays
+
+    def _met(self, response: ComplexArray, weight: FloatArray, tau: float) -> float:
+        """Return the share of a relative response, without τ, that is equal at all frequencies."""
+        turned = _turn(self.omega, np.array([tau]))[:, :, None]
+        return float(
+            np.linalg.norm((np.nan_to_num(weight)[:, None, None] * response * turned).sum(0))
+        )
+
+    def _spectra(self, samples: FloatArray, starts: IntArray) -> list[ComplexArray]:
+        """Return the spectra of each sensor, shape (n_freqs, n_segments, n_channels)."""
+        length, end = len(self.window), len(self.omega) + 1
+        frames = np.lib.stride_tricks.sliding_window_view(samples, length, axis=0)
+        spectra = []
+        for columns in self.columns:  # one by one, to bound memory
+            own = frames[:, columns][starts]
+            own -= own.mean(axis=-1, keepdims=True)
+            own *= self.window
+            found = np.fft.rfft(own, axis=-1)[:, :, 1:end].transpose(2, 0, 1)
+            spectra.append(np.ascontiguousarray(found))  # makes products fast
+        return spectra
+
+    def _advanced(self, spectra: ComplexArray, tau: FloatArray) -> ComplexArray:
+        return np.asarray(spectra * _turn(self.omega, tau)[:, :, None])
+
+    def _delays(
+        self, frame: _Frame, x0: ComplexArray, xj: ComplexArray, *, doubt_cycles: bool = True
+    ) -> tuple[FloatArray, FloatArray]:
+        """Measure delays in a frame, shapes (n_segments,): the maxima of J.
+
+        `doubt_cycles`: whether peaks that are equal but for noise count as equal.
+        """
+        omega = self.omega
+        response, left = _prediction(frame)
+        weight = np.linalg.inv(left)
+        predicted = np.matmul(x0, response.transpose(0, 2, 1))
+        weighted = np.matmul(predicted.conj(), weight)
+        crossed = np.einsum("fsp,fsp->fs", weighted, xj)
+        energy = np.einsum("fsp,fsp->fs", weighted, predicted).real
+        # Neighbouring frequencies share samples of the window: κ of them count as one.
+        w2 = self.window**2
+        kappa = len(w2) * float(w2 @ w2) / float(w2.sum()) ** 2
+        total = energy.sum(axis=0)
+        informative = omega**2 @ energy
+        # The share of P's noise, which predicts nothing: d0 dj / n, for Wishart matrices.
+        spurious = x0.shape[2] * xj.shape[2] / frame.n_segments * float(omega @ omega)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.maximum(1 - spurious / informative.mean(), 0.0)
+            std = np.sqrt(kappa / (2 * informative)) / share
+            alike = _ALIKE * np.sqrt(kappa / total) / share
+        alike = np.minimum(np.nan_to_num(alike, nan=1.0), 1.0) * doubt_cycles
+        tau, is_one = self._peak(crossed, alike)
+        met = (crossed * _turn(omega, tau)).real.sum(axis=0)
+        # R is an estimate too: correct by the mean of an inverse Wishart matrix.
+        freedom = max(frame.n_segments - x0.shape[2], 1)
+        std *= math.sqrt(freedom / max(freedom - xj.shape[2] - 1, 1))
+        known = (2 * total / kappa > _SIGNIFICANT) & (met > 0.3 * total)
+        known &= is_one | (alike < _WEAK)  # else the cycle is chosen by chance
+        return tau, np.where(known, std, np.inf)
+
+    def _peak(self, crossed: ComplexArray, alike: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Return the τ that maximises Re Σ crossed exp(iωτ) for every column, and if it is alone.
+
+        Of peaks that are lower by less than the share `alike`, shape (n_segments,), the nearest to
+        zero: those of hum, a few cycles apart, are equal but for noise.
+        """
+        reach = min(self._n_grid // 2 - 1, int(_LONGEST / self.sampling_rate / self._step))
+        even, odd = (np.zeros((crossed.shape[1], reach + 1)) for _ in range(2))
+        # For so few τ a product with the transform's matrix costs less than the transform.
+        for first in range(0, len(crossed), _FREQUENCIES_AT_ONCE):
+            some = crossed[first : first + _FREQUENCIES_AT_ONCE]
+            cosine, sine = _fourier(self._n_grid, first + 1, reach + 1)
+            even += some.real.T @ cosine[: len(some)]
+            odd += some.imag.T @ sine[: len(some)]
+        near = np.concatenate([(even + odd)[:, :0:-1], even - odd], axis=1)
+        highest = np.argmax(near, axis=1)
+        middle = near[:, 1:-1]
+        high = middle >= (1 - alike[:, None]) * near.max(axis=1, keepdims=True)
+        peaks = high & (middle >= near[:, :-2]) & (middle >= near[:, 2:]) & (middle > 0)
+        away = np.where(peaks, np.abs(np.arange(1 - reach, reach)), reach + 1)
+        nearest = np.where(peaks.any(axis=1), np.argmin(away, axis=1) + 1, highest)
+        is_one = np.count_nonzero(peaks, axis=1) < 2
+        return self._polished(crossed, (nearest - reach) * self._step), is_one
+
+    @property
+    def _n_grid(self) -> int:
+        """Number of grid points of τ, less than a period of the highest frequency apart."""
+        return _fast_length(4 * len(self.window))
+
+    @property
+    def _step(self) -> float:
+        """Interval between grid points of τ, in s."""
+        return float(2 * np.pi / self.omega[0] / self._n_grid)
+
+    def _constant(self, crossed: ComplexArray) -> float:
+        """Return the τ of the most likely peak of Re Σ crossed exp(iωτ).
+
+        Arrival times make τ nearly zero, and nearly monochromatic motion has other peaks of equal
+        height. So the peak nearest zero is chosen, unless another one within `_LONGEST` is clearly
+        higher, or a more distant one is too high for noise.
+        """
+        step, middle = self._step, self._n_grid // 2
+        height = np.fft.fftshift(np.fft.irfft(np.append(0, crossed), n=self._n_grid))
+        peaks = np.flatnonzero((height[1:-1] > height[:-2]) & (height[1:-1] >= height[2:])) + 1
+        away = np.abs(peaks - middle) * step * self.sampling_rate
+        if not (away < _LONGEST).any():
+            return 0.0
+        best = peaks[np.argmin(away)]
+        near, far = (
+            max(peaks[away < limit].tolist(), key=height.item)
+            for limit in (_LONGEST, len(self.window) / 2)
+        )
+        if height[near] > _CLEAR * height[best]:
+            best = near
+        if height[far] > _OUTSTANDING * height[near]:
+            best = far
+        return float(self._polished(crossed[:, None], np.array([(best - middle) * step]))[0])
+
+    def _polished(self, crossed: ComplexArray, tau: FloatArray) -> FloatArray:
+        omega = self.omega
+        for _ in range(_NEWTON_STEPS):
+            turned = crossed * _turn(omega, tau)
+            curvature = omega**2 @ turned.real
+            step = (omega @ turned.imag) / np.where(curvature > 0, curvature, np.inf)
+            tau = tau - np.clip(step, -1 / self.sampling_rate, 1 / self.sampling_rate)
+        return tau
+
+
+@cache
+def _fast_length(n: int) -> int:
+    """Return the smallest length from `n` on with prime factors 2, 3 and 5: fast to transform."""
+    while n != math.gcd(n, 2**64 * 3**40 * 5**28):
+        n += 1
+    return n
+
+
+@lru_cache(maxsize=4)
+def _fourier(n: int, first: int, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return cosine and sine of 2π f t / n for `_FREQUENCIES_AT_ONCE` f, and t from 0."""
+    turns = np.outer(np.arange(first, first + _FREQUENCIES_AT_ONCE), np.arange(count)) % n
+    angle = 2 * np.pi / n * np.arange(n)
+    return np.cos(angle)[turns], np.sin(angle)[turns]
+
+
+def _turn(omega: FloatArray, tau: FloatArray) -> ComplexArray:
+    """Return exp(iωτ), shape (n_freqs, n_segments)."""
+    # Frequencies are evenly spaced: powers of one factor, sixteen at a time.
+    block = 16
+    count = -(-len(omega) // block)
+    fine = np.exp(1j * omega[0] * np.outer(np.arange(1, block + 1), tau))
+    coarse = np.exp(1j * omega[0] * block * np.outer(np.arange(count), tau))
+    turned = coarse[:, None] * fine[None]
+    return np.asarray(turned.reshape(count * block, len(tau))[: len(omega)])
+
+
+def _products(a: ComplexArray, b: ComplexArray) -> ComplexArray:
+    return np.asarray(np.matmul(a.transpose(0, 2, 1), b.conj()))
+
+
+def _prediction(frame: _Frame) -> tuple[ComplexArray, ComplexArray]:
+    """Return P, shape (n_freqs, dj, d0), and the residual matrix R per segment."""
+    reference = _ridged(frame.reference)
+    response = np.linalg.solve(reference.transpose(0, 2, 1), frame.crossed.transpose(0, 2, 1))
+    response = response.transpose(0, 2, 1)
+    left = frame.own - response @ frame.crossed.conj().transpose(0, 2, 1)
+    freedom = max(frame.n_segments - response.shape[2], 1)
+    return np.asarray(response), np.asarray(_ridged(left, frame.own) / freedom)
+
+
+def _ridged(matrix: ComplexArray, scale: ComplexArray | None = None) -> ComplexArray:
+    power = np.einsum("fpp->f", matrix if scale is None else scale).real / matrix.shape[1]
+    ridge = _RIDGE * power + np.finfo(np.float64).tiny
+    return np.asarray(matrix + ridge[:, None, None] * np.eye(matrix.shape[1]))

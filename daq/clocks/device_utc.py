@@ -1,0 +1,85 @@
+"""The clock of a device that states UTC itself."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.clocks.clock_model import Clock, ClockSource, ClockState, Epoch
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+    FloatArray = NDArray[np.float64]
+
+_UTC_TOLERANCE = 2e-6  # seconds; how well device UTC must agree with the nominal rate
+_NODES = 33  # of an epoch, at which clocks are compared
+
+
+def from_device_utc(
+    sensor: str,
+    epochs: Iterable[tuple[int, int, FloatArray, FloatArray]],
+    *,
+    sampling_rate: float,
+    moved: float,
+) -> Clock:
+    """Return the clock that the device states; at the nominal rate, if that agrees with it.
+
+    Parameters
+    ----------
+    sensor : str
+        Its name.
+    epochs : iterable of (int, int, float64, float64)
+        Of each its first sample and the one after its last; samples and their times in s.
+    sampling_rate : float
+        Nominal, in Hz.
+    moved : float
+        Seconds by which the times are shifted.
+    """
+    found = []
+    for first, end, index, stated in epochs:
+        nodes, late = index, stated - index / sampling_rate
+        if np.ptp(late) < _UTC_TOLERANCE:
+            nodes, late = np.array([first, max(end, first + 1)], dtype=float), np.full(2, late[0])
+        found.append(Epoch(first, end, nodes, nodes / sampling_rate + late + moved))
+    ppm, wander = 0.0, 0.0
+    if any(len(epoch.index) > 2 for epoch in found):
+        longest = max(found, key=lambda epoch: epoch.end_sample - epoch.first_sample)
+        rates = np.diff(longest.index) / np.diff(longest.seconds) / sampling_rate
+        ppm, wander = float(rates.mean() - 1) * 1e6, float(rates.std()) * 1e6
+    source = ClockSource.DEVICE_UTC
+    state = ClockState(sensor, source, found[0].start, ppm, 0.0, wander, 0.0, len(found))
+    return Clock(tuple(found), state)
+
+
+def corrected(stated: Clock, found: Clock, *, moved: float) -> Clock:
+    """Return the clock that was found with the motion, and by how much what is stated drifts.
+
+    Where the motion is too weak, that is the stated one.
+
+    Parameters
+    ----------
+    stated, found : Clock
+    moved : float
+        Seconds by which stated times are moved, and times of `found` are not yet.
+    """
+    if not found.state.refined:
+        return stated
+    squares = n = 0.0
+    for epoch in found.epochs:
+        index = np.linspace(epoch.first_sample, epoch.end_sample - 1, _NODES)
+        late, length = stated.at(index) - epoch.at(index), epoch.end_sample - epoch.first_sample
+        squares, n = squares + length * float(np.var(late)), n + length
+    epochs = tuple(replace(epoch, seconds=epoch.seconds + moved) for epoch in found.epochs)
+    state = replace(
+        found.state,
+        source=ClockSource.DEVICE_UTC,
+        offset=epochs[0].start,
+        corrected=math.sqrt(squares / n),
+    )
+    return Clock(epochs, state)

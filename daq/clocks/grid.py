@@ -1,0 +1,154 @@
+"""The common grid of a recording: copies or interpolates a sensor's samples."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.clocks.resampling import SPAN, all_present, reach, resample
+from daq.errors import CannotAlignError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from daq.clocks.sensor_reader import SensorSource
+    from daq.recording.interface import ReadableSensor
+
+    FloatArray = NDArray[np.float64]
+    BoolArray = NDArray[np.bool_]
+
+SNAP = 1e-3
+"""Constant offset between exact clocks, in samples, up to which it is rounding of the times."""
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Instants at one rate.
+
+    Attributes
+    ----------
+    sampling_rate : float
+        In Hz.
+    start : float
+        Seconds from the recording's creation to grid sample 0.
+    """
+
+    sampling_rate: float
+    start: float
+
+    @classmethod
+    def laid(
+        cls, sources: Sequence[SensorSource], sampling_rate: float, *, wanted: float | None
+    ) -> Grid:
+        """Return the grid from the start of all sensors on, or from `wanted` (s) if later."""
+        start = max(source.known_clock.start for source in sources)
+        grid = cls(sampling_rate, start)
+        if not all(grid.has(source) and not source.doubted for source in sources):
+            start += max(map(grid.reach, sources))
+        if wanted is not None and wanted > start:  # the first sensor's next sample
+            epoch = sources[0].known_clock.epochs[0]
+            index = np.ceil(epoch.position(np.array([wanted])) - SNAP)
+            start = float(epoch.at(index)[0])
+        return cls(sampling_rate, start)
+
+    def has(self, source: SensorSource) -> bool:
+        """Return whether the sensor's samples are on the grid."""
+        if source.record.sampling_rate != self.sampling_rate:
+            return False
+        for epoch in source.known_clock.epochs:
+            rate = (epoch.index[-1] - epoch.index[0]) / (epoch.seconds[-1] - epoch.seconds[0])
+            if len(epoch.index) > 2 or abs(rate / self.sampling_rate - 1) > 1e-12:
+                return False
+            position = epoch.position(np.array([self.start]))
+            if abs(position[0] - round(position[0])) > SNAP:
+                return False
+        return True
+
+    def reach(self, source: SensorSource) -> float:
+        """Return the half width of the interpolation, in s."""
+        return reach(self._ratio(source)) / source.record.sampling_rate
+
+    def read(self, source: SensorSource, at: int, samples: FloatArray) -> BoolArray:
+        """Write a sensor's samples from grid sample `at` on; return whether each is valid.
+
+        Parameters
+        ----------
+        samples : float64, shape (n, n_channels)
+            Output, in physical units; arbitrary where not valid.
+
+        Returns
+        -------
+        bool, shape (n,)
+        """
+        if self.has(source):
+            return self._pass_through(source, at, samples)
+        # Complete spans: the values then do not depend on the limits of reads.
+        first = at // SPAN * SPAN
+        last = -(-(at + len(samples)) // SPAN) * SPAN
+        whole, present = self._interpolated(source, first, last)
+        wanted = slice(at - first, at - first + len(samples))
+        samples[:] = whole[wanted]
+        return present[wanted]
+
+    def _pass_through(self, source: SensorSource, at: int, samples: FloatArray) -> BoolArray:
+        second = np.array([self.start + at / self.sampling_rate])
+        valid = np.zeros(len(samples), dtype=bool)
+        end = second[0] + (len(samples) + 1) / self.sampling_rate
+        for epoch in source.known_clock.between(second[0] - 1 / self.sampling_rate, end):
+            if not epoch.is_placed:
+                continue
+            first = round(float(epoch.position(second)[0]))
+            low = max(first, epoch.first_sample)
+            high = min(first + len(samples), epoch.end_sample)
+            if low < high:
+                rows = slice(low - first, high - first)
+                valid[rows] = source.fill(samples[rows], low)
+        return valid
+
+    def _interpolated(
+        self, source: SensorSource, start: int, stop: int
+    ) -> tuple[FloatArray, BoolArray]:
+        seconds = self.start + np.arange(start, stop) / self.sampling_rate
+        samples = np.zeros((stop - start, len(source.columns)))
+        valid = np.zeros(stop - start, dtype=bool)
+        ratio = self._ratio(source)
+        for epoch in source.known_clock.between(seconds[0], seconds[-1]):
+            if not epoch.is_placed:
+                continue
+            positions = epoch.position(seconds)
+            margin = reach(ratio)
+            low = math.floor(positions[0]) - margin
+            high = math.ceil(positions[-1]) + margin + 1
+            inputs = np.zeros((high - low, len(source.columns)))
+            present = source.fill(inputs, low)
+            inside = np.arange(low, high)
+            present &= (inside >= epoch.first_sample) & (inside < epoch.end_sample)
+            inputs[~present] = 0.0
+            usable = all_present(present, positions - low, ratio=ratio)
+            if usable.any():
+                samples[usable] = resample(inputs, positions - low, ratio=ratio)[usable]
+                valid |= usable
+        return samples, valid
+
+    def _ratio(self, source: SensorSource) -> float:
+        return max(1.0, source.record.sampling_rate / self.sampling_rate)
+
+
+def grid_rate(records: list[ReadableSensor], wanted: float | None) -> float:
+    """Return the rate of the grid: the lowest of the sensors', or a wanted one below it."""
+    rates = {record.name: record.sampling_rate for record in records}
+    lowest = min(rates.values())
+    if wanted is None or math.isclose(wanted, lowest, rel_tol=1e-12):
+        return lowest
+    if wanted > lowest or wanted <= 0:
+        listed = ", ".join(f"{name} {rate:g} Hz" for name, rate in rates.items())
+        raise CannotAlignError(
+            f"a common sampling rate of {wanted:g} Hz is above that of a sensor ({listed});"
+            f" expected at most {lowest:g} Hz"
+        )
+    return wanted

@@ -1,0 +1,56 @@
+"""Bench files, checked against the drivers installed on this computer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from daq.bench import loading
+from daq.devices.interface import DriverType
+from daq.devices.registry import driver_names, driver_type
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from daq.bench.model import Bench
+
+
+class InstalledDrivers(Mapping[str, DriverType]):
+    """The installed drivers by name, each imported when it is looked up."""
+
+    def __getitem__(self, name: str) -> DriverType:
+        if name not in driver_names():
+            raise KeyError(name)
+        return driver_type(name)
+
+    def __contains__(self, name: object) -> bool:
+        return name in driver_names()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(driver_names())
+
+    def __len__(self) -> int:
+        return len(driver_names())
+
+
+def load(path: str | Path) -> Bench:
+    """Read a bench file and check it against the installed drivers.
+
+    Raises
+    ------
+    BenchFileError
+        With all errors in the file, one per line.
+    """
+    return loading.load(path, InstalledDrivers())
+
+
+def parse(text: str, source: str | Path = "bench") -> Bench:
+    """Parse the text of a bench file and check it against the installed drivers.
+
+    Raises
+    ------
+    BenchFileError
+        With all errors in the text, one per line.
+    """
+    return loading.parse(text, source, InstalledDrivers())

@@ -1,0 +1,204 @@
+"""Decode the stream of bursts of an Epson accelerometer; see :mod:`daq.devices.epson.commands`.
+
+Theory of operation
+-------------------
+Each read is decoded in one pass. Length, header, delimiter and checksum together identify frames,
+COUNT gives the sample index of each frame, and consecutive frames become one block. Bytes outside
+frames are skipped, counted, and reported as an event at most once a second; the samples lost with
+them appear as a gap in COUNT. The first block of a session starts at index 0.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.devices.epson.commands import BURST_HEADER, DELIMITER, FLAG_ERROR, are_sums_right
+from daq.protocols.block import Block, BlockFlag, Event, EventKind
+from daq.protocols.framing import BoolArray, OctetArray, find_frames
+from daq.protocols.plural import several
+from daq.protocols.sample_counter import Run, SampleCounter
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from daq.devices.epson.commands import BurstFormat
+    from daq.protocols.block import HostTime
+
+COUNT_MODULUS = 65536
+MIN_CONSECUTIVE = 3
+"""Consecutive bursts needed to recognise a stream on a new connection."""
+REPORT_INTERVAL_NS = 1_000_000_000
+"""Minimum host time between two events of one kind."""
+_REPORTS = {
+    "checksum": (EventKind.CHECKSUM, "frame", "with a wrong checksum"),
+    "skipped": (EventKind.RESYNCHRONISED, "byte", "skipped between frames"),
+    "repeated": (EventKind.RESYNCHRONISED, "frame", "received twice"),
+}
+"""Counted faults, and the event that reports each."""
+
+
+class BurstDecoder:
+    """Bytes in, blocks out.
+
+    Parameters
+    ----------
+    sensor : str
+        Name for the blocks and events.
+    burst : BurstFormat
+        Format of the bursts that the device is configured to send.
+    fields : sequence of str
+        Fields that become channels, in order: any of x, y, z, temperature.
+    sampling_rate : float
+        In Hz.
+    full_scale_counts : int
+        Samples of x, y, z at or beyond this magnitude are clipped.
+    """
+
+    def __init__(
+        self,
+        sensor: str,
+        burst: BurstFormat,
+        *,
+        fields: Sequence[str],
+        sampling_rate: float,
+        full_scale_counts: int,
+    ) -> None:
+        self._sensor = sensor
+        self._burst = burst
+        self._dtype = burst.dtype
+        self._size = burst.size
+        self._fields = tuple(fields)
+        self._has_checksum, self._has_flag = "checksum" in burst, "flag" in burst
+        self._axes = [column for column, field in enumerate(fields) if field != "temperature"]
+        self._full_scale = full_scale_counts
+        self._counter = SampleCounter(COUNT_MODULUS, sampling_rate)
+        self._left = b""
+        self._started = False
+        self._lost_frames = 0  # without COUNT: estimated invalid frames since the last valid one
+        self._next = 0  # without COUNT: index of the next frame
+        self._error = False
+        self._counts = dict.fromkeys(_REPORTS, 0)
+        self._reported = dict.fromkeys(self._counts, -REPORT_INTERVAL_NS)
+
+    @property
+    def n_pending(self) -> int:
+        """Number of bytes of the incomplete last frame."""
+        return len(self._left)
+
+    def continues(self, data: bytes, at: HostTime) -> bool:
+        """Whether ``data``, received on a new connection, continues the stream of the old one.
+
+        This holds if ``data`` has ``MIN_CONSECUTIVE`` consecutive bursts of the same format and
+        COUNT agrees with host time. The data are not consumed: call :meth:`resume`, then
+        :meth:`receive`.
+        """
+        if not self._started or "count" not in self._burst:
+            return False
+        runs, _ = find_frames(np.frombuffer(data, np.uint8), self._size, self._valid)
+        for offset, length in runs[::-1]:
+            if length >= MIN_CONSECUTIVE:
+                frames = np.frombuffer(data, self._dtype, count=length, offset=offset)
+                counters = frames["count"][-MIN_CONSECUTIVE:].astype(np.int64)
+                in_order = bool((np.diff(counters) % COUNT_MODULUS == 1).all())
+                return in_order and self._counter.expects(int(counters[-1]), at)
+        return False
+
+    def resume(self) -> None:
+        """Continue the stream on a new connection."""
+        self._left = b""
+        self._counter.resume()
+
+    def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
+        """Return the blocks and events of all frames completed by ``data``."""
+        data = self._left + data
+        octets = np.frombuffer(data, np.uint8)
+        runs, consumed = find_frames(octets, self._size, self._valid)
+        self._left = data[consumed:]
+        skipped = consumed - sum(length for _, length in runs) * self._size
+        if skipped:
+            self._note_skipped(octets, runs, skipped)
+        frames = [
+            np.frombuffer(data, self._dtype, count=length, offset=offset) for offset, length in runs
+        ]
+        found: list[Block | Event] = []
+        if frames:
+            together = frames[0] if len(frames) == 1 else np.concatenate(frames)
+            found += self._blocks(together, at)
+            found += self._error_flag(together, at)
+        return found + self._report(at)
+
+    def _valid(self, windows: OctetArray) -> BoolArray:
+        good: BoolArray = (windows[:, 0] == BURST_HEADER) & (windows[:, -1] == DELIMITER)
+        return good & are_sums_right(windows[:, 1:-1]) if self._has_checksum else good
+
+    def _note_skipped(self, octets: OctetArray, runs: list[tuple[int, int]], skipped: int) -> None:
+        # A frame where one is due, with header and delimiter but a wrong checksum, was corrupted.
+        ends = np.array([0] + [start + length * self._size for start, length in runs])
+        ends = ends[ends + self._size <= octets.size]
+        looks = (octets[ends] == BURST_HEADER) & (octets[ends + self._size - 1] == DELIMITER)
+        starts = {start for start, _ in runs}
+        bad = sum(1 for end in ends[looks].tolist() if end not in starts)
+        self._counts["checksum"] += bad
+        self._counts["skipped"] += max(0, skipped - bad * self._size)
+        self._lost_frames += max(1, round(skipped / self._size))
+
+    def _blocks(self, frames: NDArray[np.void], at: HostTime) -> list[Block | Event]:
+        if "count" in self._burst:
+            runs, repeated = self._counter.place(frames["count"], at)
+            self._counts["repeated"] += repeated
+        else:  # without COUNT, the skipped bytes are the only estimate of the missing frames
+            lost = self._lost_frames
+            runs = [Run(0, frames.size, self._next + lost, missing=lost)]
+            self._next, self._lost_frames = runs[0].first_sample + frames.size, 0
+        counts = np.empty((frames.size, len(self._fields)), np.int32)
+        for column, field in enumerate(self._fields):
+            counts[:, column] = frames[field]
+        found: list[Block | Event] = []
+        for run in runs:
+            if run.restarted:
+                text = f"COUNT restarted; about {several(run.missing, 'sample')} missing"
+                found.append(Event(self._sensor, EventKind.RESET, text, at))
+            found.append(self._block(run, counts[run.start : run.stop], at))
+        return found
+
+    def _block(self, run: Run, counts: NDArray[np.int32], at: HostTime) -> Block:
+        flags, reason = BlockFlag.NONE, ""
+        if run.restarted or not self._started:
+            flags |= BlockFlag.CLOCK_RESTART
+        if run.missing:
+            reason = several(run.missing, "sample", "not received")
+            if run.restarted:
+                reason = "the device was reset"
+            if run.restarted or "count" not in self._burst:
+                flags |= BlockFlag.MISSING_ESTIMATED
+        # np.abs would overflow at the most negative count
+        axes = counts if len(self._axes) == len(self._fields) else counts[:, self._axes]
+        if axes.size and (axes.max() >= self._full_scale or axes.min() <= -self._full_scale):
+            flags |= BlockFlag.CLIPPED
+        self._started = True
+        return Block(self._sensor, run.first_sample, counts, at, run.counter, flags, reason)
+
+    def _error_flag(self, frames: NDArray[np.void], at: HostTime) -> list[Event]:
+        if not self._has_flag:
+            return []
+        error = bool(np.bitwise_or.reduce(frames["flag"]) & FLAG_ERROR)
+        changed, self._error = error != self._error, error
+        if not changed:
+            return []
+        text = "the device reports an error" if error else "the device no longer reports an error"
+        return [Event(self._sensor, EventKind.STATUS, text, at)]
+
+    def _report(self, at: HostTime) -> list[Event]:
+        events: list[Event] = []
+        if not any(self._counts.values()):
+            return events
+        for name, (kind, noun, what) in _REPORTS.items():
+            n = self._counts[name]
+            if n and at.monotonic_ns - self._reported[name] >= REPORT_INTERVAL_NS:
+                self._counts[name], self._reported[name] = 0, at.monotonic_ns
+                events.append(Event(self._sensor, kind, several(n, noun, what), at))
+        return events

@@ -1,0 +1,1 @@
+"""Linux Industrial I/O devices over the network."""

@@ -1,0 +1,372 @@
+"""Driver for Linux IIO devices over the network (IIOD): ADXL355, ADXL357, converters.
+
+Any board that runs ``iiod`` serves its sensors and converters on TCP port 30431. Each sensor of the
+bench file is one IIO device of the board, on a connection of its own. Where the device has a
+``timestamp`` channel, gaps follow from it; where it has none, an overflow in the board cannot be
+seen.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, PositiveFloat
+
+from daq.devices.iio import protocol
+from daq.devices.interface import DeviceInformation
+from daq.devices.port_rules import only, port_label
+from daq.errors import BenchFileError, FileFault, NoAnswerError, WrongDeviceError
+from daq.protocols.block import Block, BlockFlag, Event, EventKind
+from daq.protocols.errors import RemoteProtocolError
+from daq.transport.address import host_and_port
+from daq.transport.ports import open_port
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Coroutine, Sequence
+
+    from numpy.typing import NDArray
+
+    from daq.bench.model import Sensor
+    from daq.host_clock import HostClock
+    from daq.protocols.block import HostTime
+    from daq.transport.byte_stream import ByteStream
+
+_Reply = TypeVar("_Reply")
+SCHEME = "iio://"
+PORT = 30431
+REPLY_TIMEOUT = 5.0
+BLOCK_SECONDS = 0.1
+"""Seconds of samples in one buffer."""
+
+
+class IioSettings(BaseModel):
+    """``[sensors.settings]`` of an IIO device."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    device: str = ""
+    """Name or id of the device, as ``iio_info`` prints it; default: the only one with buffers."""
+    inputs: tuple[str, ...] | None = None
+    """IIO channel of each channel, as ``accel_x``; default: the device's first ones."""
+    trigger: str = ""
+    """Name of the trigger to use; default: the one that is set."""
+    patience: PositiveFloat = 10.0
+    """Seconds without samples after which the device is lost and reconnected."""
+
+
+class _Iiod:
+    """Commands to a server, and its replies."""
+
+    def __init__(self, stream: ByteStream) -> None:
+        self.stream = stream
+        self._buffer = b""
+        self.at: HostTime | None = None
+        """Arrival of the last bytes."""
+
+    async def ask(self, command: str, payload: bytes = b"") -> int:
+        """Return the integer that answers a command; errors are negative."""
+        await self.stream.write(f"{command}\r\n".encode() + payload)
+        return await self._limited(self.integer(), command)
+
+    async def text(self, command: str) -> bytes:
+        """Return the text that answers a command."""
+        size = await self.ask(command)
+        if not 0 <= size <= protocol.MAX_CONTEXT:
+            raise WrongDeviceError(f"{self.stream.label}: {command}: error {size}")
+        return (await self._limited(self.exactly(size + 1), command))[:-1].rstrip(b"\0\n")
+
+    async def _limited(self, reply: Coroutine[object, object, _Reply], command: str) -> _Reply:
+        try:
+            async with asyncio.timeout(REPLY_TIMEOUT):
+                return await reply
+        except TimeoutError as error:
+            raise NoAnswerError(
+                f"{self.stream.label}: no reply to {command!r} in {REPLY_TIMEOUT:g} s; is it an"
+                " IIOD?"
+            ) from error
+
+    async def integer(self) -> int:
+        """Read a line with an integer."""
+        while b"\n" not in self._buffer:
+            if len(self._buffer) > 64:
+                break
+            await self._more()
+        line, found, rest = self._buffer.partition(b"\n")
+        try:
+            number = int(line)
+        except ValueError as error:
+            raise RemoteProtocolError(f"{line[:40]!r} is no number; is it an IIOD?") from error
+        if not found:
+            raise RemoteProtocolError(f"{line[:40]!r} is no line; is it an IIOD?")
+        self._buffer = rest
+        return number
+
+    async def exactly(self, size: int) -> bytes:
+        """Read so many bytes."""
+        while len(self._buffer) < size:
+            await self._more()
+        found, self._buffer = self._buffer[:size], self._buffer[size:]
+        return found
+
+    async def _more(self) -> None:
+        received, self.at = await self.stream.read()
+        self._buffer += received
+
+
+class IioSession:
+    """One device, ready to fill buffers."""
+
+    def __init__(
+        self,
+        iiod: _Iiod,
+        sensor: Sensor,
+        device: protocol.Device,
+        inputs: Sequence[str],
+        *,
+        information: DeviceInformation,
+        patience: float,
+    ) -> None:
+        self.information = (information,)
+        self.patience = patience
+        self.hint = "expected buffers from IIOD; check the trigger of the device"
+        self._iiod, self._sensor, self._device = iiod, sensor, device
+        self._inputs = tuple(inputs)
+        names = [one.channel for one in device.elements]
+        self._has_times = protocol.TIMESTAMP in names
+        wanted = [*inputs, protocol.TIMESTAMP] if self._has_times else list(inputs)
+        self._mask = protocol.mask_of(device.elements, wanted)
+        enabled = [one for one in device.elements if one.channel in wanted]
+        self._layout = protocol.ScanLayout(enabled)
+        self._period_ns = 1e9 / (information.sampling_rate or sensor.sampling_rate)
+        self._next = 0
+        self._latest_ns: int | None = None
+        limits = {one.channel: one for one in enabled}
+        self._full_scales = np.array(
+            [2 ** (limits[name].bits - limits[name].is_signed) - 1 for name in inputs]
+        )
+
+    async def read(self) -> AsyncIterator[Block | Event]:
+        """Fill buffers and yield their samples until closed."""
+        iiod, device = self._iiod, self._device.id
+        n_scans = max(1, round(BLOCK_SECONDS * self._sensor.sampling_rate))
+        code = await iiod.ask(f"OPEN {device} {n_scans} {self._mask}")
+        if code < 0:
+            raise WrongDeviceError(
+                f"{iiod.stream.label}: {device}: its buffer does not open (error {code}); check"
+                " its trigger, and that no other program reads it"
+            )
+        size = n_scans * self._layout.size
+        while True:
+            await iiod.stream.write(f"READBUF {device} {size}\r\n".encode())
+            scans = await self._buffer(size)
+            if len(scans) % self._layout.size:
+                raise RemoteProtocolError(f"{len(scans)} bytes are no whole scans")
+            if scans and iiod.at is not None:
+                for item in self._blocks(scans, iiod.at):
+                    yield item
+
+    async def _buffer(self, size: int) -> bytes:
+        """Return the bytes that answer READBUF."""
+        scans, is_first = b"", True
+        while len(scans) < size:
+            n_bytes = await self._iiod.integer()
+            if n_bytes < 0 or n_bytes > size - len(scans):
+                raise NoAnswerError(
+                    f"{self._iiod.stream.label}: the device ended its buffer (error {n_bytes})"
+                )
+            if not n_bytes:
+                break
+            if is_first:
+                mask = await self._iiod.exactly(len(self._mask) + 1)
+                if mask.strip().decode("ascii", "replace") != self._mask:
+                    raise RemoteProtocolError(f"mask {mask!r}; expected {self._mask}")
+                is_first = False
+            scans += await self._iiod.exactly(n_bytes)
+        return scans
+
+    def _blocks(self, scans: bytes, at: HostTime) -> list[Block | Event]:
+        columns = [self._layout.decode(scans, name) for name in self._inputs]
+        counts = np.stack(columns, axis=1)
+        times = self._layout.decode(scans, protocol.TIMESTAMP) if self._has_times else None
+        cuts, missing, flags = self._gaps(times, len(counts))
+        found: list[Block | Event] = []
+        if BlockFlag.MISSING_ESTIMATED in flags:
+            text = "the clock of the board was set"
+            found.append(Event(self._sensor.name, EventKind.RESET, text, at))
+        for rows, n_missing in zip(np.split(np.arange(len(counts)), cuts), missing, strict=True):
+            if not len(rows):
+                continue
+            own = BlockFlag.CLOCK_RESTART if not self._next else BlockFlag.NONE
+            if n_missing:
+                own |= flags
+            part = counts[rows]
+            if (np.abs(part) >= self._full_scales).any():
+                own |= BlockFlag.CLIPPED
+            first = self._next + n_missing
+            reason = f"{n_missing} scans lost in the board" if n_missing else ""
+            counter = int(times[rows[0]]) if times is not None else None
+            values = part.astype(np.int32)
+            found.append(Block(self._sensor.name, first, values, at, counter, own, reason))
+            self._next = first + len(rows)
+        return found
+
+    def _gaps(
+        self, times: NDArray[np.int64] | None, n_scans: int
+    ) -> tuple[NDArray[np.int64], list[int], BlockFlag]:
+        """Return the rows before which scans are missing, and how many: one more number than rows.
+
+        Times jitter with the interrupts of the board, so the whole buffer decides how many there
+        are, and its long steps where.
+        """
+        nothing = np.empty(0, np.int64), [0], BlockFlag.NONE
+        if times is None:
+            return nothing
+        before, self._latest_ns = self._latest_ns, int(times[-1])
+        known = times if before is None else np.concatenate(([before], times))
+        steps = np.diff(known) / self._period_ns
+        if not len(steps):
+            return nothing
+        if steps.min() < -1.0 or steps.max() > 1e8:  # the system's clock was set
+            return np.empty(0, np.int64), [0], BlockFlag.MISSING_ESTIMATED
+        total = round(float(steps.sum()) - len(steps))
+        long = np.flatnonzero(steps > 1.5)
+        each = np.rint(steps[long]).astype(np.int64) - 1
+        if total <= 0 or not len(long):
+            return nothing
+        flags = BlockFlag.NONE
+        if each.sum() != total:
+            long, each = long[[np.argmax(steps[long])]], np.array([total])
+            flags = BlockFlag.MISSING_ESTIMATED
+        rows = long + (1 if before is None else 0)
+        if rows[0] == 0:
+            return rows[1:], [int(n) for n in each], flags
+        del n_scans
+        return rows, [0, *map(int, each)], flags
+
+
+class IioDriver:
+    """See :class:`daq.devices.interface.DriverType`."""
+
+    name = "iio"
+    summary = "Linux IIO devices over the network (iiod): ADXL355, ADXL357, converters"
+    settings = IioSettings
+    shares_clock = False
+
+    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:
+        """Return int32."""
+        del sensor
+        return np.dtype(np.int32)
+
+    def check(self, sensors: Sequence[Sensor]) -> None:
+        """See :meth:`daq.devices.interface.Checking.check`."""
+        _address(only_sensor(sensors))
+
+    @contextlib.asynccontextmanager
+    async def open(self, sensors: Sequence[Sensor], clock: HostClock) -> AsyncIterator[IioSession]:
+        """Connect, find the device and set its rate."""
+        sensor = only_sensor(sensors)
+        settings = IioSettings.model_validate(sensor.settings)
+        label = port_label(sensors)
+        async with open_port(f"socket://{_address(sensor)}", clock, label=label) as stream:
+            iiod = _Iiod(stream)
+            device = _device(protocol.parse_context(await iiod.text("PRINT")), settings, label)
+            inputs = _inputs(device, settings, sensor, label)
+            if settings.trigger:
+                await iiod.ask(f"SETTRIG {device.id} {settings.trigger}")
+            rate = await _set_rate(iiod, device, inputs[0], sensor, label)
+            information = DeviceInformation(
+                sensor.name,
+                model=device.name,
+                sampling_rate=rate,
+                details={"device": device.id, "inputs": ", ".join(inputs)},
+            )
+            try:
+                yield IioSession(
+                    iiod,
+                    sensor,
+                    device,
+                    inputs,
+                    information=information,
+                    patience=settings.patience,
+                )
+            finally:
+                with contextlib.suppress(Exception):
+                    await stream.write(f"CLOSE {device.id}\r\nEXIT\r\n".encode())
+
+
+async def _set_rate(
+    iiod: _Iiod, device: protocol.Device, channel: str, sensor: Sensor, label: str
+) -> float | None:
+    """Set the sampling rate, and return what the device has then."""
+    of_channel = next(one for one in device.elements if one.channel == channel).attributes
+    if protocol.RATE_ATTRIBUTE in device.attributes:
+        place = f"{device.id} {protocol.RATE_ATTRIBUTE}"
+    elif protocol.RATE_ATTRIBUTE in of_channel:
+        place = f"{device.id} INPUT {channel} {protocol.RATE_ATTRIBUTE}"
+    else:
+        return None
+    value = f"{sensor.sampling_rate:g}".encode()
+    code = await iiod.ask(f"WRITE {place} {len(value)}", value)
+    if code < 0:
+        raise WrongDeviceError(
+            f"{label}: {device.name} does not sample at {sensor.sampling_rate:g} Hz (error {code})"
+        )
+    try:
+        return float(await iiod.text(f"READ {place}"))
+    except ValueError:
+        return None
+
+
+def _device(
+    devices: Sequence[protocol.Device], settings: IioSettings, label: str
+) -> protocol.Device:
+    buffered = [one for one in devices if one.elements]
+    wanted = settings.device
+    found = [one for one in buffered if not wanted or wanted in {one.id, one.name}]
+    if len(found) != 1:
+        there = ", ".join(f"{one.name} ({one.id})" for one in buffered) or "none"
+        raise WrongDeviceError(
+            f"{label}: expected one device {wanted!r} with buffers; there are: {there}; set"
+            " settings.device"
+        )
+    return found[0]
+
+
+def _inputs(
+    device: protocol.Device, settings: IioSettings, sensor: Sensor, label: str
+) -> tuple[str, ...]:
+    names = [one.channel for one in device.elements if one.channel != protocol.TIMESTAMP]
+    inputs = settings.inputs or tuple(names[: len(sensor.channels)])
+    unknown = [name for name in inputs if name not in names]
+    if unknown or len(inputs) != len(sensor.channels):
+        raise WrongDeviceError(
+            f"{label}: {device.name} has the channels {', '.join(names)}; expected"
+            f" {len(sensor.channels)} of them, got {', '.join(inputs)}"
+        )
+    return inputs
+
+
+def only_sensor(sensors: Sequence[Sensor]) -> Sensor:
+    """Return the only sensor of a port."""
+    if len(sensors) == 1:
+        return sensors[0]
+    return only(sensors, "each IIO device needs a port of its own, as iio://host/2")
+
+
+def _address(sensor: Sensor) -> str:
+    rest = sensor.port.removeprefix(SCHEME).partition("/")[0]
+    expected = "expected iio://host, or iio://host:port"
+    fault = FileFault("port", expected, sensor.port, sensor.name)
+    if not sensor.port.startswith(SCHEME) or not rest:
+        raise BenchFileError(fault)
+    try:
+        host, number = host_and_port(f"socket://{rest if ':' in rest else f'{rest}:{PORT}'}")
+    except ValueError as error:
+        raise BenchFileError(fault) from error
+    return f"{host}:{number}"
+
+
+DRIVER = IioDriver()

@@ -1,0 +1,68 @@
+"""The installed drivers: entry points in the group ``huddle.drivers``.
+
+A third-party package adds a driver by naming a :class:`~daq.devices.interface.DriverType` in its
+metadata:
+
+.. code-block:: toml
+
+    [project.entry-points."huddle.drivers"]
+    mydevice = "mypackage.driver:DRIVER"
+
+A driver that cannot be imported, or that lacks parts of the interface, raises an error only when it
+is requested. Other drivers are not affected.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import TYPE_CHECKING, cast
+
+from daq.errors import DriverError
+
+if TYPE_CHECKING:
+    from daq.devices.interface import DriverType
+
+GROUP = "huddle.drivers"
+_SEAM = ("name", "summary", "settings", "shares_clock", "counts_dtype", "open")
+
+
+@cache
+def _entry_points() -> dict[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group=GROUP)}
+
+
+def driver_names() -> tuple[str, ...]:
+    """Return the names of all drivers without importing any."""
+    return tuple(sorted(_entry_points()))
+
+
+@cache
+def driver_type(name: str) -> DriverType:
+    """Return the driver called ``name``.
+
+    Raises
+    ------
+    ValueError
+        If no driver has this name; the message lists all names.
+    DriverError
+        If the driver cannot be imported, or lacks parts of the interface.
+    """
+    if name not in _entry_points():
+        raise ValueError(
+            f"no driver is called {name!r}; expected one of {', '.join(driver_names())}"
+        )
+    point = _entry_points()[name]
+    package = f" of package {point.dist.name}" if point.dist else ""
+    which = f"driver {name!r} ({point.value}{package})"
+    try:
+        driver = point.load()
+    except Exception as error:  # third-party code may raise anything
+        raise DriverError(
+            f"{which} cannot be imported: {type(error).__name__}: {error};"
+            " reinstall or remove that package"
+        ) from error
+    absent = [part for part in _SEAM if not hasattr(driver, part)]
+    if absent:
+        raise DriverError(f"{which} is no driver: it has no {', '.join(absent)}")
+    return cast("DriverType", driver)

@@ -1,0 +1,252 @@
+"""SeedLink packets into blocks of sensors.
+
+Theory of operation
+-------------------
+Each record holds samples of one channel and the UTC of the first. The *selection* of a sensor,
+patterns for location and channel codes, determines its streams. The available streams are known
+only from received records, which are kept until the streams of the sensor are decided. The streams
+of a sensor are joined by time (:mod:`daq.protocols.joined_streams`).
+
+Records arrive late, and out of order between channels. A hole in all streams of a sensor stays open
+for ``hold`` seconds, then becomes a gap of exact length. The decoder continues over reconnections:
+:attr:`SeedLinkDecoder.last` has the last packet of each station, and repeated samples are dropped.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import TYPE_CHECKING
+
+from daq.devices.seedlink.packets import PacketFinder
+from daq.devices.seedlink.records import decode_record
+from daq.protocols.block import Block, Event, EventKind, HostTime
+from daq.protocols.errors import RemoteProtocolError
+from daq.protocols.joined_streams import JoinedStreams
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    import numpy as np
+
+    from daq.devices.seedlink.packets import Packet, Version
+    from daq.devices.seedlink.records import WaveRecord
+
+COMPONENTS = "ZNE123UVWXY"
+"""Last characters of channel codes, in the order of the channels that match one pattern."""
+MAX_KEPT = 4096
+"""Maximum number of records kept while a sensor's streams are not decided, and number of records
+that one stream may then be ahead of the others."""
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Selection of the streams of a sensor.
+
+    Attributes
+    ----------
+    network, station : str
+        Codes.
+    patterns : tuple of (location, channel)
+        One per channel, or one for all channels. ``?`` matches any character, ``*`` any location.
+    n_channels : int
+        Number of channels of the sensor.
+    """
+
+    network: str
+    station: str
+    patterns: tuple[tuple[str, str], ...]
+    n_channels: int
+
+    @property
+    def station_id(self) -> str:
+        """Station ID as in packets of version 4."""
+        return f"{self.network}_{self.station}"
+
+    def matches(self, record: WaveRecord) -> bool:
+        """Return whether the stream of a record matches the selection."""
+        if (record.network, record.station) != (self.network, self.station):
+            return False
+        return any(_fits(record.location, record.channel, pattern) for pattern in self.patterns)
+
+    def streams(self, heard: Counter[str]) -> tuple[str, ...] | None:
+        """Return the stream of each channel, or None while it is not decided.
+
+        Parameters
+        ----------
+        heard : Counter of str
+            Number of records by matching stream ID.
+        """
+        if len(self.patterns) == self.n_channels:
+            chosen = [[s for s in heard if _id_fits(s, one)] for one in self.patterns]
+            if all(len(streams) == 1 for streams in chosen):
+                return tuple(streams[0] for streams in chosen)
+            return None
+        if len(heard) == self.n_channels and max(heard.values()) > 1:
+            return tuple(sorted(heard, key=_component))
+        return None
+
+
+def _fits(location: str, channel: str, pattern: tuple[str, str]) -> bool:
+    wanted = "" if pattern[0] == "--" else pattern[0]
+    return fnmatchcase(location, wanted) and fnmatchcase(channel, pattern[1])
+
+
+def _id_fits(stream_id: str, pattern: tuple[str, str]) -> bool:
+    _, _, location, channel = stream_id.split(".")
+    return _fits(location, channel, pattern)
+
+
+def _component(stream_id: str) -> tuple[int, str]:
+    return COMPONENTS.find(stream_id[-1]) % (len(COMPONENTS) + 1), stream_id
+
+
+class _Sensor:
+    """One sensor: its streams if decided, else its kept records."""
+
+    def __init__(self, name: str, selection: Selection, dtype: np.dtype[np.generic]) -> None:
+        self.name = name
+        self.selection = selection
+        self.joined: JoinedStreams | None = None
+        self.streams: tuple[str, ...] = ()
+        self.heard: Counter[str] = Counter()
+        self.kept: list[tuple[WaveRecord, HostTime]] = []
+        self._dtype = dtype
+        self._refused: set[str] = set()
+        self._hole_ns: int | None = None  # host time at which the hole was detected
+
+    def add(self, record: WaveRecord, at: HostTime, *, hold: float) -> Iterator[Block | Event]:
+        """Add a record of this sensor's station; yield the completed blocks and events."""
+        if record.counts.dtype.kind != self._dtype.kind:
+            yield from self._refuse(record, at)
+            return
+        if self.joined is None:
+            self.heard[record.stream_id] += 1
+            if len(self.kept) < MAX_KEPT:
+                self.kept.append((record, at))
+            streams = self.selection.streams(self.heard)
+            if streams is None:
+                return
+            self.streams = streams
+            self.joined = JoinedStreams(self.name, streams, max_pending=MAX_KEPT)
+            kept, self.kept = self.kept, []
+            for earlier, then in kept:
+                yield from self._joined(self.joined, earlier, then, hold=hold)
+        else:
+            yield from self._joined(self.joined, record, at, hold=hold)
+
+    def _joined(
+        self, joined: JoinedStreams, record: WaveRecord, at: HostTime, *, hold: float
+    ) -> Iterator[Block | Event]:
+        if record.stream_id not in self.streams:
+            if record.stream_id not in self._refused:
+                self._refused.add(record.stream_id)
+                text = f"stream {record.stream_id} belongs to no channel of this sensor"
+                yield Event(self.name, EventKind.REFUSED, text, at)
+            return
+        yield from joined.add(record, at)
+        yield from joined.take(at, awaiting=self._awaits(joined, at, hold), reason="not received")
+
+    def _awaits(self, joined: JoinedStreams, at: HostTime, hold: float) -> bool:
+        if not joined.has_hole:
+            self._hole_ns = None
+            return True  # contiguous samples do not wait, but a hole behind them stays open
+        if self._hole_ns is None:
+            self._hole_ns = at.monotonic_ns
+        return not joined.is_crowded and at.monotonic_ns - self._hole_ns < hold * 1e9
+
+    def _refuse(self, record: WaveRecord, at: HostTime) -> Iterator[Event]:
+        if record.stream_id not in self._refused:
+            self._refused.add(record.stream_id)
+            text = (
+                f"stream {record.stream_id} has samples of type {record.counts.dtype}; expected"
+                f" {self._dtype}: set settings.samples"
+            )
+            yield Event(self.name, EventKind.REFUSED, text, at)
+
+
+class SeedLinkDecoder:
+    """Decoder of the packets of one server into blocks.
+
+    Parameters
+    ----------
+    selections : mapping of str to Selection
+        Selection of each sensor.
+    dtypes : mapping of str to dtype
+        Type of the counts of each sensor.
+    hold : float
+        Time in s for which a hole stays open for a late record.
+    """
+
+    def __init__(
+        self,
+        selections: Mapping[str, Selection],
+        dtypes: Mapping[str, np.dtype[np.generic]],
+        *,
+        hold: float,
+    ) -> None:
+        self._sensors = {
+            name: _Sensor(name, selection, dtypes[name]) for name, selection in selections.items()
+        }
+        self._hold = hold
+        self._finder = PacketFinder(3)
+        self._n_unreadable = 0
+        self._name = next(iter(selections)) if len(selections) == 1 else ""
+        self.last: dict[str, tuple[int, int]] = {}
+        """Last packet of each station, by ``NET_STA``: its number, UTC of its first sample in
+        ns."""
+
+    def begin(self, version: Version) -> None:
+        """Start decoding the packets of a new connection."""
+        self._finder = PacketFinder(version)
+
+    @property
+    def silent(self) -> tuple[str, ...]:
+        """Names of the sensors whose streams have not all been received."""
+        return tuple(name for name, one in self._sensors.items() if one.joined is None)
+
+    def heard(self, sensor: str) -> tuple[str, ...]:
+        """Return the received streams that match a sensor's selection."""
+        return tuple(sorted(self._sensors[sensor].heard))
+
+    def streams(self, sensor: str) -> tuple[str, ...]:
+        """Return the stream of each channel of a sensor; empty until decided."""
+        return self._sensors[sensor].streams
+
+    def sampling_rate(self, sensor: str) -> float | None:
+        """Return the sampling rate of a sensor in Hz, or None before its first record."""
+        joined = self._sensors[sensor].joined
+        rate = None if joined is None else joined.sampling_rate
+        return None if rate is None else float(rate)
+
+    def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
+        """Decode bytes after the handshake, cut anywhere."""
+        found: list[Block | Event] = []
+        for packet in self._finder.receive(data):
+            found += self._packet(packet, at)
+        return found
+
+    def check(self) -> None:
+        """Raise RemoteProtocolError if the bytes behind the last packet are no packet.
+
+        Called when the items of :meth:`receive` are handed on.
+        """
+        self._finder.receive(b"")
+
+    def _packet(self, packet: Packet, at: HostTime) -> Iterator[Block | Event]:
+        if packet.sequence is None or not packet.is_miniseed:
+            return
+        try:
+            record = decode_record(packet.payload)
+        except RemoteProtocolError as error:
+            self._n_unreadable += 1
+            text = f"{str(error)[:150]} ({self._n_unreadable} so far)"
+            yield Event(self._name, EventKind.CHECKSUM, text, at)
+            return
+        if record is None:
+            return
+        self.last[f"{record.network}_{record.station}"] = packet.sequence, record.start_ns
+        for sensor in self._sensors.values():
+            if sensor.selection.matches(record):
+                yield from sensor.add(record, at, hold=self._hold)

@@ -1,0 +1,338 @@
+"""Driver for SeedLink servers: seismic digitizers and servers that forward their records.
+
+``port`` is ``seedlink://host`` or ``seedlink://host:port`` (default 18000). All sensors of a port
+share one connection. The driver uses version 4 of the protocol if the server offers it, else 3.
+
+Blocks state the digitizer's UTC, so no clock model is fitted. After a reconnection each station
+continues with the packet after its last one. No samples are lost while the server still has the
+packets, and repeated samples are recorded once. Packets that the server no longer has become a gap
+of exact length.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING, Annotated, Literal
+from urllib.parse import urlsplit
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, Strict
+
+from daq.devices.interface import DeviceInformation
+from daq.devices.port_rules import port_label, require_alike
+from daq.devices.seedlink import packets
+from daq.devices.seedlink.decoder import SeedLinkDecoder, Selection
+from daq.errors import BenchFileError, FileFault, NoAnswerError, WrongDeviceError
+from daq.transport.address import host_and_port
+from daq.transport.ports import open_port
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Mapping, Sequence
+    from contextlib import AbstractAsyncContextManager
+
+    from daq.bench.model import Sensor
+    from daq.devices.interface import Session
+    from daq.devices.seedlink.packets import Version
+    from daq.host_clock import HostClock
+    from daq.protocols.block import Block, Event, HostTime
+    from daq.transport.byte_stream import ByteStream
+
+PORT = 18000
+SCHEME = "seedlink"
+REPLY_TIMEOUT = 10.0
+OF_THE_SERVER = ("protocol", "late", "patience")
+"""Settings that all sensors of a port share."""
+
+Code = Annotated[str, Field(pattern=r"^[A-Z0-9]{1,8}$")]
+ChannelPattern = Annotated[str, Field(pattern=r"^[A-Z0-9?]{3}$")]
+
+
+class SeedLinkSettings(BaseModel):
+    """``[sensors.settings]`` of a station on a SeedLink server."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    network: Code
+    """Code of the network, such as ``"GE"``."""
+    station: Code
+    """Code of the station."""
+    location: Annotated[str, Field(pattern=r"^(\*|--|[A-Z0-9?]{2})$")] = "*"
+    """Location code, ``"--"`` if blank, ``"*"`` for any; ``?`` matches any character."""
+    channels: Annotated[tuple[ChannelPattern, ...], Strict(strict=False)] | None = None
+    """Code of each channel, such as ``["HNZ", "HNN", "HNE"]``, or one pattern for all, such as
+    ``["HN?"]``, whose channels are in the order Z, N, E, 1, 2, 3. Default: the names of the
+    sensor's channels."""
+    protocol: Literal["auto", "3", "4"] = "auto"
+    """Version of SeedLink; default: 4 if the server offers it, else 3."""
+    samples: Literal["int32", "float32", "float64"] = "int32"
+    """Type of the samples in the records."""
+    late: PositiveFloat = 10.0
+    """Seconds to wait for a late record before a hole becomes a gap."""
+    patience: PositiveFloat = 60.0
+    """Seconds without a record after which the server is lost and reconnected."""
+
+    def selection(self, sensor: Sensor) -> Selection:
+        """Return the selection of the sensor's streams; raise BenchFileError if invalid."""
+        n_channels = len(sensor.channels)
+        codes = self.channels or tuple(channel.name for channel in sensor.channels)
+        fits = len(codes) in {1, n_channels} and all(len(code) == 3 for code in codes)
+        if not fits or len(set(codes)) < len(codes):
+            expected = (
+                f"expected the code of each of the sensor's {n_channels} channels, or one pattern"
+                ' such as "HN?" for all of them'
+            )
+            raise BenchFileError(FileFault("settings.channels", expected, list(codes), sensor.name))
+        patterns = tuple((self.location, code) for code in codes)
+        return Selection(self.network, self.station, patterns, n_channels)
+
+
+class SeedLinkSession:
+    """A server that sends; all streams of at least one sensor have been received."""
+
+    def __init__(
+        self,
+        stream: ByteStream,
+        decoder: SeedLinkDecoder,
+        *,
+        information: tuple[DeviceInformation, ...],
+        buffered: list[Block | Event],
+        patience: float,
+        resumed: bool,
+    ) -> None:
+        self.information = information
+        self.decoder = decoder
+        self.resumed = resumed
+        """Whether blocks continue the index of the session before."""
+        self.patience = patience
+        """See :class:`daq.devices.interface.PatientSession`."""
+        self.hint = "the server sends no records; check its digitizer"
+        self._stream = stream
+        self._buffered = buffered
+
+    async def read(self) -> AsyncIterator[Block | Event]:
+        """Yield blocks and events."""
+        buffered, self._buffered = self._buffered, []
+        for item in buffered:
+            yield item
+        while True:
+            received, at = await self._stream.read()
+            for item in self.decoder.receive(received, at):
+                yield item
+            self.decoder.check()
+
+
+class SeedLinkDriver:
+    """See :class:`daq.devices.interface.DriverType`."""
+
+    name = "seedlink"
+    summary = "SeedLink server: seismic digitizers (Centaur, Q330, Raspberry Shake, SeisComP)"
+    settings = SeedLinkSettings
+    shares_clock = False
+
+    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:
+        """Return the type of the samples in the records."""
+        return np.dtype(SeedLinkSettings.model_validate(sensor.settings).samples)
+
+    def check(self, sensors: Sequence[Sensor]) -> None:
+        """See :meth:`daq.devices.interface.Checking.check`."""
+        _selections(sensors)
+
+    def open(
+        self, sensors: Sequence[Sensor], clock: HostClock
+    ) -> AbstractAsyncContextManager[SeedLinkSession]:
+        """Connect, select stations, and listen until every stream has been received."""
+        return _opened(sensors, clock, None)
+
+    def resume(
+        self, sensors: Sequence[Sensor], clock: HostClock, before: Session
+    ) -> AbstractAsyncContextManager[SeedLinkSession]:
+        """Open, and continue after the last received packets."""
+        return _opened(sensors, clock, before if isinstance(before, SeedLinkSession) else None)
+
+
+def _selections(sensors: Sequence[Sensor]) -> dict[str, Selection]:
+    settings = {s.name: SeedLinkSettings.model_validate(s.settings) for s in sensors}
+    require_alike(sensors, settings, OF_THE_SERVER)
+    _address(sensors[0])
+    return {s.name: settings[s.name].selection(s) for s in sensors}
+
+
+def _address(sensor: Sensor) -> tuple[str, int]:
+    expected = "expected seedlink://host, or seedlink://host:port"
+    fault = FileFault("port", expected, sensor.port, sensor.name)
+    port = sensor.port.rstrip("/")
+    if not port.startswith(f"{SCHEME}://"):
+        raise BenchFileError(fault)
+    try:
+        host, number = host_and_port(port if urlsplit(port).port else f"{port}:{PORT}")
+    except ValueError as error:
+        raise BenchFileError(fault) from error
+    return f"[{host}]" if ":" in host else host, number
+
+
+@contextlib.asynccontextmanager
+async def _opened(
+    sensors: Sequence[Sensor], clock: HostClock, before: SeedLinkSession | None
+) -> AsyncIterator[SeedLinkSession]:
+    first = sensors[0]
+    selections = _selections(sensors)
+    settings = SeedLinkSettings.model_validate(first.settings)
+    host, number = _address(first)
+    label = port_label(sensors)
+    async with open_port(f"socket://{host}:{number}", clock, label=label) as stream:
+        server = _Server(stream)
+        await server.greet(settings.protocol)
+        decoder = before.decoder if before is not None else None
+        if decoder is None:
+            dtypes = {s.name: SeedLinkDriver().counts_dtype(s) for s in sensors}
+            decoder = SeedLinkDecoder(selections, dtypes, hold=settings.late)
+        await server.choose(selections, decoder.last)
+        decoder.begin(server.version)
+        buffered: list[Block | Event] = []
+        if server.rest is not None:
+            buffered += decoder.receive(*server.rest)
+        await _listen(stream, decoder, settings.patience / clock.speed, buffered)
+        yield SeedLinkSession(
+            stream,
+            decoder,
+            information=_information(sensors, decoder, server, label, settings.patience),
+            buffered=buffered,
+            patience=settings.patience,
+            resumed=before is not None,
+        )
+
+
+class _Server:
+    """Commands to a server, and its replies."""
+
+    def __init__(self, stream: ByteStream) -> None:
+        self.version: Version = 3
+        self.software = self.organisation = ""
+        self.rest: tuple[bytes, HostTime] | None = None
+        """Bytes received after the last reply."""
+        self._stream = stream
+        self._buffer = b""
+        self._at: HostTime | None = None
+
+    async def greet(self, wanted: str) -> None:
+        """Request the server's name, and select the version of the protocol."""
+        await self._send("HELLO")
+        self.software, self.organisation = await self._line("HELLO"), await self._line("HELLO")
+        if "seedlink" not in self.software.lower():
+            raise WrongDeviceError(
+                f"{self._stream.label}: expected a SeedLink server, got {self.software[:60]!r}"
+            )
+        offered = packets.speaks_version_4(self.software)
+        if wanted == "4" and not offered:
+            raise WrongDeviceError(
+                f"{self._stream.label}: settings.protocol is 4, but the server does not offer it:"
+                f" {self.software[:80]!r}"
+            )
+        if offered and wanted != "3":
+            await self._ask("SLPROTO 4.0")
+            self.version = 4
+
+    async def choose(
+        self, selections: Mapping[str, Selection], last: Mapping[str, tuple[int, int]]
+    ) -> None:
+        """Select stations and channels, and start the transfer."""
+        stations: dict[str, list[Selection]] = {}
+        for selection in selections.values():
+            stations.setdefault(selection.station_id, []).append(selection)
+        for station, chosen in stations.items():
+            one = chosen[0]
+            await self._ask(packets.station_command(self.version, one.network, one.station))
+            for pattern in dict.fromkeys(p for selection in chosen for p in selection.patterns):
+                await self._ask(packets.select_command(self.version, *pattern))
+            await self._ask(packets.data_command(self.version, last.get(station)))
+        await self._send("END")
+        if self._buffer and self._at is not None:
+            self.rest = self._buffer, self._at
+
+    async def _ask(self, command: str) -> None:
+        await self._send(command)
+        reply = await self._line(command)
+        if reply != "OK":
+            raise WrongDeviceError(
+                f"{self._stream.label}: expected OK to {command!r}, got {reply[:80]!r}; check"
+                " network, station, location and channels"
+            )
+
+    async def _send(self, command: str) -> None:
+        await self._stream.write(command.encode("ascii") + packets.LINE_END)
+
+    async def _line(self, command: str) -> str:
+        try:
+            async with asyncio.timeout(REPLY_TIMEOUT):
+                while packets.LINE_END not in self._buffer:
+                    if len(self._buffer) > packets.RECORD_SIZE:
+                        break
+                    received, self._at = await self._stream.read()
+                    self._buffer += received
+        except TimeoutError as error:
+            raise NoAnswerError(
+                f"{self._stream.label}: no answer to {command!r} in {REPLY_TIMEOUT:g} s; is it a"
+                " SeedLink server?"
+            ) from error
+        line, found, self._buffer = self._buffer.partition(packets.LINE_END)
+        text = line.decode("ascii", "replace").strip()
+        if not found:
+            raise WrongDeviceError(
+                f"{self._stream.label}: expected a line in answer to {command!r}, got {text[:60]!r}"
+            )
+        return text
+
+
+async def _listen(
+    stream: ByteStream, decoder: SeedLinkDecoder, seconds: float, buffered: list[Block | Event]
+) -> None:
+    """Listen until the streams of every sensor are decided, for at most ``seconds``."""
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(seconds):
+            while decoder.silent:
+                received, at = await stream.read()
+                buffered += decoder.receive(received, at)
+
+
+def _information(
+    sensors: Sequence[Sensor],
+    decoder: SeedLinkDecoder,
+    server: _Server,
+    label: str,
+    patience: float,
+) -> tuple[DeviceInformation, ...]:
+    found = []
+    for sensor in sensors:
+        if sensor.name in decoder.silent:
+            there = ", ".join(decoder.heard(sensor.name)) or "none"
+            settings = SeedLinkSettings.model_validate(sensor.settings)
+            trouble = (
+                f"{label}: the {len(sensor.channels)} streams of {sensor.name!r} not received in"
+                f" {patience:g} s; of {settings.network}.{settings.station} that match: {there}"
+            )
+            found.append(DeviceInformation(sensor=sensor.name, trouble=trouble))
+            continue
+        rate = decoder.sampling_rate(sensor.name)
+        if rate is not None and abs(rate / sensor.sampling_rate - 1) > 1e-6:
+            raise WrongDeviceError(
+                f"{label}: {sensor.name!r}: expected {sensor.sampling_rate:g} Hz, got {rate:g} Hz;"
+                " correct sampling_rate, or select other channels"
+            )
+        details = {
+            "server": server.software[:80],
+            "organisation": server.organisation[:80],
+            "protocol": f"SeedLink {server.version}",
+            "streams": ", ".join(decoder.streams(sensor.name)),
+        }
+        found.append(
+            DeviceInformation(
+                sensor=sensor.name, model=sensor.model, sampling_rate=rate, details=details
+            )
+        )
+    if all(one.trouble for one in found):
+        raise NoAnswerError(found[0].trouble)
+    return tuple(found)
+
+
+DRIVER = SeedLinkDriver()

@@ -1,0 +1,370 @@
+"""Decoder of delimited text: one line per sample, or packets of many samples of one channel.
+
+Theory of operation
+-------------------
+The terminator separates *messages*; white space around a message is removed. A message is
+``prefix``, fields separated by the delimiter, ``suffix``, and optionally a checksum ``*hh``: the
+XOR, in hexadecimal, of all characters between the prefix and the asterisk (NMEA 0183). Fields may
+be padded with spaces or quoted. Four layouts:
+
+row
+    ``LILY,2013/06/24 23:22:00,-236.026,  25.666,194.25, 26.01,11.96,N9655``
+    One sample of every channel, in the fields ``columns``. A row may have a time, or a counter that
+    increases by one.
+labelled
+    ``t:1200 X:-12 Y:40 Z:16384``: like a row, but each field has a name.
+json
+    ``{"t": 1200, "acc": [-12, 40, 16384]}``: like a row; names are ``t``, ``acc.0`` and so on.
+channel
+    ``{'EHZ', 1582315130.292, 14168, 14927, …}``
+    The channel, the time of the first sample in seconds since 1970, then samples. Packets with
+    the same time belong together (Raspberry Shake datacast over UDP: packets are lost, repeated and
+    reordered; see :mod:`daq.devices.text.packet_order`).
+
+A counter gives the exact index of a sample (:mod:`daq.protocols.sample_counter`), and so does a
+time of sufficient resolution (:mod:`daq.protocols.sample_times`): repeated rows are dropped and
+counted, missing rows become a gap. With neither, an unreadable message counts as one missing
+sample, and lost bytes are not detected.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daq.devices.text.format import (
+    LABELLED,
+    MAX_MESSAGE,
+    MessageFinder,
+    TextFormat,
+    decode_time,
+    flatten,
+    nmea_checksum,
+    read_hexadecimal,
+)
+from daq.devices.text.packet_order import Group, Packets
+from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
+from daq.protocols.errors import RemoteProtocolError
+from daq.protocols.sample_counter import SampleCounter
+from daq.protocols.sample_times import Place, SampleTimes
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from numpy.typing import NDArray
+
+_ANNOUNCED = 200
+_FIRST_ROWS = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Row:
+    """A decoded row."""
+
+    counts: NDArray[Any]
+    message: bytes
+    counter: int
+    time_ns: int
+    resolution_ns: int
+
+
+class TextDecoder:
+    """Decoder of messages into blocks of one sensor.
+
+    Parameters
+    ----------
+    sensor : str
+        Name of the sensor.
+    format_ : TextFormat
+        Format of the messages.
+    sampling_rate : float
+        In Hz.
+    joins : bool
+        Whether the device may already be sending, so that the first message may lack its start.
+    """
+
+    def __init__(
+        self, sensor: str, format_: TextFormat, *, sampling_rate: float, joins: bool = False
+    ) -> None:
+        self._sensor = sensor
+        self._format = format_
+        self._joins = joins
+        self._finder = MessageFinder(format_.terminator.encode())
+        self._next = 0
+        self._flags = BlockFlag.CLOCK_RESTART
+        self._reason = ""
+        self._counter = SampleCounter(format_.counter_modulus, sampling_rate)
+        self._times = SampleTimes(sampling_rate)
+        self._packets = Packets(format_.channel_names)
+        self._doubtful: Group | None = None
+        self._latest = b""  # the last accepted row
+        self._n_known = self._n_unreadable = self._n_given_up = 0
+        self._finest_ns: int | None = None  # resolution of the times
+        self._delimiter = format_.delimiter.strip() or None  # None: any white space
+        if "\t" in format_.delimiter:
+            self._delimiter = "\t"
+        self.first_rows: list[bytes] = []
+        """The first messages, while none of them was readable."""
+        self._has_read = False
+
+    def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
+        """Decode bytes of a line or connection, cut anywhere."""
+        messages = self._finder.receive(data)
+        if self._joins and messages:
+            messages, self._joins = messages[1:], False
+        return [*self._given_up(self._finder, at), *self._messages(messages, at)]
+
+    def receive_datagram(self, data: bytes, at: HostTime) -> list[Block | Event]:
+        """Decode one datagram: complete messages, the last with or without a terminator."""
+        finder = MessageFinder(self._format.terminator.encode())
+        messages = finder.receive(data + self._format.terminator.encode())
+        return [*self._given_up(finder, at), *self._messages(messages, at)]
+
+    def _given_up(self, finder: MessageFinder, at: HostTime) -> Iterator[Event]:
+        n, finder.n_given_up = finder.n_given_up, 0
+        for _ in range(n):
+            self._n_given_up += 1
+            self._unreadable()
+            text = (
+                f"{MAX_MESSAGE} bytes without the terminator {self._format.terminator!r}: dropped"
+                f" ({self._n_given_up} so far); check settings.terminator"
+            )
+            yield Event(self._sensor, EventKind.RESYNCHRONISED, _cut(text), at)
+
+    def _messages(self, messages: list[bytes], at: HostTime) -> list[Block | Event]:
+        found: list[Block | Event] = []
+        rows: list[_Row] = []
+        n_known = self._n_known
+        for message in messages:
+            try:
+                fields = self._split(message)
+                if fields is None:
+                    continue
+                if self._format.layout == "channel":
+                    found += self._packet(fields, at)
+                else:
+                    rows.append(self._row(fields, message))
+                self._has_read = True
+                self.first_rows.clear()
+            except RemoteProtocolError as error:
+                found += self._rows(rows, at)
+                rows = []
+                self._n_unreadable += 1
+                if not self._has_read and len(self.first_rows) < _FIRST_ROWS:
+                    self.first_rows.append(message)
+                text = f"{_cut(str(error), 160)} ({self._n_unreadable} unreadable so far)"
+                found.append(Event(self._sensor, EventKind.CHECKSUM, _cut(text), at))
+                self._unreadable()
+        found += self._rows(rows, at)
+        if self._n_known > n_known:
+            what = "packets" if self._format.layout == "channel" else "rows"
+            text = f"dropped {self._n_known - n_known} {what} that were repeated or too late"
+            found.append(
+                Event(self._sensor, EventKind.STATUS, f"{text} ({self._n_known} so far)", at)
+            )
+        return found
+
+    def _split(self, message: bytes) -> list[str] | None:
+        """Return the fields of a message, or None if it has another tag."""
+        format_ = self._format
+        text = message.decode("ascii", "replace")
+        if format_.layout in {"labelled", "json"}:
+            return [text]
+        if not text.startswith(format_.prefix):
+            raise RemoteProtocolError(f"no {format_.prefix!r} at the start of {text[:80]!r}")
+        text = text[len(format_.prefix) :]
+        if format_.nmea_checksum:
+            text, star, checksum = text.rpartition("*")
+            if not star or f"{nmea_checksum(text):02X}" != checksum.strip().upper():
+                raise RemoteProtocolError(f"checksum {checksum[:8]!r} of {text[:80]!r} is wrong")
+        if not text.endswith(format_.suffix):
+            raise RemoteProtocolError(f"no {format_.suffix!r} at the end of {text[-80:]!r}")
+        fields = text.removesuffix(format_.suffix).split(self._delimiter)
+        fields = [field.strip() for field in fields] or [""]
+        if format_.tag and fields[0] != format_.tag:
+            return None
+        return fields
+
+    # --- rows --------------------------------------------------------------------------------
+
+    def _row(self, fields: list[str], message: bytes) -> _Row:
+        """Return samples, time and counter of a row."""
+        format_ = self._format
+        time_ns = resolution_ns = counter = 0
+        try:
+            by_key = _by_key(fields, format_)
+            values = _numbers([by_key[key] for key in format_.channel_keys], format_)
+            if format_.time_column is not None:
+                time_ns, resolution_ns = self._time(by_key[format_.time_column])
+            if format_.counter_column is not None:
+                counter = int(by_key[format_.counter_column]) % format_.counter_modulus
+        except (ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:
+            text = format_.delimiter.join(fields)[:80]
+            raise RemoteProtocolError(f"not a row of this format: {text!r}") from error
+        return _Row(values, message, counter, time_ns, resolution_ns)
+
+    def _time(self, text: str) -> tuple[int, int]:
+        """Return a time and the resolution of the times: trailing zeros may be omitted."""
+        time_ns, resolution_ns = decode_time(text, self._format)
+        self._finest_ns = min(resolution_ns, self._finest_ns or resolution_ns)
+        return time_ns, self._finest_ns
+
+    def _rows(self, rows: list[_Row], at: HostTime) -> Iterator[Block | Event]:
+        if not rows:
+            return
+        if self._format.counter_column is not None:
+            yield from self._counted(rows, at)
+        elif self._format.time_column is not None:
+            groups = [Group(row.time_ns, row.counts[None], at, row.resolution_ns) for row in rows]
+            yield from self._timed(zip(groups, (row.message for row in rows), strict=True))
+        else:
+            yield self._block(np.stack([row.counts for row in rows]), None, at)
+
+    def _counted(self, rows: list[_Row], at: HostTime) -> Iterator[Block | Event]:
+        counts = np.stack([row.counts for row in rows])
+        counters = np.array([row.counter for row in rows], np.int64)
+        runs, n_repeated = self._counter.place(counters, at)
+        self._n_known += n_repeated
+        for run in runs:
+            if run.missing:
+                self._reason = "counter"
+            if run.restarted:
+                self._flags |= BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
+                yield Event(self._sensor, EventKind.RESET, "the counter restarted", at)
+            self._next = run.first_sample
+            device = rows[run.start].time_ns if self._format.device_time else run.counter
+            yield self._block(counts[run.start : run.stop], device, at)
+
+    def _unreadable(self) -> None:
+        """Count an unreadable message as missing, if neither a counter nor a time shows this."""
+        format_ = self._format
+        if format_.layout != "channel" and format_.counter_column is format_.time_column is None:
+            self._skip(1, "unreadable row", is_exact=False)
+
+    # --- packets -----------------------------------------------------------------------------
+
+    def _packet(self, fields: list[str], at: HostTime) -> Iterator[Block | Event]:
+        name = fields[0].strip("'\"")
+        try:
+            time_ns, resolution_ns = self._time(fields[1])
+            values = _numbers(fields[2:], self._format)
+        except (ValueError, IndexError, OverflowError) as error:
+            text = self._format.delimiter.join(fields)[:80]
+            raise RemoteProtocolError(f"not a packet of this format: {text!r}") from error
+        if name not in self._format.channel_names or not len(values):
+            return
+        if self._times.is_known(time_ns, at, resolution_ns=resolution_ns):
+            self._n_known += 1
+            return
+        self._n_known += self._packets.add(name, values, time_ns, at, resolution_ns)
+        for group in self._packets.ready(self._times):
+            yield from self._timed([(group, b"")])
+        for text in self._packets.dropped(at):
+            yield Event(self._sensor, EventKind.OVERFLOW, _cut(text), at)
+
+    # --- positions by time -------------------------------------------------------------------
+
+    def _timed(self, groups: Iterable[tuple[Group, bytes]]) -> Iterator[Block | Event]:
+        """Yield blocks of contiguous groups; each group comes with its message."""
+        together: list[Group] = []
+        for group, message in groups:
+            place = self._place(group, alike=bool(message) and message == self._latest)
+            if place.kind == "next" and not place.missing and self._doubtful is None:
+                self._latest = message
+                together.append(group)
+                continue
+            yield from self._joined(together)
+            together = []
+            if place.kind == "reset":
+                yield from self._restarted(place, group.received)
+                place = self._place(group)
+            elif self._doubtful is not None:  # the next message shows that it was damaged
+                yield self._out_of_time(self._doubtful, group.received)
+            self._doubtful = group if place.kind == "doubtful" else None
+            if place.kind == "next":
+                self._latest = message
+                self._skip(place.missing, "time step", is_exact=place.is_exact)
+                together.append(group)
+            elif place.kind == "known":
+                self._n_known += 1
+        yield from self._joined(together)
+
+    def _place(self, group: Group, *, alike: bool = False) -> Place:
+        return self._times.place(
+            group.time_ns,
+            len(group.counts),
+            group.received,
+            resolution_ns=group.resolution_ns,
+            alike=alike,
+        )
+
+    def _joined(self, groups: list[Group]) -> Iterator[Block]:
+        if groups:
+            counts = np.concatenate([group.counts for group in groups])
+            yield self._block(counts, groups[0].time_ns, groups[-1].received)
+
+    def _restarted(self, place: Place, at: HostTime) -> Iterator[Block | Event]:
+        """Yield the doubtful group after the device's clock was found to be set."""
+        yield Event(self._sensor, EventKind.RESET, "the device's clock was set", at)
+        self._flags |= BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
+        self._skip(place.missing, "clock set", is_exact=False)
+        if self._doubtful is not None:
+            yield from self._joined([self._doubtful])
+            self._doubtful = None
+
+    def _out_of_time(self, group: Group, at: HostTime) -> Event:
+        self._n_unreadable += 1
+        text = (
+            f"dropped {len(group.counts)} samples whose time contradicts those of the others"
+            f" ({self._n_unreadable} unreadable so far)"
+        )
+        return Event(self._sensor, EventKind.CHECKSUM, text, at)
+
+    def _skip(self, missing: int, reason: str, *, is_exact: bool) -> None:
+        if missing:
+            self._next += missing
+            self._reason = reason
+            if not is_exact:
+                self._flags |= BlockFlag.MISSING_ESTIMATED
+
+    def _block(self, counts: NDArray[Any], device: int | None, at: HostTime) -> Block:
+        first, self._next = self._next, self._next + len(counts)
+        flags, self._flags = self._flags, BlockFlag.NONE
+        reason, self._reason = self._reason, ""
+        if self._format.device_time and device is not None:
+            flags |= BlockFlag.DEVICE_UTC
+        return Block(self._sensor, first, counts, at, device, flags, reason)
+
+
+def _by_key(fields: list[str], format_: TextFormat) -> dict[int | str, str]:
+    """Return the fields of a row by number or name."""
+    if format_.layout == "labelled":
+        return {name: value for name, value in LABELLED.findall(fields[0])}  # noqa: C416 -- keys of either type
+    if format_.layout == "json":
+        return {path: value for path, value in flatten(json.loads(fields[0])).items()}  # noqa: C416
+    return {n: field for n, field in enumerate(fields)}  # noqa: C416
+
+
+def _numbers(fields: list[str], format_: TextFormat) -> NDArray[Any]:
+    if format_.hexadecimal_bits is not None:
+        n_bits = format_.hexadecimal_bits
+        values = np.array([read_hexadecimal(field, n_bits) for field in fields], np.float64)
+    else:
+        if format_.decimal_comma:
+            fields = [field.replace(",", ".") for field in fields]
+        values = np.array(fields, dtype=np.float64) if fields else np.empty(0)
+    if not np.isfinite(values).all():
+        raise ValueError(fields)
+    if not format_.whole:
+        return values
+    whole = np.rint(values).clip(-(1 << 31), (1 << 31) - 1)
+    if (whole != values).any():
+        raise ValueError(fields)
+    return whole.astype(np.int32)
+
+
+def _cut(text: str, n_bytes: int = _ANNOUNCED) -> str:
+    return text.encode()[:n_bytes].decode(errors="ignore")

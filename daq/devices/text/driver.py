@@ -1,0 +1,327 @@
+"""Driver for devices that send delimited text over a serial line, TCP or UDP.
+
+``preset`` selects the format of a known device; other settings override it.
+:mod:`daq.devices.text.decoder` describes formats. Ports: serial, ``socket://host:port``, and
+``udp://address:port`` to listen on (``udp://0.0.0.0:8888`` for any interface).
+
+Some devices send only after a command: the driver sends ``start`` at the start and ``stop`` at the
+end. LILY tiltmeters need ``*9900XYC2`` and ``*9900XYC-OFF``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Annotated, Literal, Protocol
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PositiveFloat,
+    PositiveInt,
+    Strict,
+    field_validator,
+)
+
+from daq.devices.interface import DEFAULT_PATIENCE, DeviceInformation
+from daq.devices.port_rules import only
+from daq.devices.text.decoder import TextDecoder
+from daq.devices.text.format import (
+    LILY,
+    RASPBERRY_SHAKE,
+    SINCE_START,
+    TextFormat,
+    is_readable,
+)
+from daq.devices.text.guess import guess_settings
+from daq.errors import BenchFileError, DeviceError, FileFault, toml_value
+from daq.protocols.block import Block, Event, EventKind
+from daq.transport.ports import open_port
+from daq.transport.udp import open_datagrams
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Sequence
+
+    import numpy as np
+
+    from daq.bench.model import Sensor
+    from daq.host_clock import HostClock
+    from daq.transport.byte_stream import ByteStream
+    from daq.transport.udp import DatagramStream
+
+PRESETS = {"raspberry-shake": RASPBERRY_SHAKE, "lily": LILY, "none": TextFormat()}
+
+
+class TextSettings(BaseModel):
+    """``[sensors.settings]`` of a device that sends text."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    preset: Literal["none", "raspberry-shake", "lily"] = "none"
+    layout: Literal["row", "labelled", "json", "channel"] | None = None
+    """"row": one line per sample of every channel. "labelled": likewise, as ``X:1 Y:2``. "json":
+    likewise, as a JSON object. "channel": name, time, samples of one channel."""
+    delimiter: str | None = None
+    terminator: Annotated[str, Field(min_length=1)] | None = None
+    prefix: str | None = None
+    suffix: str | None = None
+    tag: str | None = None
+    """Required value of the first field of a row."""
+    columns: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Strict(strict=False)] | None = None
+    """Field of each channel, counted from 0 (layout "row"); default: the first fields."""
+    channel_names: Annotated[tuple[str, ...], Strict(strict=False)] | None = None
+    """Name of each channel in the messages (not in layout "row"); default: the channels' names. In
+    layout "json", ``acc.0`` is the first entry of the list ``acc``."""
+    time_column: Annotated[int, Field(ge=0)] | str | None = None
+    """Field of the time: its number (layout "row") or name."""
+    time_format: str | None = None
+    """"epoch" (seconds since 1970), a format of Python's strptime (UTC), or "millis" or "micros"
+    since the start of the device."""
+    counter_column: Annotated[int, Field(ge=0)] | str | None = None
+    counter_modulus: PositiveInt | None = None
+    nmea_checksum: bool | None = None
+    whole: bool | None = None
+    """Whether samples are integers."""
+    decimal_comma: bool | None = None
+    """Whether numbers are written ``1,5``."""
+    hexadecimal_bits: Annotated[int, Field(ge=4, le=32)] | None = None
+    """Bits of samples written in hexadecimal, two's complement."""
+    device_time: bool | None = None
+    """Whether the device's time is used as clock, instead of the arrival."""
+    start: str = ""
+    """Command that starts the device."""
+    stop: str = ""
+    """Command that stops the device."""
+    baud_rate: PositiveInt = 19200
+    parity: Literal["N", "E", "O"] = "N"
+    patience: PositiveFloat = DEFAULT_PATIENCE
+    """Seconds without samples after which the device is lost and reconnected. If the device sends
+    less often than every minute, set at least twice its interval."""
+
+    @field_validator("time_format")
+    @classmethod
+    def _readable(cls, value: str | None) -> str | None:
+        known = value is None or value == "epoch" or value in SINCE_START
+        if not known and not is_readable(value or ""):
+            raise ValueError(
+                'expected "epoch", "millis", "micros", or date and time in a format of Python\'s'
+                ' strptime, such as "%Y-%m-%d %H:%M:%S.%f"'
+            )
+        return value
+
+    def format_for(self, sensor: Sensor) -> TextFormat:
+        """Return the format of these settings.
+
+        Raises
+        ------
+        BenchFileError
+            If the number of columns or names differs from the number of channels, or the settings
+            contradict each other.
+        """
+        given = {
+            field.name: value
+            for field in fields(TextFormat)
+            if (value := getattr(self, field.name)) is not None
+        }
+        format_ = replace(PRESETS[self.preset], **given)
+        n_channels = len(sensor.channels)
+        if format_.layout != "row":
+            names = self.channel_names or tuple(channel.name for channel in sensor.channels)
+            format_ = replace(format_, channel_names=names)
+        elif not format_.columns:
+            format_ = replace(format_, columns=tuple(range(n_channels)))
+        places = format_.channel_keys
+        if len(places) != n_channels:
+            what = "columns" if format_.layout == "row" else "channel_names"
+            expected = f"expected one for each of the sensor's {n_channels} channels"
+            raise BenchFileError(FileFault(f"settings.{what}", expected, list(places), sensor.name))
+        if format_.terminator in format_.delimiter:
+            expected = (
+                f"is in settings.delimiter = {toml_value(format_.delimiter)}; expected one that"
+                " ends a message, not a field"
+            )
+            raise BenchFileError(
+                FileFault("settings.terminator", expected, format_.terminator, sensor.name)
+            )
+        _check_format(format_, sensor)
+        return format_
+
+
+def _check_format(format_: TextFormat, sensor: Sensor) -> None:
+    """Raise BenchFileError for settings that contradict each other."""
+    if format_.device_time and format_.layout != "channel" and format_.time_column is None:
+        expected = "expected settings.time_column with it"
+        raise BenchFileError(FileFault("settings.device_time", expected, True, sensor.name))
+    if format_.device_time and format_.time_format in SINCE_START:
+        expected = f"a time in {format_.time_format} is no UTC: leave it out"
+        raise BenchFileError(FileFault("settings.device_time", expected, True, sensor.name))
+    if format_.decimal_comma and "," in format_.delimiter and format_.layout == "row":
+        expected = "expected another settings.delimiter than a comma with it"
+        raise BenchFileError(FileFault("settings.decimal_comma", expected, True, sensor.name))
+    for key in ("time_column", "counter_column"):
+        value = getattr(format_, key)
+        if value is not None and isinstance(value, int) != (format_.layout == "row"):
+            what = "the number" if format_.layout == "row" else "the name"
+            expected = f'expected {what} of a field, for layout "{format_.layout}"'
+            raise BenchFileError(FileFault(f"settings.{key}", expected, value, sensor.name))
+
+
+class _Source(Protocol):
+    """Source of the text."""
+
+    async def receive(self) -> list[Block | Event]: ...
+    async def send(self, payload: bytes) -> None: ...
+    def discard(self) -> None: ...
+
+
+class _StreamSource:
+    def __init__(self, stream: ByteStream, decoder: TextDecoder) -> None:
+        self._stream = stream
+        self._decoder = decoder
+
+    async def receive(self) -> list[Block | Event]:
+        received, at = await self._stream.read()
+        return self._decoder.receive(received, at)
+
+    async def send(self, payload: bytes) -> None:
+        await self._stream.write(payload)
+
+    def discard(self) -> None:
+        self._stream.discard()
+
+
+class _DatagramSource:
+    def __init__(self, stream: DatagramStream, decoder: TextDecoder, sensor: str) -> None:
+        self._stream = stream
+        self._decoder = decoder
+        self._sensor = sensor
+        self._told: set[str] = set()
+
+    async def receive(self) -> list[Block | Event]:
+        received, at = await self._stream.read()
+        found = self._decoder.receive_datagram(received, at)
+        for host in sorted(self._stream.strangers - self._told):
+            self._told.add(host)
+            text = f"datagrams from {host} are ignored: another device sends to this port"
+            found.append(Event(self._sensor, EventKind.STATUS, text, at))
+        return found
+
+    async def send(self, payload: bytes) -> None:
+        """Do nothing: the source only listens."""
+
+    def discard(self) -> None:
+        self._stream.discard()
+
+
+class TextSession:
+    """An open port; the device sends by itself or after the start command."""
+
+    def __init__(
+        self,
+        source: _Source,
+        settings: TextSettings,
+        *,
+        information: DeviceInformation,
+        decoder: TextDecoder,
+    ) -> None:
+        self.information = (information,)
+        self.patience = settings.patience
+        """See :class:`daq.devices.interface.PatientSession`."""
+        self._source = source
+        self._settings = settings
+        self._decoder = decoder
+        self._advice = (
+            "check that the device sends to this computer and port, and that no firewall blocks it"
+            if isinstance(source, _DatagramSource)
+            else "check cable, power, settings.baud_rate and settings.start"
+        )
+
+    @property
+    def hint(self) -> str:
+        """Advice if no block arrives: on the format, if rows arrive but none is readable."""
+        rows = self._decoder.first_rows
+        if not rows:
+            return self._advice
+        shown = ", ".join(repr(row[:60].decode("ascii", "replace")) for row in rows[:2])
+        guess = guess_settings(rows)
+        if guess is None:
+            return f"received rows that settings do not match: {shown}; check settings.baud_rate"
+        would = ", ".join(f"{key} = {toml_value(value)}" for key, value in guess.items())
+        return f"received rows that settings do not match: {shown}; these would: {would}"
+
+    async def read(self) -> AsyncIterator[Block | Event]:
+        """Start the device and yield blocks and events."""
+        self._source.discard()
+        if self._settings.start:
+            await self._source.send(self._settings.start.encode())
+        while True:
+            for item in await self._source.receive():
+                yield item
+
+
+class TextDriver:
+    """See :class:`daq.devices.interface.DriverType`."""
+
+    name = "text"
+    summary = "Delimited text over serial, TCP or UDP (Raspberry Shake, LILY, any format)"
+    settings = TextSettings
+    shares_clock = False
+
+    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:
+        """Return int32 for integers, else float64."""
+        return TextSettings.model_validate(sensor.settings).format_for(sensor).dtype
+
+    def check(self, sensors: Sequence[Sensor]) -> None:
+        """See :meth:`daq.devices.interface.Checking.check`."""
+        _checked(sensors)
+
+    @contextlib.asynccontextmanager
+    async def open(self, sensors: Sequence[Sensor], clock: HostClock) -> AsyncIterator[TextSession]:
+        """Open the port."""
+        sensor, settings, format_ = _checked(sensors)
+        label = f"sensor {sensor.name!r} on {sensor.port}"
+        decoder = TextDecoder(
+            sensor.name, format_, sampling_rate=sensor.sampling_rate, joins=not settings.start
+        )
+        information = DeviceInformation(
+            sensor=sensor.name,
+            model=sensor.model,
+            details={"format": settings.preset if settings.preset != "none" else format_.layout},
+        )
+        async with _opened(sensor, clock, settings, decoder, label=label) as source:
+            try:
+                yield TextSession(source, settings, information=information, decoder=decoder)
+            finally:
+                if settings.stop:
+                    with contextlib.suppress(DeviceError):
+                        await source.send(settings.stop.encode())
+
+
+def _checked(sensors: Sequence[Sensor]) -> tuple[Sensor, TextSettings, TextFormat]:
+    """Return the sensor, its settings and format; raise BenchFileError if they are invalid."""
+    sensor = only(sensors, "text comes from one")
+    settings = TextSettings.model_validate(sensor.settings)
+    for key in ("start", "stop"):
+        if sensor.port.startswith("udp://") and (value := getattr(settings, key)):
+            expected = f"nothing can be sent to {sensor.port}: leave it out"
+            raise BenchFileError(FileFault(f"settings.{key}", expected, value, sensor.name))
+    return sensor, settings, settings.format_for(sensor)
+
+
+@contextlib.asynccontextmanager
+async def _opened(
+    sensor: Sensor, clock: HostClock, settings: TextSettings, decoder: TextDecoder, *, label: str
+) -> AsyncIterator[_Source]:
+    port = sensor.port
+    if port.startswith("udp://"):
+        async with open_datagrams(port, clock, listen=True, label=label) as datagrams:
+            yield _DatagramSource(datagrams, decoder, sensor.name)
+    else:
+        async with open_port(
+            port, clock, label=label, baud_rate=settings.baud_rate, parity=settings.parity
+        ) as stream:
+            yield _StreamSource(stream, decoder)
+
+
+DRIVER = TextDriver()

@@ -1,0 +1,195 @@
+"""Preview of the sensors of a bench before a test: latest samples, and failures of ports.
+
+Nothing is recorded. A port that fails is opened again. The recorder opens the ports itself: end the
+preview before a test starts.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from daq.devices.registry import driver_type
+from daq.errors import DeviceError, WrongDeviceError
+from daq.preflight.arrivals import arrivals
+from daq.protocols.block import Block, BlockFlag
+from daq.protocols.errors import RemoteProtocolError
+from daq.recorder.device_identity import check_identity, with_owner
+
+if TYPE_CHECKING:
+    import threading
+    from collections.abc import AsyncGenerator, Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from daq.bench.model import Bench, Sensor
+    from daq.devices.interface import DeviceInformation
+    from daq.host_clock import HostClock
+    from daq.protocols.block import Event
+
+LENGTH = 10.0
+"""Seconds of samples that are kept."""
+INTERVAL = 0.5
+"""Seconds from one update to the next."""
+RETRY = 2.0
+"""Seconds until a port that failed is opened again."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorPreview:
+    """One sensor at one moment.
+
+    Attributes
+    ----------
+    sensor : Sensor
+        As in the bench file.
+    information : DeviceInformation or None
+        As reported by the device; None before its first reply.
+    samples : float64, shape (n_samples, n_channels)
+        The latest samples in the units of the channels.
+    last_ns : int
+        Host monotonic time of the last sample, in ns.
+    measured_rate : float or None
+        Samples per second by the host's clock; None while it is not known.
+    rate_error : float
+        Its standard error, as a fraction of the rate.
+    arrival_scatter : float
+        Standard deviation of the arrival times about even ones, in s.
+    is_clipping : bool
+        Whether a sample reached the end of the range.
+    n_missing : int
+        Samples missing between the kept ones.
+    trouble : str
+        Why the sensor does not deliver, or is not the one in the bench file; empty if it is.
+    """
+
+    sensor: Sensor
+    information: DeviceInformation | None
+    samples: NDArray[np.float64]
+    last_ns: int = 0
+    measured_rate: float | None = None
+    rate_error: float = 0.0
+    arrival_scatter: float = 0.0
+    is_clipping: bool = False
+    n_missing: int = 0
+    trouble: str = ""
+
+
+class _SensorBuffer:
+    """The latest blocks of one sensor."""
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor = sensor
+        self.information: DeviceInformation | None = None
+        self.trouble = ""
+        self._blocks: deque[Block] = deque()
+        self._n_samples = 0
+
+    def clear(self) -> None:
+        self._blocks.clear()
+        self._n_samples = 0
+
+    def add(self, block: Block) -> None:
+        self._blocks.append(block)
+        self._n_samples += block.n_samples
+        most = LENGTH * self.sensor.sampling_rate
+        while self._n_samples - self._blocks[0].n_samples >= most:
+            self._n_samples -= self._blocks.popleft().n_samples
+
+    def preview(self) -> SensorPreview:
+        blocks = list(self._blocks)
+        if not blocks:
+            none = np.empty((0, len(self.sensor.channels)))
+            return SensorPreview(self.sensor, self.information, none, trouble=self.trouble)
+        counts = np.concatenate([block.counts for block in blocks]).astype(np.float64)
+        arrived = arrivals(blocks)
+        return SensorPreview(
+            self.sensor,
+            self.information,
+            counts / [channel.sensitivity for channel in self.sensor.channels],
+            last_ns=blocks[-1].received.monotonic_ns,
+            measured_rate=arrived.rate,
+            rate_error=arrived.error,
+            arrival_scatter=arrived.scatter,
+            is_clipping=any(BlockFlag.CLIPPED in block.flags for block in blocks),
+            n_missing=blocks[-1].end_sample - blocks[0].first_sample - len(counts),
+            trouble=self.trouble,
+        )
+
+
+async def preview(
+    bench: Bench,
+    clock: HostClock,
+    show: Callable[[tuple[SensorPreview, ...]], None],
+    *,
+    ended: threading.Event,
+    interval: float = INTERVAL,
+) -> None:
+    """Read all sensors until `ended` is set, and show them periodically.
+
+    Parameters
+    ----------
+    bench : Bench
+    clock : HostClock
+    show : callable
+        Called with all sensors in the order of the bench file.
+    ended : threading.Event
+        May be set by another thread.
+    interval : float
+        Seconds between updates.
+    """
+    buffers = {sensor.name: _SensorBuffer(sensor) for sensor in bench.sensors}
+    async with asyncio.TaskGroup() as group:
+        tasks = [
+            group.create_task(_read_port(bench, sensors, clock, buffers))
+            for sensors in bench.ports().values()
+        ]
+        while not ended.is_set():
+            await asyncio.sleep(interval)
+            show(tuple(buffer.preview() for buffer in buffers.values()))
+        for task in tasks:
+            task.cancel()
+
+
+async def _read_port(
+    bench: Bench, sensors: Sequence[Sensor], clock: HostClock, buffers: dict[str, _SensorBuffer]
+) -> None:
+    """Read one port for ever; open it again after it failed."""
+    mine = [buffers[sensor.name] for sensor in sensors]
+    while True:
+        try:
+            await _read_once(bench, sensors, clock, buffers)
+            trouble = "the device ended by itself"
+        except DeviceError as error:
+            trouble = str(with_owner(error, bench.sensors))
+        except RemoteProtocolError as error:
+            trouble = f"port {sensors[0].port}: {error}"
+        for buffer in mine:
+            buffer.clear()
+            buffer.trouble = trouble
+        await asyncio.sleep(RETRY)
+
+
+async def _read_once(
+    bench: Bench, sensors: Sequence[Sensor], clock: HostClock, buffers: dict[str, _SensorBuffer]
+) -> None:
+    async with driver_type(sensors[0].driver).open(sensors, clock) as session:
+        for sensor, about in zip(sensors, session.information, strict=True):
+            buffer = buffers[sensor.name]
+            buffer.information, buffer.trouble = about, about.trouble
+            if not about.trouble:
+                try:
+                    check_identity(sensor, about)
+                except WrongDeviceError as error:
+                    buffer.trouble = str(with_owner(error, bench.sensors))
+        async with contextlib.aclosing(
+            cast("AsyncGenerator[Block | Event]", session.read())  # others have nothing to close
+        ) as stream:
+            async for item in stream:
+                if isinstance(item, Block):
+                    buffers[item.sensor].add(item)

@@ -1,1 +1,0 @@
-"""Güralp: GCF blocks, their streams, and the BRP and Scream links that transport them."""

@@ -1,1 +1,0 @@
-"""LabJack T7 and T8: stream packets and registers."""

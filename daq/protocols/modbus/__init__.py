@@ -1,1 +1,0 @@
-"""Modbus: RTU frames, samples in registers, block FIFOs."""

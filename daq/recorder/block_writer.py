@@ -1,0 +1,335 @@
+"""Writes the items of all connections into the recording: blocks, gaps and events.
+
+It has no clock and no event loop; the recorder calls it from its writing thread.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import defaultdict, deque
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from daq.protocols.block import Block, Event, EventKind
+from daq.recorder.connection import SensorLate, SensorLost
+from daq.recorder.sample_index import Gap, SampleIndexer
+from daq.recording.sensor_state import SensorState
+from daq.recording.writer import SensorCounts
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+    from daq.protocols.block import HostTime
+    from daq.recorder.connection import Connected, Item
+    from daq.recording.writer import Committed, RecordingWriter
+
+_LOGGER = logging.getLogger(__name__)
+_ROUTINE = {
+    EventKind.STARTED,
+    EventKind.STOPPED,
+    EventKind.MARK,
+    EventKind.CONNECTED,
+    EventKind.STATUS,
+}
+"""Kinds of events that are logged as information; all others are warnings."""
+_REPORT_INTERVAL_NS = 1_000_000_000
+MAX_EVENTS_PER_SECOND = 20
+"""Maximum number of events of one kind and sensor written per second."""
+
+
+@dataclass(frozen=True, slots=True)
+class SensorProgress:
+    """Recorded samples and state of one sensor."""
+
+    state: SensorState
+    samples: int
+    """Number of samples safe on disk."""
+    gaps: int
+    missing: int
+    """Known number of samples that were not received."""
+
+
+class _Sensor:
+    def __init__(self, sampling_rate: float) -> None:
+        self.rate = sampling_rate
+        self.indexer = SampleIndexer(sampling_rate)
+        self.state = SensorState.WAITING
+        self.late_event: Event | None = None  # written only if the sensor is lost afterwards
+        self.n_missing = 0
+        self.n_repeated = 0
+        self.repeats_reported_ns = -_REPORT_INTERVAL_NS
+        self.unsafe = _Unsafe()
+        self.rows_before = self.gaps_before = 0
+        """Rows and gaps that are safe in earlier files."""
+        self.base = 0
+        """Index of the first sample of the current file."""
+
+
+class _Unsafe:
+    """Blocks and gaps of one sensor in the current file that no commit has acknowledged.
+
+    Needed if the file can no longer be written and the recording continues in another file.
+    """
+
+    def __init__(self) -> None:
+        self._blocks: deque[tuple[int, Block]] = (
+            deque()
+        )  # each with the number of rows of the file up to its end
+        self._gaps: deque[Gap] = deque()
+        self._n_rows = self._n_gaps = 0
+        self.safe = SensorCounts(0, 0, 0)
+
+    def add(self, item: Block | Gap) -> None:
+        if isinstance(item, Gap):
+            self._gaps.append(item)
+            self._n_gaps += 1
+        else:
+            self._n_rows += item.n_samples
+            self._blocks.append((self._n_rows, item))
+
+    def are_safe(self, counts: SensorCounts) -> None:
+        """Drop the acknowledged items."""
+        self.safe = counts
+        while self._blocks and self._blocks[0][0] <= counts.rows:
+            self._blocks.popleft()
+        while self._n_gaps - len(self._gaps) < counts.gaps:
+            self._gaps.popleft()
+
+    def taken(self) -> list[Block | Gap]:
+        """Return and remove the unacknowledged items, for another file."""
+        rest: list[Block | Gap] = [*self._gaps, *(block for _, block in self._blocks)]
+        self._blocks.clear()
+        self._gaps.clear()
+        self._n_rows = self._n_gaps = 0
+        self.safe = SensorCounts(0, 0, 0)
+        return rest
+
+
+class _RateLimit:
+    """Limits events of one kind of one sensor: noise on a line must not fill the file."""
+
+    def __init__(self) -> None:
+        self._since_ns = -_REPORT_INTERVAL_NS
+        self._n = 0
+
+    def passed(self, event: Event) -> Iterator[Event]:
+        """Yield the events to write now: this one, after the number of omitted ones."""
+        if event.kind == EventKind.MARK:  # a user's remark is never omitted
+            yield event
+            return
+        now_ns = event.received.monotonic_ns
+        if now_ns - self._since_ns >= _REPORT_INTERVAL_NS:
+            yield from self.left_out(event)
+            self._since_ns, self._n = now_ns, 0
+        self._n += 1
+        if self._n <= MAX_EVENTS_PER_SECOND:
+            yield event
+
+    def left_out(self, event: Event) -> Iterator[Event]:
+        """Yield an event with the number of omitted events of this kind, if there are any."""
+        n = self._n - MAX_EVENTS_PER_SECOND
+        if n > 0:
+            yield replace(event, text=f"{n} more events of this kind before")
+
+
+class BlockWriter:
+    """Writes the rows of a recording."""
+
+    def __init__(self, writer: RecordingWriter, sampling_rates: Mapping[str, float]) -> None:
+        self._writer = writer
+        self._sensors = {name: _Sensor(rate) for name, rate in sampling_rates.items()}
+        self._limits: defaultdict[tuple[str, str], _RateLimit] = defaultdict(_RateLimit)
+        self._items: deque[Item] = deque()
+        self._unsafe_events: list[Event] = []
+        self._ended = False
+
+    def write(self, items: Iterable[Item]) -> None:
+        """Write items in order, after those left by an earlier error.
+
+        Raises
+        ------
+        RecordingError
+            If the file cannot be written.
+        """
+        self._items.extend(items)
+        while self._items:
+            item = self._items.popleft()
+            if isinstance(item, Block):
+                self._write_block(item)
+            elif isinstance(item, Event):
+                self._write_event(item)
+            elif isinstance(item, SensorLate):
+                self._set_late(item)
+            elif isinstance(item, SensorLost):
+                self._set_lost(item)
+            else:
+                self._begin_session(item)
+
+    @property
+    def run_id(self) -> str:
+        """Unique identifier of the current file."""
+        return self._writer.run_id
+
+    @property
+    def n_written(self) -> int:
+        """Rows of samples of all sensors in the file, including uncommitted ones."""
+        return self._writer.n_written
+
+    def commit(self) -> Committed:
+        """Make all written items safe on disk."""
+        committed = self._writer.commit()
+        for name, counts in committed.sensors.items():
+            self._sensors[name].unsafe.are_safe(counts)
+        self._unsafe_events.clear()
+        return committed
+
+    def continue_in(self, writer: RecordingWriter) -> None:
+        """Continue in another file, and write the unacknowledged items there."""
+        before, self._writer = self._writer, writer
+        before.abandon()  # last: a follower that sees its end looks for the next file
+        events, self._unsafe_events = self._unsafe_events, []
+        for event in events:
+            self._unsafe_events.append(event)
+            writer.event(event)
+        for name, sensor in self._sensors.items():
+            sensor.rows_before += sensor.unsafe.safe.rows
+            sensor.gaps_before += sensor.unsafe.safe.gaps
+            rest = sensor.unsafe.taken()
+            sensor.base = min(
+                (item.first_sample for item in rest), default=sensor.indexer.next_sample
+            )
+            for item in rest:
+                if isinstance(item, Block):
+                    self._append(name, item)
+                else:
+                    self._append_gap(name, item)
+
+    def close(self, now: HostTime, reason: str) -> Committed:
+        """Record the last gap of lost sensors and the reason of the end, and close the file.
+
+        May be called again after an error.
+        """
+        if not self._ended:
+            self._ended = True
+            self._end(now, reason)
+        return self._writer.close()
+
+    def _end(self, now: HostTime, reason: str) -> None:
+        for name, sensor in self._sensors.items():
+            if sensor.state.is_lost or sensor.state is SensorState.WAITING:
+                gap = sensor.indexer.lost_until(now)
+                if gap is not None:
+                    self._write_gap(name, sensor, gap)
+            if not sensor.state.is_lost:
+                sensor.state = SensorState.ENDED
+        for (name, kind), limit in self._limits.items():
+            for event in limit.left_out(Event(name, kind, "", now)):
+                self._record(event)
+        self._record(Event("", EventKind.STOPPED, reason, now))
+
+    def abandon(self) -> None:
+        """Close the file without writing anything more."""
+        self._writer.abandon()
+
+    def progress(self, committed: Committed) -> dict[str, SensorProgress]:
+        """Return the progress of each sensor."""
+        return {
+            name: SensorProgress(
+                self._sensors[name].state,
+                self._sensors[name].rows_before + counts.rows,
+                self._sensors[name].gaps_before + counts.gaps,
+                self._sensors[name].n_missing,
+            )
+            for name, counts in committed.sensors.items()
+        }
+
+    def states(self) -> dict[str, SensorState]:
+        """Return the state of each sensor."""
+        return {name: sensor.state for name, sensor in self._sensors.items()}
+
+    def recorded_seconds(self) -> float:
+        """Return the recorded duration in s, with gaps, of the sensor with the shortest one."""
+        return min(s.indexer.next_sample / s.rate for s in self._sensors.values())
+
+    def _write_event(self, event: Event) -> None:
+        for passed in self._limits[event.sensor, event.kind].passed(event):
+            self._record(passed)
+
+    def _set_late(self, item: SensorLate) -> None:
+        """Keep the event of a late sensor until it is lost.
+
+        Otherwise blocks that are slightly late would fill the file with events.
+        """
+        sensor = self._sensors[item.event.sensor]
+        if sensor.state is SensorState.LIVE:
+            sensor.state, sensor.late_event = SensorState.LATE, item.event
+
+    def _set_lost(self, item: SensorLost) -> None:
+        sensor = self._sensors[item.event.sensor]
+        if sensor.late_event is not None:
+            self._write_event(sensor.late_event)
+        sensor.state, sensor.late_event = item.state, None
+        self._write_event(item.event)
+
+    def _begin_session(self, item: Connected) -> None:
+        for name in item.sensors if item.reason else ():
+            sensor = self._sensors[name]
+            sensor.state = SensorState.WAITING
+            if item.resumed:
+                sensor.indexer.resume(item.reason)
+            else:
+                sensor.indexer.new_session(item.reason)
+
+    def _write_block(self, block: Block) -> None:
+        sensor = self._sensors[block.sensor]
+        placed = sensor.indexer.place(block)
+        if placed.repeated:
+            sensor.n_repeated += placed.repeated
+            self._report_repeated(sensor, block)
+        if placed.gap is not None:
+            self._write_gap(block.sensor, sensor, placed.gap)
+        if placed.block is not None:
+            sensor.state, sensor.late_event = SensorState.LIVE, None
+            self._append(block.sensor, placed.block)
+
+    def _append(self, name: str, block: Block) -> None:
+        sensor = self._sensors[name]
+        sensor.unsafe.add(block)
+        self._writer.append(replace(block, first_sample=block.first_sample - sensor.base))
+
+    def _report_repeated(self, sensor: _Sensor, block: Block) -> None:
+        """Report at most once a second: a device may repeat all samples for weeks."""
+        at = block.received
+        if at.monotonic_ns - sensor.repeats_reported_ns >= _REPORT_INTERVAL_NS:
+            sensor.repeats_reported_ns = at.monotonic_ns
+            text = f"{sensor.n_repeated} samples so far arrived twice and were recorded once"
+            self._record(Event(block.sensor, EventKind.RESYNCHRONISED, text, at))
+
+    def _record(self, event: Event) -> None:
+        """Write an event to the recording and to the log."""
+        self._unsafe_events.append(event)
+        self._writer.event(event)
+        level = logging.INFO if event.kind in _ROUTINE else logging.WARNING
+        what = " ".join(part for part in (event.sensor, event.kind) if part)
+        fields = {"sensor": event.sensor, "kind": event.kind}
+        _LOGGER.log(level, "%s: %s", what, event.text, extra=fields)
+
+    def _write_gap(self, name: str, sensor: _Sensor, gap: Gap) -> None:
+        sensor.n_missing += gap.missing
+        _LOGGER.debug(
+            "%s gap: %d samples missing from %d on: %s",
+            *(name, gap.missing, gap.first_sample, gap.reason),
+            extra={"sensor": name, "first_sample": gap.first_sample, "missing": gap.missing},
+        )
+        self._append_gap(name, gap)
+
+    def _append_gap(self, name: str, gap: Gap) -> None:
+        sensor = self._sensors[name]
+        sensor.unsafe.add(gap)
+        self._writer.gap(
+            name,
+            gap.first_sample - sensor.base,
+            gap.missing,
+            reason=gap.reason,
+            estimated=gap.estimated,
+        )

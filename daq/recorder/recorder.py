@@ -1,0 +1,412 @@
+"""The recorder: writes all devices of a bench into one recording, until it is stopped.
+
+Theory of operation
+-------------------
+One task per port (:class:`daq.recorder.connection.Connection`) puts items into one bounded
+queue. The recorder takes them from the queue in batches and writes them in a separate thread
+(:class:`daq.recorder.block_writer.BlockWriter`), so that neither compression nor ``fsync``
+delays a port. It commits about once a second, sooner if a complete chunk of samples is waiting,
+and acknowledges only committed samples. If writing lags, the queue fills, the ports' tasks wait,
+and the operating system's buffers hold the data.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import math
+import signal
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from daq.devices.registry import driver_type
+from daq.errors import DeviceError, DiskError, RecordingError
+from daq.host_clock import SystemClock
+from daq.protocols.block import Event, EventKind
+from daq.protocols.errors import RemoteProtocolError
+from daq.recorder.block_writer import BlockWriter, SensorProgress
+from daq.recorder.connection import CLOSE_TIMEOUT, Connection
+from daq.recorder.device_identity import with_owner
+from daq.recording import control
+from daq.recording.control import Command
+from daq.recording.file_format import SensorLayout
+from daq.recording.storage.names import CONTINUES, continuation_names
+from daq.recording.storage.writing_thread import WritingThread
+from daq.recording.writer import RecordingWriter
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from daq.bench.model import Bench
+    from daq.devices.interface import DriverType
+    from daq.host_clock import HostClock
+    from daq.recorder.connection import Item
+    from daq.recording.writer import Committed
+
+_LOGGER = logging.getLogger(__name__)
+QUEUE_LENGTH = 4096
+COMMIT_INTERVAL, MIN_COMMIT_INTERVAL = 1.0, 0.25
+"""Seconds between commits: usually, and if a complete chunk of samples is waiting."""
+CANCEL_TIMEOUT = CLOSE_TIMEOUT + 2.0
+"""Seconds that all connections may take to end."""
+_BATCH_INTERVAL = 0.25
+MIN_CONTINUATION = 60.0
+"""Seconds that a continuation file must last; a disk that fails sooner ends the run."""
+_LAST_BLOCKS = 1.0
+"""Seconds after the end of a run in which its last blocks may arrive."""
+_Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderStatus:
+    """An acknowledgment: all counted samples are safe on disk."""
+
+    path: str
+    elapsed: float
+    """Host time since the start, in seconds."""
+    sensors: dict[str, SensorProgress]
+    closed: bool = False
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the status as a JSON object."""
+        return asdict(self)
+
+
+def run(
+    bench: Bench,
+    path: str | Path,
+    *,
+    duration: float | None = None,
+    attributes: Mapping[str, str] = MappingProxyType({}),
+    clock: HostClock | None = None,
+    loop_factory: Callable[[], asyncio.AbstractEventLoop] | None = None,
+    acknowledged: Callable[[RecorderStatus], None] | None = None,
+) -> RecorderStatus:
+    """Record until done, SIGINT or SIGTERM, in the main thread; see :func:`record`."""
+
+    async def main() -> RecorderStatus:
+        stop = asyncio.Event()
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            try:
+                loop.add_signal_handler(number, stop.set)
+            except NotImplementedError:  # Windows
+                signal.signal(number, lambda *_: loop.call_soon_threadsafe(stop.set))
+        return await record(
+            bench,
+            path,
+            duration=duration,
+            attributes=attributes,
+            clock=clock,
+            stop=stop,
+            acknowledged=acknowledged,
+        )
+
+    runner = asyncio.Runner(loop_factory=loop_factory)
+    try:
+        return runner.run(main())
+    finally:
+        # Closing would wait for a driver that does not end, and no signal would interrupt it.
+        if not asyncio.all_tasks(runner.get_loop()):
+            runner.close()
+
+
+async def record(
+    bench: Bench,
+    path: str | Path,
+    *,
+    duration: float | None = None,
+    attributes: Mapping[str, str] = MappingProxyType({}),
+    clock: HostClock | None = None,
+    stop: asyncio.Event | None = None,
+    acknowledged: Callable[[RecorderStatus], None] | None = None,
+    drivers: Callable[[str], DriverType] = driver_type,
+) -> RecorderStatus:
+    """Record a bench.
+
+    Parameters
+    ----------
+    bench : Bench
+        Sensors to record.
+    path : path
+        The new file.
+    duration : float, optional
+        Seconds to record of every sensor, counted by its samples; the run ends after this host time
+        even if a sensor is lost. Without a duration, ``stop`` ends the run.
+    attributes : mapping of str to str
+        Further attributes of the recording, such as what of the live estimate ends the run
+        (``until``): the recorder only writes them.
+    clock : HostClock, optional
+        Source of host times; default: the system's clock, at the bench's speed.
+    stop : asyncio.Event, optional
+        Ends the run properly when set.
+    acknowledged : callable, optional
+        Called after every commit, and when the state of a sensor has changed.
+    drivers : callable
+        Returns the driver with a given name.
+
+    Returns
+    -------
+    RecorderStatus
+        Status of the closed recording; not ``closed``, and without a file, if ``stop`` was set
+        before all devices were connected.
+
+    Raises
+    ------
+    ExceptionGroup of DeviceError
+        If devices cannot be used at the start: one error per device, naming its sensor.
+    RecordingError
+        If no file can be written; all acknowledged samples are safe.
+    """
+    clock = SystemClock(bench.speed) if clock is None else clock
+    recorder = _Recorder(
+        bench, Path(path), clock, stop or asyncio.Event(), acknowledged, attributes=attributes
+    )
+    return await recorder.run(duration, drivers)
+
+
+class _Recorder:
+    def __init__(
+        self,
+        bench: Bench,
+        path: Path,
+        clock: HostClock,
+        stop: asyncio.Event,
+        acknowledged: Callable[[RecorderStatus], None] | None,
+        *,
+        attributes: Mapping[str, str],
+    ) -> None:
+        self._bench = bench
+        self._attributes = attributes
+        self._path = self._file = path
+        self._clock = clock
+        self._stop = stop
+        self._acknowledged = acknowledged
+        self._queue: asyncio.Queue[Item] = asyncio.Queue(QUEUE_LENGTH)
+        self._started = self._file_started = clock.now()
+        self._end_reason = "stopped"
+        self._status = RecorderStatus(str(path), 0.0, {})
+
+    async def run(
+        self, duration: float | None, drivers: Callable[[str], DriverType]
+    ) -> RecorderStatus:
+        connections = [
+            Connection(drivers(sensors[0].driver), sensors, self._clock)
+            for sensors in self._bench.ports().values()
+        ]
+        start = asyncio.Event()
+        async with control.serve(self._answer) as address:
+            tasks = [
+                asyncio.create_task(c.run(self._queue, start), name=c.port) for c in connections
+            ]
+            try:
+                if not await self._all_connected(connections):
+                    return self._status
+                with WritingThread() as thread:
+                    writer = await thread.run(lambda: self._create(connections, address, duration))
+                    try:
+                        start.set()
+                        await self._write_until_end(writer, thread, duration, tasks)
+                        await self._cancel(tasks)
+                        await self._finish(writer, thread)
+                    except BaseException:
+                        await asyncio.shield(thread.run(writer.abandon))
+                        raise
+            finally:
+                await self._cancel(tasks)
+        return self._status
+
+    async def _cancel(self, tasks: list[asyncio.Task[None]]) -> None:
+        """Cancel the remaining tasks and wait until they have closed their sessions.
+
+        A task that does not end in time is reported and abandoned.
+        """
+        remaining = [task for task in tasks if not task.done()]
+        for task in remaining:
+            task.cancel()
+        if not remaining:
+            return
+        _, stuck = await asyncio.wait(remaining, timeout=CANCEL_TIMEOUT)
+        for task in stuck:
+            tasks.remove(task)
+            text = f"the driver on {task.get_name()} does not end; it was abandoned"
+            with contextlib.suppress(asyncio.QueueFull):
+                self._queue.put_nowait(Event("", EventKind.STATUS, text, self._clock.now()))
+
+    async def _all_connected(self, connections: list[Connection]) -> bool:
+        """Wait for all first sessions; return False if the run was stopped before."""
+        stopped = asyncio.ensure_future(self._stop.wait())
+        waiting = asyncio.gather(*(c.connected for c in connections), return_exceptions=True)
+        try:
+            await asyncio.wait((waiting, stopped), return_when=asyncio.FIRST_COMPLETED)
+            if self._stop.is_set():
+                return False
+            failures = [
+                DeviceError(f"port {connection.port}: {result}")
+                if isinstance(result, RemoteProtocolError)
+                else with_owner(result, self._bench.sensors)
+                for connection, result in zip(connections, waiting.result(), strict=True)
+                if isinstance(result, Exception)
+            ]
+        finally:
+            waiting.cancel()
+            stopped.cancel()
+            await asyncio.wait([stopped])
+        for failure in failures:
+            if not isinstance(failure, DeviceError):
+                raise failure  # an error in the bench file or in the program, not of a device
+        if failures:
+            raise ExceptionGroup(f"{len(failures)} ports cannot be used", failures)
+        return True
+
+    def _create(
+        self, connections: list[Connection], address: tuple[int, str], duration: float | None
+    ) -> BlockWriter:
+        layouts: dict[str, SensorLayout] = {}
+        for connection in connections:
+            information = {i.sensor: i for i in connection.information}
+            for sensor in connection.sensors:
+                layout = SensorLayout.of(sensor, connection.driver)
+                found = information.get(sensor.name)
+                if found is not None:
+                    layout = replace(
+                        layout,
+                        sampling_rate=found.sampling_rate or layout.sampling_rate,
+                        model=found.model or layout.model,
+                        serial_number=found.serial_number or layout.serial_number,
+                    )
+                layouts[sensor.name] = layout
+        ordered = [layouts[sensor.name] for sensor in self._bench.sensors]
+        self._started = self._file_started = self._clock.now()
+        self._new_file = partial(
+            RecordingWriter.create, bench=self._bench, sensors=ordered, control=address
+        )
+        attributes: dict[str, str | float] = {} if duration is None else {"duration": duration}
+        attributes |= self._attributes
+        writer = self._new_file(self._path, created=self._started, attributes=attributes)
+        writer.event(Event("", EventKind.STARTED, f"{len(ordered)} sensors", self._started))
+        _LOGGER.info("recording to %s", self._path, extra={"recording": str(self._path)})
+        return BlockWriter(writer, {layout.name: layout.sampling_rate for layout in ordered})
+
+    async def _write_until_end(
+        self,
+        writer: BlockWriter,
+        thread: WritingThread,
+        duration: float | None,
+        tasks: Sequence[asyncio.Task[None]],
+    ) -> None:
+        """Write and commit the items of the connections until the run ends."""
+        loop = asyncio.get_running_loop()
+        last_commit, n_committed = -math.inf, 0
+        while not self._stop.is_set():
+            batch = await self._batch()
+            await self._done(
+                writer, thread, partial(writer.write, batch), partial(writer.write, ())
+            )
+            for task in tasks:
+                if task.done():  # only an error in the program ends a connection
+                    task.result()
+            chunk_waits = writer.n_written > n_committed
+            interval = MIN_COMMIT_INTERVAL if chunk_waits else COMMIT_INTERVAL
+            if loop.time() >= last_commit + interval:
+                n_committed = writer.n_written
+                self._acknowledge(writer, await self._done(writer, thread, writer.commit))
+                last_commit = loop.time()
+            elif (sensors := self._with_current_states(writer)) != self._status.sensors:
+                self._publish(replace(self._status, sensors=sensors))
+            if duration is not None and self._is_complete(writer, duration):
+                self._end_reason = "duration reached"
+                return
+
+    async def _batch(self) -> list[Item]:
+        """Return the items of a short interval, so that one call of the thread writes many."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_BATCH_INTERVAL):
+                await self._stop.wait()
+        return self._queued()
+
+    def _queued(self) -> list[Item]:
+        batch: list[Item] = []
+        while not self._queue.empty():
+            batch.append(self._queue.get_nowait())
+        return batch
+
+    async def _finish(self, writer: BlockWriter, thread: WritingThread) -> None:
+        write = partial(writer.write, self._queued())
+        await self._done(writer, thread, write, partial(writer.write, ()))
+        close = partial(writer.close, self._clock.now(), self._end_reason)
+        self._acknowledge(writer, await self._done(writer, thread, close))
+
+    async def _done(
+        self,
+        writer: BlockWriter,
+        thread: WritingThread,
+        action: Callable[[], _Result],
+        again: Callable[[], _Result] | None = None,
+    ) -> _Result:
+        """Run `action` on the file; if the disk refuses, run `again` on another file."""
+        try:
+            return await thread.run(action)
+        except DiskError as error:
+            await thread.run(partial(self._continue, writer, error))
+        return await thread.run(again or action)
+
+    def _continue(self, writer: BlockWriter, error: DiskError) -> None:
+        """Continue the recording in another file.
+
+        Raises
+        ------
+        DiskError
+            The given error, if no other file can be created, or if this one did not last.
+        """
+        now, before = self._clock.now(), self._file
+        lasted = (now.monotonic_ns - self._file_started.monotonic_ns) / 1e9
+        if before != self._path and lasted < MIN_CONTINUATION:
+            raise error
+        path = next(each for each in continuation_names(self._path) if not each.exists())
+        attributes: dict[str, str | float] = {CONTINUES: writer.run_id}
+        following = None
+        try:
+            following = self._new_file(path, created=now, attributes=attributes)
+            writer.continue_in(following)
+        except RecordingError:
+            if following is not None:
+                following.discard()
+            raise error from None
+        self._file, self._file_started = path, now
+        _LOGGER.error("%s; the recording continues in %s", error, path)
+        text = f"continues {before.name}, which could no longer be written"
+        writer.write([Event("", EventKind.STATUS, text, now)])
+
+    def _acknowledge(self, writer: BlockWriter, committed: Committed) -> None:
+        sensors = writer.progress(committed)
+        self._publish(RecorderStatus(str(self._file), self._elapsed(), sensors, committed.closed))
+
+    def _publish(self, status: RecorderStatus) -> None:
+        self._status = status
+        if self._acknowledged is not None:
+            self._acknowledged(status)
+
+    def _with_current_states(self, writer: BlockWriter) -> dict[str, SensorProgress]:
+        """Return the last acknowledged counts with the current states."""
+        states = writer.states()
+        return {n: replace(one, state=states[n]) for n, one in self._status.sensors.items()}
+
+    def _elapsed(self) -> float:
+        return (self._clock.now().monotonic_ns - self._started.monotonic_ns) / 1e9
+
+    def _is_complete(self, writer: BlockWriter, duration: float) -> bool:
+        return writer.recorded_seconds() >= duration or self._elapsed() >= duration + _LAST_BLOCKS
+
+    async def _answer(self, command: Command, text: str) -> dict[str, Any]:
+        """Execute a command of the control channel."""
+        if command is Command.STOP:
+            self._end_reason = "stopped by command"
+            self._stop.set()
+        elif command is Command.MARK:
+            await self._queue.put(Event("", EventKind.MARK, text, self._clock.now()))
+        return self._status.to_dict()

@@ -1,4 +1,0 @@
-"""When samples were taken: clock models from arrival times.
-
-Reads no file; `daq.alignment` does.
-"""

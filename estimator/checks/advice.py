@@ -1,0 +1,373 @@
+"""Advice on a test: one class per kind, with numbers.
+
+Sensors and channels are indices from 0, in the order of the cross-spectral matrix. Front ends
+convert advice to sentences.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from estimator.checks.kinds import AdviceKind, Level
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Advice:
+    """Advice on a test; each kind is a subclass.
+
+    Attributes
+    ----------
+    kind : AdviceKind
+        Kind of the class.
+    level : Level
+    sensors : tuple of int
+        The sensors concerned; empty for all.
+    band : (float, float) or None
+        Hz; None for all frequencies.
+    """
+
+    kind: ClassVar[AdviceKind]
+    level: Level
+    sensors: tuple[int, ...] = ()
+    band: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoSignal(Advice):
+    """Channels of one sensor have no power, or a constant count.
+
+    Attributes
+    ----------
+    channels : tuple of int
+    whole_sensor : bool
+        Whether these are all channels of a sensor with several channels.
+    share_of_frequencies : float
+        Share of the frequencies at which the worst of them is dead.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.NO_SIGNAL
+    channels: tuple[int, ...]
+    whole_sensor: bool
+    share_of_frequencies: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Copies(Advice):
+    """Channels repeat others sample for sample.
+
+    Attributes
+    ----------
+    channels : tuple of (int, int)
+        The original, and the channel that repeats it.
+    share_of_frequencies : float
+        Share of the frequencies at which they are equal.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.COPIES
+    channels: tuple[tuple[int, int], ...]
+    share_of_frequencies: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoSharedMotion(Advice):
+    """A sensor records none of the motion that others share.
+
+    Attributes
+    ----------
+    partners : tuple of int
+        The sensors that share the motion.
+    share : float
+        Largest share of the motion that the sensor has in common with one of them; 0 for none.
+    share_of_partners : float
+        Smallest share of the motion that two partners have in common.
+    for_part : bool
+        Whether it shared the motion for another part of the test; `share` is then 0.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.NO_SHARED_MOTION
+    partners: tuple[int, ...]
+    share: float
+    share_of_partners: float
+    for_part: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TooFewSensors(Advice):
+    """Fewer than three sensors, `sensors`, have a signal of their own."""
+
+    kind: ClassVar[AdviceKind] = AdviceKind.TOO_FEW_SENSORS
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MissingChannels(Advice):
+    """Channels of `sensors` are missing, so that fewer than three sensors are complete.
+
+    Attributes
+    ----------
+    whole_sensors : tuple of int
+        The sensors with a signal of their own on every channel.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.MISSING_CHANNELS
+    whole_sensors: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TooFewDimensions(Advice):
+    """A model of fewer dimensions than the sensors sense does not explain the averages.
+
+    Attributes
+    ----------
+    n_factors : int
+        Dimensions of the motion in the model.
+    statistic : float
+        Statistic of the model test over its expectation, in the whole `band`.
+    worst_statistic : float
+        Largest of these ratios in any band.
+    worst_band : (float, float)
+        Band with this ratio, Hz.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.TOO_FEW_DIMENSIONS
+    n_factors: int
+    statistic: float
+    worst_statistic: float
+    worst_band: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelMisfit(Advice):
+    """One common motion does not explain the averages.
+
+    Attributes
+    ----------
+    n_factors : int
+        Dimensions of the motion in the model.
+    statistic : float
+        Statistic of the model test over its expectation, in the whole `band`.
+    worst_statistic : float
+        Largest of these ratios in any band.
+    worst_band : (float, float)
+        Band with this ratio, Hz.
+    p_value : float
+        Smallest p value.
+    unexplained : float
+        Misfit in `worst_band`, as a fraction of the noise.
+    error : float
+        Possible error of the estimate in `worst_band`, as a fraction of the noise; see
+        `estimator.checks.rules`.
+    largest_error : float
+        Possible error if waves cross distant sensors; infinite if these sensors do not bound it.
+    is_wrong : bool
+        Whether `error` is so large that the estimate is wrong.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.MODEL_MISFIT
+    n_factors: int
+    statistic: float
+    worst_statistic: float
+    worst_band: tuple[float, float]
+    p_value: float
+    unexplained: float
+    error: float
+    largest_error: float
+    is_wrong: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MotionAcross(Advice):
+    """Sensors compared by fewer than three channels do not measure motion across these.
+
+    Attributes
+    ----------
+    n_channels : int
+        Number of compared channels per sensor: 1 (axes) or 2 (planes).
+    larger_sensors : tuple of int
+        Sensors with more channels; may be empty.
+    snr : float
+        Largest ratio of the motion's PSD to the noise's.
+    added_by_one_degree : float
+        Maximum noise added by an angle of 1° between planes or axes, as a fraction of the noise.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.MOTION_ACROSS
+    n_channels: int
+    larger_sensors: tuple[int, ...]
+    snr: float
+    added_by_one_degree: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MissingDimension(Advice):
+    """Motion is found in fewer dimensions than the sensors sense; in the others it is weaker.
+
+    Attributes
+    ----------
+    n_dimensions : float
+        Dimensions in which motion is significant: median over the frequencies of a band, smallest
+        of all bands.
+    n_channels : int
+        Dimensions that the sensors sense.
+    condition : float
+        Largest condition number of the matrix between two sensors.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.MISSING_DIMENSION
+    n_dimensions: float
+    n_channels: int
+    condition: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NearlySingular(Advice):
+    """The cross-spectral matrix between two sensors is nearly singular.
+
+    Attributes
+    ----------
+    condition : float
+        Its largest condition number.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.NEARLY_SINGULAR
+    condition: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WeakMotion(Advice):
+    """The motion is weaker than the noise in every channel.
+
+    Attributes
+    ----------
+    snr : float
+        Largest ratio of the motion's PSD to the noise's.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.WEAK_MOTION
+    snr: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SwappedChannels(Advice):
+    """Two channels of the second of `sensors` are swapped.
+
+    Attributes
+    ----------
+    channels : tuple of (int, int)
+        Channel of the second sensor, and the channel of the first that it follows.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.SWAPPED_CHANNELS
+    channels: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rotated(Advice):
+    """Two sensors have different orientations.
+
+    Attributes
+    ----------
+    angle_deg : float
+        Angle of the rotation between them.
+    horizontal_deg : float
+        Angle in the horizontal plane, with the sign of `RelativeResponse.horizontal_deg`; NaN
+        without two horizontal channels.
+    error_deg : float
+        Standard error of both angles.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.ROTATED
+    angle_deg: float
+    horizontal_deg: float
+    error_deg: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NotOrthogonal(Advice):
+    """Channels of one of two sensors are not at right angles.
+
+    Attributes
+    ----------
+    deviation_deg : float
+        Largest deviation from a right angle.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.NOT_ORTHOGONAL
+    deviation_deg: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReversedPolarity(Advice):
+    """A channel has the opposite sign of its counterpart.
+
+    Attributes
+    ----------
+    channel, counterpart : int
+        Channels of the second and of the first of `sensors`.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.REVERSED_POLARITY
+    channel: int
+    counterpart: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Gain(Advice):
+    """A channel's gain differs from that of its counterpart.
+
+    Attributes
+    ----------
+    channel, counterpart : int
+        Channels of the second and of the first of `sensors`.
+    ratio : float
+        Gain of the channel over that of its counterpart.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.GAIN
+    channel: int
+    counterpart: int
+    ratio: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Delay(Advice):
+    """One sensor lags another.
+
+    Attributes
+    ----------
+    delay : float
+        Lag of the second of `sensors` behind the first, s; negative if it leads.
+    delay_samples : float
+        The same, in samples.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.DELAY
+    delay: float
+    delay_samples: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UnequalResponses(Advice):
+    """Responses of `sensors` differ from those of others: motion leaks at the edges of segments.
+
+    Attributes
+    ----------
+    channel : int
+        The channel whose noise has the largest leakage.
+    share : float
+        Minimum leakage, as a fraction of the noise estimate of that channel, in the third of an
+        octave with the largest fraction.
+    share_without : float
+        The same without equalisation.
+    equalised_by : tuple of str
+        Sources of the equalised responses: "known", "estimated", both, or neither.
+    unproven : tuple of int
+        Sensors with filters that did not lower the noise of other segments, and are not used.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.UNEQUAL_RESPONSES
+    channel: int
+    share: float
+    share_without: float
+    equalised_by: tuple[str, ...]
+    unproven: tuple[int, ...] = ()

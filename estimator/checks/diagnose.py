@@ -1,0 +1,427 @@
+"""Diagnosis of a test from its averages.
+
+Coherence, conditioning, dimension and strength of the motion, the test of one common motion,
+orientation of the sensors, and the recommendations of section 5 of the paper.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.checks.band import BandDiagnosis
+from estimator.checks.kinds import Level, Untested
+from estimator.checks.misfit import DisturbedSegments, NoiseChanges
+from estimator.checks.relative_response import RelativeResponse, relative_response
+from estimator.checks.rules import advise
+from estimator.checks.shared_motion import (
+    CanonicalCoherence,
+    matched_coherence,
+    may_have_moved,
+    moved,
+    shared_motion,
+    significant_dimensions,
+)
+from estimator.checks.shared_noise import shared_noise
+from estimator.checks.stability import Stability, stability
+from estimator.errors import InsufficientDataError
+from estimator.likelihood import fisher
+from estimator.likelihood.chi_square import critical_value
+from estimator.likelihood.dimension import bands
+from estimator.likelihood.factor_analysis import Maximum, maximise
+from estimator.likelihood.goodness_of_fit import (
+    HANN_HALF,
+    REJECT,
+    ModelTest,
+    deflated,
+    model_test,
+    p_values,
+    pool,
+)
+from estimator.likelihood.maximum_likelihood import standard_error
+from estimator.median import median_of_columns
+from estimator.self_noise.coherency import (
+    check_averages,
+    check_dims,
+    check_frequency,
+    coherency,
+    testable,
+)
+from estimator.self_noise.live_channels import Presence, presence
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from estimator.checks.advice import Advice
+    from estimator.checks.stability import SegmentCourse, Stability
+    from estimator.self_noise.coherency import Coherency
+    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+
+NAMED = 5
+"""Maximum number of disturbed segments with reported times."""
+MATERIAL = 0.1
+"""Change of the noise between parts, as a fraction, from which it is reported."""
+LARGE = 0.5
+SMALL = 0.05
+
+
+def changes(stability: Stability, times: FloatArray, sensor_of: IntArray) -> Iterator[Advice]:
+    """Yield advice on disturbed segments, or else on changing noise.
+
+    Parameters
+    ----------
+    stability : Stability
+    times : float64, shape (n_segments,)
+        Start times of the segments, s.
+    sensor_of : int64, shape (n_channels,)
+    """
+    n_disturbed = len(stability.disturbed)
+    if n_disturbed:
+        level = Level.WARNING if stability.excess >= SMALL else Level.NOTE
+        yield DisturbedSegments(
+            level=Level.PROBLEM if stability.excess >= LARGE else level,
+            sensors=(int(sensor_of[stability.channel]),),
+            n_disturbed=n_disturbed,
+            n_segments=stability.n_segments,
+            times=tuple(times[stability.disturbed[:NAMED]].tolist()),
+            excess=stability.excess,
+            channel=stability.channel,
+        )
+        return
+    found = stability.parts
+    more = np.sqrt(np.maximum(found.deviation**2 - found.expected**2, 0.0))
+    ratio = (found.n_parts - 1) * (found.deviation / found.expected) ** 2
+    seen = ratio > critical_value(found.n_parts - 1, REJECT / ratio.size)
+    strength = np.where(seen & (more > MATERIAL), more, 0.0)
+    if not strength.any():
+        return
+    group, channel = np.unravel_index(int(strength.argmax()), strength.shape)
+    yield NoiseChanges(
+        level=Level.WARNING if strength.max() >= LARGE else Level.NOTE,
+        sensors=(int(sensor_of[channel]),),
+        band=(float(stability.low[group]), float(stability.high[group])),
+        channel=int(channel),
+        deviation=float(found.deviation[group, channel]),
+        expected=float(found.expected[group, channel]),
+        n_parts=found.n_parts,
+        inflation=stability.inflation,
+    )
+
+
+LOST = 0.5
+"""Share of a band's frequencies with noise below its standard error from which `noise_lost` is
+set."""
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnostics:
+    """The diagnosis of a test.
+
+    Attributes
+    ----------
+    frequency : float64, shape (n_freqs,)
+        Hz.
+    pairs : tuple of (int, int)
+        Pairs of sensors, from 0.
+    coherence : float64, shape (n_freqs, n_pairs)
+        Smallest coherence between like channels.
+    condition : float64, shape (n_freqs, n_pairs)
+        Condition number of ``S_jk`` in units of its channels' amplitudes. Above about the square
+        root of the number of averages the matrix is nearly singular. Infinite if singular.
+    dimension : float64, shape (n_freqs,)
+        Significant dimensions of the motion (canonical coherences between two sensors, tested at
+        1 %).
+    snr : float64, shape (n_freqs, n_channels)
+        ``(S_ii - psi_i) / psi_i`` with the maximum likelihood noise psi; NaN for dead channels and
+        copies, which the model excludes, and if psi is within its standard error of zero.
+    model : ModelTest
+        Test at every frequency.
+    n_factors : int
+        Dimensions of the motion in that model.
+    untested : Untested or None
+        Why the model was tested at no frequency; None if it was tested.
+    bands : tuple of BandDiagnosis
+    responses : tuple of RelativeResponse
+        Relative responses of the comparable pairs: sensors with all their channels.
+    advice : tuple of Advice
+        Most severe first.
+    stability : Stability or None
+        None without segments, or with too few.
+    """
+
+    frequency: FloatArray
+    pairs: tuple[tuple[int, int], ...]
+    coherence: FloatArray
+    condition: FloatArray
+    dimension: FloatArray
+    snr: FloatArray
+    model: ModelTest
+    n_factors: int
+    untested: Untested | None
+    bands: tuple[BandDiagnosis, ...]
+    responses: tuple[RelativeResponse, ...]
+    advice: tuple[Advice, ...]
+    stability: Stability | None = None
+
+
+def diagnose(
+    csm: ComplexArray,
+    frequency: FloatArray,
+    *,
+    dims: tuple[int, ...],
+    n_effective: float,
+    n_factors: int | None = None,
+    neighbours: FloatArray | None = None,
+    vertical: int | None = None,
+    course: SegmentCourse | None = None,
+) -> Diagnostics:
+    """Diagnose a huddle test.
+
+    Dead channels, and copies of earlier ones, are reported and excluded.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
+        channels grouped by sensor.
+    frequency : float64, shape (n_freqs,)
+        Hz, ascending.
+    dims : tuple of int
+        Number of channels of each of three or more sensors.
+    n_effective : float
+        Number of independent averages. Results of the likelihood (SNR and model test) are NaN if
+        it does not exceed the number of channels, or with fewer than three sensors with signal.
+    n_factors : int, optional
+        Dimensions of the motion in the tested model: those of the diagnosed estimate; default:
+        ``max(dims)``.
+    neighbours : float64, shape (n_lags,), optional
+        From `estimator.likelihood.goodness_of_fit.neighbour_correlation`.
+    vertical : int, optional
+        Index of the vertical channel of every sensor, for the horizontal angles.
+    course : SegmentCourse, optional
+        Spectra of single segments, all channels: reveal disturbances and changes, for which the
+        tests are then corrected.
+
+    Returns
+    -------
+    Diagnostics
+
+    Raises
+    ------
+    InvalidMatrixError
+        As `estimator.self_noise.coherency.coherency`, or if `frequency` does not fit.
+    InsufficientDataError
+        With fewer than three sensors, or if `n_effective` is not a finite number above zero.
+    """
+    check_dims(dims)
+    check_averages(n_effective)
+    csm = np.asarray(csm, np.complex128)
+    given = coherency(csm, dims)
+    frequency = check_frequency(frequency, len(csm))
+    pairs = tuple(combinations(range(len(dims)), 2))
+    coherence = np.stack(
+        [_least(matched_coherence(given.matrix, dims, j, k)) for j, k in pairs], axis=1
+    )
+    there = presence(given, dims)
+    part = given.part(list(there.channels))
+    matrix = testable(part, frequency)
+    condition = np.full((len(csm), len(pairs)), np.nan)
+    for one, two in combinations(range(len(there.sensors)), 2):
+        pair = pairs.index((there.sensors[one], there.sensors[two]))
+        condition[:, pair] = _condition(part.matrix, there.dims, one, two)
+    d = max(there.dims, default=max(dims))
+    q = d if n_factors is None else n_factors
+    fit = _fit(matrix, there, d, n_effective)
+    tested = fit if q == d else _fit(matrix, there, q, n_effective)
+    model, untested = _test(tested, there, n_effective, len(csm))
+    snr, lost = np.full((2, len(csm), sum(dims)), np.nan)
+    if isinstance(fit, Maximum):
+        error = standard_error(fit, n_effective=n_effective)
+        snr = there.spread(np.where(error < fit.psi, 1 / fit.psi - 1, np.nan), sum(dims))
+        lost = there.spread((error >= fit.psi).astype(np.float64), sum(dims))
+    canonical = CanonicalCoherence(matrix)
+    del matrix  # as large as all averages
+    dimension = significant_dimensions(canonical, there.dims, n_effective)
+    number = bands(frequency)
+    insides = [number == band for band in sorted(set(number.tolist()))]
+    found = tuple(
+        BandDiagnosis(
+            low=float(frequency[inside][0]),
+            high=float(frequency[inside][-1]),
+            coherence=float(median_of_columns(_least(coherence[inside]))),
+            condition=float(median_of_columns(-_least(-condition[inside]))),
+            dimension=float(median_of_columns(dimension[inside])),
+            snr=median_of_columns(snr[inside]),
+            noise_lost=lost[inside].mean(axis=0) > LOST,
+            test=pool(model, inside, neighbours=neighbours),
+            shared=_shared(canonical, there, len(dims), inside=inside, n_effective=n_effective),
+            n_frequencies=int(inside.sum()),
+        )
+        for inside in insides
+    )
+    shared, steady, left = None, None, frozenset[int]()
+    if course is not None:
+        course = replace(course, spectra=course.spectra[:, :, list(there.channels)])
+        if any(may_have_moved(each.shared) for each in found):
+            gone = moved(course.spectra, there.dims, n_effective)
+            left = frozenset(there.sensors[sensor] for sensor in gone)
+            found = tuple(replace(b, shared=_without(b.shared, left)) for b in found)
+    between = HANN_HALF if neighbours is None else neighbours
+    if isinstance(tested, Maximum) and q >= d:
+        if course is not None:
+            steady = stability(
+                course, tested, frequency, n_effective=n_effective, neighbours=between
+            )
+        if steady is not None:
+            steady = steady.among(there.channels, sum(dims))
+            found = tuple(replace(b, test=deflated(b.test, steady.inflation)) for b in found)
+        shared = shared_noise(
+            tested,
+            insides,
+            dims=there.dims,
+            n_effective=n_effective,
+            neighbours=between,
+            inflation=1.0 if steady is None else steady.inflation,
+        )
+        shared = None if shared is None else shared.among(there.channels, sum(dims))
+    responses = _responses(csm, given, frequency, there, vertical=vertical, coherence=canonical)
+    return Diagnostics(
+        frequency=frequency,
+        pairs=pairs,
+        coherence=coherence,
+        condition=condition,
+        dimension=dimension,
+        snr=snr,
+        model=model,
+        n_factors=q,
+        untested=untested,
+        bands=found,
+        responses=responses,
+        advice=advise(
+            found,
+            responses,
+            given,
+            dims=dims,
+            n_factors=q,
+            n_effective=n_effective,
+            nyquist=float(frequency[-1]),
+            shared=shared,
+            moved=left,
+            further=(
+                ()
+                if steady is None or course is None
+                else tuple(changes(steady, course.times, np.repeat(np.arange(len(dims)), dims)))
+            ),
+        ),
+        stability=steady,
+    )
+
+
+def _without(shared: FloatArray, sensors: frozenset[int]) -> FloatArray:
+    """Return shares of common motion of which these sensors have none."""
+    shared = shared.copy()
+    for sensor in sensors:
+        shared[sensor] = shared[:, sensor] = np.where(np.isnan(shared[sensor]), np.nan, 0.0)
+    return shared
+
+
+def _shared(
+    canonical: CanonicalCoherence,
+    there: Presence,
+    n_sensors: int,
+    *,
+    inside: BoolArray,
+    n_effective: float,
+) -> FloatArray:
+    """Return the share of motion that two sensors have in common; NaN for those without signal."""
+    shared = np.full((n_sensors, n_sensors), np.nan)
+    if len(there.sensors):
+        found = shared_motion(canonical, there.dims, inside, n_effective)
+        shared[np.ix_(there.sensors, there.sensors)] = found
+    return shared
+
+
+def _least(values: FloatArray) -> FloatArray:
+    """Return the smallest finite number of each row, shape (n_freqs,); NaN without one."""
+    least = np.where(np.isnan(values), np.inf, values).min(axis=1)
+    return np.where(np.isnan(values).all(axis=1), np.nan, least)
+
+
+def _condition(matrix: ComplexArray, dims: tuple[int, ...], j: int, k: int) -> FloatArray:
+    """Return the condition number of the coherency between two sensors, shape (n_freqs,)."""
+    a, b = (slice(sum(dims[:sensor]), sum(dims[: sensor + 1])) for sensor in (j, k))
+    singular = np.linalg.svd(matrix[:, a, b], compute_uv=False)
+    least = singular[:, -1]
+    return np.where(least > 0, singular[:, 0] / np.where(least > 0, least, 1.0), np.inf)
+
+
+def _fit(matrix: ComplexArray, there: Presence, q: int, n_effective: float) -> Maximum | Untested:
+    """Fit motion of q dimensions, or return why this is impossible."""
+    if len(there.sensors) < 3:
+        return Untested.TOO_FEW_SENSORS
+    if n_effective <= matrix.shape[1]:
+        return Untested.TOO_FEW_AVERAGES
+    try:
+        return maximise(matrix, q)
+    except InsufficientDataError:
+        return Untested.TOO_FEW_CHANNELS
+
+
+def _test(
+    fit: Maximum | Untested, there: Presence, n_effective: float, n_freqs: int
+) -> tuple[ModelTest, Untested | None]:
+    """Test the model at every frequency; return NaN and the reason if no test is possible.
+
+    If only two channels sense a dimension, the division of their noise is arbitrary. Such a
+    direction of ln psi, with an error of more than a factor e, does not count as a parameter. With
+    equal sensors this happens only for further dimensions.
+    """
+    unknown = np.full(n_freqs, np.nan)
+    if isinstance(fit, Untested):
+        return ModelTest(unknown, unknown, unknown), fit
+    try:
+        test = model_test(fit, n_effective=n_effective)
+    except InsufficientDataError:  # as many parameters as the matrix has
+        return ModelTest(unknown, unknown, unknown), Untested.TOO_FEW_CHANNELS
+    untested = None if np.isfinite(test.p_value).any() else Untested.SINGULAR
+    if len(set(there.dims)) == 1 and fit.n_factors <= there.dims[0]:
+        return test, untested
+    information = fisher.information(fit.eigenvectors[:, :, fit.n_factors :])
+    degrees = test.degrees + (n_effective * np.linalg.eigvalsh(information) < 1).sum(axis=1)
+    return ModelTest(test.statistic, degrees, p_values(degrees, test.statistic)), untested
+
+
+def _responses(
+    csm: ComplexArray,
+    checked: Coherency,
+    frequency: FloatArray,
+    there: Presence,
+    *,
+    vertical: int | None,
+    coherence: CanonicalCoherence,
+) -> tuple[RelativeResponse, ...]:
+    found = []
+    if len(there.channels) < csm.shape[1] and len(there.whole) > 1:
+        csm = csm[np.ix_(range(len(csm)), there.channels, there.channels)]
+        checked = coherency(csm, there.dims)
+    for first, second in combinations(range(len(there.sensors)), 2):
+        pair = there.sensors[first], there.sensors[second]
+        if not set(pair) <= set(there.whole):  # motion along a missing channel is unknown
+            continue
+        with suppress(InsufficientDataError):  # not comparable
+            response = relative_response(
+                csm,
+                frequency,
+                dims=there.dims,
+                first=first,
+                second=second,
+                vertical=vertical,
+                coherence=coherence,
+                checked=checked,
+            )
+            found.append(replace(response, first=pair[0], second=pair[1]))
+    return tuple(found)

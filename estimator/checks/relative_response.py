@@ -1,0 +1,444 @@
+"""Relative response of two sensors to the same motion: rotation, gain and delay.
+
+For common motion, ``S_jk S_ik^-1 = H_j H_i^-1`` for any third sensor k, independent of the noise of
+all three sensors. Averaged over a band and without its delay this matrix is real; its rows express
+the channels of sensor j by those of sensor i.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.checks.shared_motion import (
+    MIN_COHERENCE,
+    CanonicalCoherence,
+    is_coherent,
+    seen_by_others,
+)
+from estimator.errors import EstimatorError, InsufficientDataError
+from estimator.self_noise.coherency import (
+    check_dims,
+    check_frequency,
+    coherency,
+    other_channels,
+    own_channels,
+)
+
+if TYPE_CHECKING:
+    from estimator.self_noise.coherency import Coherency
+    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+
+_NEAREST, _FARTHEST = 0.3, 1.2  # rivals that are examined: cycles from the delay, either way
+_STEP = 0.02  # cycles; the maximum is refined by a parabola
+_CORRELATION = 2.0  # variance of a sum over that of independent frequencies, with tapered windows
+_CERTAIN = math.log(1000.0)
+"""Logarithm of how much likelier a delay must be than its rivals."""
+
+
+def cycle_is_ambiguous(f: FloatArray, weight: FloatArray, aligned: ComplexArray) -> bool:
+    """Return whether a delay fits little better than others half a cycle or a cycle off.
+
+    Parameters
+    ----------
+    f : float64, shape (n_freqs,)
+        Hz.
+    weight : float64, shape (n_freqs,)
+        Inverse variance of the response up to a factor.
+    aligned : complex128, shape (n_freqs, d, d)
+        Relative response without the delay: a real matrix and errors.
+
+    Notes
+    -----
+    A real matrix and a delay leave the sum of squares R. Its logarithm, times the number of
+    independent complex values less half of the fitted ones, is the logarithm of the likelihood of
+    errors of unknown size.
+    """
+    elements = aligned.reshape(len(f), -1)
+    weighted = np.asarray(weight[:, None] * elements, np.complex128)
+    energy = np.einsum("fk,fk->f", weighted, elements.conj()).real
+    whole, total = float(energy.sum()), float(weight.sum())
+    values = (elements.size - (elements.shape[1] + 1) / 2) / _CORRELATION
+    if not whole > 0 or values <= 0:
+        return True
+    omega = 2 * np.pi * f
+    cycle = 2 * np.pi / math.sqrt(float(omega**2 @ energy) / whole)
+    best = float((weighted.sum(axis=0).real ** 2).sum()) / total
+    rival = max(
+        _largest(omega * side, weighted, start=_NEAREST * cycle, step=_STEP * cycle) / total
+        for side in (-1, 1)
+    )
+    left = max(whole - best, 1e-12 * whole)
+    return values * math.log(max(whole - rival, 1e-12 * whole) / left) < _CERTAIN
+
+
+def _largest(omega: FloatArray, weighted: ComplexArray, *, start: float, step: float) -> float:
+    """Return the largest square of the summed response over delays on one side."""
+    turn, by = np.exp(1j * omega * start), np.exp(1j * omega * step)
+    squares = []
+    for _ in range(round((_FARTHEST - _NEAREST) / _STEP) + 1):
+        squares.append(float(((turn @ weighted).real ** 2).sum()))
+        turn *= by
+    top = int(np.argmax(squares))
+    if not 0 < top < len(squares) - 1:
+        return squares[top]
+    before, at, after = squares[top - 1 : top + 2]
+    bend = before - 2 * at + after
+    return at - (after - before) ** 2 / (8 * bend) if bend < 0 else at
+
+
+_STEPS = 4  # steps of least squares from the coarse delay
+_PARTS = 8  # parts of the band, for the scatter of the angles
+_MIN_PARTS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class RelativeResponse:
+    """Response of sensor `second` relative to sensor `first`.
+
+    Attributes
+    ----------
+    first, second : int
+        The sensors, from 0.
+    low, high : float
+        Limits of the averaged band, Hz.
+    matrix : float64, shape (d, d)
+        Channels of `second` in terms of those of `first`, without delay: gain and direction.
+    rotation : float64, shape (d, d)
+        Orthogonal matrix nearest to `matrix` with normalised rows (polar decomposition).
+    rotation_deg : float
+        Angle of the rotation after correction of reversed channels; 0 for one channel.
+    horizontal_deg : float
+        Angle in the horizontal plane between the first horizontal channels of the two sensors.
+        Positive if that of `second` is rotated away from the second horizontal channel of `first`:
+        counterclockwise from above for north and east. NaN without two horizontal channels.
+    angle_error_deg : float
+        Standard error of both angles, from their scatter over parts of the band.
+    rotation_error_deg : float
+        Standard error of the rotation, of its three components together.
+    gains, gain_errors : float64, shape (d,)
+        Gains of the channels of `second` over those of `first`, and their standard errors.
+    nonorthogonality_deg : float
+        Largest deviation from a right angle between channels of `second`, if those of `first`
+        are orthogonal and have equal gains.
+    nonorthogonality_error_deg : float
+        Standard error of all these deviations together.
+    reversed_channels : tuple of int
+        Channels of `second` with opposite polarity.
+    delay, delay_error : float
+        Lag of `second` behind `first`, and its standard error, s.
+    is_ambiguous : bool
+        Whether the delay may be half a cycle or a cycle off, in so narrow a band of motion; then
+        the sign of `matrix` is not certain either.
+    coherence : float
+        Coherence in the direction of its minimum, mean over the band.
+
+    Notes
+    -----
+    Standard errors are NaN with few frequencies.
+    """
+
+    first: int
+    second: int
+    low: float
+    high: float
+    matrix: FloatArray
+    rotation: FloatArray
+    rotation_deg: float
+    horizontal_deg: float
+    angle_error_deg: float
+    rotation_error_deg: float
+    gains: FloatArray
+    gain_errors: FloatArray
+    nonorthogonality_deg: float
+    nonorthogonality_error_deg: float
+    reversed_channels: tuple[int, ...]
+    delay: float
+    delay_error: float
+    is_ambiguous: bool
+    coherence: float
+
+
+def relative_response(
+    csm: ComplexArray,
+    frequency: FloatArray,
+    *,
+    dims: tuple[int, ...],
+    first: int,
+    second: int,
+    band: tuple[float, float] | None = None,
+    vertical: int | None = None,
+    coherence: CanonicalCoherence | None = None,
+    checked: Coherency | None = None,
+) -> RelativeResponse:
+    """Return rotation, gains, non-orthogonality and delay of one sensor against another.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
+        channels grouped by sensor; at least three sensors, both with d channels, and the others
+        with at least d channels in total.
+    frequency : float64, shape (n_freqs,)
+        Hz, ascending.
+    dims : tuple of int
+        Channels of each sensor.
+    first, second : int
+        The sensors, from 0.
+    band : (low, high), optional
+        Hz; default: all frequencies above zero.
+    vertical : int, optional
+        Index of the vertical channel of every sensor. Default: none for two channels, unknown for
+        three.
+    coherence : CanonicalCoherence, optional
+        Canonical coherence of the same matrix, to avoid its computation for several pairs.
+    checked : Coherency, optional
+        Coherency of the same matrix, likewise.
+
+    Returns
+    -------
+    RelativeResponse
+
+    Raises
+    ------
+    InsufficientDataError
+        If the two have different numbers of channels, no third sensor exists, or they are coherent
+        at no frequency of the band.
+    InvalidMatrixError
+        As `estimator.self_noise.coherency.coherency`, or if `frequency` does not fit.
+    EstimatorError
+        If `first` or `second` is invalid.
+
+    Notes
+    -----
+    ``T = [sum_f w S_jk exp(2 pi i f tau)] [sum_f w S_ik]^-1`` with all other sensors as k (least
+    squares if these have more channels), and weights ``w = g / ((1 - g) P)``: P is the mean PSD of
+    sensor i and g the coherence in the direction of its minimum, so that frequencies are weighted
+    by their signal-to-noise ratio. The delay tau first maximises
+    ``Re sum_f w T(f) exp(2 pi i f tau)`` on a grid of up to half a segment in both directions. Then
+    least squares fit a line through the origin to the remaining phase, with the same weights.
+    """
+    check_dims(dims)
+    csm = np.asarray(csm, dtype=np.complex128)
+    given = coherency(csm, dims) if checked is None else checked
+    frequency = check_frequency(frequency, len(csm))
+    if first == second or not {first, second} <= set(range(len(dims))):
+        raise EstimatorError(
+            f"sensors {first} and {second}: expected two different ones of 0 to {len(dims) - 1}"
+        )
+    d = dims[first]
+    if dims[second] != d:
+        raise InsufficientDataError(
+            f"sensors {first} and {second} have {d} and {dims[second]} channels: only sensors "
+            "with as many channels can be compared"
+        )
+    low, high = band or (0.0, np.inf)
+    usable = (frequency > 0) & (frequency >= low) & (frequency <= high)
+    usable &= ~(given.flags != 0).any(axis=1)
+    coherence = coherence or CanonicalCoherence(given.matrix)
+    own = [np.array(own_channels(dims, sensor)) for sensor in (first, second)]
+    rest = other_channels(dims, first, second)
+    if len(rest) < d:
+        raise InsufficientDataError(
+            f"sensors {first} and {second}: the others have {len(rest)} channels; expected {d}"
+        )
+    g = coherence.between(*own)[:, -1]
+    weight = g / np.maximum(1 - g, 1e-9)
+    weight[~(usable & is_coherent(g, usable))] = 0.0
+    weight[~seen_by_others(coherence, dims, (first, second), weight > 0)] = 0.0
+    if not weight.any():
+        raise InsufficientDataError(
+            f"sensors {first} and {second}: at no frequency from {low:g} to {high:g} Hz are they "
+            f"alive and coherent, with each other and with the others, in all {d} directions by "
+            f"more than {MIN_COHERENCE}"
+        )
+    inside = np.flatnonzero(weight)
+    f, weight = frequency[inside], weight[inside]
+    power = _power(csm, dims, first)[inside]
+    S_ik, S_jk = (_part(csm, inside, channels, rest) / power[:, None, None] for channels in own)
+    delay, delay_error, is_ambiguous = _delay(f, weight, S_ik, S_jk)
+    S_jk = S_jk * np.exp(2j * np.pi * f * delay)[:, None, None]
+    matrix = _transfer(weight, S_ik, S_jk)
+    horizontal = _horizontal_channels(d, vertical)
+    rotation, reversed_channels = _rotation(matrix)
+    gains, between = _gains_and_skew(matrix)
+    rotation_deg, horizontal_deg = _angles(matrix, horizontal)
+    without = [_transfer(weight[~part], S_ik[~part], S_jk[~part]) for part in _parts(weight)]
+    gain_errors = _jackknife([_gains_and_skew(each)[0] for each in without], gains)
+    skew_errors = _jackknife([_gains_and_skew(each)[1] for each in without], between)
+    turned = _jackknife([np.rad2deg(_rotation(each)[0] - rotation) for each in without], rotation)
+    return RelativeResponse(
+        first=first,
+        second=second,
+        low=float(f[0]),
+        high=float(f[-1]),
+        matrix=matrix,
+        rotation=rotation,
+        rotation_deg=rotation_deg,
+        horizontal_deg=float("nan") if horizontal is None else horizontal_deg,
+        angle_error_deg=_angle_error(weight, S_ik, S_jk, horizontal),
+        rotation_error_deg=float(np.linalg.norm(turned) / math.sqrt(2)),
+        gains=gains,
+        gain_errors=gain_errors,
+        nonorthogonality_deg=float(np.abs(between).max()),
+        nonorthogonality_error_deg=float(np.linalg.norm(skew_errors)),
+        reversed_channels=reversed_channels,
+        delay=delay,
+        delay_error=delay_error,
+        is_ambiguous=is_ambiguous,
+        coherence=float(g[inside].mean()),
+    )
+
+
+def _part(csm: ComplexArray, inside: IntArray, rows: IntArray, columns: IntArray) -> ComplexArray:
+    """Return rows and columns at some frequencies, which are the fastest axis in memory."""
+    part = np.empty((len(rows), len(columns), len(inside)), np.complex128).transpose(2, 0, 1)
+    part[...] = csm[inside[:, None, None], rows[:, None], columns]
+    return part
+
+
+def _power(csm: ComplexArray, dims: tuple[int, ...], sensor: int) -> FloatArray:
+    """Return the mean PSD of a sensor's channels."""
+    channels = np.arange(dims[sensor]) + sum(dims[:sensor])
+    return np.asarray(csm[:, channels, channels].real.mean(axis=1))
+
+
+def _transfer(weight: FloatArray, S_ik: ComplexArray, S_jk: ComplexArray) -> FloatArray:
+    """Return the band average of ``S_jk S_ik^-1``, real part, shape (d, d)."""
+    left = np.einsum("f,fab->ab", weight, S_jk)
+    right = np.einsum("f,fab->ab", weight, S_ik)
+    return np.asarray((left @ np.linalg.pinv(right)).real)
+
+
+def _gains_and_skew(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the lengths of the rows, and their deviations from right angles in degrees."""
+    gains = np.linalg.norm(matrix, axis=1)
+    directions = matrix / gains[:, None]
+    between = np.rad2deg(np.arcsin(np.clip(np.triu(directions @ directions.T, 1), -1, 1)))
+    return gains, np.asarray(between)
+
+
+def _delay(
+    f: FloatArray, weight: FloatArray, S_ik: ComplexArray, S_jk: ComplexArray
+) -> tuple[float, float, bool]:
+    """Return the lag of the second sensor and its error in s, and whether its cycle is ambiguous.
+
+    It is from a grid, refined by the phase.
+    """
+    transfer = S_jk @ np.linalg.pinv(S_ik)
+    known = np.isfinite(transfer).all(axis=(1, 2))
+    f, weight, transfer = f[known], weight[known], transfer[known]
+    delay = _coarse_delay(f, np.asarray(weight[:, None, None] * transfer, np.complex128))
+    for _ in range(_STEPS):
+        aligned = transfer * np.exp(2j * np.pi * f * delay)[:, None, None]
+        mean = np.einsum("f,fab->ab", weight, aligned).real
+        phase = np.angle(np.einsum("ab,fab->f", mean, aligned))
+        delay -= float((weight * f) @ phase / ((weight * f) @ f) / (2 * np.pi))
+    without = [
+        np.atleast_1d((weight * f)[~part] @ phase[~part] / ((weight * f)[~part] @ f[~part]))
+        for part in _parts(weight)
+    ]
+    aligned = transfer * np.exp(2j * np.pi * f * delay)[:, None, None]
+    error = float(_jackknife(without, np.zeros(1))[0]) / (2 * np.pi)
+    return delay, error, cycle_is_ambiguous(f, weight, aligned)
+
+
+def _parts(weight: FloatArray) -> list[BoolArray]:
+    """Return parts of the band of about equal weight, as masks; none with few frequencies."""
+    share = np.minimum(np.cumsum(weight) / weight.sum() * _PARTS, _PARTS - 1e-9).astype(np.int64)
+    parts = [share == number for number in sorted(set(share.tolist()))]
+    return parts if len(parts) >= _MIN_PARTS and len(weight) >= 2 * _PARTS else []
+
+
+def _jackknife(without: list[FloatArray], like: FloatArray) -> FloatArray:
+    """Return standard errors from estimates that leave out one part each; NaN without any."""
+    n = len(without)
+    if not n:
+        return np.full(like.shape, np.nan)
+    return np.asarray(np.std(without, axis=0) * math.sqrt(n - 1))
+
+
+def _coarse_delay(f: FloatArray, transfer: ComplexArray) -> float:
+    """Return the delay on a grid that maximises the real part of the sum over frequencies.
+
+    The sum at all delays is a Fourier transform over frequency; frequencies are rounded to the
+    nearest multiple of their smallest distance.
+    """
+    step = float(np.diff(f).min()) if len(f) > 1 else float(f[0])
+    place = np.rint((f - f[0]) / step).astype(np.int64)
+    # eight delays per period of the highest frequency resolve every peak
+    n = 1 << int(np.ceil(np.log2(8 * max(f[-1] / step, place[-1] + 1))))
+    spectrum = np.zeros((n, *transfer.shape[1:]), np.complex128)
+    np.add.at(spectrum, place, transfer)
+    delays = np.fft.fftfreq(n, step)
+    total = np.fft.ifft(spectrum, axis=0) * np.exp(2j * np.pi * f[0] * delays)[:, None, None]
+    return float(delays[np.argmax((total.real**2).sum(axis=(1, 2)))])
+
+
+def _horizontal_channels(d: int, vertical: int | None) -> tuple[int, int] | None:
+    channels = [channel for channel in range(d) if channel != vertical]
+    return (channels[0], channels[1]) if len(channels) == 2 else None
+
+
+def _rotation(matrix: FloatArray) -> tuple[FloatArray, tuple[int, ...]]:
+    """Return the nearest rotation and the reversed channels.
+
+    Of the reversals that leave a proper rotation, the one with the smallest angle is chosen:
+    sensors meant to be parallel are rarely rotated by more than a right angle.
+    """
+    d = len(matrix)
+    directions = matrix / np.linalg.norm(matrix, axis=1)[:, None]
+    candidates = []
+    for code in range(2**d):
+        signs = 1.0 - 2.0 * ((code >> np.arange(d)) & 1)
+        u, _, v = np.linalg.svd(signs[:, None] * directions)
+        nearest = u @ v
+        if np.linalg.det(nearest) > 0:
+            candidates.append((float(np.trace(nearest)), signs, nearest))
+            if code == 0:  # no reversed channels
+                break
+    _, signs, nearest = max(candidates, key=lambda entry: entry[0])
+    return nearest, tuple(int(channel) for channel in np.flatnonzero(signs < 0))
+
+
+def _angles(matrix: FloatArray, horizontal: tuple[int, int] | None) -> tuple[float, float]:
+    """Return the angles of the rotation and of the first horizontal channel, degrees."""
+    rotation, turned_round = _rotation(matrix)
+    d = len(matrix)
+    sine = np.linalg.norm(rotation - rotation.T) / (2 * np.sqrt(2)) if d > 1 else 0.0
+    cosine = (np.trace(rotation) - (d - 2)) / 2 if d > 1 else 1.0
+    whole = float(np.rad2deg(np.arctan2(sine, cosine)))
+    if horizontal is None:
+        return whole, 0.0
+    one, two = horizontal
+    sign = -1.0 if one in turned_round else 1.0
+    return whole, float(np.rad2deg(np.arctan2(-sign * matrix[one, two], sign * matrix[one, one])))
+
+
+def _angle_error(
+    weight: FloatArray,
+    S_ik: ComplexArray,
+    S_jk: ComplexArray,
+    horizontal: tuple[int, int] | None,
+) -> float:
+    """Return the larger standard error of the two angles, degrees; NaN with few frequencies.
+
+    By the scatter between parts of the band of equal weight. Where single frequencies weigh too
+    much for that, as in microseism, by a jackknife that leaves out one part at a time.
+    """
+    parts = _parts(weight)
+    n = len(parts)
+    if len(weight) < 4 * _PARTS or not n:
+        return math.nan
+    whole = n == _PARTS
+    angles = np.array(
+        [
+            _angles(_transfer(weight[part], S_ik[part], S_jk[part]), horizontal)
+            for part in (parts if whole else [~part for part in parts])
+        ]
+    )
+    scatter = float(angles.std(axis=0, ddof=1).max())
+    return scatter / math.sqrt(n) if whole else scatter * (n - 1) / math.sqrt(n)

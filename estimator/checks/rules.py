@@ -1,0 +1,362 @@
+"""Conditions for each kind of advice: section 5 of the paper, and the model test.
+
+A misfit of the model is graded by its possible effect on the noise estimate. The averages show a
+misfit of ``sqrt((statistic - 1) / (n - d))`` of the noise, where ``statistic`` is in units of its
+expectation. The error of the estimate is larger, because the fit absorbs most of a misfit and the
+test sees only the rest. Computed on true matrices, it is larger by up to `TYPICAL` times for noise
+shared by channels, for noise of a sensor's mount, and for one more dimension of motion. For
+waves that cross sensors 0.1 m apart it is larger by up to `CROSSING` times with four sensors or
+more, by up to `CROSSING_THREE` times with three triaxial sensors, and without bound with three
+sensors of fewer channels. See `docs/decisions/0012`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import groupby
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.checks.advice import (
+    Advice,
+    Copies,
+    MissingChannels,
+    MissingDimension,
+    ModelMisfit,
+    MotionAcross,
+    NearlySingular,
+    NoSharedMotion,
+    NoSignal,
+    TooFewDimensions,
+    TooFewSensors,
+    WeakMotion,
+)
+from estimator.checks.kinds import Level
+from estimator.checks.misfit import SharedNoise
+from estimator.checks.orientation import orientation
+from estimator.checks.shared_motion import outsiders
+from estimator.likelihood.goodness_of_fit import less, rejected_below
+from estimator.self_noise.live_channels import presence
+from estimator.self_noise.result import Flag
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+    from estimator.checks.band import BandDiagnosis
+    from estimator.checks.relative_response import RelativeResponse
+    from estimator.checks.shared_noise import SharedPairs
+    from estimator.self_noise.coherency import Coherency
+    from estimator.types import FloatArray
+
+TYPICAL = 10.0
+CROSSING = 20.0
+CROSSING_THREE = 100.0
+LARGE_ERROR = 0.5
+"""Error, as a fraction of the noise, from which an estimate is wrong."""
+SMALL_ERROR = 0.05
+"""Error, as a fraction of the noise, below which it is harmless."""
+_NEARLY_SINGULAR = 30.0  # condition number; the scatter of smaller ones is no surprise
+
+
+def advise(
+    bands: tuple[BandDiagnosis, ...],
+    responses: tuple[RelativeResponse, ...],
+    given: Coherency,
+    *,
+    dims: tuple[int, ...],
+    n_factors: int,
+    n_effective: float,
+    nyquist: float,
+    shared: SharedPairs | None = None,
+    further: tuple[Advice, ...] = (),
+    moved: frozenset[int] = frozenset(),
+) -> tuple[Advice, ...]:
+    """Return the advice on a test, most severe first.
+
+    Parameters
+    ----------
+    bands : tuple of BandDiagnosis
+        Ascending.
+    responses : tuple of RelativeResponse
+    given : Coherency
+        The averages.
+    dims : tuple of int
+    n_factors : int
+        Dimensions of the motion in the tested model.
+    n_effective : float
+    nyquist : float
+        Hz.
+    shared : SharedPairs, optional
+        Pairs of channels that share noise: their part of the statistic is no further misfit.
+    further : tuple of Advice
+        Other advice to include.
+    moved : frozenset of int
+        Sensors that left their place for a part of the test.
+
+    Returns
+    -------
+    tuple of Advice
+    """
+    alive = presence(given, dims).dims
+    strangers = [
+        replace(each, for_part=not moved.isdisjoint(each.sensors))
+        for each in _strangers(bands, len(dims), n_effective)
+    ]
+    others = [
+        *(
+            _too_few_dimensions(bands, n_factors)
+            if n_factors < max(alive, default=0)
+            else _incoherence(_unexplained(bands, shared), dims, n_factors, n_effective)
+        ),
+        *([] if shared is None else _shared_noise(bands, shared, dims)),
+        *_sensor_space(bands, dims),
+        *_dimensions(bands, alive, n_effective),
+        *_weak_motion(bands),
+    ]
+    found = [
+        *_absent(given, dims),
+        *further,
+        *strangers,
+        *(each for each in others if not any(_overlap(each, other) for other in strangers)),
+        *(advice for response in responses for advice in orientation(response, dims, nyquist)),
+    ]
+    order = list(Level)
+    return tuple(sorted(found, key=lambda advice: order.index(advice.level)))
+
+
+def _overlap(one: Advice, other: Advice) -> bool:
+    """Return whether the bands of two pieces of advice overlap."""
+    if one.band is None or other.band is None:
+        return True
+    return one.band[0] <= other.band[1] and other.band[0] <= one.band[1]
+
+
+def _strangers(
+    bands: tuple[BandDiagnosis, ...], n_sensors: int, n_effective: float
+) -> Iterator[NoSharedMotion]:
+    """Yield advice on sensors that record none of the motion shared by others.
+
+    Other findings in these bands are consequences, and not reported.
+    """
+    of_bands = [dict(outsiders(band.shared, n_effective, band.n_frequencies)) for band in bands]
+    for sensor in range(n_sensors):
+        named = [sensor in found for found in of_bands]
+        for is_stranger, run in groupby(range(len(bands)), named.__getitem__):
+            here = list(run)
+            if is_stranger:
+                groups = [of_bands[n][sensor] for n in here]
+                yield _stranger(sensor, [bands[n] for n in here], groups)
+
+
+def _stranger(
+    sensor: int, run: list[BandDiagnosis], groups: list[tuple[int, ...]]
+) -> NoSharedMotion:
+    partners = max(groups, key=len)
+    weights = [band.n_frequencies for band in run]
+    shared = np.average([band.shared for band in run], axis=0, weights=weights)
+    return NoSharedMotion(
+        level=Level.PROBLEM,
+        sensors=(sensor,),
+        band=_span(run),
+        partners=partners,
+        share=max(0.0, *(float(shared[sensor, j]) for j in partners)),
+        share_of_partners=min(float(shared[j, k]) for j in partners for k in partners if j < k),
+    )
+
+
+def _runs(
+    bands: Iterable[BandDiagnosis], applies: Callable[[BandDiagnosis], bool]
+) -> Iterator[list[BandDiagnosis]]:
+    """Yield runs of neighbouring bands to which a condition applies."""
+    for true, run in groupby(bands, applies):
+        if true:
+            yield list(run)
+
+
+def _span(run: list[BandDiagnosis]) -> tuple[float, float]:
+    return run[0].low, run[-1].high
+
+
+def _is_weak(band: BandDiagnosis) -> bool:
+    """Return whether the motion is weaker than the noise in every channel."""
+    known = band.snr[~np.isnan(band.snr)]
+    is_known = len(known) > 0 and not band.noise_lost.any()
+    return is_known and bool(known.max() < 1)
+
+
+def _absent(given: Coherency, dims: tuple[int, ...]) -> Iterator[Advice]:
+    """Yield advice on dead channels and copies, and on too few sensors without them."""
+    valid = given.valid
+    sensor_of = np.repeat(np.arange(len(dims)), dims)
+    dead = ((given.flags[valid] & Flag.DEAD_CHANNEL) != 0).mean(axis=0)
+    copies = given.duplicates[valid].mean(axis=0)
+    for sensor in range(len(dims)):
+        own = np.flatnonzero((sensor_of == sensor) & (dead > 0.5))
+        if len(own):
+            yield NoSignal(
+                level=Level.PROBLEM,
+                sensors=(sensor,),
+                channels=tuple(own.tolist()),
+                whole_sensor=len(own) == dims[sensor] > 1,
+                share_of_frequencies=float(dead[own].max()),
+            )
+    pairs = np.argwhere(np.triu(copies > 0.5))
+    if len(pairs):
+        yield Copies(
+            level=Level.PROBLEM,
+            sensors=tuple(np.unique(sensor_of[pairs]).tolist()),
+            channels=tuple((int(original), int(copy)) for original, copy in pairs),
+            share_of_frequencies=float(copies.max()),
+        )
+    there = presence(given, dims)
+    missing = tuple(s for s in range(len(dims)) if s not in there.whole)
+    if len(there.sensors) < 3:
+        yield TooFewSensors(level=Level.PROBLEM, sensors=there.sensors)
+    elif missing and len(there.whole) < 3:
+        yield MissingChannels(level=Level.WARNING, sensors=missing, whole_sensors=there.whole)
+
+
+def _statistic(*bands: BandDiagnosis) -> float:
+    """Return the statistic of the model test over its expectation, for several bands."""
+    return sum(b.test.statistic for b in bands) / sum(b.test.degrees for b in bands)
+
+
+def _too_few_dimensions(bands: tuple[BandDiagnosis, ...], n_factors: int) -> Iterator[Advice]:
+    """Yield advice on a model with fewer dimensions than the sensors sense."""
+    rejected = rejected_below(band.test for band in bands)
+    for run in _runs(bands, lambda band: band.test.p_value < rejected):
+        worst = max(run, key=_statistic)
+        yield TooFewDimensions(
+            level=Level.PROBLEM,
+            band=_span(run),
+            n_factors=n_factors,
+            statistic=_statistic(*run),
+            worst_statistic=_statistic(worst),
+            worst_band=_span([worst]),
+        )
+
+
+def _incoherence(
+    bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...], n_factors: int, n_effective: float
+) -> Iterator[Advice]:
+    d = max(dims)
+    crossing = CROSSING if len(dims) > 3 else CROSSING_THREE if d == 3 else np.inf
+    rejected = rejected_below(band.test for band in bands)
+    for run in _runs(bands, lambda band: band.test.p_value < rejected):
+        worst = max(run, key=_statistic)
+        most = _statistic(worst)
+        seen = float(np.sqrt(max(0.0, most - 1) / max(n_effective - d, 1.0)))
+        error, largest = TYPICAL * seen, crossing * seen
+        likely = float(np.sqrt(error * largest)) if np.isfinite(largest) else error
+        level = Level.WARNING if likely >= SMALL_ERROR else Level.NOTE
+        if likely >= LARGE_ERROR:
+            level = Level.PROBLEM
+        yield ModelMisfit(
+            level=level,
+            band=_span(run),
+            n_factors=n_factors,
+            statistic=_statistic(*run),
+            worst_statistic=most,
+            worst_band=_span([worst]),
+            p_value=min(b.test.p_value for b in run),
+            unexplained=seen,
+            error=error,
+            largest_error=largest,
+            is_wrong=error >= LARGE_ERROR,
+        )
+
+
+def _unexplained(
+    bands: tuple[BandDiagnosis, ...], shared: SharedPairs | None
+) -> tuple[BandDiagnosis, ...]:
+    """Return bands without the part of the model test that shared noise explains."""
+    if shared is None:
+        return bands
+    return tuple(
+        replace(band, test=less(band.test, explained))
+        for band, explained in zip(bands, shared.explained.tolist(), strict=True)
+    )
+
+
+def _shared_noise(
+    bands: tuple[BandDiagnosis, ...], shared: SharedPairs, dims: tuple[int, ...]
+) -> Iterator[Advice]:
+    """Yield advice on pairs that share noise, grouped by their sensors."""
+    sensor_of = np.repeat(np.arange(len(dims)), dims)
+    sensors = [tuple(sorted({int(sensor_of[i]), int(sensor_of[j])})) for i, j in shared.pairs]
+    bias = np.fmax(np.abs(shared.three_sensor), np.abs(shared.maximum_likelihood))
+    for pair in dict.fromkeys(sensors):
+        here = [number for number, each in enumerate(sensors) if each == pair]
+        found = SharedNoise(
+            level=Level.NOTE,
+            sensors=pair,
+            band=_span([bands[n] for n in shared.bands]),
+            channels=tuple(shared.pairs[n] for n in here),
+            amounts=tuple(float(shared.amount[n]) for n in here),
+            errors=tuple(float(shared.error[n]) for n in here),
+            alternatives=shared.alternatives,
+            three_sensor=_largest(shared.three_sensor),
+            maximum_likelihood=_largest(shared.maximum_likelihood),
+            channel=int(np.nanargmax(bias)) if np.isfinite(bias).any() else shared.pairs[0][0],
+        )
+        level = Level.WARNING if found.harm >= SMALL_ERROR else Level.NOTE
+        yield replace(found, level=Level.PROBLEM if found.harm >= LARGE_ERROR else level)
+
+
+def _largest(bias: FloatArray) -> float:
+    """Return the finite number of largest magnitude; NaN without one."""
+    known = bias[np.isfinite(bias)]
+    return float(known[np.argmax(np.abs(known))]) if len(known) else float("nan")
+
+
+def _sensor_space(bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...]) -> Iterator[Advice]:
+    """Yield advice of section 5: the motion's dimension against that of the compared channels."""
+    strong = [band for band in bands if not _is_weak(band) and np.isfinite(band.snr).any()]
+    if not strong:
+        return
+    snr = float(max(np.nanmax(band.snr) for band in strong))
+    shared = [sorted(dims[:i] + dims[i + 1 :])[-2] for i in range(len(dims))]
+    for d in sorted({n for n in shared if n < 3}):
+        larger = tuple(i for i, n in enumerate(dims) if n > d)
+        yield MotionAcross(
+            level=Level.NOTE,
+            sensors=tuple(i for i, n in enumerate(shared) if n == d) if larger else (),
+            band=_span(strong),
+            n_channels=d,
+            larger_sensors=larger,
+            snr=snr,
+            added_by_one_degree=float(snr * np.sin(np.deg2rad(1)) ** 2),
+        )
+
+
+def _dimensions(
+    bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...], n_effective: float
+) -> Iterator[Advice]:
+    if len(dims) < 2:
+        return
+    full = min(sorted(dims)[-2:])
+
+    def is_missing(band: BandDiagnosis) -> bool:
+        hidden = _is_weak(band)
+        return band.dimension < full and not hidden
+
+    for run in _runs(bands, is_missing):
+        yield MissingDimension(
+            level=Level.WARNING,
+            band=_span(run),
+            n_dimensions=min(b.dimension for b in run),
+            n_channels=full,
+            condition=max(b.condition for b in run),
+        )
+    limit = max(_NEARLY_SINGULAR, float(np.sqrt(n_effective)))
+    for run in _runs(bands, lambda band: band.dimension >= full and band.condition > limit):
+        yield NearlySingular(
+            level=Level.NOTE, band=_span(run), condition=max(b.condition for b in run)
+        )
+
+
+def _weak_motion(bands: tuple[BandDiagnosis, ...]) -> Iterator[Advice]:
+    for run in _runs(bands, _is_weak):
+        snr = float(np.nanmax([b.snr for b in run]))
+        yield WeakMotion(level=Level.NOTE, band=_span(run), snr=snr)

@@ -1,1 +1,0 @@
-"""Tests of daq.acquisition.before_test."""

@@ -1,0 +1,128 @@
+"""Delays from the common motion: known ones in any orientation, and silence where there is none."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.clocks.delay_estimation import DelayEstimator
+from daq.clocks.resampling import resample
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    FloatArray = NDArray[np.float64]
+
+RATE, LENGTH, HOP = 200.0, 1000, 500
+WINDOW = np.hanning(LENGTH + 1)[:-1]
+COLUMNS = (slice(0, 2), slice(2, 4))
+
+
+def shifted(n: int, delays: FloatArray) -> FloatArray:
+    """White motion in two directions, read late by a curve given at the middles of segments."""
+    motion = np.random.default_rng(5).standard_normal((n + 200, 2))
+    middles = np.arange(len(delays)) * HOP + LENGTH / 2
+    rows = np.arange(n) - RATE * np.interp(np.arange(n), middles, delays)
+    return resample(motion, 100.5 + rows)
+
+
+def huddle(n_segments: int, delays: FloatArray, noise: float, seed: int) -> FloatArray:
+    """Two sensors, the second turned by 25° and delayed."""
+    rng = np.random.default_rng(seed)
+    n = (n_segments - 1) * HOP + LENGTH
+    cos, sin = np.cos(0.44), np.sin(0.44)
+    second = shifted(n, delays) @ np.array([[cos, -sin], [sin, cos]])
+    samples = np.hstack([shifted(n, np.zeros(n_segments)), 1.02 * second])
+    return np.asarray(samples + noise * rng.standard_normal(samples.shape))
+
+
+def test_known_delays_are_measured_within_their_stated_error() -> None:
+    n = 80
+    delays = 4e-4 + 2e-4 * np.sin(np.arange(n) / 9.0)
+    samples = huddle(n, delays, 0.03, 1)
+    meter = DelayEstimator(RATE, WINDOW, COLUMNS)
+    measured, std = meter.measure(samples, np.arange(n) * HOP)
+    whole = measured[:, 1] + meter.frame_delays()[1]
+    # The curve bends by some 1 µs within a segment.
+    error = whole - delays
+    assert not measured[:, 0].any()  # the reference's own
+    assert abs(error.mean()) < 5e-6
+    assert np.std(error) < 1.3 * np.median(std[:, 1]) + 1e-6
+    assert np.std(error) > 0.5 * np.median(std[:, 1])
+    assert np.median(std[:, 1]) < 2e-5
+
+
+def test_later_batches_are_measured_in_the_frame_of_the_first() -> None:
+    n = 80
+    delays = np.concatenate([np.zeros(40), np.full(40, 3e-3)])  # more than half a sample
+    samples = huddle(n, delays, 0.03, 2)
+    meter = DelayEstimator(RATE, WINDOW, COLUMNS)
+    starts = np.arange(n) * HOP
+    first, _ = meter.measure(samples, starts[:38])
+    second, _ = meter.measure(samples, starts[42:])
+    assert second[:, 1].mean() - first[:, 1].mean() == pytest.approx(3e-3, abs=5e-6)
+
+
+def test_without_common_motion_no_delay_is_returned() -> None:
+    rng = np.random.default_rng(3)
+    n = 120
+    samples = rng.standard_normal(((n - 1) * HOP + LENGTH, 4))
+    meter = DelayEstimator(RATE, WINDOW, COLUMNS)
+    starts = np.arange(n) * HOP
+    first, _ = meter.measure(samples, starts[:60])
+    later, std = meter.measure(samples, starts[60:])
+    assert np.all(np.abs(first[np.isfinite(first)]) < 5e-3)  # in its own sums: about nothing
+    assert np.mean(np.isinf(std[:, 1])) > 0.8
+    assert np.isnan(later[np.isinf(std)]).all()
+
+
+@pytest.mark.parametrize("dead", [False, True])
+def test_a_reference_without_the_common_motion_is_replaced(dead: bool) -> None:
+    n = 40
+    delays = 2e-4 * np.sin(np.arange(n) / 9.0)
+    samples = huddle(n, delays, 0.03, 1)
+    alone = np.random.default_rng(7).standard_normal((len(samples), 2)) * (not dead)
+    columns = (slice(0, 2), slice(2, 4), slice(4, 6))
+    for others in ((0, 2), (0, 1), (1, 2)):
+        parts = [alone] * 3
+        for number, part in zip(others, (samples[:, :2], samples[:, 2:]), strict=True):
+            parts[number] = part
+        meter = DelayEstimator(RATE, WINDOW, columns)
+        measured, std = meter.measure(np.hstack(parts), np.arange(n) * HOP)
+        assert not std[:, others[0]].any()
+        error = measured[:, others[1]] + meter.frame_delays()[others[1]] - delays
+        assert np.sqrt(np.mean(error**2)) < 2e-5
+        assert np.median(std[:, ({0, 1, 2} - set(others)).pop()]) > 1e-4
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_hum_does_not_shift_sensors_by_half_periods(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = 120 * HOP + LENGTH
+    phase = np.cumsum(0.002 * rng.standard_normal((n, 2)), axis=0) + np.array([0.0, 1.2])
+    common = 10 * np.cos(2 * np.pi * 50.0 / RATE * np.arange(n)[:, None] + phase)
+    common += 0.03 * rng.standard_normal((n, 2))
+    samples = np.hstack([common, common @ np.array([[0.9, -0.44], [0.44, 0.9]])])
+    samples += 0.3 * rng.standard_normal(samples.shape)
+    meter = DelayEstimator(RATE, WINDOW, COLUMNS)
+    meter.measure(samples, np.arange(120) * HOP)
+    assert abs(meter.frame_delays()[1]) < 1e-3  # half a period: 10 ms
+
+
+@pytest.mark.parametrize("delay", [0.9, 1.5, 1.9, -1.5])  # a segment lasts 5 s
+def test_a_long_constant_delay_is_distinguished_from_its_alias(delay: float) -> None:
+    motion = np.random.default_rng(5).standard_normal((100 * HOP, 2))
+    motion += 0.03 * np.random.default_rng(6).standard_normal(motion.shape)
+    samples = np.hstack([motion, np.roll(motion, round(delay * RATE), axis=0)])[LENGTH:-LENGTH]
+    meter = DelayEstimator(RATE, WINDOW, COLUMNS)
+    measured, _ = meter.measure(samples, np.arange(90) * HOP)
+    assert np.nanmean(measured[:, 1]) + meter.frame_delays()[1] == pytest.approx(delay, abs=1e-3)
+
+
+def test_too_few_segments_define_no_frame() -> None:
+    samples = huddle(10, np.zeros(10), 0.03, 4)
+    measured, std = DelayEstimator(RATE, WINDOW, COLUMNS).measure(samples, np.arange(10) * HOP)
+    assert np.isnan(measured).all()
+    assert np.isinf(std).all()

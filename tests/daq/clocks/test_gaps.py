@@ -1,0 +1,144 @@
+"""Many gaps: the work is that of a recording without any, and what is left is used."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from daq.clocks.aligned_recording import AlignedRecording
+from daq.clocks.resampling import resample
+from daq.clocks.sensor_reader import from_instants
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.estimation.snapshot import NoResultError
+from daq.recording.reader import Recording
+from daq.recording.sensor_record import SensorRecord
+from tests.daq.clocks.recordings import Sensor as FreeRunning
+from tests.daq.clocks.recordings import counts, write, write_polled
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+RATE, N_SAMPLES = 50, 18_000
+NAMES = ("a", "b", "c")
+
+
+def lossy_minutes(n_gaps: int, seed: int) -> NDArray[np.bool_]:
+    """Single samples are lost in the last ten seconds of each minute."""
+    rng = np.random.default_rng(seed)
+    late = np.arange(1, N_SAMPLES - 1)
+    late = late[(late // RATE % 60 >= 50) & (late % 2 == 0)]
+    gone = np.zeros(N_SAMPLES, dtype=np.bool_)
+    gone[rng.choice(late, n_gaps, replace=False)] = True
+    return gone
+
+
+class Work:
+    """How often the expensive steps were taken."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.n_rows = self.n_reads = self.n_resampled = 0
+        for name in ("counts", "instants_ns"):
+            self._count(monkeypatch, getattr(SensorRecord, name), name)
+
+        def resampled(inputs: NDArray[Any], positions: NDArray[Any], **options: float) -> object:
+            self.n_resampled += len(positions)
+            return resample(inputs, positions, **options)
+
+        monkeypatch.setattr("daq.clocks.grid.resample", resampled)
+
+    def _count(self, monkeypatch: pytest.MonkeyPatch, read: Any, name: str) -> None:  # noqa: ANN401
+        def counted(record: SensorRecord, first_row: int, last_row: int) -> object:
+            self.n_reads += 1
+            self.n_rows += last_row - first_row
+            return read(record, first_row, last_row)
+
+        monkeypatch.setattr(SensorRecord, name, counted)
+
+
+def work_of(path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Work, int]:
+    with monkeypatch.context() as patch:
+        work = Work(patch)
+        snapshot = estimate([path], Settings(segment=4.0))
+    return work, snapshot.n_segments
+
+
+@pytest.mark.long
+def test_many_gaps_of_polled_sensors_do_not_increase_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    none, n_whole = work_of(
+        write_polled(tmp_path / "0.h5", {name: lossy_minutes(0, 1) for name in NAMES}), monkeypatch
+    )
+    for n_gaps in (20, 1000):
+        lost = {name: lossy_minutes(n_gaps, seed) for seed, name in enumerate(NAMES)}
+        path = write_polled(tmp_path / f"{n_gaps}.h5", lost)
+        work, n_segments = work_of(path, monkeypatch)
+        assert n_whole / 2 < n_segments < n_whole
+        assert work.n_reads <= none.n_reads
+        assert work.n_rows <= none.n_rows
+        assert work.n_resampled <= none.n_resampled
+
+
+def test_polled_sensor_keeps_one_clock_across_gaps(tmp_path: Path) -> None:
+    lost = {name: lossy_minutes(300, seed) for seed, name in enumerate(NAMES)}
+    with Recording.open(write_polled(tmp_path / "r.h5", lost)) as recording:
+        aligned = AlignedRecording(recording)
+        assert [clock.n_epochs for clock in aligned.clocks] == [1, 1, 1]
+        # Instants are uniform within 0.1 ms: 301 stretches of 345 s in all leave 2 ppm.
+        assert max(abs(clock.ppm) for clock in aligned.clocks) < 4 * 2.1
+        samples, valid = aligned.read(0, aligned.n_available)
+        whole = write_polled(tmp_path / "w.h5", {name: lossy_minutes(0, 0) for name in NAMES})
+        with Recording.open(whole) as without:
+            reference = AlignedRecording(without)
+            expected, _ = reference.read(0, reference.n_available)
+    kept = np.flatnonzero(valid[: min(len(samples), len(expected))])
+    assert len(kept) > N_SAMPLES / 2
+    assert np.abs(samples[kept] - expected[kept]).max() < 1e-5  # resampling errs by -110 dB
+
+
+def test_a_backward_step_of_time_begins_an_epoch() -> None:
+    seconds = np.array([0.0, 0.1, 0.2, 0.5, 0.6, 0.3, 0.4, 0.5])
+    clock = from_instants(
+        "a",
+        seconds,
+        sampling_rate=10.0,
+        first_samples=np.array([0, 5, 9]),
+        first_rows=np.array([0, 3, 5]),
+    )
+    assert [(epoch.first_sample, epoch.end_sample) for epoch in clock.epochs] == [(0, 7), (9, 12)]
+    assert clock.epochs[0].position(np.array([0.35])) == pytest.approx(3.5)  # straight across
+    assert clock.at(np.array([1.0, 6.0, 9.0, 11.0])) == pytest.approx([0.1, 0.6, 0.3, 0.5])
+    assert clock.state.ppm == pytest.approx(0.0)
+
+
+def test_loss_of_half_of_all_samples_is_reported_immediately(tmp_path: Path) -> None:
+    rng = np.random.default_rng(8)
+    lost = {name: rng.random(N_SAMPLES) < 0.5 for name in NAMES}
+    for gone in lost.values():
+        gone[0] = False
+    path = write_polled(tmp_path / "r.h5", lost)
+    with pytest.raises(NoResultError, match="not one whole segment"):
+        estimate([path], Settings(segment=4.0))
+
+
+def test_many_gaps_of_free_running_sensors_do_not_increase_the_reads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    motion = counts(N_SAMPLES, 1, 3)
+    reads = {}
+    for n_gaps in (0, 200):
+        gaps = tuple((3000 + 20 * number, 3001 + 20 * number) for number in range(n_gaps))
+        sensors = {
+            name: FreeRunning(motion + counts(N_SAMPLES, 1, 7 + number) // 100, 50.0, gaps=gaps)
+            for number, name in enumerate(NAMES)
+        }
+        path = write(tmp_path / f"{n_gaps}.h5", sensors)
+        work, n_segments = work_of(path, monkeypatch)
+        assert n_segments > 10
+        reads[n_gaps] = work.n_reads
+    assert reads[200] <= 1.5 * reads[0]

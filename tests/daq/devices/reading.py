@@ -1,0 +1,68 @@
+"""Read from a driver until a test has enough."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING, cast
+
+from daq.errors import NoAnswerError
+from daq.protocols.block import Block, Event
+from daq.recorder.connection import patience_of
+from tests.devices import host_clock
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator, AsyncIterator, Sequence
+
+    from daq.bench.model import Sensor
+    from daq.devices.interface import DriverType, Session
+
+
+@contextlib.asynccontextmanager
+async def reading(
+    driver: DriverType, sensors: Sequence[Sensor], *, speed: float = 1.0
+) -> AsyncIterator[AsyncIterator[Block | Event]]:
+    """Open a session and its reading; both are closed on exit."""
+    async with (
+        driver.open(sensors, host_clock(speed)) as session,
+        contextlib.aclosing(_patiently(session, speed)) as items,
+    ):
+        yield items
+
+
+async def _patiently(session: Session, speed: float) -> AsyncGenerator[Block | Event]:
+    """Yield what the session yields, until nothing has come for as long as it states."""
+    patience = patience_of(session) / speed
+    loop = asyncio.get_running_loop()
+    async with contextlib.aclosing(cast("AsyncGenerator[Block | Event]", session.read())) as items:
+        deadline = loop.time() + patience
+        while True:
+            try:
+                async with asyncio.timeout_at(deadline):
+                    item = await anext(items)
+            except TimeoutError as error:
+                if isinstance(error, NoAnswerError):
+                    raise
+                hint = getattr(session, "hint", "")
+                sensor = session.information[0].sensor
+                raise NoAnswerError(f"{sensor!r}: nothing for {patience:g} s; {hint}") from error
+            if isinstance(item, Block):
+                deadline = loop.time() + patience
+            yield item
+
+
+async def record(
+    driver: DriverType, sensor: Sensor, n_samples: int, *, speed: float = 1.0
+) -> tuple[list[Block], list[Event]]:
+    """Return the blocks of one sensor up to a sample, and the events until then."""
+    blocks: list[Block] = []
+    events: list[Event] = []
+    async with reading(driver, [sensor], speed=speed) as items:
+        async for item in items:
+            if isinstance(item, Event):
+                events.append(item)
+                continue
+            blocks.append(item)
+            if item.end_sample >= n_samples:
+                break
+    return blocks, events

@@ -1,0 +1,233 @@
+"""What every driver must do, swept over all of them and their simulated devices."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+import pytest
+
+from daq.conformance.replay import replay
+from daq.conformance.suite import EARLY, LATENCY, check_counters, check_truth, watching_the_loop
+from daq.devices.registry import driver_names, driver_type
+from daq.errors import DeviceError, NoAnswerError, NotConnectedError
+from daq.protocols.block import Block, BlockFlag, Event
+from daq.protocols.errors import RemoteProtocolError
+from daq.transport.wire_log import logging_to, session_ends
+from tests.daq.devices.driver_modes import CASES, RATE, Served, serving_all
+from tests.daq.devices.reading import reading
+from tests.devices import host_clock
+from tests.waiting import limit
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator, AsyncIterator, Iterator
+    from pathlib import Path
+
+    from daq.bench.model import Sensor
+
+pytestmark = pytest.mark.devices
+
+SPEED = 4.0
+N = 150
+
+
+@pytest.fixture(scope="module")
+def served() -> Iterator[Served]:
+    with serving_all(speed=SPEED) as devices:
+        yield devices
+
+
+def test_no_driver_is_left_out() -> None:
+    tested_elsewhere = {"epson-can", "sound"}  # have no simulated device to serve
+    assert {case["driver"] for case in CASES.values()} | tested_elsewhere == set(driver_names())
+
+
+@pytest.mark.parametrize("mode", CASES)
+async def test_blocks_are_in_order_and_whole(served: Served, mode: str) -> None:
+    kind = driver_type(CASES[mode]["driver"])
+    chosen = served.sensors(mode)
+    wanted = round(N * chosen[0].sampling_rate / RATE)
+    by_name = {sensor.name: sensor for sensor in chosen}
+    found: dict[str, list[Block]] = {name: [] for name in by_name}
+    clock = host_clock(SPEED)
+    begin = clock.now()
+    for _ in range(2):  # the port is free again after a session, and a session begins anew
+        found = {name: [] for name in by_name}
+        async with kind.open(chosen, clock) as session:
+            assert [one.sensor for one in session.information] == list(by_name)
+            assert not any(one.trouble for one in session.information)
+            stream = cast("AsyncGenerator[Block | Event]", session.read())
+            async with contextlib.aclosing(stream) as items:
+                async for item in items:
+                    if isinstance(item, Event):
+                        assert item.kind in {"connected", "status"}, item
+                        continue
+                    found[item.sensor].append(item)
+                    if all(b and b[-1].end_sample >= wanted for b in found.values()):
+                        break
+    for name, blocks in found.items():
+        first = blocks[0]
+        assert first.first_sample == 0
+        assert BlockFlag.CLOCK_RESTART in first.flags
+        assert not first.reason
+        end, at = 0, begin.monotonic_ns
+        for block in blocks:
+            assert block.n_samples > 0
+            assert block.counts.shape == (block.n_samples, len(by_name[name].channels))
+            assert block.counts.dtype == kind.counts_dtype(by_name[name])
+            if block.instants_ns is None:
+                assert block.first_sample == end
+            else:  # a busy host polls late: what it left out is said
+                assert block.first_sample >= end
+                assert bool(block.reason) == (block.first_sample > end)
+            assert block.received.monotonic_ns >= at
+            assert block.instants_ns is None or np.all(np.diff(block.instants_ns) > 0)
+            end, at = block.end_sample, block.received.monotonic_ns
+        counts = np.concatenate([block.counts for block in blocks])
+        assert counts.std(axis=0).min() > 0
+        index = np.concatenate([np.arange(b.first_sample, b.end_sample) for b in blocks])
+        if CASES[mode]["driver"] == "registers":
+            which = served.assert_felt(mode, name, index, counts)
+            instants = np.concatenate([b.instants_ns for b in blocks if b.instants_ns is not None])
+            late = instants * 1e-9 - served.sent(mode, name, clock, speed=SPEED).due[which]
+            assert late.min() >= -EARLY
+            assert np.median(late) <= LATENCY
+            continue
+        sent = served.sent(mode, name, clock, speed=SPEED)
+        check_counters(blocks)
+        check_truth(by_name[name], blocks, sent)
+
+
+@pytest.mark.parametrize("mode", CASES)
+def test_the_event_loop_is_not_blocked(served: Served, mode: str) -> None:
+    """In a loop that does not wait for slow processes."""
+
+    async def run() -> list[float]:
+        async with watching_the_loop() as blocked:
+            kind, found = driver_type(CASES[mode]["driver"]), 0
+            async with asyncio.timeout(limit()), reading(kind, served.sensors(mode)) as items:
+                async for item in items:
+                    found += item.n_samples if isinstance(item, Block) else 0
+                    if found >= N:
+                        break
+        return blocked
+
+    assert not asyncio.run(run())
+
+
+@pytest.mark.parametrize("mode", [mode for mode in CASES if mode != "registers tcp"])
+async def test_a_logged_session_is_replayed(served: Served, mode: str, tmp_path: Path) -> None:
+    """Every block and event, with its host time; pymodbus has ports of its own."""
+    kind, chosen = driver_type(CASES[mode]["driver"]), served.sensors(mode)
+    found: list[Block | Event] = []
+    n_samples = 0
+    with logging_to(tmp_path / "wire.jsonl"):
+        async with reading(kind, chosen, speed=SPEED) as items:
+            async for item in items:
+                found.append(item)
+                n_samples += item.n_samples if isinstance(item, Block) else 0
+                if n_samples >= N * chosen[0].sampling_rate / RATE:
+                    session_ends()
+                    break
+    replayed = await replay(tmp_path / "wire.jsonl", kind, chosen, limit=limit())
+    for was, now in zip(found, replayed, strict=False):
+        if isinstance(was, Block):
+            assert isinstance(now, Block)
+            np.testing.assert_array_equal(was.counts, now.counts)
+            assert was.first_sample == now.first_sample
+            assert was.device_counter == now.device_counter
+            assert was.flags == now.flags
+            assert was.received == now.received
+        else:
+            assert isinstance(now, Event)
+            assert was.text == now.text
+    assert len(replayed) >= len(found)
+
+
+@pytest.mark.parametrize("mode", CASES)
+async def test_a_port_that_is_not_there_is_named(served: Served, mode: str) -> None:
+    scheme = served.device(mode).port.partition("://")[0]
+    known = scheme in {"modbus-tcp", "seedlink", "udp", "iio"}
+    port = f"{scheme}://127.0.0.1:1" if known else "socket://127.0.0.1:1"
+    if mode == "text udp":  # listens itself, at an address that is not this computer's
+        port = "udp://192.0.2.1:8888"
+    chosen = served.sensors(mode, port=port)
+    with pytest.raises(NotConnectedError) as caught:
+        async with reading(driver_type(CASES[mode]["driver"]), chosen) as items:
+            await anext(items)
+    assert port in str(caught.value)
+    assert repr(chosen[0].name) in str(caught.value)
+
+
+@contextlib.asynccontextmanager
+async def stranger(garbage: bytes) -> AsyncIterator[int]:
+    """Yield the number of a port where something listens that is no device."""
+    tasks: list[asyncio.Task[None] | None] = []
+
+    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        tasks.append(asyncio.current_task())
+        with contextlib.suppress(ConnectionError):
+            writer.write(garbage)
+            while await reader.read(4096):
+                writer.write(garbage)
+        writer.transport.abort()
+
+    async with await asyncio.start_server(talk, "127.0.0.1", 0) as server:
+        yield server.sockets[0].getsockname()[1]
+    await asyncio.gather(*filter(None, tasks))
+
+
+async def outcome(mode: str, chosen: list[Sensor]) -> tuple[Exception | None, int]:
+    """Return how reading ends within a few seconds, and how many blocks came until then."""
+    kind, n_blocks = driver_type(CASES[mode]["driver"]), 0
+    try:
+        async with asyncio.timeout(12), reading(kind, chosen, speed=SPEED) as items:
+            async for item in items:
+                n_blocks += isinstance(item, Block)
+    except (DeviceError, RemoteProtocolError, TimeoutError) as error:
+        return error, n_blocks
+    return None, n_blocks
+
+
+def _scheme(port: str) -> str:
+    scheme = port.partition("://")[0]
+    return scheme if scheme in {"modbus-tcp", "seedlink", "iio"} else "socket"
+
+
+@pytest.mark.parametrize("garbage", [b"", bytes(range(256)) * 3], ids=["silence", "garbage"])
+async def test_strangers_are_no_devices(served: Served, garbage: bytes) -> None:
+    modes = [mode for mode in CASES if not served.device(mode).port.startswith("udp")]
+    async with stranger(garbage) as number:
+        ports = {
+            mode: f"{_scheme(served.device(mode).port)}://127.0.0.1:{number}" for mode in modes
+        }
+        outcomes = await asyncio.gather(
+            *(outcome(mode, served.sensors(mode, port=ports[mode])) for mode in modes)
+        )
+    for mode, (error, n_blocks) in zip(modes, outcomes, strict=True):
+        assert not n_blocks, mode
+        assert isinstance(error, (DeviceError, RemoteProtocolError)), (mode, error)
+
+
+@pytest.mark.parametrize("mode", CASES)
+async def test_z_a_device_that_vanishes_ends_the_session(served: Served, mode: str) -> None:
+    """Last in this file: it ends the devices."""
+    chosen = served.sensors(mode)
+    error: Exception | None = None
+    seen = 0
+    try:
+        async with (
+            asyncio.timeout(30),
+            reading(driver_type(CASES[mode]["driver"]), chosen, speed=SPEED) as items,
+        ):
+            async for item in items:
+                seen += isinstance(item, Block)
+                if seen:
+                    served.device(mode).kill()
+    except (NotConnectedError, NoAnswerError) as came:
+        error = came
+    assert seen
+    assert error is not None
+    assert repr(chosen[0].name) in str(error)

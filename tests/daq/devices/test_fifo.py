@@ -1,0 +1,233 @@
+"""Block FIFO driver and simulated unit over a pseudo-terminal and TCP."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import pytest
+
+from daq.devices.interface import DeviceInformation
+from daq.devices.modbus import rtu
+from daq.devices.modbus.fifo import FifoSession, FifoSettings
+from daq.devices.modbus.fifo_protocol import FifoDecoder
+from daq.devices.registry import driver_type
+from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
+from daq.protocols.block import Block, BlockFlag, Event, HostTime
+from daq.transport.ports import open_port
+from sim_devices.devices.fifo import create
+from sim_devices.devices.interface import Source
+from sim_devices.faults import LineFaults
+from sim_devices.server.serve import Served, WorldClock, device_spec
+from sim_devices.world.world import World
+from tests.daq.devices.reading import reading
+from tests.devices import host_clock, paced_clock, serving
+from tests.sim_devices.simulated_bench import device, scenario, sensors, spec
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from daq.bench.model import Sensor
+    from daq.transport.byte_stream import ByteStream
+    from sim_devices.server.launch import RunningDevice
+    from sim_devices.world.scenario import Scenario
+
+pytestmark = pytest.mark.devices
+
+RATE = 2000.0
+COUNTS = 100_000.0
+DRIVER = driver_type("fifo")
+CHANNELS = [{"name": axis, "sensitivity": COUNTS} for axis in "xyz"]
+
+
+def table(name: str, *, rate: float = RATE, **changes: Any) -> dict[str, Any]:  # noqa: ANN401 -- whatever a table holds
+    return device(name, "fifo", channels={name: CHANNELS}, sampling_rate=rate, **changes)
+
+
+TABLES = [
+    table("A", settings={"capacity": 6000}),
+    table("B", port="tcp", settings={"header": "left", "unit": 7}),
+]
+SETTINGS: list[dict[str, Any]] = [{"capacity": 6000}, {"header": "left", "unit": 7}]
+
+
+SPEC = spec(*TABLES, sampling_rate=RATE)
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[tuple[RunningDevice, ...]]:
+    with serving(SPEC) as devices:
+        yield devices
+
+
+def sensor(running: tuple[RunningDevice, ...], index: int, **changes: Any) -> Sensor:  # noqa: ANN401
+    settings = {**SETTINGS[index], **changes.pop("settings", {})}
+    return sensors(running[index], TABLES[index], settings=settings, **changes)[0]
+
+
+async def record(
+    one: Sensor, n_samples: int, *, idle_after: int | None = None
+) -> tuple[list[Block], list[Event]]:
+    blocks: list[Block] = []
+    events: list[Event] = []
+    async with reading(DRIVER, [one]) as items:
+        async for item in items:
+            if isinstance(item, Event):
+                events.append(item)
+                continue
+            blocks.append(item)
+            if idle_after is not None and item.end_sample >= idle_after:
+                idle_after = None
+                await asyncio.sleep(2.5)  # the test's own idleness is what is tested
+            if blocks[-1].end_sample >= n_samples and idle_after is None:
+                break
+    return blocks, events
+
+
+@pytest.mark.parametrize("index", [0, 1])
+async def test_the_fifo_is_read_as_fast_as_it_fills(
+    running: tuple[RunningDevice, ...], index: int
+) -> None:
+    """Every sample once: the counts are the world's, in one piece."""
+    blocks, events = await record(sensor(running, index), 1500)
+    assert not events
+    assert [b.first_sample for b in blocks] == [0, *(b.end_sample for b in blocks[:-1])]
+    assert blocks[0].flags == BlockFlag.CLOCK_RESTART
+    assert {b.flags for b in blocks[1:]} == {BlockFlag.NONE}
+    counts = np.concatenate([b.counts for b in blocks])[:1500]
+    assert counts.dtype == np.int16
+    assert counts.std(axis=0) == pytest.approx(np.full(3, COUNTS * 0.03), rel=0.3)
+    assert_felt(scenario("AB", sampling_rate=RATE), "AB"[index], blocks, SPEC)
+
+
+def assert_felt(
+    truth: Scenario, name: str, blocks: list[Block], world: dict[str, Any], n: int = 1500
+) -> None:
+    """See that counts are what the sensor felt, one after the other."""
+    rate = world["devices"][0]["sampling_rate"]
+    counts = np.concatenate([b.counts for b in blocks])[:n]
+    elapsed = round((blocks[0].received.monotonic_ns - world["epoch_ns"]) * 1e-9 * rate)
+    first = max(0, elapsed - 6000)
+    felt = World(truth).samples(name, first, elapsed - first + 200) * COUNTS
+    start = int(np.abs(felt - counts[0]).max(axis=1).argmin())
+    expected = World(truth).samples(name, first + start, n) * COUNTS
+    assert np.abs(expected - counts).max() <= 0.5
+
+
+async def test_every_sample_is_received_at_the_factory_rate() -> None:
+    """7812 Hz of three channels: 191 reads a second."""
+    one = table("A", rate=7812.0, settings={"capacity": 65_535})
+    world = spec(one, sampling_rate=7812.0, age=0.0)
+    with serving(world) as (running,):
+        patient = sensors(running, one, settings={"capacity": 65_535, "timeout": 2.0})[0]
+        blocks, events = await record(patient, 4000)
+    assert not events
+    assert [b.first_sample for b in blocks] == [0, *(b.end_sample for b in blocks[:-1])]
+    assert_felt(scenario("A", sampling_rate=7812.0), "A", blocks, world, 4000)
+
+
+async def test_replies_are_not_delayed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However rarely a device sends what is due, and however long ago the computer was started."""
+    monkeypatch.setattr("sim_devices.server.serve.MIN_INTERVAL", 1e9)
+    described = device_spec(table("A"))
+    (line,) = create(described, Source(scenario("A", sampling_rate=RATE), described))
+    clock = WorldClock(paced_clock().now_ns(), monotonic_ns=paced_clock().now_ns)
+    served = Served(line, clock, LineFaults((), "A", begin=0.0), lambda *_: None)
+    try:
+        await served.port.open()
+        async with asyncio.timeout(10), open_port(served.port.address, host_clock()) as stream:
+            for _ in range(3):
+                await stream.write(rtu.read_request(1, 2, 1))
+                assert (await stream.read())[0]
+    finally:
+        await served.close()
+
+
+async def test_a_link_that_is_too_slow_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("daq.devices.modbus.fifo.MAX_FILLING_TIME", 0.4)
+    one = table("A", settings={"baud_rate": 115_200, "capacity": 6000})
+    with serving(spec(one, sampling_rate=RATE)) as (running,):
+        slow = sensors(running, one, settings={})[0]
+        with pytest.raises(NoAnswerError, match=r"never empty, 58\d\d words left: the link is too"):
+            await record(slow, 1)
+
+
+async def test_a_lost_reply_is_not_reported_as_a_slow_link(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However much waits: a link is slow where that never lessens."""
+    monkeypatch.setattr("daq.devices.modbus.fifo.MAX_FILLING_TIME", 0.4)
+
+    class Backlog:
+        label, level, asked = "backlog", 6000, 0
+
+        def discard(self) -> None:
+            pass
+
+        async def write(self, request: bytes) -> None:
+            n = int.from_bytes(request[4:6], "big") - 1
+            self.asked += 1
+            self.reply = rtu.encode_registers(1, 4, np.array([self.level] + [7] * n, np.uint16))
+            self.level = max(0, self.level - n)
+
+        async def read(self) -> tuple[bytes, HostTime]:
+            await asyncio.sleep(10.0 if self.asked == 1 else 0.015)
+            return self.reply, host_clock().now()
+
+    settings = FifoSettings(timeout=0.1, poll_interval=1e-3)
+    decoder = FifoDecoder("A", RATE, n_channels=3, header="size", unit=1, capacity=None)
+    stream = cast("ByteStream", Backlog())
+    session = FifoSession(
+        stream,
+        settings,
+        decoder,
+        information=DeviceInformation("A"),
+        clock=host_clock(),
+        patience=10.0,
+    )
+    items = []
+    async with asyncio.timeout(30):
+        async for item in session.read():
+            items.append(item)
+            if len(items) == 2:
+                break
+    assert isinstance(items[0], Event)
+    assert isinstance(items[1], Block)
+
+
+async def test_an_overflow_is_reported_and_its_gap_estimated(
+    running: tuple[RunningDevice, ...],
+) -> None:
+    """2000 samples fit; nobody reads for 2.5 s, 5000 samples."""
+    blocks, events = await record(sensor(running, 0), 6000, idle_after=400)
+    assert [e.kind for e in events] == ["overflow"]
+    gap = next(b for b in blocks if b.reason)
+    before = blocks[blocks.index(gap) - 1]
+    assert gap.reason == "FIFO full"
+    assert gap.flags == BlockFlag.MISSING_ESTIMATED
+    assert gap.first_sample - before.end_sample > 300
+    # by the host, all samples of the time are there or missing, to what the host may be late by:
+    # without the gap 3000 would be missing
+    elapsed = (blocks[-1].received.monotonic_ns - blocks[0].received.monotonic_ns) * 1e-9 * RATE
+    assert blocks[-1].end_sample - blocks[0].end_sample == pytest.approx(elapsed, abs=2500)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "said"),
+    [
+        ({"settings": {"unit": 9}}, NoAnswerError, "of unit 9: nothing received; check cable"),
+        ({"sampling_rate": 20_001.0}, WrongDeviceError, "refused setting .*: illegal value"),
+        ({"sampling_rate": 0.5}, BenchFileError, "expected whole Hz"),
+    ],
+)
+async def test_wrong_settings_are_reported(
+    running: tuple[RunningDevice, ...], changes: dict[str, Any], error: type[Exception], said: str
+) -> None:
+    with pytest.raises(error, match=said):
+        await record(sensor(running, 0, **changes), 1)
+
+
+async def test_two_sensors_do_not_share_a_line(running: tuple[RunningDevice, ...]) -> None:
+    some = [sensor(running, 0, name=name) for name in ("P", "Q")]
+    with pytest.raises(BenchFileError, match="'P', 'Q'; reading one FIFO takes all of a line"):
+        async with DRIVER.open(some, host_clock()):
+            pass

@@ -1,0 +1,105 @@
+"""Linux IIO devices: what overflows in the board is a gap of exact length, and what is refused."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import pytest
+
+from daq.bench.model import Channel, Sensor
+from daq.devices.iio.driver import IioSession
+from daq.devices.iio.protocol import Device, ScanElement, ScanLayout
+from daq.devices.interface import DeviceInformation
+from daq.devices.registry import driver_type
+from daq.errors import WrongDeviceError
+from daq.protocols.block import Block, BlockFlag, Event, HostTime
+from tests.daq.devices.reading import record
+from tests.devices import serving
+from tests.sim_devices.simulated_bench import device, sensors, spec
+
+if TYPE_CHECKING:
+    from sim_devices.server.launch import RunningDevice
+
+pytestmark = pytest.mark.devices
+
+RATE = 100.0
+DRIVER = driver_type("iio")
+TABLE = device("A", "iio", port="tcp", sampling_rate=RATE)
+ELEMENTS = (
+    ScanElement.of("accel_x", 0, "le:s32/32>>0", ()),
+    ScanElement.of("timestamp", 1, "le:s64/64>>0", ()),
+)
+
+
+def of(running: RunningDevice, **settings: Any) -> Sensor:  # noqa: ANN401
+    (one,) = sensors(running, TABLE, settings=settings)
+    return one
+
+
+async def test_any_channels_in_any_order() -> None:
+    with serving(spec(TABLE, speed=4.0)) as (running,):
+        plain, _ = await record(DRIVER, of(running), 50, speed=4.0)
+        inputs = ("accel_z", "accel_x", "accel_y")
+        turned, _ = await record(DRIVER, of(running, inputs=inputs), 50, speed=4.0)
+    first = {block.device_counter: block for block in plain}
+    assert plain[0].counts.shape[1] == 3
+    assert turned[0].device_counter not in first
+    assert turned[0].counts.std(axis=0).min() > 0
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"device": "adxl357"}, r"there are: adxl355 \(iio:device0\); set settings.device"),
+        (
+            {"inputs": ("accel_x", "accel_y", "gyro_z")},
+            "has the channels accel_x, accel_y, accel_z",
+        ),
+        ({"inputs": ("accel_x",)}, "expected 3 of them"),
+    ],
+)
+async def test_another_device_is_refused(settings: dict[str, Any], said: str) -> None:
+    with serving(spec(TABLE)) as (running,), pytest.raises(WrongDeviceError, match=said):
+        await record(DRIVER, of(running, **settings), 1)
+
+
+def decoded(*buffers: list[float], jitter: float = 0.0) -> list[Block | Event]:
+    """Return what becomes of scans at these numbers of a sample, their values."""
+    channels = (Channel(name="x", sensitivity=1.0),)
+    one = Sensor(name="A", driver="iio", port="iio://x", sampling_rate=RATE, channels=channels)
+    session = IioSession(
+        cast("Any", None),  # nothing is read
+        one,
+        Device("iio:device0", "x", ELEMENTS, ()),
+        ["accel_x"],
+        information=DeviceInformation("A", sampling_rate=RATE),
+        patience=1.0,
+    )
+    layout, rng = ScanLayout(ELEMENTS), np.random.default_rng(1)
+    found: list[Block | Event] = []
+    for numbers in buffers:
+        late = rng.uniform(-jitter, jitter, len(numbers)) / RATE
+        times = np.rint((np.array(numbers) / RATE + late + 1.8e9) * 1e9).astype(np.int64)
+        scans = layout.encode({"accel_x": np.array(numbers, np.int64), "timestamp": times})
+        found += session._blocks(scans, HostTime(0, 0))  # noqa: SLF001
+    return found
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.2])
+def test_lost_scans_are_gaps_where_the_times_have_them(jitter: float) -> None:
+    """Within a buffer and between two; the value of each scan is its number."""
+    numbers = [*range(13), *range(17, 40), *range(140, 150)], [*range(150, 160)], [*range(190, 200)]
+    blocks = [b for b in decoded(*map(list, numbers), jitter=jitter) if isinstance(b, Block)]
+    for block in blocks:
+        assert block.counts[:, 0].tolist() == list(range(block.first_sample, block.end_sample))
+        assert BlockFlag.MISSING_ESTIMATED not in block.flags
+    assert [b.first_sample for b in blocks if b.reason] == [17, 140, 190]
+    assert BlockFlag.CLOCK_RESTART in blocks[0].flags
+
+
+def test_a_clock_that_is_set_makes_no_gap() -> None:
+    found = decoded([0, 1, 2, 3], [4, 5, 6], [-5000, -4999, -4998], [-4997, -4996])
+    blocks = [item for item in found if isinstance(item, Block)]
+    assert [(b.first_sample, b.end_sample) for b in blocks] == [(0, 4), (4, 7), (7, 10), (10, 12)]
+    assert [item.kind for item in found if isinstance(item, Event)] == ["reset"]

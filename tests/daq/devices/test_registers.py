@@ -1,0 +1,234 @@
+"""The register poller against slaves whose replies are damaged, and through adapters that echo."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections import Counter
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.bench.model import Channel, Sensor
+from daq.devices.modbus import rtu
+from daq.devices.modbus.bus import open_bus
+from daq.devices.registry import driver_type
+from daq.errors import NoAnswerError
+from daq.protocols.block import Block, Event
+from tests.devices import host_clock
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+pytestmark = pytest.mark.virtual_time
+
+RATE = 20.0
+DRIVER = driver_type("registers")
+
+
+@contextlib.asynccontextmanager
+async def slave(answer: Callable[[int, bytes], bytes]) -> AsyncIterator[str]:
+    """Serve a slave that answers its n-th request, of eight bytes; yield its port."""
+    tasks: list[asyncio.Task[None] | None] = []
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        tasks.append(asyncio.current_task())
+        n = 0
+        with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
+            while True:
+                request = await reader.readexactly(8)
+                await asyncio.sleep(0.005)  # the line
+                writer.write(answer(n, request))
+                n += 1
+        writer.close()
+
+    async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
+        yield f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+    await asyncio.gather(*filter(None, tasks))
+
+
+def reply(n: int, *, unit: int = 1) -> bytes:
+    return rtu.encode_registers(unit, 3, np.array([n, 7, 9], np.uint16))
+
+
+def sensor(port: str, **settings: object) -> Sensor:
+    return Sensor(
+        name="A",
+        driver="registers",
+        port=port,
+        sampling_rate=RATE,
+        channels=tuple(Channel(name=axis, sensitivity=1.0) for axis in "xyz"),
+        settings={"address": 0, **settings},
+    )
+
+
+async def polled(one: Sensor, n_polls: int) -> tuple[int, int, Counter[str]]:
+    """Return samples recorded and missing after so many polls, and the events by their kind."""
+    n_samples = end = 0
+    kinds: Counter[str] = Counter()
+    async with DRIVER.open([one], host_clock()) as session:
+        async for item in session.read():
+            if isinstance(item, Event):
+                kinds[item.kind] += 1
+                continue
+            assert isinstance(item, Block)
+            assert (item.counts[:, 1:] == [7, 9]).all()
+            n_samples += item.n_samples
+            end = item.end_sample
+            if end >= n_polls:
+                break
+    return n_samples, end - n_samples, kinds
+
+
+def flipped(frame: bytes, at: int) -> bytes:
+    return frame[:at] + bytes([frame[at] ^ 0x10]) + frame[at + 1 :]
+
+
+@pytest.mark.parametrize("at", [10, 5, 2, 0], ids=["checksum", "value", "length", "unit"])
+async def test_a_damaged_reply_loses_one_poll(at: int) -> None:
+    """One in twenty: 5 % of the samples, whatever byte of the reply is damaged."""
+
+    def answer(n: int, _request: bytes) -> bytes:
+        return flipped(reply(n), at) if n % 20 == 10 else reply(n)
+
+    async with slave(answer) as port:
+        n_samples, n_missing, kinds = await polled(sensor(port), 400)
+    assert kinds == {"checksum": pytest.approx(20, abs=1)}
+    assert n_missing <= 20
+    assert n_samples >= 380
+
+
+async def test_garbage_before_a_reply_loses_at_most_one_poll() -> None:
+    """And its reply never answers the next request."""
+
+    def answer(n: int, _request: bytes) -> bytes:
+        return bytes(range(40)) + reply(n) if n % 20 == 10 else reply(n)
+
+    async with slave(answer) as port:
+        n_samples, n_missing, _ = await polled(sensor(port), 400)
+    assert n_missing <= 20
+    assert n_samples >= 380
+
+
+async def test_a_cut_reply_loses_two_polls() -> None:
+    """That its rest will not come is known after 60 ms."""
+
+    def answer(n: int, _request: bytes) -> bytes:
+        return reply(n)[:-3] if n % 20 == 10 else reply(n)
+
+    async with slave(answer) as port:
+        n_samples, n_missing, _ = await polled(sensor(port), 400)
+    assert n_missing <= 40
+    assert n_samples >= 360
+
+
+@pytest.mark.parametrize("settings", [{}, {"echo": True}], ids=["recognised", "stated"])
+async def test_replies_are_read_over_an_adapter_with_echo(settings: dict[str, object]) -> None:
+    async with slave(lambda n, request: request + reply(n)) as port:
+        n_samples, n_missing, kinds = await polled(sensor(port, **settings), 100)
+    assert (n_missing, kinds) == (0, {})
+    assert n_samples >= 100
+
+
+async def test_an_echo_is_not_accepted_as_reply_to_a_write() -> None:
+    """Where the user says that the adapter echoes, a silent slave is none that obeys."""
+    async with slave(lambda _n, request: request) as port:
+        silent = sensor(port)
+        settings = {"preset": "witmotion", "echo": True, "timeout": 0.1}
+        silent = silent.model_copy(update={"settings": settings, "sampling_rate": 50.0})
+        with pytest.raises(NoAnswerError, match="function 6"):
+            async with DRIVER.open([silent], host_clock()):
+                pass
+
+
+class SlowSlave:
+    """Answers in order, some requests late and some never; it tells when each was read.
+
+    Its first three registers have the time of the reading in units of 0.1 ms.
+    """
+
+    def __init__(self, seed: int, *, lost: float, late: float, n_registers: int = 100) -> None:
+        self._rng = np.random.default_rng(seed)
+        self._lost, self._late, self._n_registers = lost, late, n_registers
+        self.n_late = 0
+        self.n_lost = 0
+
+    @contextlib.asynccontextmanager
+    async def serve(self) -> AsyncIterator[str]:
+        """Serve; yield the port."""
+        tasks: list[asyncio.Task[None] | None] = []
+
+        async def answered(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            tasks.append(asyncio.current_task())
+            with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
+                while True:
+                    request = await reader.readexactly(8)
+                    await asyncio.sleep(0.002)
+                    writer.write(await self._reply(request))
+            writer.close()
+
+        async with await asyncio.start_server(answered, "127.0.0.1", 0) as server:
+            yield f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+        await asyncio.gather(*filter(None, tasks))
+
+    async def _reply(self, request: bytes) -> bytes:
+        count = int.from_bytes(request[4:6], "big")
+        if count > self._n_registers:
+            return rtu.encode_exception(1, 3, 2)
+        now = round(host_clock().now().monotonic_ns / 1e5)
+        values = [now >> 32 & 0xFFFF, now >> 16 & 0xFFFF, now & 0xFFFF, *range(count - 3)]
+        drawn = self._rng.uniform()
+        if drawn < self._lost:
+            self.n_lost += 1
+            return b""
+        late = drawn < self._lost + self._late
+        self.n_late += late
+        await asyncio.sleep(self._rng.uniform(0.02, 0.4) if late else 0.003)
+        return rtu.encode_registers(1, 3, np.array(values[:count], np.uint16))
+
+
+async def _polled_slow(slow: SlowSlave, n_polls: int) -> float:
+    """Return the share of missing readings."""
+    n_samples = end = 0
+    async with slow.serve() as port:
+        one = sensor(port).model_copy(update={"sampling_rate": 50.0})
+        async with DRIVER.open([one], host_clock()) as session:
+            async for item in session.read():
+                if isinstance(item, Block):
+                    n_samples += item.n_samples
+                    end = item.end_sample
+                if end >= n_polls:
+                    return 1 - n_samples / end
+    raise AssertionError("the session ended")
+
+
+@pytest.mark.parametrize("n_registers", [100, 4])
+async def test_lost_replies_cost_little_more_than_themselves(n_registers: int) -> None:
+    """2 % lost at 50 Hz: at most 8 % missing."""
+    slow = SlowSlave(1, lost=0.02, late=0.0, n_registers=n_registers)
+    assert 0.01 < await _polled_slow(slow, 3000) <= 0.08
+    assert slow.n_lost > 30
+
+
+@pytest.mark.parametrize("n_registers", [100, 4, 3])
+@pytest.mark.parametrize("seed", range(3))
+async def test_a_late_reply_is_never_the_reply_to_a_later_request(
+    seed: int, n_registers: int
+) -> None:
+    """Whether the device has further registers, which tell by their number, or not."""
+    slow = SlowSlave(seed, lost=0.02, late=0.03, n_registers=n_registers)
+    clock, n_replies = host_clock(), 0
+    async with slow.serve() as port, open_bus(port, clock, label="A") as bus:
+        for _ in range(2000):
+            with contextlib.suppress(NoAnswerError):
+                reply = await bus.read(3, 1, 0, 3)
+                read_ns = sum(
+                    word << shift for word, shift in zip(reply.registers, (32, 16, 0), strict=True)
+                )
+                assert reply.sent.monotonic_ns <= read_ns * 10**5 + 10**5
+                assert read_ns * 10**5 <= reply.received.monotonic_ns + 10**5
+                n_replies += 1
+            await asyncio.sleep(0.015)
+    assert slow.n_late > 20
+    assert n_replies > 1600

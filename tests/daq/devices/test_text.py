@@ -1,0 +1,185 @@
+"""Text driver and simulated devices: rows over a pseudo-terminal and TCP, packets over UDP."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from daq.devices.registry import driver_type
+from daq.errors import BenchFileError, NoAnswerError
+from daq.protocols.block import BlockFlag, Event
+from daq.transport.address import host_and_port
+from sim_devices.world.world import World
+from tests.daq.devices import reading
+from tests.devices import serving
+from tests.sim_devices.simulated_bench import device, scenario, sensors, spec
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from daq.bench.model import Sensor
+    from daq.protocols.block import Block
+    from sim_devices.server.launch import RunningDevice
+
+pytestmark = pytest.mark.devices
+
+SPEED = 4.0
+RATE = 100.0
+COUNTS = 1e6
+DRIVER = driver_type("text")
+LILY = {"preset": "lily", "start": "*9900XYC2\r\n", "stop": "*9900XYC-OFF\r\n"}
+OWN = {
+    "delimiter": ";",
+    "prefix": "$",
+    "tag": "ACC",
+    "columns": [2, 3, 4],
+    "counter_column": 1,
+    "counter_modulus": 256,
+    "nmea_checksum": True,
+    "whole": True,
+}
+SETTINGS: list[dict[str, Any]] = [{"preset": "raspberry-shake"}, OWN, LILY, {"time_column": 3}]
+PORTS = ["udp", "pty", "pty", "tcp"]
+RATES = [RATE, RATE, 1.0, RATE]
+
+
+def table(index: int) -> dict[str, Any]:
+    name, names = "ABCD"[index], "XY" if index == 2 else ("EHZ", "EHN", "EHE")
+    return device(
+        name,
+        "text",
+        channels={name: [{"name": n, "sensitivity": COUNTS} for n in names]},
+        port=PORTS[index],
+        sampling_rate=RATES[index],
+        settings=SETTINGS[index],
+    )
+
+
+TABLES = [table(i) for i in range(4)]
+
+
+def specification() -> dict[str, Any]:
+    """Sensor C is a tiltmeter: it has two channels, and one sample a second."""
+    made = spec(*TABLES, speed=SPEED, sampling_rate=RATE)
+    two = {"directions": [[1, 0, 0], [0, 1, 0]], "sampling_rate": 1.0}
+    made["scenario"]["sensors"]["C"] |= two
+    made["scenario"]["motion"]["bandwidth"] = 40.0
+    return made
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[tuple[RunningDevice, ...]]:
+    with serving(specification()) as devices:
+        yield devices
+
+
+def sensor(running: tuple[RunningDevice, ...], index: int, **changes: Any) -> Sensor:  # noqa: ANN401
+    settings = {**SETTINGS[index], **changes.pop("settings", {})}
+    return sensors(running[index], TABLES[index], settings=settings, **changes)[0]
+
+
+async def record(one: Sensor, n_samples: int) -> tuple[list[Block], list[Event]]:
+    return await reading.record(DRIVER, one, n_samples, speed=SPEED)
+
+
+@pytest.mark.parametrize(("index", "dtype"), [(0, np.int32), (1, np.int32), (2, float), (3, float)])
+async def test_every_format_delivers_every_sample(
+    running: tuple[RunningDevice, ...], index: int, dtype: type
+) -> None:
+    n = 4 if index == 2 else 400
+    one = sensor(running, index)
+    blocks, events = await record(one, n)
+    assert not events
+    assert [b.first_sample for b in blocks] == [0, *(b.end_sample for b in blocks[:-1])]
+    assert blocks[0].flags == BlockFlag.CLOCK_RESTART
+    assert {b.flags for b in blocks[1:]} <= {BlockFlag.NONE}
+    counts = np.concatenate([b.counts for b in blocks])[:n]
+    assert counts.dtype == DRIVER.counts_dtype(one) == dtype
+    assert counts.shape == (n, len(one.channels))
+    if index == 0:  # what was sent is what the sensor felt
+        world = scenario("ABCD", sampling_rate=RATE).to_dict()
+        world["motion"]["bandwidth"] = 40.0
+        truth = World(type(scenario("A")).from_dict(world)).samples("A", 0, 12_000) * COUNTS
+        start = int(np.abs(truth - counts[0]).max(axis=1).argmin())
+        assert np.abs(truth[start : start + n] - counts).max() <= 0.5
+
+
+async def test_another_device_on_the_same_port_is_ignored(
+    running: tuple[RunningDevice, ...],
+) -> None:
+    one = sensor(running, 0)
+    counts: list[int] = []
+    said = ""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        try:
+            other.bind(("127.0.0.2", 0))
+        except OSError:
+            pytest.skip("this system has one loopback address only")
+        async with reading.reading(DRIVER, [one], speed=SPEED) as items:
+            async for item in items:
+                if isinstance(item, Event):
+                    said = item.text
+                    break
+                counts += item.counts[:, 0].tolist()
+                where = host_and_port(one.port)
+                other.sendto(b"{'EHZ', 1582315130.292, 777777777, 777777777}", where)
+    assert said == "datagrams from 127.0.0.2 are ignored: another device sends to this port"
+    assert counts
+    assert 777777777 not in counts
+
+
+async def test_a_device_is_started_and_stopped_by_its_commands(
+    running: tuple[RunningDevice, ...],
+) -> None:
+    with pytest.raises(NoAnswerError, match=r"nothing for 0\.125 s; check cable"):
+        await record(sensor(running, 2, settings={"start": "", "patience": 0.5}), 2)
+    assert (await record(sensor(running, 2), 2))[0]
+
+
+@pytest.mark.parametrize(
+    ("index", "settings", "said"),
+    [
+        (1, {"columns": [1, 2]}, r"settings.columns = \[1, 2\]: expected one for each of the"),
+        (0, {"channel_names": ["EHZ"]}, r'channel_names = \["EHZ"\]: expected one for each'),
+    ],
+)
+async def test_formats_that_do_not_match_are_refused(
+    running: tuple[RunningDevice, ...], index: int, settings: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(BenchFileError, match=said):
+        await record(sensor(running, index, settings=settings), 1)
+
+
+FAULTS = [
+    {"kind": "duplicate", "at": 6.0, "every": 0.7, "count": 2},
+    {"kind": "drop", "at": 6.3, "every": 1.1, "count": 3},
+    {"kind": "late", "at": 7.5, "every": 2.5, "duration": 0.6},
+]
+
+
+async def test_repeated_lost_and_late_rows_leave_every_sample_at_its_index() -> None:
+    """Packets, counted rows, rows with a time: the motion says which sample is which."""
+    chosen = (0, 1, 3)
+    world = spec(*(TABLES[i] for i in chosen), speed=SPEED, sampling_rate=RATE)
+    with serving(world | {"faults": FAULTS}) as running:
+        ones = [
+            sensors(device, TABLES[i], settings=SETTINGS[i])[0]
+            for i, device in zip(chosen, running, strict=True)
+        ]
+        found = await asyncio.gather(*(record(one, 600) for one in ones))
+    same_world = World(scenario([one.name for one in ones], sampling_rate=RATE))
+    for one, (blocks, events) in zip(ones, found, strict=True):
+        truth = same_world.samples(one.name, 0, 6000) * COUNTS
+        start = int(np.abs(truth - blocks[0].counts[0]).max(axis=1).argmin())
+        for block in blocks:
+            expected = truth[start + block.first_sample :][: block.n_samples]
+            assert np.abs(expected - block.counts).max() <= 0.5, (one.name, block.first_sample)
+            assert not block.flags & BlockFlag.MISSING_ESTIMATED
+        reasons = {block.reason for block in blocks}
+        assert reasons == {"", "counter" if one.name == "B" else "time step"}
+        assert {event.kind for event in events} == {"status"}
+        assert "repeated" in events[-1].text

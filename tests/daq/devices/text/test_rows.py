@@ -1,0 +1,170 @@
+"""Delimited text: rows, presets, checksums, any bytes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daq.devices.text import format as text_format
+from daq.devices.text import packet_order
+from daq.devices.text.decoder import TextDecoder
+from daq.devices.text.format import (
+    LILY,
+    TextFormat,
+    encode_fields,
+)
+from daq.protocols.block import Block, BlockFlag, Event
+from tests.daq.devices.text.text_formats import COUNTED, ROWS, SHAKE, at, datacast, split
+
+
+@pytest.mark.parametrize("step", [1, 5, 1000])
+def test_rows_cut_anywhere_are_decoded(step: int) -> None:
+    line = b"1,2,3\r\n 4.5 , -5e1,6\n\n7,8,9\n10,1"
+    decoder = TextDecoder("A", ROWS, sampling_rate=10.0)
+    found = [
+        x for i in range(0, len(line), step) for x in decoder.receive(line[i : i + step], at(1))
+    ]
+    index, rows, events = split(found)
+    assert index == [0, 1, 2]
+    assert rows == [[1, 2, 3], [4.5, -50, 6], [7, 8, 9]]
+    assert not events
+    first = found[0]
+    assert isinstance(first, Block)
+    assert first.flags == BlockFlag.CLOCK_RESTART
+    assert first.counts.dtype == np.float64
+
+
+def test_decoding_of_a_running_device_starts_at_a_message() -> None:
+    decoder = TextDecoder("A", ROWS, sampling_rate=10.0, joins=True)
+    found = decoder.receive(b"5,6\n1,2,3", at(1)) + decoder.receive(b"\n4,5,6\n", at(2))
+    index, rows, events = split(found)
+    assert (index, rows, events) == ([0, 1], [[1, 2, 3], [4, 5, 6]], [])
+
+
+def test_lily_rows_are_decoded() -> None:
+    """The manual's line, padded as it is; seconds that do not come are a gap."""
+    line = "LILY,2013/06/24 23:22:{:02d},-236.026,  25.666,194.25, 26.01,11.96,N9655\r\n"
+    decoder = TextDecoder("A", LILY, sampling_rate=1.0)
+    found = []
+    for second in (0, 1, 2, 6, 7):
+        found += decoder.receive(line.format(second).encode(), at(second))
+    found += decoder.receive(b"*9900XYC-OFF\r\n", at(8))
+    index, rows, events = split(found)
+    assert index == [0, 1, 2, 6, 7]
+    assert rows == [[-236.026, 25.666]] * 5
+    assert not events
+    gap = found[3]
+    assert isinstance(gap, Block)
+    assert (gap.reason, gap.flags) == ("time step", BlockFlag.MISSING_ESTIMATED)
+    assert gap.device_counter == 1_372_116_126 * 10**9  # 2013-06-24T23:22:06Z
+
+
+def test_a_counter_makes_gaps_exact() -> None:
+    decoder = TextDecoder("A", COUNTED, sampling_rate=100.0)
+    found: list[Block | Event] = []
+    for i in range(600):
+        if not 300 <= i < 400 and i != 7:
+            found += decoder.receive(f"{i % 256},{i},{-i}\n".encode(), at(i / 100))
+    index, rows, _ = split(found)
+    kept = [i for i in range(600) if not 300 <= i < 400 and i != 7]
+    assert index == kept
+    assert [row[0] for row in rows] == kept
+    assert {b.reason for b in found if isinstance(b, Block)} == {"", "counter"}
+
+
+def test_unreadable_rows_are_counted() -> None:
+    sent = b"1,2,3\n4,five,6\n7,8\n9,9,9\nnan,1,1\n1,1,1\n"
+    found = TextDecoder("A", ROWS, sampling_rate=10.0).receive(sent, at(1))
+    index, _, events = split(found)
+    assert index == [0, 3, 5]
+    assert [e.kind for e in events] == ["checksum"] * 3
+    assert "4,five,6" in events[0].text
+
+
+def test_nmea_checksum() -> None:
+    """Of a sentence known to everybody."""
+    sentence = "GPGLL,5300.97914,N,00259.98174,E,125926,A"
+    assert text_format.nmea_checksum(sentence) == 0x28
+    format_ = TextFormat(
+        prefix="$", nmea_checksum=True, tag="PACC", columns=(1, 2), terminator="\r\n"
+    )
+    good = encode_fields(["PACC", "1.5", "-2"], format_)
+    checksum = f"{text_format.nmea_checksum('PACC,1.5,-2'):02X}"
+    assert good == b"$PACC,1.5,-2*" + checksum.encode() + b"\r\n"
+    sent = good + good.replace(b"1.5", b"2.5") + good + b"$GPGLL,1*" + b"%02X\r\n" % 0x6D
+    found = TextDecoder("A", format_, sampling_rate=1.0).receive(sent, at(1))
+    index, rows, events = split(found)
+    assert index == [0, 2]
+    assert rows == [[1.5, -2]] * 2
+    assert "checksum" in events[0].text
+
+
+@pytest.mark.parametrize(
+    ("format_", "line"),
+    [
+        (TextFormat(delimiter=";", columns=(0, 1)), b"1;2\n"),
+        (TextFormat(delimiter=" ", columns=(0, 1)), b"  1    2 \n"),
+        (TextFormat(delimiter="\t", columns=(0, 1)), b"1\t2\n"),
+        (TextFormat(terminator=";", columns=(0, 1)), b"1,2;"),
+        (TextFormat(prefix="<", suffix=">", columns=(0, 1)), b"<1,2>\n"),
+        (TextFormat(columns=(2, 0)), b"2,x,1\n"),
+        (TextFormat(columns=(0, 1), whole=True), b"1,2\n"),
+    ],
+)
+def test_any_format(format_: TextFormat, line: bytes) -> None:
+    decoder = TextDecoder("A", format_, sampling_rate=1.0)
+    assert split(decoder.receive(line, at(1)))[1] == [[1, 2]]
+
+
+def test_integers_remain_integers() -> None:
+    decoder = TextDecoder("A", TextFormat(columns=(0,), whole=True), sampling_rate=1.0)
+    sent = b"2147483647\n2147483648\n1.5\n1e300\n-1e300\n-2147483648\n"
+    assert split(decoder.receive(sent, at(1)))[1] == [[2147483647], [-2147483648]]
+
+
+@settings(max_examples=60)
+@given(st.lists(st.binary(max_size=200), max_size=6), st.sampled_from([ROWS, COUNTED, SHAKE, LILY]))
+def test_decoding_continues_after_any_bytes(pieces: list[bytes], format_: TextFormat) -> None:
+    decoder = TextDecoder("A", format_, sampling_rate=100.0)
+    decoder.receive(b"".join(pieces) + format_.terminator.encode(), at(0))
+    lines = {
+        id(ROWS): [b"1,2,%d\n" % i for i in range(50)],
+        id(COUNTED): [b"%d,2,%d\n" % (i, i) for i in range(50)],
+        id(SHAKE): [datacast(c, i) for i in range(20) for c in SHAKE.channel_names],
+        id(LILY): [b"LILY,2013/06/24 23:22:%02d,1,%d\r\n" % (i, i) for i in range(50)],
+    }[id(format_)]
+    found: list[Block | Event] = []
+    for i, line in enumerate(lines):
+        found += decoder.receive(line, at(1 + i / 100))
+    values: list[Any] = [row[-1] for row in split(found)[1]]
+    expected = [2000 + i for i in range(500)] if format_ is SHAKE else list(range(50))
+    assert values[-len(expected) :] == expected
+
+
+@settings(max_examples=60)
+@given(st.lists(st.text(alphabet="0123456789.,-+eE{}' \n", max_size=60), max_size=10))
+def test_any_text_of_numbers_is_decoded_or_refused(pieces: list[str]) -> None:
+    for format_ in (ROWS, COUNTED, SHAKE):
+        decoder = TextDecoder("A", format_, sampling_rate=100.0)
+        for piece in pieces:
+            decoder.receive(piece.encode(), at(0))
+            decoder.receive_datagram(piece.encode(), at(0))
+
+
+def test_memory_stays_bounded() -> None:
+    decoder = TextDecoder("A", ROWS, sampling_rate=10.0)
+    found = [x for _ in range(50) for x in decoder.receive(b"1," * 20_000, at(0))]
+    (event,) = found
+    assert isinstance(event, Event)
+    assert "without the terminator '\\n': dropped (1 so far)" in event.text
+    assert len(decoder._finder._buffer) <= text_format.MAX_MESSAGE  # noqa: SLF001 -- the claim
+    index, rows, events = split(decoder.receive(b"1\n1,2,3\n", at(0)))
+    assert (index, rows, len(events)) == ([1], [[1, 2, 3]], 0)
+    shake = TextDecoder("A", SHAKE, sampling_rate=100.0)
+    for packet in range(500):
+        shake.receive_datagram(datacast("ENZ", packet), at(0))
+    assert len(shake._packets._waiting) <= packet_order.MAX_WAITING  # noqa: SLF001 -- the claim

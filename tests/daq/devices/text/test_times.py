@@ -1,0 +1,166 @@
+"""Rows placed by the times in them: gaps, repetitions, clocks that drift or are set."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from daq.devices.text.decoder import TextDecoder
+from daq.devices.text.format import (
+    LILY,
+    TextFormat,
+    decode_time,
+    encode_time,
+)
+from daq.protocols.block import Block, BlockFlag, Event
+from tests.daq.devices.text.text_formats import TIMED, at, split
+
+
+def rows_at(times: list[float], arrivals: list[float], rate: float) -> list[Block | Event]:
+    """Return what rows come to that state these times, each with its own time as the sample."""
+    decoder = TextDecoder("A", TIMED, sampling_rate=rate)
+    found: list[Block | Event] = []
+    for time, came in zip(times, arrivals, strict=True):
+        found += decoder.receive(f"{time:.3f},{time:.3f}\n".encode(), at(came))
+    return found
+
+
+def test_rows_are_placed_by_their_time() -> None:
+    """Rows that come twice are dropped and counted, missing ones a gap of exact length."""
+    decoder = TextDecoder("A", TIMED, sampling_rate=100.0)
+    sent = [f"{1000 + i / 100:.3f},{i}\n".encode() for i in range(300)]
+    came = [*range(10), 9, *range(7, 50), *range(57, 100), *([99] * 5), *range(200, 300)]
+    found: list[Block | Event] = []
+    for k in range(0, len(came), 7):
+        rows = came[k : k + 7]
+        found += decoder.receive(b"".join(sent[i] for i in rows), at(rows[-1] / 100))
+    index, rows_, events = split(found)
+    kept = [i for i in range(300) if not 50 <= i < 57 and not 100 <= i < 200]
+    assert index == kept
+    assert [row[0] for row in rows_] == kept
+    assert not any(b.flags & BlockFlag.MISSING_ESTIMATED for b in found if isinstance(b, Block))
+    assert {e.kind for e in events} == {"status"}
+    assert events[-1].text.endswith("(9 so far)")
+
+
+def test_a_clock_that_drifts_and_times_that_jitter_lose_nothing() -> None:
+    """100 ppm fast, stamped up to 0.3 periods late and rounded: each row is one sample."""
+    rng = np.random.default_rng(5)
+    n = 12_000
+    true = 1000 + np.arange(n) / 100 * (1 - 1e-4)
+    times = true + rng.uniform(0, 0.003, n)
+    index, _, events = split(rows_at(times.tolist(), (true + 0.01).tolist(), 100.0))
+    assert index == list(range(n))
+    assert not events
+
+
+@pytest.mark.parametrize("written", ["{}", "{}.000"])
+def test_one_time_may_belong_to_many_rows(written: str) -> None:
+    """Ten rows a second with whole seconds, however they are written.
+
+    That 23 of them are lost is noticed at the next second.
+    """
+    decoder = TextDecoder("A", TIMED, sampling_rate=10.0)
+    found: list[Block | Event] = []
+    for i in range(103, 400):
+        if not 215 <= i < 238:
+            time = written.format(1000 + i // 10)
+            found += decoder.receive(f"{time},{i}\n".encode(), at(i / 10))
+    index, rows, events = split(found)
+    assert not events
+    by_index = {row[0] - 103: k for k, row in zip(index, rows, strict=True)}
+    assert all(k == sent for sent, k in by_index.items() if not 215 - 103 <= sent < 240 - 103)
+    gaps = [b for b in found if isinstance(b, Block) and b.reason]
+    assert all(b.flags & BlockFlag.MISSING_ESTIMATED for b in gaps)
+
+
+def test_a_leap_second_loses_nothing_of_a_tiltmeter() -> None:
+    """A device that writes the second 60: at a row a second the index goes on."""
+    decoder = TextDecoder("A", LILY, sampling_rate=1.0)
+    times = ["2016/12/31 23:59:58", "2016/12/31 23:59:59", "2016/12/31 23:59:60"]
+    times += [f"2017/01/01 00:00:0{second}" for second in range(5)]
+    found: list[Block | Event] = []
+    for second, time in enumerate(times):
+        found += decoder.receive(
+            f"LILY,{time},{second},25,194,26,11,N9655\r\n".encode(), at(second)
+        )
+    index, rows, events = split(found)
+    assert index == list(range(8))
+    assert [row[0] for row in rows] == index
+    assert not events
+
+
+def test_a_leap_second_of_many_rows_is_a_gap() -> None:
+    """The second after it has the same times, which came before: a gap, but none in silence."""
+    format_ = TextFormat(columns=(1,), time_column=0, time_format="%Y-%m-%dT%H:%M:%S.%f")
+    decoder = TextDecoder("A", format_, sampling_rate=10.0)
+    seconds = ["23:59:59", "23:59:60", "00:00:00", "00:00:01", "00:00:02"]
+    found: list[Block | Event] = []
+    for second, time in enumerate(seconds):
+        day = "2016-12-31T" if second < 2 else "2017-01-01T"
+        for k in range(10):
+            row = f"{day}{time}.{k},{10 * second + k}\n"
+            found += decoder.receive(row.encode(), at(second + k / 10))
+    index, rows, events = split(found)
+    assert [row[0] for row in rows] == index == [*range(20), *range(29, 50)]
+    assert events[-1].kind == "reset"
+
+
+def test_a_repeated_row_of_a_tiltmeter_is_dropped() -> None:
+    """Times as coarse as the rows: only what repeats to the letter is known already."""
+    decoder = TextDecoder("A", LILY, sampling_rate=1.0)
+    line = "LILY,2013/06/24 23:22:{:02d},{},25,194,26,11,N9655\r\n"
+    sent = [(0, 10), (1, 11), (1, 11), (2, 12), (2, 13), (4, 14)]
+    found: list[Block | Event] = []
+    for k, (second, value) in enumerate(sent):
+        found += decoder.receive(line.format(second, value).encode(), at(k - (k > 1)))
+    index, rows, events = split(found)
+    assert index == [0, 1, 2, 3, 4]
+    assert [row[0] for row in rows] == [10, 11, 12, 13, 14]
+    assert [e.kind for e in events] == ["status"]
+
+
+def test_one_damaged_time_is_one_row_lost() -> None:
+    times = [10_000 + i / 10 for i in range(50)]
+    for wrong in (90_000.0, 5.0, 10_009.0):
+        damaged = [*times[:20], wrong, *times[21:]]
+        found = rows_at(damaged, [t + 0.05 for t in times], 10.0)
+        index, _, events = split(found)
+        assert index == [i for i in range(50) if i != 20]
+        assert [e.kind for e in events] == ["checksum"]
+        assert "(1 unreadable so far)" in events[0].text
+
+
+@pytest.mark.parametrize(
+    ("step", "n_dropped"), [(90_000.0, 0), (30.0, 0), (-20.0, 20), (-1.0, 10), (-0.3, 3)]
+)
+def test_a_set_clock_is_a_reset(step: float, n_dropped: int) -> None:
+    """Set back by less than an hour, it may be rows that come again: those of 2 s are dropped."""
+    arrivals = [i / 10 for i in range(100)]
+    times = [100_000 + t + (step if t >= 5 else 0) for t in arrivals]
+    found = rows_at(times, arrivals, 10.0)
+    index, rows, events = split(found)
+    kept = [i for i in range(100) if not 50 <= i < 50 + n_dropped]
+    assert index == kept
+    assert [row[0] for row in rows] == [round(times[i], 3) for i in kept]
+    assert [e.text for e in events if e.kind == "reset"] == ["the device's clock was set"]
+    (block,) = [b for b in found[1:] if isinstance(b, Block) and b.flags]
+    assert block.flags & BlockFlag.CLOCK_RESTART
+
+
+@pytest.mark.parametrize(
+    "time",
+    ["-1", "nan", "1e300", "9e9", "x", ""],
+)
+def test_invalid_times_are_refused(time: str) -> None:
+    decoder = TextDecoder("A", TextFormat(columns=(1,), time_column=0), sampling_rate=1.0)
+    index, _, events = split(decoder.receive(f"{time},1\n0.000001,1\n".encode(), at(1)))
+    assert index == [0]
+    assert len(events) == 1
+
+
+def test_times_keep_their_resolution() -> None:
+    format_ = TextFormat(time_format="%Y-%m-%dT%H:%M:%S.%f")
+    written = encode_time(1_795_219_200_123_456_789, format_)
+    assert written == "2026-11-21T00:00:00.123456"
+    assert decode_time(written, format_) == (1_795_219_200_123_456_000, 1000)

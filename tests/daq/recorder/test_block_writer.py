@@ -1,0 +1,134 @@
+"""States of sensors: the recorder's, and those that a monitor derives from the file, agree."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, cast
+
+import pytest
+
+from daq.protocols.block import Event, EventKind
+from daq.recorder.block_writer import BlockWriter
+from daq.recorder.connection import Connected, SensorLate, SensorLost
+from daq.recording.file_format import SensorLayout
+from daq.recording.monitor import RecordingMonitor
+from daq.recording.reader import Recording
+from daq.recording.sensor_state import SensorState
+from daq.recording.writer import RecordingWriter
+from tests.scripted_driver import RATE, ManualClock, PlayedDriver, bench, block
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from daq.devices.interface import DriverType
+    from daq.recorder.connection import Item
+
+LOST_BY = (EventKind.STALLED, EventKind.DISCONNECTED, EventKind.REFUSED)
+
+
+class Run:
+    """A block writer with one sensor "a", its clock, and a monitor of its file."""
+
+    def __init__(self, writer: RecordingWriter, recording: Recording, clock: ManualClock) -> None:
+        self.blocks = BlockWriter(writer, {"a": RATE})
+        self.clock = clock
+        self._recording = recording
+        self._monitor = RecordingMonitor(recording)
+
+    def write(self, *items: Item) -> None:
+        """Write and commit items, a second after those before."""
+        self.clock.advance(1.0)
+        self.blocks.write(items)
+        self.blocks.commit()
+
+    def event(self, kind: EventKind) -> Event:
+        """Return an event that happens with the next items."""
+        self.clock.advance(0.001)
+        return Event("a", kind, f"a {kind} sensor", self.clock.now())
+
+    def samples(self, first: int) -> None:
+        """Write a chunk of samples, which is committed at once."""
+        self.write(block("a", first, 100, self.clock.now()))
+
+    def states(self) -> tuple[SensorState, SensorState]:
+        """Return the state that the recorder reports, and the monitor's."""
+        self._recording.refresh()
+        states = self.blocks.states()
+        (sensor,) = self._monitor.with_late_sensors(self._monitor.status(), states).sensors
+        return states["a"], sensor.state
+
+
+@contextmanager
+def running(path: Path) -> Iterator[Run]:
+    clock = ManualClock()
+    (sensor,) = bench("a").sensors
+    layout = SensorLayout.of(sensor, cast("DriverType", PlayedDriver()))
+    writer = RecordingWriter.create(path, sensors=[layout], created=clock.now())
+    try:
+        with Recording.open(path) as recording:
+            yield Run(writer, recording, clock)
+    finally:
+        writer.abandon()
+
+
+def both(state: SensorState) -> tuple[SensorState, SensorState]:
+    return state, state
+
+
+@pytest.mark.parametrize("kind", LOST_BY)
+def test_recorder_and_monitor_give_a_sensor_the_same_state(tmp_path: Path, kind: EventKind) -> None:
+    with running(tmp_path / "r.h5") as run:
+        run.write(Connected(("a",), ""), run.event(EventKind.CONNECTED))
+        assert run.states() == both(SensorState.WAITING)
+        run.samples(0)
+        assert run.states() == both(SensorState.LIVE)
+        run.write(SensorLate(run.event(EventKind.LATE)))
+        assert run.states() == both(SensorState.LATE)
+        run.write(SensorLost(run.event(kind)))
+        assert run.states() == both(SensorState(kind))
+        run.write(Connected(("a",), kind), run.event(EventKind.CONNECTED))
+        assert run.states() == both(SensorState.WAITING)
+        run.samples(0)
+        assert run.states() == both(SensorState.LIVE)
+        run.blocks.close(run.clock.now(), "end of the test")
+        assert run.states() == both(SensorState.ENDED)
+
+
+@pytest.mark.parametrize("kind", LOST_BY)
+def test_a_sensor_that_is_lost_at_the_end_keeps_its_state(tmp_path: Path, kind: EventKind) -> None:
+    with running(tmp_path / "r.h5") as run:
+        run.samples(0)
+        run.write(SensorLost(run.event(kind)))
+        run.clock.advance(3.0)
+        run.blocks.close(run.clock.now(), "end of the test")
+        assert run.states() == both(SensorState(kind))
+    with Recording.open(tmp_path / "r.h5") as recording:
+        (gap,) = recording.sensors[0].gaps
+    assert (gap["first_sample"], gap["reason"]) == (100, b"lost at the end")
+
+
+def test_a_sensor_without_a_block_since_it_was_connected_again_has_a_gap_at_the_end(
+    tmp_path: Path,
+) -> None:
+    with running(tmp_path / "r.h5") as run:
+        run.samples(0)
+        run.write(SensorLost(run.event(EventKind.DISCONNECTED)))
+        run.write(Connected(("a",), EventKind.DISCONNECTED), run.event(EventKind.CONNECTED))
+        run.blocks.close(run.clock.now(), "end of the test")
+        assert run.states() == both(SensorState.ENDED)
+    with Recording.open(tmp_path / "r.h5") as recording:
+        assert recording.sensors[0].gaps["reason"].tolist() == [b"lost at the end"]
+
+
+def test_a_late_event_is_recorded_only_if_the_sensor_is_lost_afterwards(tmp_path: Path) -> None:
+    with running(tmp_path / "r.h5") as run:
+        run.samples(0)
+        run.write(SensorLate(run.event(EventKind.LATE)))
+        run.samples(100)
+        run.write(SensorLate(run.event(EventKind.LATE)))
+        run.write(SensorLost(run.event(EventKind.STALLED)))
+        run.blocks.close(run.clock.now(), "end of the test")
+    with Recording.open(tmp_path / "r.h5") as recording:
+        kinds = [event.kind for event in recording.events]
+    assert kinds == [EventKind.LATE, EventKind.STALLED, EventKind.STOPPED]

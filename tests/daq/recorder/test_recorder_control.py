@@ -1,0 +1,84 @@
+"""The control port of a recorder: commands, invalid requests, a silent client."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING
+
+import pytest
+
+from daq.errors import (
+    NotConnectedError,
+)
+from daq.recording.control import ControlRefusedError, ask
+from daq.recording.reader import Recording, control_address
+from tests.daq.recorder.test_recorder import Run
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = pytest.mark.virtual_time
+
+
+async def test_a_silent_client_of_the_control_port_does_not_delay_the_end(
+    tmp_path: Path,
+) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    async with run.going():
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+        address = control_address(run.path)
+        assert address is not None
+        reader, writer = await asyncio.open_connection("127.0.0.1", address[0])
+        await asyncio.to_thread(ask, run.path, "stop")
+    with contextlib.suppress(ConnectionError):
+        assert await reader.read() == b""
+    writer.close()
+    with contextlib.suppress(ConnectionError):
+        await writer.wait_closed()
+
+
+async def test_commands_of_the_control_port_are_executed(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    async with run.going() as task:
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+        status = await asyncio.to_thread(ask, run.path, "status")
+        assert status["sensors"]["a"]["samples"] == 100
+        await asyncio.to_thread(ask, run.path, "mark", "a door\nslammed")
+        address = control_address(run.path)
+        assert address is not None
+        port, token = address
+        with pytest.raises(ControlRefusedError, match="wrong token"):
+            await asyncio.to_thread(ask, (port, "0" * 32), "stop")
+        with pytest.raises(ControlRefusedError, match="unknown command 'dance'"):
+            await asyncio.to_thread(ask, (port, token), "dance")
+        await asyncio.to_thread(ask, run.path, "stop")
+        assert (await task).closed
+    with pytest.raises(NotConnectedError, match="no recorder is writing it"):
+        ask(run.path, "stop")
+    with Recording.open(run.path) as recording:
+        marks = [event.text for event in recording.events if event.kind == "mark"]
+        assert marks == ["a door slammed"]
+        assert recording.events[-1].text == "stopped by command"
+
+
+async def test_invalid_requests_to_the_control_port_have_no_effect(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    async with run.going():
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+        address = control_address(run.path)
+        assert address is not None
+        port, _ = address
+        for nonsense in (b"", b"\n", b"\xff" * 100 + b"\n", b"x" * 100_000):
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            with contextlib.suppress(ConnectionError):
+                writer.write(nonsense)
+                writer.write_eof()
+                await reader.read()
+            writer.close()
+            with contextlib.suppress(ConnectionError):
+                await writer.wait_closed()
+        assert (await asyncio.to_thread(ask, run.path, "status"))["closed"] is False

@@ -1,0 +1,357 @@
+"""Diagnostics on models whose faults are known."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from estimator.checks.advice import (
+    Advice,
+    Delay,
+    Gain,
+    MissingDimension,
+    ModelMisfit,
+    NoSharedMotion,
+    NotOrthogonal,
+    ReversedPolarity,
+    Rotated,
+    SwappedChannels,
+    TooFewDimensions,
+    WeakMotion,
+)
+from estimator.checks.diagnose import Diagnostics, diagnose
+from estimator.checks.kinds import AdviceKind, Level, Untested
+from estimator.errors import InsufficientDataError, InvalidMatrixError
+from estimator.likelihood.factor_analysis import maximise
+from tests.estimator.csm_models import pentagon, plane_waves, random_bench, wishart
+
+if TYPE_CHECKING:
+    from estimator.types import ComplexArray, FloatArray
+
+FREQUENCY = np.linspace(1, 20, 96)
+THREE = (3, 3, 3)
+INDEPENDENT = np.zeros(0)
+Kind = TypeVar("Kind", bound=Advice)
+
+
+def averages(csm: ComplexArray, *, n: int = 1080, seed: int = 1) -> ComplexArray:
+    whole = np.broadcast_to(csm, (len(FREQUENCY), *csm.shape[-2:]))
+    return np.asarray(wishart(whole, n, np.random.default_rng(seed))[0])
+
+
+def bench(*sensors: FloatArray, motion: FloatArray | None = None) -> ComplexArray:
+    channels = np.concatenate(sensors)
+    strength = np.diag([100.0, 150, 80]) if motion is None else motion
+    return np.asarray(channels @ strength @ channels.T + np.eye(len(channels)), np.complex128)
+
+
+def of(csm: ComplexArray, *, dims: tuple[int, ...] = THREE, n: int = 1080) -> Diagnostics:
+    return diagnose(csm, FREQUENCY, dims=dims, n_effective=n, neighbours=INDEPENDENT)
+
+
+def advice_of(kind: type[Kind], found: Diagnostics) -> list[Kind]:
+    return [advice for advice in found.advice if isinstance(advice, kind)]
+
+
+def test_every_kind_of_advice_is_one_class() -> None:
+    kinds = {each.__name__: each.kind for each in Advice.__subclasses__()}
+    assert sorted(kinds.values()) == sorted(AdviceKind)
+
+
+def test_a_good_bench_gets_no_warning() -> None:
+    found = of(averages(bench(np.eye(3), np.eye(3), np.eye(3))))
+    assert [advice for advice in found.advice if advice.level is not Level.NOTE] == []
+    assert found.untested is None
+    assert np.all(found.dimension == 3)
+    assert np.median(found.snr[:, 0]) == pytest.approx(100, rel=0.05)
+    assert np.median(found.snr[:, 1]) == pytest.approx(150, rel=0.05)
+    assert found.coherence.shape == (96, 3)
+    assert np.median(found.coherence) == pytest.approx((80 / 81) ** 2, abs=0.005)
+    assert found.condition.max() < 1.5
+    assert [band.test.p_value > 0.001 for band in found.bands].count(False) == 0
+
+
+def elsewhere(sensor: int, *, n_sensors: int = 3, snr: float = 100.0) -> ComplexArray:
+    """Sensors on one floor, but for one that stands on another and moves as much."""
+    csm = snr * np.kron(np.ones((n_sensors, n_sensors)), np.diag([1.0, 1.5, 0.8]))
+    apart = np.arange(3 * n_sensors) // 3 == sensor
+    csm[apart[:, None] != apart] = 0.0
+    return np.asarray(csm + np.eye(3 * n_sensors), np.complex128)
+
+
+@pytest.mark.parametrize("n", [10, 1080])
+@pytest.mark.parametrize("n_sensors", [3, pytest.param(5, marks=pytest.mark.long)])
+def test_a_sensor_on_another_floor_is_named(n_sensors: int, n: int) -> None:
+    """Without advice that contradicts it, such as to record longer."""
+    for sensor in range(3):
+        averaged = averages(elsewhere(sensor, n_sensors=n_sensors), n=max(n, 3 * n_sensors))
+        found = of(averaged, dims=(3,) * n_sensors, n=max(n, 3 * n_sensors))
+        (advice,) = [each for each in found.advice if each.level is not Level.NOTE]
+        assert isinstance(advice, NoSharedMotion)
+        assert advice.sensors == (sensor,)
+        assert advice.partners == tuple(i for i in range(n_sensors) if i != sensor)
+        assert advice.level is Level.PROBLEM
+        assert advice.share < 0.05
+        assert advice.share_of_partners > 0.9
+        assert advice.band == (1.0, 20.0)
+        kinds = {each.kind for each in found.advice}
+        assert AdviceKind.WEAK_MOTION not in kinds
+
+
+def test_weakly_coherent_sensors_are_not_reported_without_common_motion() -> None:
+    """Where no two agree, where all do, and where one shares a part of the motion."""
+    weak = bench(np.eye(3), np.eye(3), np.eye(3), motion=0.05 * np.eye(3))
+    assert advice_of(NoSharedMotion, of(averages(weak))) == []
+    assert advice_of(NoSharedMotion, of(averages(weak, n=12), n=12)) == []
+    noisy = bench(np.eye(3), np.eye(3), np.eye(3)) + np.diag([100.0] * 3 + [0.0] * 6)
+    assert advice_of(NoSharedMotion, of(averages(noisy))) == []
+    pairs = np.kron(np.kron(np.eye(2), np.ones((2, 2))), 100 * np.eye(3)) + np.eye(12)
+    found = of(averages(pairs.astype(np.complex128)), dims=(3,) * 4)
+    assert advice_of(NoSharedMotion, found) == []  # who of the two pairs is elsewhere?
+
+
+def test_a_sensor_coherent_only_at_low_frequencies_is_reported_above_them() -> None:
+    together, apart = (averages(each) for each in (elsewhere(9), elsewhere(1)))
+    csm = np.where((FREQUENCY < 5)[:, None, None], together, apart)
+    (advice,) = advice_of(NoSharedMotion, of(csm))
+    assert advice.sensors == (1,)
+    assert advice.band is not None
+    assert advice.band[0] == pytest.approx(5, abs=1)
+    assert advice.band[1] == 20.0
+
+
+def test_rotated_sensors_are_found_with_their_angle() -> None:
+    turned = Rotation.from_euler("z", -4.1, degrees=True).as_matrix()
+    found = of(averages(bench(np.eye(3), turned, np.eye(3))))
+    rotated = advice_of(Rotated, found)
+    assert [advice.sensors for advice in rotated] == [(0, 1), (1, 2)]
+    assert {advice.level for advice in rotated} == {Level.NOTE}
+    assert rotated[0].angle_deg == pytest.approx(4.1, abs=0.1)
+    assert rotated[0].error_deg < 0.1
+    assert np.isnan(rotated[0].horizontal_deg)  # nobody said which channel is vertical
+
+
+def test_a_wrong_gain_is_found_with_its_channel() -> None:
+    found = of(averages(bench(np.eye(3), np.diag([1.0, 1.05, 1.0]), np.eye(3))))
+    first, second = advice_of(Gain, found)
+    assert (first.sensors, first.channel, first.counterpart) == ((0, 1), 4, 1)
+    assert first.ratio == pytest.approx(1.05, abs=0.005)
+    assert (second.sensors, second.channel, second.counterpart) == ((1, 2), 7, 4)
+    assert second.ratio == pytest.approx(1 / 1.05, abs=0.005)
+
+
+def test_reversed_polarity_is_found_with_its_channel() -> None:
+    found = of(averages(bench(np.eye(3), np.diag([1.0, -1.0, 1.0]), np.eye(3))))
+    first, second = advice_of(ReversedPolarity, found)
+    assert (first.sensors, first.channel, first.counterpart) == ((0, 1), 4, 1)
+    assert (second.sensors, second.channel, second.counterpart) == ((1, 2), 7, 4)
+    assert first.level is Level.WARNING
+
+
+@pytest.mark.parametrize(
+    ("angle_deg", "level"), [(5.7, Level.NOTE), (25.0, Level.WARNING)], ids=["some", "much"]
+)
+def test_channels_that_are_not_orthogonal(angle_deg: float, level: Level) -> None:
+    angle = np.deg2rad(angle_deg)
+    fault = np.array([[1, 0, 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    found = of(averages(bench(np.eye(3), fault, np.eye(3))))
+    skewed = advice_of(NotOrthogonal, found)
+    assert skewed[0].sensors == (0, 1)
+    assert skewed[0].deviation_deg == pytest.approx(angle_deg, abs=0.2)
+    assert skewed[0].level is level
+
+
+def test_swapped_channels_are_distinguished_from_a_rotated_sensor() -> None:
+    near = Rotation.from_euler("z", 7, degrees=True).as_matrix()
+    found = of(averages(bench(np.eye(3), near[[1, 0, 2]], np.eye(3))))
+    swapped = advice_of(SwappedChannels, found)
+    assert [advice.sensors for advice in swapped] == [(0, 1), (1, 2)]
+    assert swapped[0].channels == ((3, 1), (4, 0))
+    assert swapped[1].channels == ((6, 4), (7, 3))
+    assert not advice_of(ReversedPolarity, found)
+    turned = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    other = of(averages(bench(np.eye(3), turned, np.eye(3))))
+    assert not advice_of(SwappedChannels, other)
+    assert advice_of(Rotated, other)[0].angle_deg == pytest.approx(90, abs=0.1)
+
+
+def test_incoherence_is_reported_in_its_band() -> None:
+    csm = plane_waves(FREQUENCY, pentagon()[:3], snr=400.0)
+    found = of(averages(csm))
+    (problem,) = [advice for advice in found.advice if advice.level is Level.PROBLEM]
+    assert isinstance(problem, ModelMisfit)
+    assert problem.n_factors == 3
+    assert problem.worst_statistic >= problem.statistic > 1
+    assert problem.p_value < 1e-10
+    assert not problem.is_wrong  # unless waves cross the sensors: then it is
+    assert problem.largest_error > 0.5 > problem.error
+    assert problem.largest_error == 10 * problem.error  # three triaxial sensors bound it
+    assert problem.band is not None
+    assert problem.band[0] > 2
+    assert problem.band[1] == FREQUENCY[-1]
+    assert found.bands[-1].test.p_value < 1e-10
+    assert problem.band[0] <= problem.worst_band[0] < problem.worst_band[1] <= problem.band[1]
+    five = of(averages(plane_waves(FREQUENCY, pentagon(), snr=400.0)), dims=(3,) * 5)
+    misfit = advice_of(ModelMisfit, five)[0]
+    assert misfit.largest_error == 2 * misfit.error  # five bound it closer
+
+
+def test_planar_sensors_in_motion_of_three_dimensions_get_advice() -> None:
+    tilted = Rotation.from_euler("x", 10, degrees=True).as_matrix()
+    two = [tilted[:2], np.eye(3)[:2], tilted.T[:2]]
+    found = of(averages(bench(*two)), dims=(2, 2, 2))
+    misfit = advice_of(ModelMisfit, found)[0]
+    assert misfit.n_factors == 2
+    assert np.isinf(misfit.largest_error)  # three planar sensors do not bound it
+    assert misfit.is_wrong
+    assert misfit.error >= 0.5
+
+
+def test_a_missing_dimension_is_reported() -> None:
+    flat = np.diag([100.0, 150.0, 0.0])
+    turned = Rotation.from_euler("y", 30, degrees=True).as_matrix()
+    found = of(averages(bench(np.eye(3), turned, np.eye(3), motion=flat)))
+    assert np.mean(found.dimension == 2) > 0.95
+    (missing,) = advice_of(MissingDimension, found)
+    assert (missing.n_dimensions, missing.n_channels) == (2, 3)
+    assert missing.condition > np.sqrt(1080)
+
+
+def test_noise_without_motion_is_reported() -> None:
+    rng = np.random.default_rng(3)
+    csm = random_bench(rng, dims=THREE, snr=0.05, noise_psd=np.ones(9))
+    found = of(averages(csm))
+    assert all(advice.snr < 1 for advice in advice_of(WeakMotion, found))
+    assert advice_of(WeakMotion, found)
+
+
+def test_a_lagging_sensor_is_reported_with_its_delay() -> None:
+    phase = np.exp(-2j * np.pi * FREQUENCY[:, None] * np.repeat([0, 0.02, 0], 3))
+    csm = phase[:, :, None] * (bench(*[np.eye(3)] * 3) - np.eye(9)) * phase[:, None].conj()
+    found = of(averages(csm + np.eye(9)))
+    first, second = advice_of(Delay, found)
+    assert (first.sensors, second.sensors) == ((0, 1), (1, 2))
+    assert first.delay == pytest.approx(0.02, rel=0.01)
+    assert first.delay_samples == pytest.approx(0.8, rel=0.01)
+    assert second.delay == pytest.approx(-0.02, rel=0.01)  # the third leads the second
+
+
+def test_a_small_significant_misfit_is_graded_by_its_effect() -> None:
+    """Noise shared by all channels, about one per cent of it: too many pairs to be named."""
+    turned = [Rotation.from_rotvec(v).as_matrix() for v in ([1, 2, -1], [-0.5, 0.4, 1], [0, 1, 2])]
+    csm = bench(*turned)
+    shared = np.tril(np.random.default_rng(3).normal(scale=0.008, size=(9, 9)), -1)
+    csm += shared + shared.T
+    n = 8000
+    found = of(averages(csm, n=n), n=n)
+    misfit = max(advice_of(ModelMisfit, found), key=lambda advice: advice.worst_statistic)
+    truth = maximise(csm[None], 3)
+    off = np.abs(truth.psi - 1).max()
+    seen = np.sqrt(2 * truth.discrepancy[0] / 27)
+    assert misfit.level is Level.WARNING
+    assert misfit.worst_statistic < 2.5
+    assert misfit.unexplained == pytest.approx(seen, rel=0.2)
+    assert off < misfit.error < 5 * off
+    assert not misfit.is_wrong
+
+
+@pytest.mark.long
+def test_a_sound_test_seldom_fails_in_any_band() -> None:
+    """One in a hundred, however many bands are tested: with one in a hundred each, 8 of these."""
+    rng = np.random.default_rng(11)
+    csm = np.broadcast_to(bench(*[np.eye(2)] * 3, motion=np.diag([100.0, 150])), (96, 6, 6))
+    draws = wishart(csm, 400, rng, n_draws=100)
+    found = [of(draw, dims=(2, 2, 2), n=400) for draw in draws]
+    failing = sum(bool(advice_of(ModelMisfit, each)) for each in found)
+    assert failing <= 5  # Poisson of mean 1: more in one of a thousand
+
+
+def test_the_effect_of_waves_is_within_the_stated_bound() -> None:
+    csm = plane_waves(FREQUENCY, pentagon()[:3], snr=100.0)
+    found = of(averages(csm, n=8000), n=8000)
+    off = np.abs(maximise(csm[-1:], 3).psi - 1).max()
+    assert any(off < advice.largest_error < 4 * off for advice in advice_of(ModelMisfit, found))
+
+
+def test_a_model_of_too_few_dimensions_has_its_own_advice() -> None:
+    csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)))
+    for q in (0, 1, 3):
+        found = diagnose(
+            csm, FREQUENCY, dims=THREE, n_effective=1080, n_factors=q, neighbours=INDEPENDENT
+        )
+        failing = advice_of(TooFewDimensions, found)
+        assert found.n_factors == q
+        assert bool(failing) == (q < 3)
+        assert not advice_of(ModelMisfit, found)
+        for advice in failing:
+            assert advice.level is Level.PROBLEM
+            assert advice.n_factors == q
+            assert advice.worst_statistic >= advice.statistic > 2
+        assert np.median(found.snr) > 50  # whatever is tested
+    assert np.isfinite(found.model.p_value).all()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("rank", [0, 1])
+def test_the_dimension_is_overrated_as_seldom_as_its_level_says(rank: int) -> None:
+    """Bartlett's degrees of freedom: with fewer it would be too often, with more hardly ever."""
+    n_freqs, n = 3000, 40
+    csm = bench(*[np.eye(2)] * 3, motion=np.diag([1e6 * rank, 0.0]))
+    draws = wishart(np.broadcast_to(csm, (n_freqs, 6, 6)), n, np.random.default_rng(5))[0]
+    found = diagnose(draws, np.linspace(1, 20, n_freqs), dims=(2, 2, 2), n_effective=n)
+    share = np.mean(found.dimension > rank)
+    assert 0.004 < share < 0.016  # 1 % ± 0.18 %, and what Bonferroni and the expansion leave open
+
+
+def test_zero_frequency_is_no_part_of_the_test() -> None:
+    """There the spectra are real, and their scatter another."""
+    csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)))
+    frequency = FREQUENCY - FREQUENCY[0]
+    found = diagnose(csm, frequency, dims=THREE, n_effective=1080, neighbours=INDEPENDENT)
+    assert np.isnan(found.model.statistic[0])
+    assert found.bands[0].test.n_frequencies == np.sum(frequency <= found.bands[0].high) - 1
+
+
+def test_early_averages_leave_the_model_open() -> None:
+    csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)), n=9)
+    found = of(csm, n=9)
+    assert np.isnan(found.model.p_value).all()
+    assert found.untested is Untested.TOO_FEW_AVERAGES
+    assert len(found.responses) == 3
+
+
+def test_the_reason_for_a_missing_model_test_is_reported() -> None:
+    csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)))
+    for q in (6, 7):  # nothing is left for the test; more than can be told from the noise
+        many = diagnose(csm, FREQUENCY, dims=THREE, n_effective=1080, n_factors=q)
+        assert many.untested is Untested.TOO_FEW_CHANNELS
+        assert np.isnan(many.model.p_value).all()
+    singular = averages(csm[0], n=1080)
+    singular[:, 8, :] = singular[:, 7, :] + singular[:, 6, :]
+    singular[:, :, 8] = singular[:, :, 7] + singular[:, :, 6]
+    found = of(singular)
+    assert found.untested is Untested.SINGULAR
+    assert np.isnan(found.model.p_value).all()
+
+
+def test_invalid_arguments_are_refused() -> None:
+    csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)))
+    with pytest.raises(InvalidMatrixError, match="frequency"):
+        diagnose(csm, FREQUENCY[:5], dims=THREE, n_effective=100)
+    with pytest.raises(InsufficientDataError, match="2 sensors"):
+        diagnose(csm[:, :6, :6], FREQUENCY, dims=(3, 3), n_effective=100)
+    with pytest.raises(InvalidMatrixError, match="ascending"):
+        diagnose(csm, FREQUENCY[::-1], dims=THREE, n_effective=100)
+    for n in (np.nan, np.inf, -1):
+        with pytest.raises(InsufficientDataError, match="finite number above zero"):
+            diagnose(csm, FREQUENCY, dims=THREE, n_effective=n)
+
+
+def test_lists_are_accepted_like_arrays() -> None:
+    csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)))[:12]
+    array = diagnose(csm, FREQUENCY[:12], dims=THREE, n_effective=100)
+    lists = diagnose(csm.tolist(), FREQUENCY[:12].tolist(), dims=THREE, n_effective=100)
+    np.testing.assert_array_equal(lists.snr, array.snr)

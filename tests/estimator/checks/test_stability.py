@@ -1,0 +1,160 @@
+"""Disturbed segments, noise that changes, and the tests corrected for it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from estimator.checks.diagnose import Diagnostics, diagnose
+from estimator.checks.kinds import AdviceKind
+from estimator.checks.misfit import DisturbedSegments, NoiseChanges
+from estimator.checks.shared_motion import (
+    CanonicalCoherence,
+    may_have_moved,
+    moved,
+    shared_motion,
+)
+from estimator.checks.stability import PARTS, SegmentCourse
+from estimator.likelihood.goodness_of_fit import neighbour_correlation
+from estimator.spectra.segment_spectra import (
+    MAX_SEGMENTS,
+    MAX_VALUES,
+    SegmentSpectra,
+    kept_bins,
+)
+from estimator.spectra.welch import CrossSpectra, WelchSettings
+from estimator.spectra.windows import get_window
+from tests.estimator.csm_models import rotation
+
+if TYPE_CHECKING:
+    from estimator.types import ComplexArray
+
+LENGTH, HOP = 256, 128
+N_SEGMENTS = 300
+DIMS = (3, 3, 3)
+
+
+def diagnosed(
+    seed: int, *, change: float = 1.0, burst: bool = False, n_runs: int = 1
+) -> Diagnostics:
+    """White motion at SNR 900; noise of all channels changes in the middle by a factor."""
+    rng = np.random.default_rng(seed)
+    directions = np.concatenate([rotation(rng, 3) for _ in DIMS])
+    n = HOP * (N_SEGMENTS + 1)
+    noise = rng.standard_normal((n, 9))
+    noise[n // 2 :] *= np.sqrt(change)
+    if burst:
+        noise[6400:6500, 4] += 40 * rng.standard_normal(100)
+    samples = 30 * rng.standard_normal((n, 3)) @ directions.T + noise
+    settings = WelchSettings(100.0, LENGTH)
+    single = SegmentSpectra(kept_bins(LENGTH // 2 + 1), 9)
+    spectra = CrossSpectra(settings, 9, segments=single)
+    starts = np.arange(N_SEGMENTS) * HOP
+    spectra.add(samples, starts)
+    return diagnose(
+        spectra.csm(),
+        settings.frequencies,
+        dims=DIMS,
+        n_effective=spectra.n_effective,
+        neighbours=neighbour_correlation(get_window("hann", LENGTH), HOP, N_SEGMENTS),
+        course=SegmentCourse(
+            spectra=single.values(),
+            bins=single.bins,
+            times=starts / 100.0,
+            runs=np.arange(N_SEGMENTS) * n_runs // N_SEGMENTS,
+        ),
+    )
+
+
+def test_steady_noise_scatters_as_expected() -> None:
+    found = diagnosed(1, n_runs=3).stability
+    assert found is not None
+    assert found.n_segments == N_SEGMENTS
+    assert len(found.disturbed) == 0
+    assert found.inflation == 1
+    assert found.parts.n_parts == PARTS
+    assert found.runs is not None
+    assert found.runs.n_parts == 3
+    for scatter, parts in ((found.parts, PARTS), (found.runs, 3)):
+        ratio = (scatter.deviation / scatter.expected) ** 2
+        degrees = (parts - 1) * ratio.size
+        assert ratio.mean() == pytest.approx(1, abs=5 * np.sqrt(2 / degrees))
+
+
+def test_disturbed_segments_are_named() -> None:
+    found = diagnosed(2, burst=True)
+    (advice,) = [each for each in found.advice if isinstance(each, DisturbedSegments)]
+    assert advice.channel == 4
+    assert advice.sensors == (1,)
+    assert advice.n_disturbed == 2  # samples 6400 to 6500 lie in two, at half overlap
+    assert advice.times == (49 * HOP / 100, 50 * HOP / 100)
+    assert advice.n_segments == N_SEGMENTS
+    # 100 samples of variance 1600 among 38 528 of variance 1, by the window's square over its mean
+    assert 2 < advice.excess < 9
+
+
+def test_changing_noise_causes_no_false_alarms() -> None:
+    """Products of noise with half the time four times the power have 1.36 times the variance."""
+    found = diagnosed(3, change=4.0)
+    assert found.stability is not None
+    assert found.stability.inflation == pytest.approx(1.36, abs=0.2)
+    (advice,) = [each for each in found.advice if isinstance(each, NoiseChanges)]
+    assert advice.deviation == pytest.approx(0.6, rel=0.4)  # levels 0.4 and 1.6
+    assert advice.expected < 0.3
+    kinds = {each.kind for each in found.advice}
+    assert not kinds & {AdviceKind.MODEL_MISFIT, AdviceKind.SHARED_NOISE}
+
+
+def test_kept_segments_are_bounded_in_number() -> None:
+    bins = kept_bins(2001)
+    assert len(np.unique(bins)) == len(bins) <= 48
+    assert bins.min() >= 2
+    assert bins.max() <= 1800
+    kept = SegmentSpectra(bins[:1], 1)
+    n = 2 * MAX_SEGMENTS + 5
+    for part in np.array_split(np.arange(n, dtype=np.complex128), 7):
+        kept.add(part[:, None, None])
+    assert kept.every == 4
+    assert np.array_equal(kept.values()[:, 0, 0].real, np.arange(0, n, 4))
+    assert 64 <= SegmentSpectra(bins, 192).most <= MAX_VALUES / (192 * len(bins))
+
+
+def course_of(
+    rng: np.random.Generator, *, snr: float, noise: float = 1.0, fade: float = 1.0, away: float = 0
+) -> ComplexArray:
+    """Return 360 segments of three triaxial sensors; the last one is away at the end.
+
+    Its noise is `noise` times that of the others; the motion fades to `fade` of its amplitude.
+    """
+
+    def white(*shape: int) -> ComplexArray:
+        return rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+
+    n, n_kept = 360, 48
+    here, elsewhere = white(2, n, n_kept, 3)
+    level = np.sqrt(snr) * np.linspace(1.0, fade, n)[:, None, None]
+    is_away = (np.arange(n) >= n * (1 - away))[:, None, None]
+    sensors = []
+    for number in range(3):
+        motion = np.where(is_away, elsewhere, here) if number == 2 else here
+        turned = motion @ np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        own = np.sqrt(noise if number == 2 else 1.0) * white(n, n_kept, 3)
+        sensors.append(level * turned + own)
+    return np.concatenate(sensors, axis=2)
+
+
+@pytest.mark.parametrize("snr", [10.0, 1e4])
+def test_a_sensor_that_leaves_its_place_is_named_and_a_noisy_one_is_not(snr: float) -> None:
+    rng = np.random.default_rng(8)
+    for away in (0.1, 0.5, 0.9):
+        course = course_of(rng, snr=snr, away=away)
+        assert moved(course, DIMS, 340.0) == [2]
+        csm = np.einsum("sfp,sfq->fpq", course, course.conj()) / len(course)
+        inside = np.ones(len(csm), dtype=bool)
+        assert may_have_moved(shared_motion(CanonicalCoherence(csm), DIMS, inside, 340.0))
+    for noise in (1.0, 10.0, 1000.0):
+        fading = course_of(rng, snr=snr, noise=noise, fade=0.02)
+        assert moved(fading, DIMS, 340.0) == []
+    assert moved(course_of(rng, snr=snr, away=0.5)[:30], DIMS, 28.0) == []  # too few
