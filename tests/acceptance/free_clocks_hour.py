@@ -154,7 +154,7 @@ def outcome(
     # A Hann window leaves one independent value in 1.94 frequencies.
     error = np.stack([cov * np.sqrt(1.94 / np.count_nonzero(band)) for band in bands])
     diagnostics = told["diagnostics"]
-    stated = diagnostics["synchronisation"]["residual"]
+    stated = diagnostics["synchronisation"]["residual_s"]
     return Outcome(
         bias=np.stack([(noise[band] / true[band]).mean(axis=0) - 1 for band in bands]),
         error=error,
@@ -162,7 +162,7 @@ def outcome(
         cov=cov,
         left=_left(diagnostics, scenario, origin_utc_ns, truths),
         stated=np.array([stated[name] for name in scenario.names[1:]], dtype=float),
-        ppm=tuple(clock["ppm"] for clock in diagnostics["clocks"]),
+        ppm=tuple(clock["rate_ppm"] for clock in diagnostics["clocks"]),
     )
 
 
@@ -170,7 +170,7 @@ def _left(
     diagnostics: dict[str, Any], scenario: Scenario, origin_utc_ns: int, truths: dict[str, Truth]
 ) -> FloatArray:
     """Return what is left between each clock and the first sensor's, about its mean, s rms."""
-    drift = np.array(diagnostics["drift"])
+    drift = np.array(diagnostics["drift_s"])
     seconds = (diagnostics["start_utc_ns"] - origin_utc_ns) * 1e-9 + drift[:, 0]
     errors = [
         seconds - truths[name].at((seconds - delay) * scenario.sensors[name].sampling_rate)

@@ -16,9 +16,8 @@ from daq.results.band_summary import band_of, channel_means, data_means
 from daq.results.clock_effect import relative_time
 from daq.results.facts import Fact, Finding
 from estimator.checks.advice import Advice
-from estimator.checks.shared_noise import MAX_CHANNELS
-from estimator.self_noise.result import Flag
 from tui.output.calibration import channels_of
+from tui.output.json_diagnostics import diagnostics_document
 from tui.output.json_values import plain
 from tui.output.noise_parameters import noise_parameters_document
 from tui.wording.facts import known
@@ -28,9 +27,6 @@ if TYPE_CHECKING:
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
-    from daq.estimation.snapshot_diagnostics import (
-        Diagnosis,
-    )
     from daq.results.calibration import Calibration
     from daq.results.decision.verdict import TestVerdict
     from daq.results.noise_parameters import ChannelNoise
@@ -66,7 +62,7 @@ def result_document(snapshot: Snapshot, method: str) -> dict[str, Any]:
             }
             for column, label in enumerate(snapshot.channels)
         ],
-        "diagnostics": _diagnostics(snapshot),
+        "diagnostics": diagnostics_document(snapshot),
     }
 
 
@@ -269,54 +265,6 @@ def verdict_document(found: TestVerdict | None) -> dict[str, Any]:
             }
             for each in found.limits
         ],
-    }
-
-
-def _diagnostics(snapshot: Snapshot) -> dict[str, Any]:
-    found = snapshot.diagnostics
-    document = {
-        "elapsed": snapshot.elapsed,
-        "dropped_segments": snapshot.n_dropped,
-        "left_out": snapshot.left_out,
-        "bridged": snapshot.bridged,
-        "octaves": snapshot.octaves,
-        "flags": {flag.name: flag.value for flag in Flag},
-        "start_utc_ns": snapshot.start_utc_ns,
-        "closed": snapshot.closed,
-        "refused": snapshot.refused,
-        "sensors": snapshot.sensors,
-        "clocks": snapshot.clocks,
-        "drift": snapshot.drift,
-        "synchronisation": {
-            "residual": found.synchronisation.residual,
-            "reference": found.synchronisation.reference,
-        },
-        "untested": found.untested,
-    }
-    if found.synchronisation.noise_bias is not None:
-        document["synchronisation"] = found.synchronisation
-    if found.edge_leakage is not None:
-        document["edge_leakage"] = found.edge_leakage
-    if found.dimensions:
-        document["dimension"] = found.dimensions
-    if found.diagnosis is not None:
-        document |= _diagnosis(found.diagnosis, snapshot)
-    for key, by_column in (("clipped", found.clipped), ("stood_still", found.stood_still)):
-        if by_column:
-            document[key] = {snapshot.channels[n].name: value for n, value in by_column.items()}
-    return {key: plain(value) for key, value in document.items()}
-
-
-def _diagnosis(found: Diagnosis, snapshot: Snapshot) -> dict[str, Any]:
-    sensors = snapshot.sensor_names
-    return {
-        "bands": found.bands,
-        "responses": found.responses,
-        "shared_noise_searched": len(snapshot.channels) <= MAX_CHANNELS,
-        "stability": found.stability,
-        "n_factors": found.n_factors,
-        "pairs": [(sensors[one], sensors[two]) for one, two in found.pairs],
-        "per_frequency": found.per_frequency,
     }
 
 

@@ -146,14 +146,14 @@ def test_the_report_shows_the_angles_and_where_the_model_test_fails(
 ) -> None:
     out = tmp_path / "result.json"
     options = ("--segment", "102.4s", "--unit", "m/s²", "--json", str(out))
-    said = " ".join(huddle("estimate", str(tst), *options).split())
+    said = " ".join(huddle("estimate", str(tst), *options, "--details").split())
     _, horizontal = said.split("; in the horizontal plane ")  # some of it is a tilt
     shown = [float(angle) for angle in re.findall(r"(\d\.\d+)°", horizontal)]
     assert shown == pytest.approx([2.242, 3.400, 1.158], abs=0.05)
     assert re.search(r"model test fails at [\d.]+–[\d.]+ Hz: one common motion", said)
     found = json.loads(out.read_text(encoding="utf-8"))["diagnostics"]
     failing = [band for band in found["bands"] if band["test"]["p_value"] < 0.01]
-    assert any(band["low"] < 0.3 < band["high"] for band in failing)  # the microseism
+    assert any(band["low_hz"] < 0.3 < band["high_hz"] for band in failing)  # the microseism
     assert [pair["horizontal_deg"] for pair in found["responses"]] == pytest.approx(shown, abs=1e-3)
     long = huddle("estimate", str(tst), *options, "--details")
     assert "XX.TST5.00 → XX.TST5.10" in long
@@ -182,6 +182,6 @@ def test_octaves_and_dimension_through_the_command(tst: Path) -> None:
     assert frequency[1] <= 0.01
     assert frequency[-1] == 20.0
     octaves = document["diagnostics"]["octaves"]
-    assert octaves[0]["segment"] > 100 * 0.99
-    assert all(octave["left_out"]["gap"] == 0 for octave in octaves)
-    assert len(document["diagnostics"]["dimension"]) >= len(octaves)
+    assert octaves[0]["segment_s"] > 100 * 0.99
+    assert all(octave["excluded_by_reason"]["gap"] == 0 for octave in octaves)
+    assert len(document["diagnostics"]["dimensions"]) >= len(octaves)

@@ -35,7 +35,7 @@ def test_advice_has_its_kind_its_numbers_and_its_words() -> None:
     assert polarity["action"].endswith(".")
     (rotated, *_) = by_kind["rotated"]["numbers"]["findings"]
     assert set(rotated["numbers"]) == {"angle_deg", "horizontal_deg", "error_deg"}
-    assert diagnostics["n_factors"] == 3
+    assert diagnostics["tested_dimensions"] == 3
     assert diagnostics["untested"] is None
     assert diagnostics["pairs"] == [["A", "B"], ["A", "C"], ["B", "C"]]
     assert set(diagnostics["per_frequency"]) == {
@@ -43,14 +43,14 @@ def test_advice_has_its_kind_its_numbers_and_its_words() -> None:
     }  # fmt: skip
     assert len(diagnostics["per_frequency"]["coherence"][0]) == 3
     assert set(diagnostics["bands"][0]["test"]) == {
-        "statistic", "degrees", "p_value", "n_frequencies", "spread",
+        "statistic", "degrees", "p_value", "frequencies", "spread",
     }  # fmt: skip
 
 
 def test_what_is_not_known_is_left_out() -> None:
     snapshot = made_snapshot()
     diagnostics = result_document(snapshot, "three-sensor")["diagnostics"]
-    assert not {"bands", "advice", "clipped", "stood_still", "dimension"} & set(diagnostics)
+    assert not {"bands", "clipped_share", "stood_still_s", "dimensions"} & set(diagnostics)
     assert diagnostics["untested"] == "unfinished"
     assert diagnostics["flags"] == {flag.name: flag.value for flag in Flag}
     faulty = replace(
@@ -64,9 +64,14 @@ def test_what_is_not_known_is_left_out() -> None:
         ),
     )
     told = json.loads(json.dumps(finite(result_document(faulty, "three-sensor"))))["diagnostics"]
-    assert told["clipped"] == {"B.Y": 0.25}
-    assert told["stood_still"] == {"A.X": 3.0}
-    assert told["left_out"] == {"gap": 2, "transient": 0}
+    assert told["clipped_share"] == {"B.Y": 0.25}
+    assert told["stood_still_s"] == {"A.X": 3.0}
+    assert told["excluded_by_reason"] == {"gap": 2, "transient": 0}
     assert told["untested"] == "too-few-sensors"
-    assert set(told["synchronisation"]) == {"residual", "noise_bias", "removed", "reference"}
-    assert told["synchronisation"]["residual"]["C"] == 0.6e-6
+    assert set(told["synchronisation"]) == {
+        "residual_s",
+        "noise_bias_share",
+        "removed_psd",
+        "reference",
+    }
+    assert told["synchronisation"]["residual_s"]["C"] == 0.6e-6

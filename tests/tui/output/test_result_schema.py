@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 SCHEMA: dict[str, Any] = json.loads(
     (resources.files("tui.resources") / f"result-{SCHEMA_VERSION}.schema.json").read_text("utf-8")
 )
-OPEN = ("settings", "diagnostics", "noise_parameters", "flags")
+OPEN = ("settings", "noise_parameters")
 """Objects with keys that docs/json.md describes, and the schema does not."""
 
 

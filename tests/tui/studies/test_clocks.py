@@ -51,7 +51,7 @@ def test_the_command_takes_samples_at_face_value_only_if_told(tmp_path: Path) ->
     sources = {clocks: {each["source"] for each in told[clocks]["clocks"]} for clocks in told}
     assert sources == {"refined": {"arrival times"}, "nominal": {"nominal rate"}}
     # Lined up by the first arrivals to the sample, and left there.
-    drift = np.array(told["nominal"]["drift"])[:, 1:] * 200.0
+    drift = np.array(told["nominal"]["drift_s"])[:, 1:] * 200.0
     assert np.ptp(drift, axis=0).max() == pytest.approx(0.0, abs=1e-6)
     assert np.abs(drift - np.round(drift)).max() < 1e-6
     assert np.abs(drift[0] - [0.0, 6.42, 11.46]).max() < 1.0  # 32.1 and 57.3 ms, and latency

@@ -41,7 +41,7 @@ def test_text_has_time_level_and_logger_and_is_never_wrapped(
     LOGGER.info("word %s", "word " * 60)
     LOGGER.debug("not written")
     (line,) = lines(capsys)
-    assert re.fullmatch(STAMP + r" INFO daq\.acquisition\.recorder: (word ){61}", line)
+    assert re.fullmatch(STAMP + r" INFO daq\.recorder\.recorder: (word ){61}", line)
 
 
 def test_control_characters_of_a_device_stay_one_harmless_line(
