@@ -291,7 +291,7 @@ def _model(snapshot: Snapshot) -> Iterator[Fact]:
     more = any(each.n_factors > each.usual for each in choices)
     if diagnostics.untested is not None:
         named = found is not None and any(isinstance(each, TooFewSensors) for each in found.advice)
-        if not named:
+        if not named and snapshot.no_segment is None:
             yield _untested(snapshot, diagnostics.untested)
     elif (
         found is not None
@@ -410,7 +410,7 @@ def _precision(snapshot: Snapshot, settings: Settings) -> Iterator[Fact]:
         if shares := widening(snapshot, settings, method):
             rank = Rank.TO_KNOW
             yield IntervalsWidened(rank=rank, method=method, shares=shares)
-    if not snapshot.closed:
+    if not snapshot.closed or (settings.target_cov is None and settings.target_cov_bin is None):
         return
     try:
         reached = precision(snapshot, settings)

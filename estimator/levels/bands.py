@@ -177,4 +177,4 @@ def third_octaves(frequency: FloatArray, low: float, high: float) -> NDArray[np.
     n_bands = max(1, round(BANDS_PER_OCTAVE * np.log2(high / low)))
     edges = np.searchsorted(frequency, np.geomspace(low, high, n_bands + 1))
     edges[-1] += 1
-    return np.unique(edges).astype(np.int64)
+    return np.array(sorted(set(edges)), dtype=np.int64)  # np.unique loads numpy.ma

@@ -201,9 +201,12 @@ def _no_segment(fact: NoSegmentUsable, names: Names) -> Wording:
     del names
     head = f"No segment of {fact.segment:g} s can be used:"
     if fact.reason is Reason.GAP:
-        text = f"{head} {listed(fact.sensors)} has at most {fact.longest:.2g} s without a gap."
+        sensor = listed(fact.sensors)
+        text = f"{head} {sensor} has at most {fact.longest:.2g} s without a gap."
         do = "Check its cable, lower its sampling rate, or choose a shorter --segment."
-    elif fact.reason is Reason.CLIPPED:
+        line = f"{sensor} has no {fact.segment:g} s without a gap (at most {fact.longest:.2g} s)"
+        return Wording(f"{line}: check its cable, or shorten --segment", text, do)
+    if fact.reason is Reason.CLIPPED:
         text = f"{head} samples are clipped."
         do = "Choose a larger range, reduce the motion, or keep them (--no-reject)."
     else:

@@ -145,11 +145,11 @@ async def test_what_the_diagnosis_finds_is_shown_while_recording(told: ProgressC
     async with app.run_test(size=WIDE) as pilot:
         await shown(pilot, app, StatusUpdated(now), SnapshotReady(snapshot, SETTINGS))
         text = screen_text(app)
-        assert "▲ A records none of the motion that B and C share: check its input" in text
+        assert "✗ A records none of the motion that B and C share: check its input" in text
         assert text.count("no shared motion") == 3
         await resized(pilot, NARROW)
         await shown(pilot, app)
-        assert "▲ A records none of the motion that B and C share" in screen_text(app)
+        assert "✗ A records none of the motion that B and C share" in screen_text(app)
 
 
 async def test_the_verdict_so_far_is_shown_with_how_long_to_record(

@@ -184,17 +184,17 @@ def test_names_with_punctuation_are_printed_as_they_are(tmp_path: Path) -> None:
     said = huddle("estimate", str(out), "--segment", "1s", "--json", str(json_file))
     words = " ".join(said.split())
     for name in names:
-        assert name in said.split("segments (")[0]  # the table
+        assert name in said.split("▲ ")[0]  # the table
     label = [
         f"{channel['sensor']}.{channel['channel']}"
         for channel in json.loads(json_file.read_text(encoding="utf-8"))["channels"]
     ]
     reversed_ = f"{label[5]} has the opposite polarity to {label[2]}"
-    assert f"{reversed_}, {label[8]} has the opposite polarity to {label[5]}: no bias" in words
-    assert f"All of these have {names[1]} in common" in words
+    assert f"▲ {reversed_}: check the wires (and 1 more like this)" in words
     long = " ".join(huddle("estimate", str(out), "--segment", "1s", "--details").split())
     assert f"{names[0]} → {names[1]}" in long
-    assert f"warning: {reversed_}: no bias" in long
+    assert f"{reversed_}, {label[8]} has the opposite polarity to {label[5]}: no bias" in long
+    assert f"All of these have {names[1]} in common" in long
 
 
 # ------------------------------------------------------------------------ exit codes

@@ -11,6 +11,7 @@ from rich.text import Text
 
 from daq.results.band_summary import band_of, channel_means, data_means, judged_method
 from daq.results.comparison import compare
+from daq.results.facts import Rank
 from daq.results.partners import without_partners
 from daq.results.precision import channel_covs, precision
 from tui.application.dialogs import item
@@ -18,7 +19,7 @@ from tui.application.test_view.panels import alerts, known_to
 from tui.output.results import averages_line
 from tui.wording.facts import MARKS as MARKS_OF_RANKS
 from tui.wording.facts import NOTHING_TO_DO, known
-from tui.wording.formatting import clock_time, level, level_with_error, percent, signed
+from tui.wording.formatting import level, level_with_error, percent, signed
 from tui.wording.verdict_text import (
     MARKS,
     STYLES,
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from tui.application.state import State
 
 MUTED, BAD = "#9aa5b8", "bold #ff6b6b"
+_STYLES_OF_RANKS = {Rank.INVALIDATES: BAD, Rank.DELAYS: "yellow", Rank.TO_KNOW: MUTED}
 WIDE = 110  # columns from which there is room for what can be missed
 
 
@@ -61,7 +63,10 @@ def result(state: State, *, width: int) -> RenderableType:
     facts = known(snapshot, settings)
     if not any(each.needs_action for each in facts):
         parts.append(item(NOTHING_TO_DO))
-    parts += [item(f"{MARKS_OF_RANKS[each.fact.rank]} {each}") for each in facts]
+    parts += [
+        item(str(each), MARKS_OF_RANKS[each.fact.rank], _STYLES_OF_RANKS[each.fact.rank])
+        for each in facts
+    ]
     parts.append(item(averages_line(snapshot)))
     if path is not None:
         parts += ["", Text.assemble(("recording  ", MUTED), str(path.resolve()))]
@@ -86,12 +91,8 @@ def _verdict(snapshot: Snapshot, settings: Settings, found: TestVerdict | None) 
             worst = min(known, key=lambda each: each.margin_low_db)
             yield Text(f"Least margin: {limit_line(worst)}.")
     reached = precision(snapshot, settings)
-    if reached.target is not None and not math.isnan(reached.cov):
-        mark, style = ("✓", "green") if reached.is_reached else ("✗", "yellow")
-        text = f"{mark} {known_to(reached)}"
-        if not reached.is_reached and reached.total is not None:
-            text += f": would have taken {clock_time(reached.total)} in all"
-        yield Text(text, style)
+    if reached.is_reached:  # a missed target is a fact, below
+        yield Text(f"✓ {known_to(reached)}", "green")
 
 
 def _channels(state: State, snapshot: Snapshot, settings: Settings, *, width: int) -> Table:

@@ -8,6 +8,7 @@ from rich.text import Text
 from textual.containers import Vertical, VerticalScroll
 from textual.widgets import Static
 
+from daq.results.facts import SensorLost
 from tui.application.test_view import clocks, panels
 from tui.application.test_view.channels import channel_table
 from tui.application.test_view.plot import DriftPlot, PsdPlot
@@ -127,7 +128,9 @@ class Board(Vertical):
     def _write_alerts(self, shown: State) -> None:
         alerts = [] if shown.now is None else panels.alerts(shown.now, shown.settings)
         if shown.snapshot is not None and not shown.trouble:
-            alerts += panels.findings(shown.snapshot, width=self.size.width - 10)
+            alerts += panels.findings(
+                shown.snapshot, width=self.size.width - 10, besides=SensorLost
+            )
         if shown.trouble:
             alerts.insert(0, Text(f"▲ {shown.trouble}", BAD))
         room = 3 if self.has_class("-tall") else 1

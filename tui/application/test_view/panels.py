@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from daq.recording.monitor import RecordingStatus, SensorStatus
     from daq.results.band_summary import BandMeans
     from daq.results.decision.verdict import TestVerdict
+    from daq.results.facts import Fact
     from daq.results.partners import WithoutPartner
     from daq.results.precision import Precision
     from tui.application.test_view.plotted import Choice
@@ -302,10 +303,17 @@ def _overdue_alert(sensor: SensorStatus, now: RecordingStatus) -> str:
     return alert.format(sensor=sensor.name, time=time, reason=sensor.reason)
 
 
-def findings(snapshot: Snapshot, *, width: int) -> list[Text]:
-    """Return the facts that invalidate or delay the result, a line each, the worst first."""
+def findings(snapshot: Snapshot, *, width: int, besides: type[Fact] | None = None) -> list[Text]:
+    """Return the facts that invalidate or delay the result, a line each, the worst first.
+
+    Those of the kind `besides` are left out: they are shown elsewhere.
+    """
     styles = {Rank.INVALIDATES: "bold #ff6b6b", Rank.DELAYS: "yellow"}
-    needed = [each for each in known(snapshot) if each.needs_action]
+    needed = [
+        each
+        for each in known(snapshot)
+        if each.needs_action and (besides is None or not isinstance(each.fact, besides))
+    ]
     lines = [Text(each.line, styles[each.fact.rank]) for each in needed]
     for line in lines:
         line.truncate(width, overflow="ellipsis")
