@@ -48,7 +48,7 @@ def test_the_sensor_with_most_gaps_and_its_longest_stretch_are_known(path: Path)
     assert (found.no_segment.reason, found.no_segment.sensor) == (Reason.GAP, "b")
     assert found.no_segment.longest == pytest.approx(40 / RATE)  # the first; later ones have 39
     assert shown[0] == (
-        "✗ b has no 4 s without a gap (at most 0.8 s): check its cable, or shorten --segm…"
+        "✗ b has no 4 s without a gap (at most 0.8 s): check its cable, or shorten --seg…"
     )
 
 
