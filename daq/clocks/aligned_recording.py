@@ -361,8 +361,8 @@ class AlignedRecording:
                 )
             else:
                 clock = source.solved(measured, utc)
-                if clock.state.refined:  # relative to the reference, whose rate is also uncertain
-                    clock = clock.rate_known_to(reference.known_clock.state.ppm_std)
+                if clock.state.refined:
+                    clock = clock.beside(reference.known_clock.state)
                 source.clock = clock
         if self._recording.closed:  # before that, arrivals may be few
             for source in sources:

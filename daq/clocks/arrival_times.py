@@ -477,13 +477,19 @@ class ArrivalTimes:
             variance=variance,
             from_samples=variance > 0,
             restarts=np.diff(epoch, prepend=epoch[:1]) > 0,
+            counts=_counts(index, variance > 0),
         )
         hidden = step / math.sqrt(12) * math.sqrt(max(beat / node, 1.0))
         smoothed = smooth(observations, least_noise=max(hidden, scatter))
         residual = smoothed.varying
         refined = bool(observations.from_samples.any())
+        information = np.where(
+            variance > 0, 1 / np.maximum(variance, _FLOOR**2), smoothed.noise**-2
+        )
+        by_arrivals = float(information[variance == 0].sum() / information.sum())
         if not refined:  # nothing checks the line within the time of one observation
-            residual = math.hypot(residual, max(hidden, 2 * scatter) / len(kept))
+            unchecked = max(hidden, 2 * scatter) / len(kept)
+            residual = math.hypot(residual, smoothed.wander, unchecked)
         if refined and unplaced is None:
             seen = observations.from_samples
             poor = self._poorly_known(epoch, smoothed.std, seen)
@@ -520,7 +526,22 @@ class ArrivalTimes:
         )
         seen = observations.from_samples
         state = _guarded(state, (late_seen - curve)[seen], variance[seen], self.sampling_rate)
-        return Clock(tuple(epochs), state)
+        return Clock(tuple(epochs), state, by_arrivals)
+
+
+def _counts(index: FloatArray, from_samples: BoolArray) -> BoolArray:
+    """Return where the error of a clock counts: at measured delays, and at arrivals far from them.
+
+    A delay is that of half a segment before and after, which clocks hardly leave between delays.
+    """
+    at = index[from_samples]
+    if len(at) < 2:
+        return np.ones(len(index), np.bool_)
+    half = np.diff(at).min()  # by default
+    after = np.searchsorted(at, index)
+    before = index - at[np.maximum(after - 1, 0)]
+    apart = np.minimum(np.abs(before), np.abs(at[np.minimum(after, len(at) - 1)] - index))
+    return np.asarray(from_samples | (apart > half))
 
 
 def _guarded(

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     IntArray = NDArray[np.int64]
 
 _NEVER = 1 << 62  # a sample index beyond all others
+_BETWEEN = 3  # nodes of a cubic's straight pieces, in each interval: 1/16 of its bend is left
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,7 +88,11 @@ class Epoch:
         sampling_rate: float,
         is_placed: bool,
     ) -> Epoch:
-        """Return the epoch of this lateness in s, straight on at both ends at the rate there."""
+        """Return the epoch of this lateness in s, straight on at both ends at the rate there.
+
+        Between nodes a walk of the rate is expected to follow a cubic (Hermite).
+        """
+        index, late = _curved(index, late, rate / sampling_rate)
         low, high = min(float(bounds[0]), index[0]) - 1, max(float(bounds[1]), index[-1]) + 1
         first, last = rate[[0, -1]] / sampling_rate
         late = np.concatenate(
@@ -258,10 +263,13 @@ class Clock:
     epochs : tuple of Epoch
         In order of sample index.
     state : ClockState
+    by_arrivals : float
+        Share of the arrivals in what is known of it, beside measured delays.
     """
 
     epochs: tuple[Epoch, ...]
     state: ClockState
+    by_arrivals: float = 0.0
     _spans: list[FloatArray] = field(default_factory=list, init=False, repr=False)
 
     @property
@@ -282,10 +290,15 @@ class Clock:
         """Time of the last sample."""
         return self.epochs[-1].end
 
-    def rate_known_to(self, ppm_std: float) -> Clock:
-        """Return the same clock, its rate no better known than to this besides, in ppm."""
-        total = float(np.hypot(self.state.ppm_std, ppm_std))
-        return replace(self, state=replace(self.state, ppm_std=total))
+    def beside(self, reference: ClockState) -> Clock:
+        """Return the same clock as known beside that against which its delays were measured.
+
+        Its rate is no better known. As far as arrivals know it, it does not follow what the other
+        is off by.
+        """
+        rate = float(np.hypot(self.state.ppm_std, reference.ppm_std))
+        left = float(np.hypot(self.state.residual, self.by_arrivals * reference.residual))
+        return replace(self, state=replace(self.state, ppm_std=rate, residual=left))
 
     def at(self, index: FloatArray) -> FloatArray:
         """Return the time in seconds of (fractional) sample indices."""
@@ -417,6 +430,20 @@ def nominal(
         shared_clock=shared_clock,
     )
     return Clock((epoch,), state)
+
+
+def _curved(
+    index: FloatArray, late: FloatArray, slope: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the nodes of a cubic with these slopes, and `_BETWEEN` more in each interval."""
+    wide, high = np.diff(index)[:, None], np.diff(late)[:, None]
+    u = np.arange(_BETWEEN + 1.0) / (_BETWEEN + 1)
+    begins, ends = u * (1 - u) ** 2, u**2 * (1 - u)
+    off = wide * (slope[:-1, None] * begins - slope[1:, None] * ends) - high * (begins - ends)
+    return (
+        np.append((index[:-1, None] + wide * u).ravel(), index[-1]),
+        np.append((late[:-1, None] + high * u + off).ravel(), late[-1]),
+    )
 
 
 def _straight(x: FloatArray, xp: FloatArray, fp: FloatArray) -> FloatArray:

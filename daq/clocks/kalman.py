@@ -37,8 +37,7 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
     BoolArray = NDArray[np.bool_]
 
-_WALKS = 10.0 ** np.arange(-10.0, -6.4, 0.5)  # random walk of the rate, s/s per √s
-_FAST_WALKS = 10.0 ** np.arange(-6.0, -4.4, 0.5)  # by a changing temperature; seen by samples only
+_WALKS = 10.0 ** np.arange(-10.0, -4.4, 0.5)  # random walk of the rate, s/s per √s
 _NOISES = 10.0 ** np.arange(-6.0, -2.4, 0.5)  # of arrival observations, s
 _STEADY = 1.1e-8  # at most, of an oscillator that is left in peace: 0.25 ppm in ten minutes
 _START = np.array([1e-2, 1e-4, 1.0])  # what is not known at first: s, s/s, s
@@ -67,6 +66,8 @@ class Observations:
         Whether the observation is from the samples, and so up to a constant.
     restarts : bool, shape (n,)
         Whether the clock has started anew between the one before and this one.
+    counts : bool, shape (n,)
+        Where the error of the clock counts: some at least.
     """
 
     seconds: FloatArray
@@ -74,6 +75,7 @@ class Observations:
     variance: FloatArray
     from_samples: BoolArray
     restarts: BoolArray
+    counts: BoolArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,8 +90,12 @@ class Smoothed:
         Standard deviation in s of the lateness; of that with the constant where samples were
         observed.
     varying : float
-        The same in s rms, of what is not constant; where only arrivals were observed, with what
-        may be their wander.
+        The same in s rms, of what is not constant, where it counts.
+    wander : float
+        What may be wander of the arrivals and not of the clock, in s rms; 0 where samples were
+        observed.
+    noise : float
+        Likely standard deviation of an arrival, in s.
     constant : float
         By how much observations from the samples lie above those from arrivals, in s.
     """
@@ -98,6 +104,8 @@ class Smoothed:
     rate: FloatArray
     std: FloatArray
     varying: float
+    wander: float
+    noise: float
     constant: float
 
 
@@ -111,9 +119,7 @@ def smooth(observations: Observations, *, least_noise: float = 0.0) -> Smoothed:
     least_noise : float
         Standard deviation of arrivals, in s, that they have at least.
     """
-    seen = observations.from_samples.any()
-    walks = np.concatenate([_WALKS, _FAST_WALKS]) if seen else _WALKS
-    strengths = walks, np.array(sorted(set(np.maximum(_NOISES, least_noise).tolist())))
+    strengths = _WALKS, np.array(sorted(set(np.maximum(_NOISES, least_noise).tolist())))
     walks, noises = (grid.ravel() for grid in np.meshgrid(*strengths, indexing="ij"))
     likelihood = _filter(observations, walks, noises, None)
     likelihood -= (np.log10(walks / _USUAL) / _USUALLY) ** 2 / 2
@@ -124,21 +130,21 @@ def smooth(observations: Observations, *, least_noise: float = 0.0) -> Smoothed:
     track = _Track.empty(len(observations.seconds), len(taken))
     _filter(observations, walks[taken], noises[taken], track)
     sees = np.array([1.0, 0.0, float(observations.from_samples.any())])
-    states, covariances, of_means = _backwards(track, sees)
+    counts = observations.counts
+    states, covariances, of_means = _backwards(track, sees, counts)
     weight = np.append(relative[taken[:-1]], 0.0)
     weight /= weight.sum()
     state = np.einsum("npk,p->nk", states, weight)
     apart = (states - state[:, None]) @ sees
     variance = (sees @ covariances @ sees + apart**2) @ weight
-    of_mean = (of_means + apart.mean(axis=0) ** 2) @ weight
-    wander = 0.0 if sees[2] else float(np.std(apart[:, -1]))
-    bends = np.diff(state[:, 1]) * np.diff(observations.seconds)  # straight between nodes
-    bent = math.sqrt(float(bends @ bends) / max(len(bends), 1) / 120)
+    of_mean = (of_means + apart[counts].mean(axis=0) ** 2) @ weight
     return Smoothed(
         lateness=state[:, 0],
         rate=state[:, 1],
         std=np.sqrt(np.maximum(variance, 0.0)),
-        varying=math.hypot(math.sqrt(max(float(variance.mean() - of_mean), 0.0)), wander, bent),
+        varying=math.sqrt(max(float(variance[counts].mean() - of_mean), 0.0)),
+        wander=0.0 if sees[2] else float(np.std(apart[:, -1])),
+        noise=float(weight @ noises[taken] ** -2.0) ** -0.5,
         constant=float(state[-1, 2]),
     )
 
@@ -218,17 +224,20 @@ def _filter(
     return likelihood
 
 
-def _backwards(track: _Track, sees: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _backwards(
+    track: _Track, sees: FloatArray, counts: BoolArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Rauch-Tung-Striebel: what later observations say about earlier states.
 
     Returns states, their covariances, and of every pair the variance that the mean of all
-    ``sees @ state`` has. States take the place of the filtered ones in `track`: after a day copies
+    ``sees @ state`` that count has. States take the place of the filtered ones in `track`: after a day copies
     of them would take 40 MB.
     """
     state, covariance = track.filtered, track.filtered_covariance
     # Of each state with the sum of all later ones; smoothed states are a Markov chain too.
     later = np.zeros(state.shape[1:])
-    of_sum = sees @ covariance[-1] @ sees
+    share = counts / np.count_nonzero(counts)
+    of_mean = share[-1] ** 2 * (sees @ covariance[-1] @ sees)
     for end in range(len(state) - 1, 0, -_AT_ONCE):
         begin = max(0, end - _AT_ONCE)
         predicted = track.predicted_covariance[begin + 1 : end + 1]
@@ -240,6 +249,7 @@ def _backwards(track: _Track, sees: FloatArray) -> tuple[FloatArray, FloatArray,
             state[number] += (gain @ ahead[:, :, None])[:, :, 0]
             known = covariance[after] - track.predicted_covariance[after]
             covariance[number] += gain @ known @ gain.swapaxes(-1, -2)
-            later = (gain @ (covariance[after] @ sees + later)[:, :, None])[:, :, 0]
-            of_sum = of_sum + sees @ covariance[number] @ sees + 2 * later @ sees
-    return state, covariance, np.asarray(of_sum / len(state) ** 2)
+            later = (gain @ (share[after] * covariance[after] @ sees + later)[:, :, None])[:, :, 0]
+            mine = share[number] * (sees @ covariance[number] @ sees) + 2 * later @ sees
+            of_mean = of_mean + share[number] * mine
+    return state, covariance, np.asarray(of_mean)

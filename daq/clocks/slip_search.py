@@ -105,8 +105,11 @@ def _seen(source: SensorSource, reference: SensorSource) -> _Seen:
     index, seconds, std = source.delays(reference)
     at_reference = np.sort(source.learnt.values[:, 1])
     when = reference.known_clock.at(at_reference)
-    counted = source.slips.holds(index) | reference.slips.holds(at_reference)
+    known = source.slips.holds(index) | reference.slips.holds(at_reference)
     rate = source.record.sampling_rate
+    if not (reference.device_utc or reference.polled):  # by counts: its clock follows its slips
+        counted = at_reference + reference.slips.ahead(at_reference)
+        seconds = seconds - when + counted / reference.record.sampling_rate
     late = seconds - (index + source.slips.ahead(index)) / rate
     restarts = source.arrivals.restarts
     epoch = np.searchsorted(restarts, index, side="right") + np.searchsorted(
@@ -115,7 +118,7 @@ def _seen(source: SensorSource, reference: SensorSource) -> _Seen:
     least = min(1 / rate, 1 / reference.record.sampling_rate)
     found: list[Step] = []
     for number in sorted(set(epoch.tolist())):  # np.unique loads numpy.ma
-        mine = np.flatnonzero((epoch == number) & ~counted)
+        mine = np.flatnonzero((epoch == number) & ~known)
         some = mine[np.isfinite(std[mine])]
         found += steps(when[some], late[some], std[some], least=least)
     return _Seen(source, index, when, found)

@@ -39,6 +39,7 @@ _LEAST = 3  # of them, next to an end or to another step
 _CERTAIN = 8.0  # standard deviations of what steps
 _WHOLE = 0.15  # samples that a step may be off a whole number
 _SPAN = 4  # segments that one step disturbs at most
+_MARGIN = 0.25  # of half a segment: one that holds a step may show the delay of its smaller part
 _SLOPES = 11  # differences by whose median the rate is known
 _NODE = 10.0  # seconds of arrivals, the earliest of which counts
 _NODES = 6  # of these on either side of a step
@@ -150,6 +151,7 @@ def steps(at: FloatArray, late: FloatArray, std: FloatArray, *, least: float) ->
         return []
     wide = np.maximum(np.diff(at), 1e-9)
     slope = np.diff(late) / wide
+    margin = _MARGIN * median(wide)
     half = _SLOPES // 2
     padded = np.pad(slope, half, mode="reflect" if len(slope) > half else "edge")
     usual = np.sort(np.lib.stride_tricks.sliding_window_view(padded, _SLOPES), axis=1)[:, half]
@@ -174,7 +176,7 @@ def steps(at: FloatArray, late: FloatArray, std: FloatArray, *, least: float) ->
         spread = max(float(np.ptp(left)), float(np.ptp(right)))
         error = max(spread, float(std[before].max())) / np.sqrt(_LEAST)
         if abs(size) > max(least / 2, _CERTAIN / 2 * error):
-            found.append(Step(float(at[low]), float(at[high]), float(size)))
+            found.append(Step(float(at[low]) - margin, float(at[high]) + margin, float(size)))
     return found
 
 

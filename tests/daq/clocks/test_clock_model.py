@@ -269,6 +269,7 @@ def test_the_smoother_states_its_own_error() -> None:
                 np.zeros(n),
                 np.zeros(n, dtype=bool),
                 np.zeros(n, dtype=bool),
+                np.ones(n, dtype=bool),
             )
         )
         spread.append(float(np.mean(((found.lateness - truth) / found.std) ** 2)))

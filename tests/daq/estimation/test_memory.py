@@ -69,7 +69,12 @@ def test_a_clock_is_smoothed_with_one_set_of_states() -> None:
     lateness = 1e-5 * np.random.default_rng(0).standard_normal(n)
     from_samples = np.arange(n) % 2 == 0
     observed = Observations(
-        seconds, lateness, 1e-12 * from_samples, from_samples, np.zeros(n, np.bool_)
+        seconds,
+        lateness,
+        1e-12 * from_samples,
+        from_samples,
+        np.zeros(n, np.bool_),
+        np.ones(n, np.bool_),
     )
     n_pairs = 2  # of walk and noise that are likely here, with the steady one
     assert peak_of(lambda: smooth(observed)) < 2.2 * n * n_pairs * 24 * 8
