@@ -205,10 +205,12 @@ def truth_of(scene: Scene) -> Truth:
     return truth
 
 
-def growing(path: Path, scene: Scene, *, every: float) -> Iterator[float]:
+def growing(
+    path: Path, scene: Scene, *, every: float, control: tuple[int, str] | None = None
+) -> Iterator[float]:
     """Write a recording; yield the seconds so far each time that so many are on disk."""
     layouts, blocks, _ = _made(scene)
-    writer = RecordingWriter.create(path, sensors=layouts, created=_ORIGIN)
+    writer = RecordingWriter.create(path, sensors=layouts, created=_ORIGIN, control=control)
     later = every
     for block in blocks:
         writer.append(block)

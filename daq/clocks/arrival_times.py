@@ -483,10 +483,6 @@ class ArrivalTimes:
         smoothed = smooth(observations, least_noise=max(hidden, scatter))
         residual = smoothed.varying
         refined = bool(observations.from_samples.any())
-        information = np.where(
-            variance > 0, 1 / np.maximum(variance, _FLOOR**2), smoothed.noise**-2
-        )
-        by_arrivals = float(information[variance == 0].sum() / information.sum())
         if not refined:  # nothing checks the line within the time of one observation
             unchecked = max(hidden, 2 * scatter) / len(kept)
             residual = math.hypot(residual, smoothed.wander, unchecked)
@@ -526,7 +522,17 @@ class ArrivalTimes:
         )
         seen = observations.from_samples
         state = _guarded(state, (late_seen - curve)[seen], variance[seen], self.sampling_rate)
-        return Clock(tuple(epochs), state, by_arrivals)
+        return Clock(tuple(epochs), state, _share_of_arrivals(variance, smoothed.noise))
+
+
+def _share_of_arrivals(variance: FloatArray, noise: float) -> float:
+    """Return by how much arrivals of this scatter know a clock, beside delays of these variances.
+
+    Rows of arrivals have a variance of zero.
+    """
+    measured = variance > 0
+    arrivals = np.count_nonzero(~measured) / noise**2
+    return float(arrivals / (arrivals + np.sum(1 / variance[measured])))
 
 
 def _counts(index: FloatArray, from_samples: BoolArray) -> BoolArray:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.clocks.slips import Slips
+    from daq.protocols.block import Uncounted
 
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
@@ -158,25 +159,6 @@ class RelativeTime(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class LostCount:
-    """Samples that a sensor lost without counting them.
-
-    Attributes
-    ----------
-    utc_ns : int
-        When, in ns since 1970: the middle of what is known.
-    within : float
-        By how much that may be wrong, in seconds.
-    n_samples : int
-        Negative: samples that were counted twice.
-    """
-
-    utc_ns: int
-    within: float
-    n_samples: int
-
-
-@dataclass(frozen=True, slots=True)
 class ClockState:
     """What is known about one sensor's clock.
 
@@ -212,7 +194,7 @@ class ClockState:
     is_understood : bool
         False where delays measured from the motion do not lie on the clock, or its rate is off by
         more than an oscillator's: `residual` is then what they scatter about it.
-    slips : tuple of LostCount
+    slips : tuple of Uncounted
         Samples lost, or repeated, without being counted; the clock allows for them.
     """
 
@@ -231,7 +213,7 @@ class ClockState:
     drifts: bool = False
     unchecked: bool = False
     is_understood: bool = True
-    slips: tuple[LostCount, ...] = ()
+    slips: tuple[Uncounted, ...] = ()
 
     def relative_time(self, other: ClockState) -> RelativeTime:
         """Return how the times of this sensor are known against those of another."""

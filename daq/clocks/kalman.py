@@ -230,8 +230,8 @@ def _backwards(
     """Rauch-Tung-Striebel: what later observations say about earlier states.
 
     Returns states, their covariances, and of every pair the variance that the mean of all
-    ``sees @ state`` that count has. States take the place of the filtered ones in `track`: after a day copies
-    of them would take 40 MB.
+    ``sees @ state`` that count has. States take the place of the filtered ones in `track`: after a
+    day copies of them would take 40 MB.
     """
     state, covariance = track.filtered, track.filtered_covariance
     # Of each state with the sum of all later ones; smoothed states are a Markov chain too.

@@ -16,7 +16,6 @@ from daq.clocks.clock_model import (
     ClockSource,
     ClockState,
     Epoch,
-    LostCount,
     MeasuredDelays,
     OffsetSource,
 )
@@ -25,7 +24,7 @@ from daq.clocks.quantiles import median
 from daq.clocks.slips import Slips
 from daq.clocks.utc_rate import UtcRate
 from daq.errors import CannotAlignError
-from daq.protocols.block import BlockFlag
+from daq.protocols.block import BlockFlag, Uncounted
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -301,7 +300,7 @@ class SensorSource:
         clock = clock.without(self.slips)
         return replace(clock, state=replace(clock.state, slips=self._dated(clock)))
 
-    def _dated(self, clock: Clock) -> tuple[LostCount, ...]:
+    def _dated(self, clock: Clock) -> tuple[Uncounted, ...]:
         found = []
         for each in self.slips.all:
             if each.n_samples == 0:  # blocks were late, and nothing was lost
@@ -309,7 +308,7 @@ class SensorSource:
             ends = clock.at(np.array([each.first_sample, each.end_sample], dtype=np.float64))
             middle, within = float(ends.mean()), float(np.ptp(ends)) / 2
             utc_ns = self.arrivals.origin_utc_ns + round(middle * 1e9)
-            found.append(LostCount(utc_ns, within, each.n_samples))
+            found.append(Uncounted(utc_ns, within, each.n_samples))
         return tuple(found)
 
     def _judged(self, clock: Clock) -> Clock:

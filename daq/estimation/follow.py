@@ -11,6 +11,7 @@ once more: that is the result. A recorder that ends without closing its file end
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import sys
 import threading
@@ -31,10 +32,11 @@ from daq.recording.reader import Recording, control_address
 from daq.recording.storage import locking
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
     from pathlib import Path
 
     from daq.estimation.snapshot import Snapshot
+    from daq.protocols.block import Uncounted
     from daq.recording.monitor import RecordingStatus
 
 INTERVAL = 20.0
@@ -202,7 +204,7 @@ def follow(
 
         known, sensors = seen(recording)
         looks, estimates, memory = Throttle(LOOK_SHARE), Throttle(share), FreedMemory()
-        wanted = 0.0
+        wanted, uncounted = 0.0, _Uncounted()
         if sensors is not None:
             sensors.look()
 
@@ -235,6 +237,7 @@ def follow(
                     with estimates:
                         snapshot = estimation.snapshot()
                     observer.snapshot(snapshot, estimation.settings)
+                    uncounted.take(recording.path, snapshot)
                 elif sensors is not None:
                     sensors.look()
             memory.give_back()
@@ -290,6 +293,34 @@ def _result(
         raise
     observer.snapshot(snapshot, estimation.settings)
     return snapshot
+
+
+class _Uncounted:
+    """Has the recorder record the samples that sensors did not count, if two estimates show them.
+
+    Once for each: a later estimate may date it otherwise.
+    """
+
+    def __init__(self) -> None:
+        self._before: tuple[tuple[str, Uncounted], ...] = ()
+        self._recorded: list[tuple[str, Uncounted]] = []
+
+    def take(self, path: Path, snapshot: Snapshot) -> None:
+        """Record what this estimate and the one before show."""
+        found = tuple((clock.sensor, each) for clock in snapshot.clocks for each in clock.slips)
+        for sensor, each in found:
+            if _is_among(sensor, each, self._before) and not _is_among(
+                sensor, each, self._recorded
+            ):
+                self._recorded.append((sensor, each))
+                said = f"{each.utc_ns} {each.within:.3f} {each.n_samples} {sensor}"
+                with contextlib.suppress(HuddleError, OSError):  # the result has it in any case
+                    ask(path, "uncounted", said)
+        self._before = found
+
+
+def _is_among(sensor: str, one: Uncounted, others: Iterable[tuple[str, Uncounted]]) -> bool:
+    return any(sensor == name and one.is_that(other) for name, other in others)
 
 
 class _Sensors:

@@ -13,12 +13,19 @@ exact; otherwise the block has the flag ``BlockFlag.MISSING_ESTIMATED``. Gaps ar
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from enum import IntFlag, StrEnum
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+from daq.protocols.plural import several
+
+UNCOUNTED_CHECK = "check the buffers and the cable of the logger, and the load of its computer"
+"""What to do about samples that are not counted."""
 
 CountsArray: TypeAlias = NDArray[np.integer[Any]] | NDArray[np.floating[Any]]
 
@@ -119,6 +126,8 @@ class EventKind(StrEnum):
     """The device's counter or clock restarted."""
     OVERFLOW = "overflow"
     """A buffer in the device overflowed and lost samples."""
+    UNCOUNTED = "uncounted"
+    """Samples were lost, or repeated, without being counted, as measured delays show later."""
     STATUS = "status"
     """The device, its driver or the recorder reports its condition."""
 
@@ -132,6 +141,41 @@ class EventKind(StrEnum):
             return cls(text)
         except ValueError:
             return text
+
+
+@dataclass(frozen=True, slots=True)
+class Uncounted:
+    """Samples that a sensor lost, or repeated, without counting them.
+
+    Attributes
+    ----------
+    utc_ns : int
+        When, in ns since 1970: the middle of what is known.
+    within : float
+        By how much that may be wrong, in seconds.
+    n_samples : int
+        Lost samples; negative: samples that were counted twice.
+    """
+
+    utc_ns: int
+    within: float
+    n_samples: int
+
+    def is_that(self, other: Uncounted) -> bool:
+        """Whether both may be one, found twice."""
+        apart = abs(self.utc_ns - other.utc_ns) * 1e-9
+        return self.n_samples == other.n_samples and apart <= self.within + other.within
+
+    @property
+    def in_words(self) -> str:
+        """What happened, when, and what to check."""
+        count = abs(self.n_samples)
+        return (
+            f"{'lost' if self.n_samples > 0 else 'repeated'} {several(count, 'sample')} at"
+            f" {datetime.fromtimestamp(self.utc_ns * 1e-9, UTC):%H:%M:%S} UTC"
+            f" (±{math.ceil(self.within)} s) without counting {'it' if count == 1 else 'them'};"
+            f" {UNCOUNTED_CHECK}"
+        )
 
 
 @dataclass(frozen=True, slots=True)

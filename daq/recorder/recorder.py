@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from daq.devices.registry import driver_type
 from daq.errors import DeviceError, DiskError, RecordingError
 from daq.host_clock import SystemClock
-from daq.protocols.block import Event, EventKind
+from daq.protocols.block import Event, EventKind, Uncounted
 from daq.protocols.errors import RemoteProtocolError
 from daq.recorder.block_writer import BlockWriter, SensorProgress
 from daq.recorder.connection import CLOSE_TIMEOUT, Connection
@@ -187,6 +187,7 @@ class _Recorder:
         self._stop = stop
         self._acknowledged = acknowledged
         self._queue: asyncio.Queue[Item] = asyncio.Queue(QUEUE_LENGTH)
+        self._uncounted: dict[str, list[Uncounted]] = {}  # by sensor; recorded already
         self._started = self._file_started = clock.now()
         self._end_reason = "stopped"
         self._status = RecorderStatus(str(path), 0.0, {})
@@ -409,4 +410,17 @@ class _Recorder:
             self._stop.set()
         elif command is Command.MARK:
             await self._queue.put(Event("", EventKind.MARK, text, self._clock.now()))
+        elif command is Command.UNCOUNTED:
+            try:
+                utc_ns, within, n_samples, sensor = text.split(" ", 3)
+                found = Uncounted(int(utc_ns), float(within), int(n_samples))
+                event = Event(sensor, EventKind.UNCOUNTED, found.in_words, self._clock.now())
+            except (ValueError, OverflowError, OSError):
+                return {"error": f"uncounted: expected a time, two numbers and a sensor: {text!r}"}
+            if sensor not in self._status.sensors:
+                return {"error": f"uncounted: no sensor {sensor!r}"}
+            known = self._uncounted.setdefault(sensor, [])
+            if not any(found.is_that(one) for one in known):  # several may follow the recording
+                known.append(found)
+                await self._queue.put(event)
         return self._status.to_dict()

@@ -1,4 +1,4 @@
-"""Control channel of a running recorder: ``stop``, ``mark``, ``status``.
+"""Control channel of a running recorder: ``stop``, ``mark``, ``uncounted``, ``status``.
 
 Theory of operation
 -------------------
@@ -48,6 +48,8 @@ class Command(StrEnum):
     """Close the recording and end."""
     MARK = "mark"
     """Record a remark."""
+    UNCOUNTED = "uncounted"
+    """Record samples that a sensor did not count: ns since 1970, within (s), how many, sensor."""
     STATUS = "status"
     """Only reply with the status."""
 
@@ -139,9 +141,9 @@ def ask(recording: str | Path | tuple[int, str], command: str, text: str = "") -
     ----------
     recording : path, or (port, token)
         The file that the recorder writes, or the address in its attributes.
-    command : {"stop", "mark", "status"}
+    command : {"stop", "mark", "uncounted", "status"}
     text : str
-        The remark of a ``mark``.
+        The remark of a ``mark``, or what an ``uncounted`` is about.
 
     Raises
     ------

@@ -15,7 +15,7 @@ from estimator.checks.kinds import Level
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from daq.clocks.clock_model import LostCount
+    from daq.protocols.block import LostCount
     from estimator.checks.advice import Advice
     from estimator.checks.kinds import Untested
     from estimator.levels.contributions import Source

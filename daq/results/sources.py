@@ -11,14 +11,16 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 
 from daq.estimation.recording_set import continuations
+from daq.protocols.block import EventKind
 from daq.recording.reader import Recording
 from daq.recording.storage.locking import is_being_written
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
     from daq.bench.model import Bench, Channel
+    from daq.clocks.clock_model import ClockState
     from daq.recording.reader import SensorRecord
 
 _SECOND_NS = 1_000_000_000
@@ -33,6 +35,27 @@ class LoggedEvent:
     sensor: str
     kind: str
     text: str
+
+
+def uncounted_events(clocks: Iterable[ClockState]) -> tuple[LoggedEvent, ...]:
+    """Return the samples that an estimate shows to be lost without being counted, as events."""
+    found = [
+        LoggedEvent(each.utc_ns, clock.sensor, EventKind.UNCOUNTED, each.in_words)
+        for clock in clocks
+        for each in clock.slips
+    ]
+    return tuple(sorted(found, key=lambda each: each.utc_ns))
+
+
+def with_uncounted(
+    recorded: Iterable[LoggedEvent], uncounted: Sequence[LoggedEvent]
+) -> tuple[LoggedEvent, ...]:
+    """Return events in order: those of an estimate instead of what the run recorded of the same."""
+    sensors = {each.sensor for each in uncounted}
+    kept = (
+        each for each in recorded if each.kind != EventKind.UNCOUNTED or each.sensor not in sensors
+    )
+    return tuple(sorted([*kept, *uncounted], key=lambda each: each.utc_ns))
 
 
 @dataclass(frozen=True, slots=True)

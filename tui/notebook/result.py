@@ -10,6 +10,7 @@ import numpy as np
 from daq.bench.units import levels_db
 from daq.errors import WrongSettingError
 from daq.results.band_summary import band_of, channel_means
+from daq.results.sources import uncounted_events
 from estimator.levels.bands import band_edges
 from tui.notebook import text
 from tui.output.extras import load
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot_diagnostics import (
         SnapshotDiagnostics,
     )
+    from daq.results.sources import LoggedEvent
     from estimator.self_noise.result import SelfNoise
     from estimator.types import ComplexArray, FloatArray, IntArray
     from tui.wording.facts import Known
@@ -231,6 +233,14 @@ class Result:
     def advice(self) -> tuple[str, ...]:
         """The facts that invalidate or delay the result, and what to do, in sentences."""
         return tuple(str(each) for each in self.facts if each.needs_action)
+
+    @property
+    def events(self) -> tuple[LoggedEvent, ...]:
+        """Samples that sensors lost, or repeated, without counting them: when, and what to check.
+
+        What was noticed while recording has `RecordingFile.events`.
+        """
+        return uncounted_events(self.snapshot.clocks)
 
     @property
     def _noise(self) -> SelfNoise:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from daq.results.sources import uncounted_events
 from estimator.checks.shared_noise import MAX_CHANNELS
 from estimator.self_noise.result import Flag
 from tui.output.json_values import plain
@@ -46,6 +47,15 @@ def diagnostics_document(snapshot: Snapshot) -> dict[str, Any]:
         "refused": snapshot.refused,
         "sensors": [_sensor(each) for each in snapshot.sensors],
         "clocks": [_clock(each) for each in snapshot.clocks],
+        "events": [
+            {
+                "utc_ns": each.utc_ns,
+                "sensor": each.sensor,
+                "kind": each.kind,
+                "text": each.text,
+            }
+            for each in uncounted_events(snapshot.clocks)
+        ],
         "drift_s": snapshot.drift,
         "synchronisation": _synchronisation(found.synchronisation),
         "untested": found.untested,

@@ -13,6 +13,7 @@ from daq.protocols.block import EventKind
 from daq.results.band_summary import band_of
 from daq.results.clock_effect import effect_by_sensor, grade, reference, residuals
 from daq.results.facts import Rank
+from daq.results.sources import uncounted_events, with_uncounted
 from estimator.checks.advice import NoSharedMotion
 from estimator.likelihood.goodness_of_fit import rejected_below
 from tui.report.figures.drift import drift_plot
@@ -30,7 +31,7 @@ from tui.wording.formatting import several, span, utc
 from tui.wording.vocabulary import clock_source
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from daq.clocks.clock_model import ClockState
     from daq.estimation.settings import Settings
@@ -235,7 +236,8 @@ def events_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
     text = f"{several(snapshot.n_segments, 'segment')} used"
     text += f" ({snapshot.n_effective:.0f} effective averages)."
     parts: list[Part] = [Paragraph(text)]
-    logged_events = [each for source in found for each in source.logged_events]
+    recorded = (each for source in found for each in source.logged_events)
+    logged_events = with_uncounted(recorded, uncounted_events(snapshot.clocks))
     if not logged_events:
         parts.append(Paragraph("The recordings hold no events.", "quiet"))
         return Section("What happened", tuple(parts))
@@ -318,7 +320,7 @@ def _clock_row(
     )
 
 
-def _together(logged_events: Sequence[LoggedEvent]) -> list[tuple[LoggedEvent, int, int]]:
+def _together(logged_events: Iterable[LoggedEvent]) -> list[tuple[LoggedEvent, int, int]]:
     """Return what happened in time order: how often, until when; alike ones together if many."""
     ordered = sorted(logged_events, key=lambda each: each.utc_ns)
     if len(ordered) <= LISTED:

@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 from functools import singledispatch
 from typing import TYPE_CHECKING, NamedTuple
 
+from daq.protocols.block import UNCOUNTED_CHECK
 from daq.results.facts import (
     BlocksDamaged,
     ChannelsClipped,
@@ -393,7 +394,7 @@ def _uncounted(fact: SamplesUncounted, names: Names) -> Wording:
     return Wording(
         f"{text}: check the logger's buffers and cable",
         f"{text}. Its count was corrected, and the segments around are excluded.",
-        "Check the buffers and the cable of the logger, and the load of its computer.",
+        f"{UNCOUNTED_CHECK[0].upper()}{UNCOUNTED_CHECK[1:]}.",
     )
 
 

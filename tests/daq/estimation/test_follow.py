@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import sys
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -19,12 +20,16 @@ from daq.estimation.follow import (
     RecordingLeftOpenError,
     follow,
 )
+from daq.estimation.settings import Settings
+from daq.recording.control import Command, serve
 from daq.results.facts import NotInLiveEstimate
 from daq.results.known_facts import facts_of
-from daq.results.sources import sources
+from daq.results.sources import sources, uncounted_events
 from estimator.errors import InsufficientDataError
+from tests import known_clocks
 from tests.daq.estimation.follow_observer import Goes, Noted, Process
 from tests.daq.recording.sending_bench import Bench
+from tests.known_clocks import Scene
 from tests.tui.example_snapshot import SETTINGS, growing
 
 if TYPE_CHECKING:
@@ -74,6 +79,33 @@ def test_what_closes_with_its_last_segment_has_one_result(tmp_path: Path) -> Non
     assert result is not None
     assert noted.snapshots == [result]
     assert result.diagnostics.diagnosis is not None
+
+
+async def test_samples_that_a_sensor_does_not_count_become_an_event_of_the_recorder(
+    tmp_path: Path,
+) -> None:
+    path, heard = tmp_path / "run.h5", list[str]()
+    scene = Scene(rates=(50.0, 50.0, 50.0), seconds=300.0, slips={1: [(150.0, 1)]})
+
+    async def answer(command: Command, text: str) -> dict[str, Any]:
+        heard.extend([text] * (command is Command.UNCOUNTED))
+        return {"sensors": {}}
+
+    async with serve(answer) as address:
+        grows = known_clocks.growing(path, scene, every=20.0, control=address)
+        next(grows)
+        noted = Noted(cancelled=Goes(lambda: next(grows, None)))
+        process = Process(lambda: next(grows, None))
+        result = await asyncio.to_thread(
+            follow, path, Settings(), noted, recorder=process, cancelled=noted.cancelled, share=1e9
+        )
+    (said,) = heard
+    utc_ns, within, n_samples, sensor = said.split()
+    assert (sensor, n_samples) == ("B", "1")
+    assert abs(known_clocks.seconds_of(int(utc_ns)) - 150.0) <= float(within) < 15.0
+    assert result is not None
+    (event,) = uncounted_events(result.clocks)
+    assert event.sensor == "B"
 
 
 def test_a_result_that_is_not_wanted_is_not_computed(tmp_path: Path) -> None:

@@ -64,6 +64,28 @@ async def test_commands_of_the_control_port_are_executed(tmp_path: Path) -> None
         assert recording.events[-1].text == "stopped by command"
 
 
+async def test_samples_that_were_not_counted_are_recorded_once(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    at = 1_468_458_187_000_000_000  # 01:03:07
+    async with run.going():
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+        said = f"{at} 2.500 1 a", f"{at + 4_000_000_000} 2.500 1 a", f"{at} 2.500 -3 a"
+        for each in said:  # the second is the first, dated otherwise
+            await asyncio.to_thread(ask, run.path, "uncounted", each)
+        for wrong in ("1 2 3", f"{at} x 1 a", f"{at} nan 1 b", f"{10**30} 1 1 a"):
+            with pytest.raises(ControlRefusedError, match="uncounted"):
+                await asyncio.to_thread(ask, run.path, "uncounted", wrong)
+        await asyncio.to_thread(ask, run.path, "stop")
+    with Recording.open(run.path) as recording:
+        found = [(each.sensor, each.text) for each in recording.events if each.kind == "uncounted"]
+    to_do = "; check the buffers and the cable of the logger, and the load of its computer"
+    assert found == [
+        ("a", f"lost 1 sample at 01:03:07 UTC (±3 s) without counting it{to_do}"),
+        ("a", f"repeated 3 samples at 01:03:07 UTC (±3 s) without counting them{to_do}"),
+    ]
+
+
 async def test_invalid_requests_to_the_control_port_have_no_effect(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a")
     async with run.going():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from daq.clocks.clock_model import LostCount
+from daq.protocols.block import LostCount
 from daq.results import facts
 from daq.results.facts import Fact, Rank
 from estimator.checks.kinds import Untested

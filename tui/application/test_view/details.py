@@ -9,12 +9,15 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.protocols.block import EventKind
+from daq.results.sources import LoggedEvent, uncounted_events, with_uncounted
 from tui.application.test_view.panels import grouped, state
 from tui.output.diagnosis import details as diagnosis_details
 from tui.wording.facts import known
 from tui.wording.formatting import clock_time, utc
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from rich.console import RenderableType
 
     from daq.estimation.settings import Settings
@@ -23,6 +26,7 @@ if TYPE_CHECKING:
 
 LATEST_EVENTS = 200
 MUTED, HEADER, BAD = "#9aa5b8", "bold #4cc9f0", "bold #ff6b6b"
+_STYLES = {str(EventKind.MARK): "bold #f4a261", str(EventKind.UNCOUNTED): BAD}
 
 
 def details(
@@ -35,7 +39,9 @@ def details(
         parts += ["", Text("segments", HEADER), _segments(snapshot, settings)]
         parts += ["", Text("diagnosis", HEADER)]
         parts += diagnosis_details(snapshot, known(snapshot, settings))
-    parts += ["", Text("events, latest first", HEADER), _events(now)]
+    clocks = () if snapshot is None else snapshot.clocks
+    found = uncounted_events(clocks)
+    parts += ["", Text("events, latest first", HEADER), _events(now, found)]
     return Group(*parts)
 
 
@@ -66,17 +72,23 @@ def _segments(snapshot: Snapshot, settings: Settings) -> Text:
     return Text(text)
 
 
-def _events(now: RecordingStatus) -> Table:
+def _events(now: RecordingStatus, found: Sequence[LoggedEvent]) -> Table:
+    """Return what was recorded, and what the estimate found: that in place of what it had."""
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_header=False)
     table.add_column(justify="right", style=MUTED, no_wrap=True)
     for _ in range(2):
         table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
-    shown = now.events[-LATEST_EVENTS:]
+    recorded = [
+        LoggedEvent(event.received.utc_ns, event.sensor, event.kind, event.text)
+        for event in now.events
+    ]
+    every = with_uncounted(recorded, found)
+    shown = every[-LATEST_EVENTS:]
     for event in reversed(shown):
-        at = (event.received.utc_ns - now.started_utc_ns) * 1e-9
-        style = "bold #f4a261" if event.kind == EventKind.MARK else ""
+        at = (event.utc_ns - now.started_utc_ns) * 1e-9
+        style = _STYLES.get(event.kind, "")
         table.add_row(clock_time(at), Text(event.sensor), Text(event.kind, style), Text(event.text))
-    if len(shown) < len(now.events):
-        table.add_row("", "", "", f"and {len(now.events) - len(shown)} before")
+    if len(shown) < len(every):
+        table.add_row("", "", "", f"and {len(every) - len(shown)} before")
     return table
