@@ -124,6 +124,8 @@ _DRIFT = 1e-4  # by which a sampling clock may run off its rate
 _LEAP = 1e-3  # seconds; how well a step must agree with a leap second
 _OSCILLATOR = 200.0  # ppm; no oscillator of an instrument is off by more
 _CERTAIN = 3.0  # standard deviations
+_HALF = 1.25  # of the time between segments, which by default is half a segment
+_LIKELY = 2.0  # standard deviations
 _FAR_OFF = 6.0  # standard deviations, beyond which a measured delay is not on the clock
 _SEEN_AS = 1e-6  # seconds; the least of these standard deviations
 _SCATTER = 1.5  # stated deviations of measured delays, to which they may scatter of themselves
@@ -521,8 +523,12 @@ class ArrivalTimes:
             refined=refined,
         )
         seen = observations.from_samples
-        state = _guarded(state, (late_seen - curve)[seen], variance[seen], self.sampling_rate)
-        return Clock(tuple(epochs), state, _share_of_arrivals(variance, smoothed.noise))
+        off_by, by_arrivals = (
+            (late_seen - curve)[seen],
+            _share_of_arrivals(variance, smoothed.noise),
+        )
+        state = _guarded(state, off_by, variance[seen], self.sampling_rate)
+        return Clock(tuple(epochs), state, by_arrivals, _at_most(off_by, variance[seen]))
 
 
 def _share_of_arrivals(variance: FloatArray, noise: float) -> float:
@@ -535,6 +541,15 @@ def _share_of_arrivals(variance: FloatArray, noise: float) -> float:
     return float(arrivals / (arrivals + np.sum(1 / variance[measured])))
 
 
+def _at_most(late_by: FloatArray, variance: FloatArray) -> float:
+    """Return by how much a clock is off at most, as delays about it show with their variances."""
+    if not len(late_by):
+        return math.inf
+    excess = float(np.var(late_by)) - float(variance.mean())
+    error = _LIKELY * float(variance.mean()) * math.sqrt(2 / math.ceil(len(late_by) / 2))
+    return math.sqrt(max(excess, 0.0) + error)  # every second segment overlaps with the one before
+
+
 def _counts(index: FloatArray, from_samples: BoolArray) -> BoolArray:
     """Return where the error of a clock counts: at measured delays, and at arrivals far from them.
 
@@ -543,7 +558,7 @@ def _counts(index: FloatArray, from_samples: BoolArray) -> BoolArray:
     at = index[from_samples]
     if len(at) < 2:
         return np.ones(len(index), np.bool_)
-    half = np.diff(at).min()  # by default
+    half = _HALF * np.diff(at).min()
     after = np.searchsorted(at, index)
     before = index - at[np.maximum(after - 1, 0)]
     apart = np.minimum(np.abs(before), np.abs(at[np.minimum(after, len(at) - 1)] - index))

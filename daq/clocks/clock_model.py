@@ -12,7 +12,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from math import isnan
+from math import inf, isnan
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -247,11 +247,14 @@ class Clock:
     state : ClockState
     by_arrivals : float
         Share of the arrivals in what is known of it, beside measured delays.
+    most_off : float
+        By how much it may be off in s rms, as measured delays show.
     """
 
     epochs: tuple[Epoch, ...]
     state: ClockState
     by_arrivals: float = 0.0
+    most_off: float = inf
     _spans: list[FloatArray] = field(default_factory=list, init=False, repr=False)
 
     @property
@@ -276,10 +279,11 @@ class Clock:
         """Return the same clock as known beside that against which its delays were measured.
 
         Its rate is no better known. As far as arrivals know it, it does not follow what the other
-        is off by.
+        is off by, unless measured delays show that this is less.
         """
         rate = float(np.hypot(self.state.ppm_std, reference.ppm_std))
-        left = float(np.hypot(self.state.residual, self.by_arrivals * reference.residual))
+        apart = min(self.by_arrivals * reference.residual, self.most_off)
+        left = float(np.hypot(self.state.residual, apart))
         return replace(self, state=replace(self.state, ppm_std=rate, residual=left))
 
     def at(self, index: FloatArray) -> FloatArray:
