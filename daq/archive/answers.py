@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from daq.archive.density import Density
     from daq.archive.plan import Plan
+    from daq.archive.spectra_file import Described
     from daq.archive.store import Entry
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
@@ -100,6 +101,8 @@ class Answer:
         None where stretches are longer than an hour, or one of the two has too few segments.
     problems : tuple of str
         What could not be read.
+    doubted : tuple of Described
+        Of recordings that are left out, because the clock of a sensor is not understood.
     """
 
     pooled: Snapshot
@@ -114,6 +117,7 @@ class Answer:
     density: Density
     contrast: Contrast | None
     problems: tuple[str, ...]
+    doubted: tuple[Described, ...]
 
 
 def answer(
@@ -154,6 +158,13 @@ def answer(
             "the archive has no spectra yet: no recording holds one whole segment of"
             f" {plan.settings.segment:g} s"
         )
+    doubted = tuple(one.described for one in known if one.described.not_understood)
+    known = [one for one in known if not one.described.not_understood]
+    if not known:
+        raise ArchiveError(
+            "the archive has no recording in which all clocks are understood: check whether"
+            " samples are lost or repeated without being counted, and the sampling rates"
+        )
     channels = known[0].described.channels
     every = Estimator(plan, settings, channels)
     # Days and stretches go by the method that judges.
@@ -189,6 +200,7 @@ def answer(
         density=tally.density.density(),
         contrast=tally.contrast(),
         problems=tuple(problems),
+        doubted=doubted,
     )
 
 

@@ -77,6 +77,8 @@ class Described:
     left_out : mapping of Reason to int
     residual : mapping of str to float
         What is left between clocks, in seconds rms, by sensor.
+    not_understood : tuple of str
+        Sensors whose clock is not understood.
     clipped, stood_still : mapping of int to float
         As in `daq.estimation.snapshot.SnapshotDiagnostics`.
     """
@@ -87,6 +89,7 @@ class Described:
     elapsed: float
     left_out: Mapping[Reason, int] = field(default_factory=dict)
     residual: Mapping[str, float] = field(default_factory=dict)
+    not_understood: tuple[str, ...] = ()
     clipped: Mapping[int, float] = field(default_factory=dict)
     stood_still: Mapping[int, float] = field(default_factory=dict)
 
@@ -162,6 +165,7 @@ class SpectraWriter:
                 "elapsed": described.elapsed,
                 "left_out": json.dumps({str(k): v for k, v in described.left_out.items()}),
                 "residual": json.dumps(dict(described.residual)),
+                "not_understood": json.dumps(dict.fromkeys(described.not_understood, True)),
                 "clipped": json.dumps(dict(described.clipped)),
                 "stood_still": json.dumps(dict(described.stood_still)),
             }
@@ -227,6 +231,7 @@ class SpectraFile:
             elapsed=float(number(attributes, "elapsed")),
             left_out={Reason(k): int(v) for k, v in _table(attributes, "left_out").items()},
             residual={k: float(v) for k, v in _table(attributes, "residual").items()},
+            not_understood=tuple(_table(attributes, "not_understood", optional=True)),
             clipped={int(k): float(v) for k, v in _table(attributes, "clipped").items()},
             stood_still={int(k): float(v) for k, v in _table(attributes, "stood_still").items()},
         )
@@ -286,7 +291,11 @@ def _damage_named(path: Path) -> Iterator[None]:
         raise ArchiveError(f"{path}: damaged: {reason}") from error
 
 
-def _table(attributes: h5py.AttributeManager, name: str) -> dict[str, Any]:
+def _table(
+    attributes: h5py.AttributeManager, name: str, *, optional: bool = False
+) -> dict[str, Any]:
+    if optional and name not in attributes:  # of files of before
+        return {}
     found = json.loads(text(attributes, name))
     if not isinstance(found, dict):
         raise TypeError(f"attribute {name}; expected a table")

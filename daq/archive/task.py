@@ -125,6 +125,9 @@ def _archived(task: Task) -> Outcome:
                     elapsed=each.elapsed,
                     left_out={reason: left_out.get(reason, 0) for reason in Reason},
                     residual=synchronisation([each]).residual,
+                    not_understood=tuple(
+                        clock.sensor for clock in each.aligned.clocks if not clock.is_understood
+                    ),
                     clipped=clipped_columns([recording], channels),
                     stood_still=still_for_a_while([each], settings),
                 )

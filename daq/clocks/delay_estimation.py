@@ -52,6 +52,8 @@ _ALIKE = 2.0  # standard deviations of its height, by which a peak may be lower 
 _WEAK = 0.15  # share from which on noise may make any of several peaks the highest
 _SIGNIFICANT = 50.0  # 2 E / κ: a peak of seven standard deviations
 _LONGEST = 32.0  # samples, in both directions
+_FAR_SIGNIFICANT = 400.0  # the same of a peak farther away, of which there are many more
+_MET = 0.3  # share of the predicted motion that a peak explains
 _CLEAR = 1.5  # ratio to the peak nearest zero: the peaks of one line are about equal
 _OUTSTANDING = 2.0  # ratio to all peaks within _LONGEST: noise reaches at most 1.5
 _FREQUENCIES_AT_ONCE = 1024
@@ -95,12 +97,16 @@ class DelayEstimator:
         Columns of the samples of each sensor, with the preferred reference first.
     n_candidates : int
         Sensors tried as reference.
+    is_wide : bool
+        Whether delays of up to half a segment are searched for where none is nearer, once there is
+        a frame: times may be off by that much.
     """
 
     sampling_rate: float
     window: FloatArray
     columns: tuple[slice, ...]
     n_candidates: int = REFERENCES
+    is_wide: bool = False
     _reference: int = 0
     _frames: dict[int, _Frame] = field(default_factory=dict)
 
@@ -135,7 +141,8 @@ class DelayEstimator:
         -------
         delays, std : float64, shape (n_segments, n_sensors)
             In s; positive if the sensor lags the reference, whose delays are zero. NaN and infinity
-            if the coherent motion is too weak.
+            if the coherent motion is too weak. Where `is_wide`, the deviation is NaN where the
+            motion is strong, and the sensor does not follow it.
         """
         shape = (len(starts), len(self.columns))
         delays, std = np.full(shape, np.nan), np.full(shape, np.inf)
@@ -278,9 +285,22 @@ class DelayEstimator:
         # R is an estimate too: correct by the mean of an inverse Wishart matrix.
         freedom = max(frame.n_segments - x0.shape[2], 1)
         std *= math.sqrt(freedom / max(freedom - xj.shape[2] - 1, 1))
-        known = (2 * total / kappa > _SIGNIFICANT) & (met > 0.3 * total)
+        known = (2 * total / kappa > _SIGNIFICANT) & (met > _MET * total)
         known &= is_one | (alike < _WEAK)  # else the cycle is chosen by chance
-        return tau, np.where(known, std, np.inf)
+        far = ~known & (2 * total / kappa > _FAR_SIGNIFICANT) & (self.is_wide and self.has_frame)
+        if far.any():
+            tau[far] = self._highest(crossed[:, far])
+            met = (crossed * _turn(omega, tau)).real.sum(axis=0)
+            known |= far & (met > _MET * total)
+        std = np.where(known, std, np.inf)
+        return tau, np.where(far & ~known, np.nan, std)
+
+    def _highest(self, crossed: ComplexArray) -> FloatArray:
+        """Return the τ of the highest peak of every column, up to half a segment away."""
+        height = np.fft.irfft(np.pad(crossed, ((1, 0), (0, 0))), n=self._n_grid, axis=0)
+        at = np.argmax(height, axis=0)
+        at = np.where(at > self._n_grid // 2, at - self._n_grid, at)
+        return self._polished(crossed, at * self._step)
 
     def _peak(self, crossed: ComplexArray, alike: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Return the τ that maximises Re Σ crossed exp(iωτ) for every column, and if it is alone.

@@ -15,7 +15,7 @@ from estimator.checks.kinds import Level
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from daq.protocols.block import LostCount
+    from daq.protocols.block import Uncounted
     from estimator.checks.advice import Advice
     from estimator.checks.kinds import Untested
     from estimator.levels.contributions import Source
@@ -315,7 +315,7 @@ class SamplesUncounted(Fact):
     """A sensor lost or repeated samples without counting them; its count was corrected."""
 
     name: ClassVar[str] = "samples-uncounted"
-    slips: tuple[LostCount, ...]
+    slips: tuple[Uncounted, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -358,7 +358,7 @@ def _drift(fact: StatedTimesDrift, names: Names) -> Wording:
         text += f" {who} were corrected to within about {_us(fact.left)}."
     if fact.uncorrected:
         text += f" Those of {listed(list(fact.uncorrected))} could not be corrected: the motion is"
-        text += " too weak for so short segments."
+        text += " too weak for so short segments, or times step."
     do = "Check whether the clocks were synchronised, or whether waves changed direction."
     return Wording(line, text, f"Choose longer segments. {do}" if fact.uncorrected else do)
 
@@ -370,7 +370,8 @@ def _unchecked(fact: StatedTimesUnchecked, names: Names) -> Wording:
     text = f"The times that {listed(fact.sensors)} {verb} could not be compared with the motion"
     return Wording(
         f"{text}: record longer, or with more motion",
-        f"{text}: it is too weak, or the recording too short. If they drift, the noise is wrong by"
+        f"{text} everywhere: it is too weak, the recording too short, or the sensors differ in a"
+        " part of it, as where times step by seconds. If they drift or step, the noise is wrong by"
         " a share of the motion.",
         "Record longer, or with more motion.",
     )

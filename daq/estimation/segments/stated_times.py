@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from estimator.spectra.segment_spectra import SegmentSpectra
     from estimator.spectra.welch import WelchSettings
 
+    BoolArray = NDArray[np.bool_]
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
     ComplexArray = NDArray[np.complex128]
@@ -61,6 +62,7 @@ _SCATTERS = 3.0  # times the predicted scatter: the times of single blocks are w
 _GROWTH = 0.5  # of the stretch whose clocks are set, from one setting to the next
 _STEP = 16  # pieces that are measured in between
 _AGREE = 25.0  # χ² of 7 degrees of freedom: 8e-4. More is no news yet: pieces are measured then
+_FOLLOWS = 0.5  # of the power of a prediction, that a part meets at least
 _TURNED = 8.0  # standard deviations of the χ² of all phases: neighbouring frequencies depend
 _COARSE = 0.05  # samples; standard error of a part: above, one phase may be that of two delays
 
@@ -136,6 +138,9 @@ def agree(
         info = 2 * independent * (omega**2 @ (energy - spurious))
         if not (info > (welch.sampling_rate / _COARSE) ** 2).all():
             return False
+        met, crossed = crossed.real, crossed.imag
+        if (met.sum(axis=0) < _FOLLOWS * (energy - spurious).sum(axis=0)).any():
+            return False  # another motion in a part, or the same some segments later
         delays = 2 * independent * (omega @ crossed) / info
         delays -= info @ delays / info.sum()
         # A jump by samples turns phases round, and their slope may be that of no delay.
@@ -148,7 +153,7 @@ def agree(
 
 def _met(
     x0: ComplexArray, xj: ComplexArray, part: IntArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+) -> tuple[ComplexArray, FloatArray, FloatArray]:
     """Return how a sensor's prediction in each part meets what was measured.
 
     Parameters
@@ -159,9 +164,9 @@ def _met(
 
     Returns
     -------
-    crossed, energy : float64, shape (n_freqs, n_parts)
-        Imaginary part of the products of the prediction and the spectra, and the power of the
-        prediction, over the power that is not predicted.
+    crossed, energy : complex128 and float64, shape (n_freqs, n_parts)
+        Products of the prediction and the spectra, and the power of the prediction, over the power
+        that is not predicted.
     spurious : float64, shape (n_parts,)
         Of this power, the mean that noise adds to any prediction.
     """
@@ -173,7 +178,7 @@ def _met(
     noise = np.maximum(left, 1e-12 * power)
     weight = np.where(noise > 0, 1.0, 0.0) / np.where(noise > 0, noise, 1.0)
     of_part = (part[:, None] == np.arange(_PARTS)).astype(np.float64)
-    crossed = np.einsum("fp,fsp,fsp->fs", weight, xj.conj(), predicted).imag @ of_part
+    crossed = np.einsum("fp,fsp,fsp->fs", weight, xj.conj(), predicted) @ of_part
     energy = np.einsum("fp,fsp,fsp->fs", weight, predicted.conj(), predicted).real @ of_part
     return crossed, energy, x0.shape[2] * xj.shape[2] / n * of_part.sum(axis=0)
 
@@ -220,12 +225,14 @@ def drift_of(
 ) -> float:
     """Return by how much delays of a sensor drift over a recording, in s rms.
 
-    0 where that is not more than they scatter, NaN where too few are known or too many are false.
+    0 where that is not more than they scatter, NaN where too few are known or too many are false,
+    and where the sensor does not follow a strong motion in a part of the recording: its times may
+    be off by more than can be measured.
 
     Parameters
     ----------
     at, delays, std : float64, shape (n,)
-        When, the delays and their predicted standard deviations, in s.
+        When, the delays and their predicted standard deviations, in s. NaN: not the motion.
     nominal : bool
         Whether the times stated are those of the nominal rate. Of others single ones may be wrong
         too, which shows as scatter.
@@ -235,6 +242,8 @@ def drift_of(
         Of the samples that the delays were measured from, in Hz.
     """
     known = np.isfinite(std) & (std > 0)
+    if _is_elsewhere(at, np.isnan(std), known):
+        return math.nan
     at, delays, std = at[known], delays[known], std[known]
     if len(at) < 2 * _PARTS:
         return math.nan
@@ -263,6 +272,15 @@ def drift_of(
         return 0.0
     slope = float(np.polyfit(at, delays, 1)[0])
     return max(abs(slope) * duration / math.sqrt(12), float(np.std(delays)))
+
+
+def _is_elsewhere(at: FloatArray, unmet: BoolArray, known: BoolArray) -> bool:
+    """Whether most delays of a part of the recording are those of another motion."""
+    if not unmet.any():
+        return False
+    part = np.minimum((at - at[0]) / (at[-1] - at[0]) * _PARTS, _PARTS - 1).astype(np.int64)
+    n_unmet, n_known = (np.bincount(part, each, minlength=_PARTS) for each in (unmet, known))
+    return bool(((n_unmet >= _FEWEST) & (n_unmet > n_known)).any())
 
 
 class _Pieces:
@@ -304,7 +322,11 @@ class _Pieces:
             window = get_window(self._welch.window, self._welch.segment_length)
             fixed = self._aligned.stated_reference is not None
             self.meter = DelayEstimator(
-                self._welch.sampling_rate, window, self._columns, 1 if fixed else REFERENCES
+                self._welch.sampling_rate,
+                window,
+                self._columns,
+                1 if fixed else REFERENCES,
+                is_wide=True,
             )
             self.first = np.arange(begin, min(begin + n_first, self.total))
             found = self.measure(self.first, at_once=n_first)

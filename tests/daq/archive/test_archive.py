@@ -23,6 +23,8 @@ from daq.archive.store import PLAN_FILE, Store
 from daq.archive.task import Task
 from daq.errors import ArchiveError, RecordingError, WrongArchiveError, WrongSettingError
 from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from tests import known_clocks
 from tests.daq.archive.months import (
     HOUR_NS,
     SETTINGS,
@@ -38,8 +40,6 @@ from tests.daq.archive.months import (
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-    from daq.estimation.settings import Settings
 
 SNR = 25.0**2
 """Of the recordings: rounding of the motion's spectra counts so many times in the noise's."""
@@ -327,3 +327,31 @@ def test_percentiles_of_the_density() -> None:
 )
 def test_a_scheduler_in_the_open_is_named(address: str, *, exposed: bool) -> None:
     assert is_exposed(address) is exposed
+
+
+@pytest.mark.parametrize("alone", [False, True])
+def test_recordings_whose_clocks_are_not_understood_are_left_out(
+    tmp_path: Path, *, alone: bool
+) -> None:
+    good, bad = tmp_path / "good.h5", tmp_path / "bad.h5"
+    settings = Settings(methods=("three-sensor",))
+    scene = known_clocks.Scene(rates=(50.0, 50.0, 50.0), seconds=200.0)
+    known_clocks.record(bad, replace(scene, slips={1: [(22.0 * n, 1) for n in range(1, 9)]}))
+    if not alone:
+        known_clocks.record(good, replace(scene, seed=2))
+    paths = [bad] if alone else [good, bad]
+    store = store_for(tmp_path / "store", paths[0], settings)
+    assert fill(store, paths) == []
+    entries, _ = store.entries()
+    if alone:
+        with pytest.raises(ArchiveError, match="no recording in which all clocks are understood"):
+            answer(store.plan, entries, settings)
+        return
+    found = answer(store.plan, entries, settings)
+    ((doubted,),) = ([each.not_understood for each in found.doubted],)
+    assert doubted == ("B",)
+    alone_found = answer(
+        store.plan, [e for e in entries if "good" in e.described.origin.path], settings
+    )
+    assert found.pooled.n_segments == alone_found.pooled.n_segments
+    np.testing.assert_array_equal(found.levels.mean, alone_found.levels.mean)

@@ -16,7 +16,7 @@ from daq.estimation.segments.stated_times import compare, drift_of
 from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
 from daq.results.band_summary import channel_means
-from daq.results.facts import StatedTimesUnchecked
+from daq.results.facts import ClockNotUnderstood, StatedTimesDrift, StatedTimesUnchecked
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
 from tests.daq.clock_facts import clock_facts
@@ -339,6 +339,40 @@ def test_steps_of_any_size_are_looked_at_closely(
     counts[15_000:] = delayed(counts, n_samples)[15_000:]
     path = write(tmp_path / "r.h5", sensors)
     assert pieces_are_read(path, monkeypatch, replace(SETTINGS, segment=segment))
+
+
+@pytest.mark.parametrize("is_stated", [False, True])
+@pytest.mark.parametrize(
+    ("n_samples", "is_measured"), [(3.0, True), (40.0, True), (-150.0, False), (400.0, False)]
+)
+def test_a_step_in_the_middle_is_not_taken_for_noise(
+    tmp_path: Path, n_samples: float, *, is_measured: bool, is_stated: bool
+) -> None:
+    """Of the samples under times that go on, or of the times that are stated."""
+    sensors = huddle(1e4, (0.0, 0.0, 0.0))
+    counts = sensors["c"].counts
+    if not is_stated:
+        counts[12_000:] = delayed(counts, n_samples)[12_000:]
+    writer = create(tmp_path / "r.h5", sensors)
+    for name, sensor in sensors.items():
+        for block in blocks(name, sensor):
+            if is_stated and name == "c" and block.first_sample >= 12_000:
+                assert block.device_counter is not None
+                stated = block.device_counter + round(n_samples / RATE * 1e9)
+                block = replace(block, device_counter=stated)  # noqa: PLW2901
+            writer.append(block)
+    writer.close()
+    snapshot = estimate([tmp_path / "r.h5"], SETTINGS)
+    low = snapshot.results["three-sensor"].low[BAND].mean(axis=0) / (1e12 * NOISE)
+    found = [each for each in clock_facts(snapshot) if not isinstance(each, ClockNotUnderstood)]
+    assert {type(each) for each in found} <= {StatedTimesDrift, StatedTimesUnchecked}
+    assert "c" in {sensor for each in found for sensor in each.sensors}
+    clock = snapshot.clocks[2]
+    if is_measured:
+        assert clock.corrected or clock.drifts
+        assert (low < 1.0).all()
+    else:  # about half a piece and more: nobody knows by how much
+        assert clock.unchecked or clock.drifts
 
 
 @pytest.mark.parametrize("ppm", [0.3, 3.0, 60.0, 500.0])

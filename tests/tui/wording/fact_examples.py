@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from daq.protocols.block import LostCount
+from daq.protocols.block import Uncounted
 from daq.results import facts
 from daq.results.facts import Fact, Rank
 from estimator.checks.kinds import Untested
@@ -57,7 +57,7 @@ EXAMPLES: tuple[Fact, ...] = (
     facts.SamplesUncounted(
         rank=Rank.DELAYS,
         sensors=A,
-        slips=(LostCount(NOON, 1.0, 1),),
+        slips=(Uncounted(NOON, 1.0, 1),),
         time_utc_ns=(NOON, NOON),
     ),
     facts.ClockNotUnderstood(rank=Rank.INVALIDATES, sensors=A, ppm=-985.0, error=1e-3),

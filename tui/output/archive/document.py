@@ -33,6 +33,10 @@ def archive_document(answer: Answer, store: Store, n_recordings: int) -> dict[st
             "stretch_s": store.plan.stretch_s,
             "recordings": n_recordings,
             "problems": list(answer.problems),
+            "doubted": [
+                {"source": each.origin.path, "clocks": list(each.not_understood)}
+                for each in answer.doubted
+            ],
         },
         "pooled": document(pooled, answer.settings),
         "method": answer.method,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.table import Table
@@ -11,7 +12,7 @@ from rich.text import Text
 
 from daq.archive.changes import MIN_DAYS
 from daq.bench.units import decibels
-from tui.wording.formatting import percent, several, signed, span
+from tui.wording.formatting import listed, percent, several, signed, span
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -74,6 +75,15 @@ def course_table(answer: Answer) -> Table:
 
 def remarks(answer: Answer, zone: str) -> Iterator[str]:
     """Yield sentences below the table; `zone` is that of working hours and nights."""
+    if answer.doubted:
+        whose = listed(sorted({one for each in answer.doubted for one in each.not_understood}))
+        n = len(answer.doubted)
+        yield (
+            f"{several(n, 'recording is', 'recordings are')} left out: the clock of {whose} is not"
+            f" understood in {'it' if n == 1 else 'them'} ({_names(answer)}). Check whether samples"
+            " are lost or repeated without being counted (buffers, cable, the logger's software),"
+            " and the sampling rate."
+        )
     changes = answer.changes
     n_channels = len(answer.pooled.channels)
     if changes.decided.any():
@@ -115,6 +125,12 @@ def remarks(answer: Answer, zone: str) -> Iterator[str]:
             "Work: Monday to Friday, 8–18 h; night: 22–6 h"
             f" ({zone}). Each ± is half of a 95 % interval."
         )
+
+
+def _names(answer: Answer) -> str:
+    """Return the names of the first recordings that are left out."""
+    names = [Path(each.origin.path).name for each in answer.doubted[:LARGE]]
+    return ", ".join(names) + ", …" * (len(answer.doubted) > LARGE)
 
 
 def _contrast(answer: Answer, column: int) -> str:
