@@ -138,10 +138,10 @@ def agree(
         info = 2 * independent * (omega**2 @ (energy - spurious))
         if not (info > (welch.sampling_rate / _COARSE) ** 2).all():
             return False
-        met, crossed = crossed.real, crossed.imag
+        met, quadrature = crossed.real, crossed.imag
         if (met.sum(axis=0) < _FOLLOWS * (energy - spurious).sum(axis=0)).any():
             return False  # another motion in a part, or the same some segments later
-        delays = 2 * independent * (omega @ crossed) / info
+        delays = 2 * independent * (omega @ quadrature) / info
         delays -= info @ delays / info.sum()
         # A jump by samples turns phases round, and their slope may be that of no delay.
         turned = 2 * independent * crossed**2 / energy

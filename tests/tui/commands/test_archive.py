@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 from contextlib import ExitStack
+from dataclasses import replace
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,7 @@ from daq.archive.store import Store
 from daq.bench.masks.mask_file import masks_named
 from daq.estimation.snapshot import Snapshot
 from daq.python_process import python_command
+from tests import known_clocks
 from tests.daq.archive.months import (
     HOUR_NS,
     SETTINGS,
@@ -35,6 +37,7 @@ from tests.daq.archive.months import (
     store_for,
     three,
 )
+from tests.known_clocks import Oscillator, Scene
 from tests.tui.output.test_result_schema import SCHEMA as RESULT
 from tests.tui.output.test_result_schema import strict
 from tests.waiting import finish, wait_until
@@ -235,3 +238,16 @@ def test_figures_have_a_panel_a_channel_with_what_was_found(tmp_path: Path) -> N
             assert box.x0 >= 0
             assert box.x1 <= figure.bbox.width
             assert box.y0 >= max(axes.title.get_window_extent().y1 for axes in figure.axes[:6])
+
+
+def test_a_recording_whose_clock_is_not_understood_is_named(tmp_path: Path) -> None:
+    scene = Scene(rates=(20.0,) * 3, seconds=200.0)
+    known_clocks.record(tmp_path / "good.h5", scene)
+    fast = (Oscillator(), Oscillator(400.0), Oscillator())
+    known_clocks.record(tmp_path / "bad.h5", replace(scene, clocks=fast))
+    said = huddle(tmp_path, *OPTIONS, "--json", tmp_path / "a.json")
+    assert said.exit_code == 0
+    assert "the clock of B is not understood in it (bad.h5)" in " ".join(said.output.split())
+    document = json.loads((tmp_path / "a.json").read_text("utf-8"))
+    (left,) = document["archive"]["doubted"]
+    assert left == {"source": str((tmp_path / "bad.h5").resolve()), "clocks": ["B"]}
