@@ -124,8 +124,11 @@ def one(job: tuple[str, Scene]) -> tuple[str, np.ndarray, np.ndarray, list[float
         error = 10 * np.log10(found.mean / NOISE)
     ratios = []
     if not scene.restarts:  # segments of epochs that are not used cannot be told from others
-        stated = np.array(list(snapshot.diagnostics.synchronisation.residual.values()))[1:]
-        ratios = (stated / truth.residual(snapshot)[1:]).tolist()
+        found_left = snapshot.diagnostics.synchronisation
+        stated = np.array(list(found_left.residual.values()))
+        if not found_left.reference:  # each is against the computer's clock
+            stated = np.hypot(stated, stated[0])
+        ratios = (stated[1:] / truth.residual(snapshot)[1:]).tolist()
     n_slips = sum(len(clock.slips) for clock in snapshot.clocks)
     doubtful = sum(not clock.is_understood for clock in snapshot.clocks)
     ratios = [each for each in ratios if np.isfinite(each)]

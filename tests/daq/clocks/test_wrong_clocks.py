@@ -64,6 +64,39 @@ def test_the_stated_residual_of_a_good_clock_is_that_of_its_filter(
     assert (stated < 4 * real.max()).all()
 
 
+WARMING = Oscillator(15.0, 30.0, 180.0)
+"""A rate that moves by up to 1e-6/s."""
+
+
+@pytest.mark.parametrize(
+    ("snr", "polled"),
+    [(1e2, True), (1e4, False), pytest.param(1e6, True, marks=pytest.mark.long)],
+)
+def test_the_residual_of_a_rate_that_moves_with_the_temperature_is_true(
+    tmp_path: Path, snr: float, *, polled: bool
+) -> None:
+    clocks = (Oscillator(), WARMING, Oscillator(-20.0))
+    scene = Scene(clocks=clocks, snr=snr, polled=polled, seconds=400.0)
+    snapshot, truth = estimated(tmp_path, scene)
+    stated = list(snapshot.diagnostics.synchronisation.residual.values())[1]
+    assert 0.5 < stated / truth.residual(snapshot)[1] < 2.0
+
+
+def test_what_only_arrivals_know_is_followed_and_stated_as_perhaps_the_hosts(
+    tmp_path: Path,
+) -> None:
+    """The motion is too weak to say whether the clock is fast or the host is late."""
+    fast = (Oscillator(5.0, 10.0, 120.0), WARMING, Oscillator(-20.0))
+    scene = Scene(motion="red", snr=100.0, clocks=fast, seconds=300.0)
+    snapshot, truth = estimated(tmp_path, scene)
+    assert not any(clock.refined for clock in snapshot.clocks)
+    first, *others = snapshot.diagnostics.synchronisation.residual.values()
+    stated = np.hypot(others, first)  # each is against the computer's clock
+    real = truth.residual(snapshot)[1:]
+    assert (real < 50e-6).all()  # by slower walks it is 200 µs
+    assert (stated > real).all()
+
+
 def test_samples_lost_all_the_time_are_not_taken_for_a_fast_clock(tmp_path: Path) -> None:
     """One of 1000 samples is lost: the delays lie on a line, of a rate that no clock has."""
     slips = {1: [(5.0 * n, 1) for n in range(1, 60)]}
