@@ -323,6 +323,11 @@ class ArrivalTimes:
             _unmeasured=None,
         )
 
+    @property
+    def hidden(self) -> float:
+        """Standard deviation in s of what polls hide of an arrival; 0 without polls."""
+        return self._polls.step(self._lines()[0]) / math.sqrt(12)
+
     def lateness(self) -> tuple[FloatArray, FloatArray]:
         """Return when early arrivals were, on the sensor's own count, and their lateness, in s."""
         return self._index / self.sampling_rate, self._late

@@ -132,10 +132,12 @@ def _together(one: Step, other: Step) -> bool:
 
 def _slipped(source: SensorSource, step: Step, before: float, after: float) -> bool:
     """Add a slip between two samples, if the step is one of this sensor."""
+    counted = source.arrivals.counting(source.slips)
     n = lost_by_delays(
         replace(step, before=_count(source, before), after=_count(source, after)),
         source.record.sampling_rate,
-        source.arrivals.counting(source.slips).lateness(),
+        counted.lateness(),
+        known_to=counted.hidden,
     )
     if n:
         source.slips = source.slips.added(Slip(math.ceil(before), int(after), n))

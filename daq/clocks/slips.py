@@ -181,7 +181,11 @@ def steps(at: FloatArray, late: FloatArray, std: FloatArray, *, least: float) ->
 
 
 def lost_by_delays(
-    step: Step, sampling_rate: float, arrivals: tuple[FloatArray, FloatArray]
+    step: Step,
+    sampling_rate: float,
+    arrivals: tuple[FloatArray, FloatArray],
+    *,
+    known_to: float = _JITTER,
 ) -> int:
     """Return how many samples were lost at a step of measured delays, negative for repeated ones.
 
@@ -194,13 +198,17 @@ def lost_by_delays(
         Hz.
     arrivals : (float64, float64), shape (n,)
         When blocks arrived on the sensor's own count, increasing, and their lateness, in s.
+    known_to : float
+        Standard deviation of the earliest of them at least, in s.
     """
     number = round(step.size * sampling_rate)
     if abs(step.size * sampling_rate - number) > _WHOLE:
         return 0
     arrived = _step_of_arrivals(step.before, step.after, arrivals)
-    if arrived is not None and abs(arrived[0] - step.size) > _CONTRADICTS * arrived[1]:
-        return 0
+    if arrived is not None:
+        size, scatter = arrived
+        if abs(size - step.size) > _CONTRADICTS * max(scatter, known_to, _JITTER):
+            return 0
     return number
 
 
@@ -256,4 +264,4 @@ def _step_of_arrivals(
     slope = median(np.concatenate(slopes))
     left, right = (y - slope * x for x, y in zip(times, least, strict=True))
     scatter = max(1.4826 * median(np.abs(side - median(side))) for side in (left, right))
-    return median(right) - median(left), max(scatter, _JITTER)
+    return median(right) - median(left), scatter

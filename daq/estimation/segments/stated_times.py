@@ -138,13 +138,13 @@ def agree(
         info = 2 * independent * (omega**2 @ (energy - spurious))
         if not (info > (welch.sampling_rate / _COARSE) ** 2).all():
             return False
-        met, quadrature = crossed.real, crossed.imag
-        if (met.sum(axis=0) < _FOLLOWS * (energy - spurious).sum(axis=0)).any():
+        followed, turned_by = crossed.real.sum(axis=0), crossed.imag
+        if (followed < _FOLLOWS * (energy - spurious).sum(axis=0)).any():
             return False  # another motion in a part, or the same some segments later
-        delays = 2 * independent * (omega @ quadrature) / info
+        delays = 2 * independent * (omega @ turned_by) / info
         delays -= info @ delays / info.sum()
         # A jump by samples turns phases round, and their slope may be that of no delay.
-        turned = 2 * independent * crossed**2 / energy
+        turned = 2 * independent * turned_by**2 / energy
         excess = turned.sum() - turned.size
         if not (info @ delays**2 < _AGREE and excess < _TURNED * math.sqrt(2 * turned.size)):
             return False

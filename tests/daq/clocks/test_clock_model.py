@@ -13,6 +13,7 @@ from daq.clocks.clock_model import (
 )
 from daq.clocks.kalman import Observations, smooth
 from daq.clocks.lower_envelope import supporting_line
+from daq.clocks.slips import Step, lost_by_delays
 from daq.clocks.usb_polling import Polls
 from daq.protocols.block import BlockFlag
 from daq.recording.file_format import BLOCK_DTYPE
@@ -386,3 +387,11 @@ def test_errors_are_large_in_the_first_seconds(seconds: int, polled: bool) -> No
             late = (phase - taken) % 16e-3 + rng.exponential(5e-5, len(taken))
         ratios.append(error_over_stated(block_rows(np.maximum.accumulate(taken + late)), taken))
     assert np.mean(np.array(ratios) < 2.0) >= 0.9
+
+
+def test_polled_arrivals_do_not_contradict_a_step_that_they_cannot_see() -> None:
+    seconds = np.arange(0.0, 200.0, 1.0)
+    late = np.where(seconds < 100, 0.0, 1e-3)  # the first of polls, of which 5 ms are hidden
+    step = Step(95.0, 105.0, 5e-3)
+    assert lost_by_delays(step, RATE, (seconds, late)) == 0
+    assert lost_by_delays(step, RATE, (seconds, late), known_to=5e-3) == round(5e-3 * RATE)
