@@ -2,7 +2,8 @@
 
 Prints a row for each group of recordings: the worst error of any channel and band, how many of them
 are neither within 0.3 dB nor held by their interval, coverage in the worst channel, the stated over
-the real residual (lowest and highest, and the rms of its inverse), and the slips that were found. One core, about ten minutes.
+the real residual (lowest, highest, and the rms of its inverse), and the slips that were found. One
+core, some twenty minutes.
 """
 
 from __future__ import annotations
