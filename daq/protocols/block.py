@@ -128,6 +128,8 @@ class EventKind(StrEnum):
     """A buffer in the device overflowed and lost samples."""
     UNCOUNTED = "uncounted"
     """Samples were lost, or repeated, without being counted, as measured delays show later."""
+    CLOCK = "clock"
+    """State of the computer's clock: at the start, hourly, and when it was set."""
     STATUS = "status"
     """The device, its driver or the recorder reports its condition."""
 

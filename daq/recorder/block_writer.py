@@ -30,6 +30,7 @@ _ROUTINE = {
     EventKind.MARK,
     EventKind.CONNECTED,
     EventKind.STATUS,
+    EventKind.CLOCK,
 }
 """Kinds of events that are logged as information; all others are warnings."""
 _REPORT_INTERVAL_NS = 1_000_000_000

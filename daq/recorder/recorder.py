@@ -29,6 +29,7 @@ from daq.host_clock import SystemClock
 from daq.protocols.block import Event, EventKind, Uncounted
 from daq.protocols.errors import RemoteProtocolError
 from daq.recorder.block_writer import BlockWriter, SensorProgress
+from daq.recorder.clock_trust import ClockWatch
 from daq.recorder.connection import CLOSE_TIMEOUT, Connection
 from daq.recorder.device_identity import with_owner
 from daq.recording import control
@@ -303,8 +304,11 @@ class _Recorder:
         """Write and commit the items of the connections until the run ends."""
         loop = asyncio.get_running_loop()
         last_commit, n_committed = -math.inf, 0
+        watch = ClockWatch(self._clock)
         while not self._stop.is_set():
             batch = await self._batch()
+            if (report := watch.look()) is not None:
+                batch.append(report)
             await self._done(
                 writer, thread, partial(writer.write, batch), partial(writer.write, ())
             )

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import ctypes
 import shutil
-import sys
 from typing import TYPE_CHECKING, Any
 
 from daq.errors import HuddleError
+from daq.recorder.clock_trust import clock_state
 from daq.recording.control import ask
 from tui.service.processes.locks import is_held
 from tui.service.records.places import service_lock
@@ -19,9 +18,6 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Bench
     from tui.service.records.run_state import Run
-
-_TIME_ERROR = 5
-"""Answer of ``adjtimex`` where nothing keeps the clock right."""
 
 
 def service_status(bench: Bench, runs: list[Run], now: datetime) -> dict[str, Any]:
@@ -73,11 +69,5 @@ def _disk(folder: Path, least: int) -> dict[str, Any]:
 
 def clock_is_synchronised() -> bool | None:
     """Return whether the kernel knows of something that keeps the clock right; None if unknown."""
-    if sys.platform != "linux":
-        return None
-    try:
-        timex = ctypes.create_string_buffer(512)  # modes = 0: only asks
-        state = ctypes.CDLL(None).adjtimex(timex)
-    except (OSError, AttributeError):
-        return None
-    return None if state < 0 else state != _TIME_ERROR
+    state = clock_state()
+    return None if state is None else state.synchronised

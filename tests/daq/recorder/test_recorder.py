@@ -117,6 +117,7 @@ async def test_every_sensor_is_recorded(tmp_path: Path) -> None:
         kinds = [(event.sensor, event.kind) for event in recording.events]
         assert kinds[0] == ("", "started")
         assert sorted(kinds[1:3]) == [("a", "connected"), ("b", "connected")]
+        assert ("", "clock") in kinds
         assert kinds[-1] == ("", "stopped")
 
 
