@@ -19,6 +19,11 @@ The mean of these over widths g, and over :math:`\tau` with weights that sum to 
 of mean 1 while nothing changes. So the probability that it ever exceeds :math:`1/\alpha`, however
 often one looks and however long the history becomes, is :math:`\alpha` at most (Ville's
 inequality). After an alarm the test begins anew behind it, with half of the rate that was left.
+
+The cost of a run must not grow with the history. So changes long ago are merged with their
+neighbours, to 16 or more in each octave of their age: the weight of one is moved to the other in
+the ratio of their likelihoods at that moment. The mean stays a martingale of mean 1, because each
+likelihood ratio is one.
 """
 
 from __future__ import annotations
@@ -41,6 +46,10 @@ DECIBEL = math.log(10) / 10
 WIDTHS = np.array([0.1, 0.3, 1.0, 3.0, 10.0]) * DECIBEL
 """Sizes of changes that are looked for."""
 NORMAL_95 = 1.959963984540054
+BLOCK = 64
+"""Runs that are tested at once."""
+PER_OCTAVE = 16
+"""Possible changes that are kept in each octave of their age, at least."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,39 +109,93 @@ def changes(
         begin += change.found + 1
 
 
-def course(
-    levels: FloatArray, deviations: FloatArray
-) -> Iterator[tuple[float, FloatArray, FloatArray]]:
-    """Yield the martingale, A and B after each run, for changes at the runs 1 to that one."""
-    n = len(levels)
+class Evidence:
+    """The martingale of a series that grows; a run costs the logarithm of the number before it."""
+
+    def __init__(self) -> None:
+        self._n, self._weight, self._mean = 0, 0.0, 0.0
+        self._first, self._before, self._a, self._b = np.zeros((4, 0))
+        """Possible changes: first run after it, weight of all runs before it, its A and B."""
+        self._prior = np.zeros((len(WIDTHS), 0))
+        """Weights of the possible changes, for each width."""
+
+    def add(self, levels: FloatArray, deviations: FloatArray) -> Iterator[FloatArray]:
+        """Yield the martingale after each of the next runs, in blocks."""
+        for begin in range(0, len(levels), BLOCK):
+            rows = slice(begin, begin + BLOCK)
+            yield self._block(levels[rows], deviations[rows])
+
+    def _block(self, levels: FloatArray, deviations: FloatArray) -> FloatArray:
+        before, slopes, residuals = _residuals(levels, deviations, self._weight, self._mean)
+        weights = deviations**-2.0
+        total = self._weight + float(weights.sum())
+        self._mean = (self._weight * self._mean + float(weights @ levels)) / total
+        self._weight = total
+        runs = self._n + np.arange(len(levels))
+        self._n += len(levels)
+        new = runs > 0  # no change is at the first run
+        first = runs[new].astype(float)
+        own = np.repeat(1 / (first * (first + 1) * len(WIDTHS)), len(WIDTHS))
+        self._first = np.concatenate([self._first, first])
+        self._before = np.concatenate([self._before, before[new]])
+        self._prior = np.hstack([self._prior, own.reshape(-1, len(WIDTHS)).T])
+        c = np.where(runs[:, None] >= self._first, np.outer(slopes, self._before), 0.0)
+        zeros = np.zeros(len(first))
+        a = np.concatenate([self._a, zeros]) + np.cumsum(c**2, axis=0)
+        b = np.concatenate([self._b, zeros]) + np.cumsum(c * residuals[:, None], axis=0)
+        values = np.full(len(levels), 1.0 / self._n)  # of the changes that are still to come
+        for number, width in enumerate(WIDTHS):
+            spread = 1 + width**2 * a
+            ratios = np.exp(np.minimum(width**2 * b**2 / (2 * spread), 700.0)) / np.sqrt(spread)
+            values += ratios @ self._prior[number]
+            self._prior[number] *= ratios[-1]
+        self._merge(a[-1], b[-1])
+        return values
+
+    def _merge(self, a: FloatArray, b: FloatArray) -> None:
+        """Keep the first of the changes in each interval; the prior is that times likelihood."""
+        steps = 2.0 ** np.floor(np.log2(np.maximum(1.0, (self._n - self._first) / PER_OCTAVE)))
+        groups = np.cumsum(np.diff(self._first // steps + 1j * steps, prepend=-1) != 0) - 1
+        kept = np.flatnonzero(np.diff(groups, prepend=-1))
+        self._a, self._b = a[kept], b[kept]
+        self._first, self._before = self._first[kept], self._before[kept]
+        self._prior = np.add.reduceat(self._prior, kept, axis=1) if len(kept) else self._prior
+        spread = 1 + np.outer(WIDTHS**2, self._a)
+        exponent = np.minimum(np.outer(WIDTHS**2, self._b**2) / (2 * spread), 700.0)
+        self._prior = self._prior * np.sqrt(spread) * np.exp(-exponent)
+
+
+def _residuals(
+    levels: FloatArray, deviations: FloatArray, weight: float = 0.0, mean: float = 0.0
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the weight before each run, c of a change over the weight before it, and w."""
     weights = deviations**-2.0
-    total = np.concatenate([[0.0], np.cumsum(weights)])
-    mean = np.concatenate([[0.0], np.cumsum(weights * levels)]) / np.maximum(total, 1e-300)
-    j = np.arange(1, max(n, 2))
-    prior = 1.0 / (j * (j + 1.0))
-    a, b = np.zeros(n), np.zeros(n)
-    yield 1.0, a[:0], b[:0]
-    for k in range(1, n):
-        deviation = math.sqrt(deviations[k] ** 2 + 1 / total[k])
-        residual = (levels[k] - mean[k]) / deviation
-        c = total[1 : k + 1] / total[k] / deviation  # of changes at the runs 1 to k
-        a[:k] += c**2
-        b[:k] += c * residual
-        spread = 1 + np.multiply.outer(WIDTHS**2, a[:k])
-        exponent = np.multiply.outer(WIDTHS**2, b[:k] ** 2) / (2 * spread)
-        ratios = np.exp(np.minimum(exponent, 700.0)) / np.sqrt(spread)
-        yield float(prior[:k] @ ratios.mean(axis=0)) + 1 / (k + 1.0), a[:k], b[:k]
+    before = weight + np.concatenate([[0.0], np.cumsum(weights)])[:-1]
+    sums = weight * mean + np.concatenate([[0.0], np.cumsum(weights * levels)])[:-1]
+    is_first = before == 0
+    total = np.where(is_first, 1.0, before)
+    deviation = np.sqrt(deviations**2 + 1 / total)
+    residuals = np.where(is_first, 0.0, (levels - sums / total) / deviation)
+    return before, np.where(is_first, 0.0, 1 / (total * deviation)), residuals
 
 
 def _first_change(levels: FloatArray, deviations: FloatArray, rate: float) -> Change | None:
-    for k, (value, a, b) in enumerate(course(levels, deviations)):
-        if value * rate < 1:
-            continue
-        first = 1 + int(np.argmax(b**2 / a))
-        weights = deviations**-2.0
-        before = np.average(levels[:first], weights=weights[:first])
-        after = np.average(levels[first : k + 1], weights=weights[first : k + 1])
-        variance = 1 / weights[:first].sum() + 1 / weights[first : k + 1].sum()
-        shift = float(after - before)
-        return Change(first, k, float(before), float(after), shift, math.sqrt(variance))
-    return None
+    k = -1
+    for values in Evidence().add(levels, deviations):
+        is_over = values * rate >= 1
+        if is_over.any():
+            k += 1 + int(np.argmax(is_over))
+            break
+        k += len(values)
+    else:
+        return None
+    # The most likely change, of all.
+    before, slopes, residuals = _residuals(levels[: k + 1], deviations[: k + 1])
+    a = before**2 * np.cumsum(slopes[::-1] ** 2)[::-1]
+    b = before * np.cumsum((slopes * residuals)[::-1])[::-1]
+    first = 1 + int(np.argmax(b[1:] ** 2 / a[1:]))
+    weights = deviations**-2.0
+    former = float(np.average(levels[:first], weights=weights[:first]))
+    after = float(np.average(levels[first : k + 1], weights=weights[first : k + 1]))
+    variance = 1 / weights[:first].sum() + 1 / weights[first : k + 1].sum()
+    return Change(first, k, former, after, after - former, math.sqrt(variance))

@@ -29,7 +29,7 @@ from daq.devices.bench_file import parse
 from tests.torture.power_cuts import shim
 from tests.torture.service_kills import BEGIN, faults
 from tests.torture.service_program import FastClock
-from tui.service.records.run_state import RunState
+from tui.service.records.run_state import UNFINISHED, RunState
 from tui.service.records.store import RunStore
 from tui.simulation.devices import simulated
 
@@ -86,7 +86,7 @@ def main() -> int:
                 for number in range(n_episodes):
                     time.sleep(float(rng.uniform(1.0, 20.0)))
                     error = ERRORS[number % len(ERRORS)]
-                    at_work = {str(r.state) for r in store.unfinished(reachable.name)}
+                    at_work = {str(r.state) for r in store.runs(reachable.name, *UNFINISHED)}
                     struck[f"{errno.errorcode[error]} {'+'.join(sorted(at_work)) or 'idle'}"] += 1
                     trouble.write_text(str(error), encoding="ascii")
                     time.sleep(float(rng.uniform(1.0, 12.0)))

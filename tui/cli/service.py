@@ -2,6 +2,7 @@
 
 # ruff: noqa: PLC0415 - what a subcommand needs is imported when it runs
 
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, TypeAlias
 
@@ -41,7 +42,10 @@ def runs(
     source: PlaceArgument,
     *,
     last: Annotated[
-        int | None, typer.Option("--last", min=1, metavar="N", help="The last N runs only.")
+        int | None,
+        typer.Option(
+            "--last", min=1, metavar="N", help="The last N runs (default on the screen: 100)."
+        ),
     ] = None,
     json: JsonOption = None,
     csv: CsvOption = None,
@@ -57,7 +61,7 @@ def runs(
 
 @examples(
     "huddle history lab.toml",
-    "huddle history lab.toml --band 1:10 --out noise.png",
+    "huddle history lab.toml --band 1:10 --since 2026-01-01 --out noise.png",
     "huddle history lab/recordings office/recordings --csv -   (sensors by serial number)",
 )
 def history(
@@ -72,6 +76,15 @@ def history(
             "--band",
             metavar="LOW:HIGH",
             help="Band in Hz that the runs have stored (default: all).",
+        ),
+    ] = None,
+    since: Annotated[
+        datetime | None,
+        typer.Option(
+            "--since",
+            formats=["%Y-%m-%d", "%Y-%m-%dT%H:%M"],
+            metavar="DATE",
+            help="Leave out earlier runs (UTC, such as 2026-11-21).",
         ),
     ] = None,
     scatter: Annotated[
@@ -110,6 +123,7 @@ def history(
     show_history(
         sources,
         band=None if band is None else _band(band),
+        since=None if since is None else since.replace(tzinfo=UTC),
         scatter=scatter,
         false_alarms=false_alarms,
         json=json,

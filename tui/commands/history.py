@@ -19,6 +19,7 @@ from tui.service.records.run_state import utc_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+    from datetime import datetime
     from pathlib import Path
 
     from tui.service.history.series import Series
@@ -49,7 +50,7 @@ def write_figure(found: Sequence[Series], out: Path) -> None:
             for number, series in enumerate(own):
                 colour = f"C{number}"
                 used = series.usable
-                dates = [series.runs[n].due for n in used]
+                dates = [series.runs[n][1] for n in used]
                 noise = [series.noise[n] for n in used]
                 middle = [decibels(each.psd) for each in noise]
                 below = [decibels(each.psd) - decibels(each.low) for each in noise]
@@ -65,7 +66,7 @@ def write_figure(found: Sequence[Series], out: Path) -> None:
                     label=series.last.channel,
                 )
                 for change in series.changes:
-                    panel.axvline(series.run_of(change.first).due, color=colour, linestyle="--")
+                    panel.axvline(series.due_of(change.first), color=colour, linestyle="--")
             panel.set_title(f"{sensor}, {low:.3g} to {high:.3g} Hz", loc="left")
             panel.set_ylabel(f"noise, dB re 1 ({unit})²/Hz")
             panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
@@ -84,6 +85,7 @@ def show_history(
     sources: Sequence[Path],
     *,
     band: tuple[float, float] | None,
+    since: datetime | None,
     scatter: float,
     false_alarms: float,
     json: str | None,
@@ -104,10 +106,11 @@ def show_history(
         require("matplotlib")
         if out.suffix.lower() not in PICTURES:
             raise typer.BadParameter(f"{out}: expected a name that ends in {', '.join(PICTURES)}")
-    runs = [run for source in sources for run in Place.of(source).runs()]
-    found = history(runs, band=band, scatter=scatter, false_alarms=false_alarms)
+    places = [Place.of(source) for source in sources]
+    noise = [found for place in places for found in place.store.noise(place.bench_name, since)]
+    found = history(noise, band=band, scatter=scatter, false_alarms=false_alarms)
     if band is not None and not found:
-        kept = ", ".join(f"{low:g}:{high:g}" for low, high in bands_of(runs)) or "none"
+        kept = ", ".join(f"{low:g}:{high:g}" for low, high in bands_of(noise)) or "none"
         raise typer.BadParameter(
             f"band {band[0]:g}:{band[1]:g}: no run has its noise; kept are {kept} (Hz). [history]"
             " bands in the bench file adds bands"
@@ -180,18 +183,18 @@ def level(psd: float, low: float, high: float) -> str:
 def change_lines(series: Series) -> Iterator[str]:
     """Yield a sentence for each change of a channel."""
     for change in series.changes:
-        first, found = series.run_of(change.first), series.run_of(change.found)
+        first, found = series.due_of(change.first), series.due_of(change.found)
         shift, width = change.shift / DECIBEL, NORMAL_95 * change.deviation / DECIBEL
         serial = f" ({series.last.serial_number})" if series.last.serial_number else ""
         yield (
             f"{series.name}{serial}, {series.last.low_hz:.3g} to {series.last.high_hz:.3g} Hz:"
-            f" {shift:+.2f} ±{width:.2f} dB since {first.due:%Y-%m-%d %H:%M}, decided by the run of"
-            f" {found.due:%Y-%m-%d %H:%M}"
+            f" {shift:+.2f} ±{width:.2f} dB since {first:%Y-%m-%d %H:%M}, decided by the run of"
+            f" {found:%Y-%m-%d %H:%M}"
         )
 
 
 def _rows(found: Sequence[Series]) -> Iterator[list[object]]:
     for series in found:
-        for run, noise in zip(series.runs, series.noise, strict=True):
-            own = {"bench": run.bench, "due": utc_text(run.due)}
+        for (bench, due), noise in zip(series.runs, series.noise, strict=True):
+            own = {"bench": bench, "due": utc_text(due)}
             yield [own[name] if name in own else getattr(noise, name) for name in _COLUMNS]

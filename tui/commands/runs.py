@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _STYLES = {RunState.FAILED: "red", RunState.MISSED: "yellow", RunState.DONE: "green"}
+PAGE = 100
+"""Runs that are listed unless another number is given."""
 _COLUMNS = (
     *("bench", "entry", "due", "state", "verdict", "started", "ended", "duration"),
     *("recordings", "pinned", "removed", "reason"),
@@ -31,7 +33,7 @@ class RunNotFoundError(HuddleError):
 
 
 def list_runs(source: Path, *, last: int | None, json: str | None, csv: str | None) -> None:
-    """List the runs of a service, the last ones only where `last` is given.
+    """List the runs of a service: the last ones where `last` is given, or for people.
 
     Raises
     ------
@@ -39,8 +41,11 @@ def list_runs(source: Path, *, last: int | None, json: str | None, csv: str | No
         If there is no database of runs, or it cannot be read.
     """
     check_places(json, csv)
-    runs = Place.of(source).runs()
-    runs = runs if last is None else runs[-last:]
+    place = Place.of(source)
+    is_page = last is None and json is None and csv is None
+    runs = place.runs(last=PAGE + 1 if is_page else last)
+    is_page = is_page and len(runs) > PAGE
+    runs = runs[-PAGE:] if is_page else runs
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for name in ("due (UTC)", "entry", "state", "verdict", "recording", "reason"):
         table.add_column(name, overflow="fold")
@@ -53,7 +58,10 @@ def list_runs(source: Path, *, last: int | None, json: str | None, csv: str | No
             run.reason,
             style=_STYLES.get(run.state),
         )
-    for_people(json, csv).print(table)
+    screen = for_people(json, csv)
+    screen.print(table)
+    if is_page:
+        screen.print(f"The last {PAGE} runs; --last N shows more, --csv and --json all.")
     write_json(json, {"runs": [run.document() for run in runs]})
     if csv is not None:
         write_text(csv, csv_text(_COLUMNS, map(_cells, runs)))
@@ -164,6 +172,6 @@ def _recordings(sources: Sequence[Path]) -> list[Path]:
                 raise
             found += sorted(source.glob("*.h5"))
             continue
-        runs = [run for run in place.runs() if run.removed is None]
+        runs = place.runs(kept=True)
         found += [place.folder / part for run in runs for part in run.parts]
     return list(dict.fromkeys(found))

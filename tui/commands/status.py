@@ -30,7 +30,7 @@ def show_status(path: Path, *, json: str | None) -> None:
         With 3 if no service runs.
     """
     bench = load(path)
-    runs = RunStore(bench.recording_directory).runs(bench.name)
+    runs = RunStore(bench.recording_directory).current(bench.name)
     bench.recording_directory.mkdir(parents=True, exist_ok=True)
     found = service_status(bench, runs, utc_now())
     screen = for_people(json)

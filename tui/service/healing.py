@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from tui.service.records.store import RunStore
 
+EMPTIED = "it has no runs, and there is no copy"
 _LOGGER = logging.getLogger(__name__)
 
 
@@ -42,12 +43,12 @@ def heal(store: RunStore, bench: Bench, now: datetime) -> bool:
     StoreError
         If the disk refuses it.
     """
-    damage = store.damage()
-    is_lost = not damage and not store.runs()  # emptied before there was any copy
-    if not damage and not is_lost:
+    damage = damage_of(store)
+    if not damage:
         return False
-    moved, copy = store.restore(now) if damage else (None, None)
-    known = {part for run in store.runs() for part in run.parts}
+    is_lost = damage == EMPTIED
+    moved, copy = (None, None) if is_lost else store.restore(now)
+    known = store.parts()
     n_found = 0
     for run in _runs_of_recordings(bench, known):
         store.save(run)
@@ -57,12 +58,17 @@ def heal(store: RunStore, bench: Bench, now: datetime) -> bool:
     _LOGGER.error(
         "%s: damaged (%s); %s; restored from %s and %d recordings",
         store.path,
-        damage or "it is empty",
+        damage,
         "nothing was moved" if moved is None else f"moved to {moved.name}",
         "no copy" if copy is None else f"the copy {copy.name}",
         n_found,
     )
     return True
+
+
+def damage_of(store: RunStore) -> str:
+    """Return what is wrong with the database, `EMPTIED` if it has no runs, or nothing."""
+    return store.damage() or ("" if store.runs(last=1) else EMPTIED)
 
 
 def _runs_of_recordings(bench: Bench, known: set[str]) -> Iterator[Run]:

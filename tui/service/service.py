@@ -17,7 +17,7 @@ from datetime import timedelta
 from typing import TYPE_CHECKING
 
 from daq.errors import HuddleError
-from tui.service.healing import heal
+from tui.service.healing import damage_of, heal
 from tui.service.hooks import events_of
 from tui.service.planning import GRACE, missed_runs, next_runs
 from tui.service.processes.finish import Outcome, Request, is_of_disk
@@ -98,7 +98,7 @@ class Service:
         self._estimates: asyncio.Queue[Run] = asyncio.Queue()
         self._offset = 0.0  # of the clock against one that is never set
         self._inherited: dict[str, Run] = {}
-        self._checked: tuple[int, int] | None = None
+        self._is_healing = False
         self._repeats: set[asyncio.Task[None]] = set()
         self.recording: Run | None = None
         self.window: Window | None = None
@@ -135,12 +135,16 @@ class Service:
         StoreError
             If the database cannot be used at the start.
         """
-        self._check_database()
+        await self._check_database()
         self._offset = self._clock.now().timestamp() - self._clock.elapsed()
-        self._take_up()
+        # All long reading of the database is done in threads: the loop goes on.
+        name = self.bench.name
+        self._known = await asyncio.to_thread(self._store.begun, name)
+        self._take_up(await asyncio.to_thread(self._store.current, name))
         recorder = asyncio.create_task(self._record_windows())
         estimator = asyncio.create_task(self._estimate_runs())
-        workers = [asyncio.create_task(self._wait_for_runs()), recorder, estimator]
+        keeper = asyncio.create_task(self._keep_database())
+        workers = [asyncio.create_task(self._wait_for_runs()), recorder, estimator, keeper]
         try:
             # One that ends has been asked to, or has failed.
             done, _ = await asyncio.wait(workers, return_when=asyncio.FIRST_COMPLETED)
@@ -156,11 +160,9 @@ class Service:
             await asyncio.gather(*workers, return_exceptions=True)
             self._write_unsaved()
 
-    def _take_up(self) -> None:
+    def _take_up(self, runs: list[Run]) -> None:
         """Continue what an earlier service has left, and report what it has missed."""
         now = self._clock.now()
-        runs = self._store.runs(self.bench.name)
-        self._known = {run.key for run in runs if run.state is not RunState.DUE}
         # A run whose estimate has failed before waits for the others.
         for run in sorted(runs, key=lambda run: run.attempts):
             if run.state is RunState.RECORDING:
@@ -206,7 +208,6 @@ class Service:
             if self._wants_reload:
                 self._load_again()
             self._notice_step()
-            self._check_database()
             self._write_unsaved()
             run, now = self.next_run, self._clock.now()
             left = MAX_SLEEP if run is None else (run.due - now).total_seconds()
@@ -268,7 +269,7 @@ class Service:
                 return
             now = self._clock.now()
             if run.state is RunState.DUE:
-                self._tidy(self.bench)
+                await asyncio.to_thread(self._tidy, self.bench)
                 reason = self._obstacle(run, now)
                 if reason:
                     self._miss(run, reason)
@@ -315,7 +316,7 @@ class Service:
             self._note(run)
             for part in run.parts:
                 self._steps.release(part)
-            self._tidy(self.bench)
+            await asyncio.to_thread(self._tidy, self.bench)
 
     async def _estimated(self, run: Run) -> Run:
         if run.attempts >= MAX_ATTEMPTS:
@@ -398,28 +399,48 @@ class Service:
 
     def _save(self, run: Run) -> None:
         self._unsaved.pop(run.key, None)
+        if self._is_healing:
+            self._unsaved[run.key] = run
+            return
         try:
             self._store.save(run)
         except StoreError as error:
             _LOGGER.error("%s; it is tried again", error)  # noqa: TRY400 - its message says all
             self._unsaved[run.key] = run
 
-    def _check_database(self) -> None:
+    async def _keep_database(self) -> None:
+        while not self.stop.is_set():
+            await self._check_database()
+            await self._clock.sleep(MAX_SLEEP, self.stop)
+
+    async def _check_database(self) -> None:
         """Restore the database if it is damaged; make the copy of the day.
 
         Recordings do not wait for it: a run that cannot be written is kept and written later.
         """
-        now, state = self._clock.now(), self._store.state()
+        now = self._clock.now()
         try:
-            if state != self._checked:
-                if heal(self._store, self.bench, now):
-                    self._unsaved |= {run.key: run for run in self._planned.values()}
-                    if self.recording is not None:
-                        self._unsaved[self.recording.key] = self.recording
-                self._checked = self._store.state()
-            self._store.copy(now.date())
+            if self._store.is_changed and await asyncio.to_thread(self._damage):
+                await self._heal(now)
+            await asyncio.to_thread(self._store.copy, now.date())
         except StoreError as error:
             _LOGGER.error("%s; it is tried again", error)  # noqa: TRY400 - its message says all
+
+    def _damage(self) -> str:
+        return damage_of(self._store)
+
+    async def _heal(self, now: datetime) -> None:
+        """Restore the database; changes of runs are written when that is done."""
+        self._is_healing = True
+        try:
+            if await asyncio.to_thread(heal, self._store, self.bench, now):
+                if self.recording is not None:
+                    self._unsaved.setdefault(self.recording.key, self.recording)
+                for run in self._planned.values():
+                    self._unsaved.setdefault(run.key, run)
+        finally:
+            self._is_healing = False
+        self._write_unsaved()
 
     def _write_unsaved(self) -> None:
         for run in list(self._unsaved.values()):

@@ -75,7 +75,7 @@ async def test_the_first_run_makes_its_folder_and_leaves_recording_result_and_ro
             await serve(path, bench, {})
         os.kill(os.getpid(), signal.SIGTERM)
         await task
-    (run,) = store.runs()
+    (run,) = map(store.with_noise, store.runs())
     assert run.state is RunState.DONE, run.reason
     assert run.due == DUE
     assert {(each.sensor, each.channel) for each in run.noise} == {

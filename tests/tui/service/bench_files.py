@@ -11,6 +11,7 @@ from daq.bench.loading import parse
 from daq.errors import HuddleError
 from tui.service.clock import SystemTime
 from tui.service.processes.finish import Outcome, Request
+from tui.service.records.storage import tidy
 from tui.service.records.store import RunStore
 from tui.service.service import Service
 
@@ -172,6 +173,7 @@ class Place:
             options={},
             reload=self._load_again,
             on_change=self.changes.append,
+            tidy=lambda bench: _tidied(bench, self.store, self.clock),
         )
 
     async def serve(self, seconds: float, *, killed: bool = False) -> Service:
@@ -193,6 +195,10 @@ class Place:
     def states(self) -> list[tuple[str, str]]:
         """Return what the database says."""
         return [(f"{run.due:%H:%M}", str(run.state)) for run in self.store.runs()]
+
+
+def _tidied(bench: Bench, store: RunStore, clock: VirtualClock) -> None:
+    tidy(bench, store, clock.start)
 
 
 class DiskError(HuddleError):

@@ -62,6 +62,14 @@ def removed(path: Path) -> None:
     path.unlink()
 
 
+def wrong_row(path: Path) -> None:
+    """Damage that SQLite does not see: it has no checksums."""
+    database = sqlite3.connect(path)
+    database.execute("UPDATE runs SET state = 'dohe'")
+    database.commit()
+    database.close()
+
+
 def without_rows(path: Path) -> None:
     database = sqlite3.connect(path)
     database.execute("DELETE FROM runs")
@@ -71,7 +79,13 @@ def without_rows(path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("damage", "copied"),
-    [(emptied, False), (overwritten, False), (removed, True), (without_rows, True)],
+    [
+        (emptied, False),
+        (overwritten, False),
+        (removed, True),
+        (wrong_row, True),
+        (without_rows, True),
+    ],
 )
 def test_all_runs_are_there_again(tmp_path: Path, damage: object, *, copied: bool) -> None:
     place = Place(tmp_path)
@@ -83,7 +97,7 @@ def test_all_runs_are_there_again(tmp_path: Path, damage: object, *, copied: boo
     damage(place.store.path)  # type: ignore[operator]  # one of the functions above
     assert heal(place.store, place.bench, START)
     assert place.store.damage() == ""
-    (found,) = place.store.runs()
+    (found,) = map(place.store.with_noise, place.store.runs())
     assert found == run
     assert found.noise == run.noise
     assert not math.isnan(found.noise[0].psd)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from daq.results.change_test import DECIBEL, changes, course
+from daq.results.change_test import BLOCK, DECIBEL, WIDTHS, Evidence, changes
 from tests.tui.service.bench_files import START
 from tui.cli.main import app
 from tui.service.history.series import history
@@ -21,6 +21,7 @@ from tui.service.records.run_state import BandNoise, Run, RunState
 from tui.service.records.store import RunStore
 
 if TYPE_CHECKING:
+    from datetime import datetime
     from pathlib import Path
 
     from daq.results.change_test import FloatArray
@@ -38,11 +39,79 @@ def test_false_alarms_are_as_rare_as_stated() -> None:
     assert n_alarms <= rate * n + 4 * math.sqrt(rate * n)
 
 
+def evidence(levels: FloatArray, deviations: FloatArray) -> FloatArray:
+    return np.concatenate(list(Evidence().add(levels, deviations)))
+
+
+def exact_evidence(levels: FloatArray, deviations: FloatArray) -> float:
+    """Return the mean likelihood ratio of all changes from the densities of all levels."""
+    n, total = len(levels), 1.0 / len(levels)
+    covariance = np.diag(deviations**2) + 1e6  # the mean level is unknown
+    for first in range(1, n):
+        step = (np.arange(n) >= first).astype(float)
+        for width in WIDTHS:
+            wider = covariance + width**2 * np.outer(step, step)
+            found = [
+                -0.5 * (np.linalg.slogdet(each)[1] + levels @ np.linalg.solve(each, levels))
+                for each in (wider, covariance)
+            ]
+            total += math.exp(found[0] - found[1]) / (first * (first + 1) * len(WIDTHS))
+    return total
+
+
 def test_the_evidence_is_a_martingale() -> None:
     """Its mean stays 1 where nothing changes; small widths of change keep its variance small."""
     rng = np.random.default_rng(15)
-    values = [list(course(rng.normal(size=6), np.full(6, 1.0)))[-1][0] for _ in range(1500)]
+    values = [evidence(rng.normal(size=6), np.full(6, 1.0))[-1] for _ in range(1500)]
     assert np.mean(values) == pytest.approx(1.0, abs=4 * float(np.std(values)) / math.sqrt(1500))
+
+
+def test_the_evidence_is_the_likelihood_ratio() -> None:
+    rng = np.random.default_rng(17)
+    deviations = rng.uniform(0.05, 0.3, 14)
+    levels = rng.normal(0.0, deviations)
+    levels[9:] += 0.2
+    expected = exact_evidence(levels, deviations)
+    assert evidence(levels, deviations)[-1] == pytest.approx(expected, rel=1e-4)
+
+
+def exact_sum(levels: FloatArray, deviations: FloatArray) -> float:
+    """Return the mean likelihood ratio of all changes from the means before and after each."""
+    n, weights = len(levels), deviations**-2.0
+    total = np.cumsum(weights)
+    sums, first = np.cumsum(weights * levels), np.arange(1, n)
+    before, after = total[:-1], total[-1] - total[:-1]
+    shift = (sums[-1] - sums[:-1]) / after - sums[:-1] / before
+    variance = 1 / before + 1 / after
+    wider = variance + WIDTHS[:, None] ** 2
+    ratios = np.sqrt(variance / wider) * np.exp(shift**2 / 2 * (1 / variance - 1 / wider))
+    return float(1.0 / n + (ratios / (first * (first + 1))).mean(axis=0).sum())
+
+
+def test_merged_changes_keep_the_mean_and_lose_little() -> None:
+    rng = np.random.default_rng(18)
+    values, n = [], 6 * BLOCK
+    for _ in range(300):
+        deviations = rng.uniform(5.0, 15.0, n)
+        levels = rng.normal(0.0, deviations)
+        values.append(evidence(levels, deviations)[-1])
+        assert values[-1] == pytest.approx(exact_sum(levels, deviations), rel=0.2)
+    assert np.mean(values) == pytest.approx(1.0, abs=4 * float(np.std(values)) / math.sqrt(300))
+    levels, deviations = rng.normal(0.0, 0.3, n), np.full(n, 0.3)
+    levels[n // 3 :] += 0.2
+    expected = exact_sum(levels, deviations)
+    assert expected > 10
+    assert evidence(levels, deviations)[-1] == pytest.approx(expected, rel=0.2)
+
+
+def test_a_history_of_a_century_is_tested_soon() -> None:
+    """One run a day; where every run was compared with all before, this took minutes."""
+    rng = np.random.default_rng(19)
+    levels = rng.normal(0.0, 0.05, 30_000)
+    levels[20_000:] += 0.01
+    (change,) = changes(levels, np.full(30_000, 0.05), false_alarms=0.01)
+    assert abs(change.first - 20_000) < 300
+    assert change.found < 22_000
 
 
 @pytest.mark.parametrize(("shift_db", "within"), [(1.0, 8), (-3.0, 3)])
@@ -66,6 +135,10 @@ def test_a_second_change_is_found_after_the_first() -> None:
     assert found[1].shift == pytest.approx(-4 * DECIBEL)
 
 
+def noise_of(runs: list[Run]) -> list[tuple[str, datetime, BandNoise]]:
+    return [(run.bench, run.due, noise) for run in runs for noise in run.noise]
+
+
 def run_with(
     day: int, db: float, *, bench: str = "lab", sensor: str = "a", low: float = 0.95
 ) -> Run:
@@ -81,12 +154,12 @@ def test_serial_numbers_tie_benches_together_and_intervals_at_zero_are_left_out(
     runs = [run_with(day, 0.0) for day in range(20)]
     runs += [run_with(day, 2.0, bench="office", sensor="b") for day in range(20, 40)]
     runs += [run_with(50, 0.0, low=-1.0)]
-    (series,) = history(runs)
+    (series,) = history(noise_of(runs))
     assert len(series.noise) == 41
     assert len(series.usable) == 40
     (change,) = series.changes
-    assert series.run_of(change.first).due == START + timedelta(days=20)
-    assert history(runs, band=(10.0, 20.0)) == []
+    assert series.due_of(change.first) == START + timedelta(days=20)
+    assert history(noise_of(runs), band=(10.0, 20.0)) == []
 
 
 def huddle(*arguments: str, code: int = 0) -> str:
@@ -114,6 +187,12 @@ def test_the_command_says_shows_and_draws_it(tmp_path: Path) -> None:
     assert len(rows) == 24
     assert rows[0]["serial_number"] == "S1"
     assert float(rows[0]["psd"]) == 1e-12
+    since = ("--since", "2026-12-08")
+    (series,) = json.loads(huddle("history", str(folder), *since, "--json", "-"))["series"]
+    assert series["runs"][0]["due"] == "2026-12-08T12:00:30Z"
+    assert (len(series["runs"]), series["changes"]) == (7, [])
+    wrong = CliRunner().invoke(app, ["history", str(folder), "--since", "last week"])
+    assert wrong.exit_code == 2
     refused = CliRunner().invoke(app, ["history", str(folder), "--band", "2:3"])
     assert refused.exit_code == 2
     assert "kept are 1:10" in " ".join(refused.stderr.split())

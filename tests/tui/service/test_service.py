@@ -14,7 +14,7 @@ from daq.errors import BenchFileError, FileFault
 from tests.tui.service.bench_files import HOURLY, START, Place, bench_of
 from tui.service.processes.finish import Outcome
 from tui.service.processes.steps import FinishFailedError
-from tui.service.records.run_state import NEXT, Run, RunState, WrongStateError
+from tui.service.records.run_state import NEXT, UNFINISHED, Run, RunState, WrongStateError
 from tui.service.records.store import RunStore, StoreError
 from tui.service.service import MAX_ATTEMPTS, REFUSED
 from tui.service.window import STALL, STOPPED
@@ -46,7 +46,7 @@ async def test_a_stop_in_a_window_closes_it_and_the_next_service_records_the_res
 ) -> None:
     place = Place(tmp_path)
     await place.serve(HOUR + 170)  # 13:03:20
-    (run,) = place.store.unfinished("lab")
+    (run,) = place.store.runs("lab", *UNFINISHED)
     assert run.state is RunState.RECORDING
     assert run.reason == STOPPED
     place.clock.set_by += timedelta(seconds=100)
@@ -63,7 +63,7 @@ async def test_a_stop_in_the_last_second_of_a_window_ends_the_service(tmp_path: 
     place = Place(tmp_path)
     async with asyncio.timeout(2 * HOUR):
         await place.serve(HOUR + 569)  # 13:09:59
-    (run,) = place.store.unfinished("lab")
+    (run,) = place.store.runs("lab", *UNFINISHED)
     assert (run.state, run.reason) == (RunState.ESTIMATING, "")
 
 
@@ -72,7 +72,7 @@ async def test_stops_do_not_use_up_the_attempts_of_an_estimate(tmp_path: Path) -
     await place.serve(HOUR + 580)  # 13:10:10
     for _ in range(MAX_ATTEMPTS + 1):
         await place.serve(10)
-    (run,) = place.store.unfinished("lab")
+    (run,) = place.store.runs("lab", *UNFINISHED)
     assert (run.state, run.attempts) == (RunState.ESTIMATING, 0)
 
 
@@ -108,7 +108,7 @@ async def test_a_power_cut_beyond_the_window_leaves_the_estimate_to_be_made(
 async def test_an_estimate_that_was_killed_is_made_again(tmp_path: Path) -> None:
     place = Place(tmp_path)
     await place.serve(HOUR + 580, killed=True)  # 13:10:10
-    (run,) = place.store.unfinished("lab")
+    (run,) = place.store.runs("lab", *UNFINISHED)
     assert run.state is RunState.ESTIMATING
     await place.serve(60)
     assert place.states()[0] == ("13:00", "done")
@@ -120,7 +120,7 @@ async def test_a_run_whose_estimate_failed_waits_for_others_after_a_restart(
 ) -> None:
     place = Place(tmp_path)
     await place.serve(HOUR + 580, killed=True)  # 13:10:10
-    (first,) = place.store.unfinished("lab")
+    (first,) = place.store.runs("lab", *UNFINISHED)
     place.store.save(replace(first, attempts=1))
     second = replace(first, due=first.due + timedelta(minutes=5), parts=("b.h5",), attempts=0)
     place.store.save(second)
@@ -129,7 +129,7 @@ async def test_a_run_whose_estimate_failed_waits_for_others_after_a_restart(
         [part.rpartition("/")[2] for part in request.parts] for request in place.steps.finished
     ]
     assert names[1:] == [["b.h5"], list(first.parts)]
-    assert not place.store.unfinished("lab")
+    assert not place.store.runs("lab", *UNFINISHED)
 
 
 async def test_an_estimate_that_always_dies_is_given_up(tmp_path: Path) -> None:

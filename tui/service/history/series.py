@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from daq.results.change_test import DECIBEL, NORMAL_95, Change, changes
-from tui.service.records.run_state import BandNoise, Run, utc_text
+from tui.service.records.run_state import BandNoise, utc_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
+    from datetime import datetime
+
+    Found = tuple[str, datetime, BandNoise]
+    """Name of the bench, time at which the run was due, and the noise that the run found."""
 
 SCATTER = 0.1
 """Standard deviation in dB from run to run that is no change."""
@@ -25,8 +30,8 @@ class Series:
     ----------
     noise : tuple of BandNoise
         By time; the last says what the channel is called now.
-    runs : tuple of Run
-        The run of each.
+    runs : tuple of (str, datetime)
+        Bench and due time of the run of each.
     changes : tuple of Change
         By positions in `usable`.
     usable : tuple of int
@@ -34,7 +39,7 @@ class Series:
     """
 
     noise: tuple[BandNoise, ...]
-    runs: tuple[Run, ...]
+    runs: tuple[tuple[str, datetime], ...]
     changes: tuple[Change, ...]
     usable: tuple[int, ...]
 
@@ -48,9 +53,9 @@ class Series:
         """Sensor and channel."""
         return f"{self.last.sensor}.{self.last.channel}"
 
-    def run_of(self, position: int) -> Run:
-        """Return the run at a position in `usable`."""
-        return self.runs[self.usable[position]]
+    def due_of(self, position: int) -> datetime:
+        """Return when the run at a position in `usable` was due."""
+        return self.runs[self.usable[position]][1]
 
     def document(self) -> dict[str, Any]:
         """Return the series as JSON (docs/service.md)."""
@@ -66,16 +71,16 @@ class Series:
             "high_hz": last.high_hz,
             "runs": [
                 {
-                    "bench": run.bench,
-                    "due": utc_text(run.due),
+                    "bench": bench,
+                    "due": utc_text(due),
                     **{name: getattr(noise, name) for name in ("psd", "low", "high")},
                 }
-                for run, noise in zip(self.runs, self.noise, strict=True)
+                for (bench, due), noise in zip(self.runs, self.noise, strict=True)
             ],
             "changes": [
                 {
-                    "since": utc_text(self.run_of(change.first).due),
-                    "found": utc_text(self.run_of(change.found).due),
+                    "since": utc_text(self.due_of(change.first)),
+                    "found": utc_text(self.due_of(change.found)),
                     "shift_db": change.shift / DECIBEL,
                     "shift_low_db": (change.shift - NORMAL_95 * change.deviation) / DECIBEL,
                     "shift_high_db": (change.shift + NORMAL_95 * change.deviation) / DECIBEL,
@@ -88,7 +93,7 @@ class Series:
 
 
 def history(
-    runs: Iterable[Run],
+    found: Iterable[Found],
     *,
     band: tuple[float, float] | None = None,
     scatter: float = SCATTER,
@@ -98,8 +103,8 @@ def history(
 
     Parameters
     ----------
-    runs : iterable of Run
-        Of any benches.
+    found : iterable of (str, datetime, BandNoise)
+        Bench, due time and noise of runs, of any benches.
     band : (float, float), optional
         In Hz; all bands that were kept, if not given.
     scatter : float
@@ -108,29 +113,31 @@ def history(
         Probability that a history without any change, of all these channels together, ever has an
         alarm.
     """
-    collected: dict[tuple[object, ...], list[tuple[Run, BandNoise]]] = {}
-    for run in sorted(runs, key=lambda run: run.due):
-        for noise in run.noise:
-            if band is None or _same_band(noise, band):
-                collected.setdefault(_key(run, noise), []).append((run, noise))
+    collected: dict[tuple[object, ...], list[Found]] = {}
+    for each in sorted(found, key=lambda each: each[1]):
+        noise = each[2]
+        if band is None or _same_band(noise, band):
+            collected.setdefault(_key(each[0], noise), []).append(each)
     return [
-        _series(found, scatter * DECIBEL, false_alarms / len(collected))
-        for _, found in sorted(collected.items(), key=lambda item: str(item[0]))
+        _series(own, scatter * DECIBEL, false_alarms / len(collected))
+        for _, own in sorted(collected.items(), key=lambda item: str(item[0]))
     ]
 
 
-def bands_of(runs: Iterable[Run]) -> list[tuple[float, float]]:
+def bands_of(found: Iterable[Found]) -> list[tuple[float, float]]:
     """Return the bands of which there is noise, in Hz."""
-    return sorted({_rounded(noise) for run in runs for noise in run.noise})
+    return sorted({_rounded(noise.low_hz, noise.high_hz) for _, _, noise in found})
 
 
-def _key(run: Run, noise: BandNoise) -> tuple[object, ...]:
-    sensor = noise.serial_number or f"{run.bench}/{noise.sensor}"
-    return (sensor, noise.channel, noise.unit, noise.method, _rounded(noise))
+def _key(bench: str, noise: BandNoise) -> tuple[object, ...]:
+    sensor = noise.serial_number or f"{bench}/{noise.sensor}"
+    band = _rounded(noise.low_hz, noise.high_hz)
+    return (sensor, noise.channel, noise.unit, noise.method, band)
 
 
-def _rounded(noise: BandNoise) -> tuple[float, float]:
-    return float(f"{noise.low_hz:.3g}"), float(f"{noise.high_hz:.3g}")
+@lru_cache(maxsize=1024)
+def _rounded(low_hz: float, high_hz: float) -> tuple[float, float]:
+    return float(f"{low_hz:.3g}"), float(f"{high_hz:.3g}")
 
 
 def _same_band(noise: BandNoise, band: tuple[float, float]) -> bool:
@@ -140,8 +147,8 @@ def _same_band(noise: BandNoise, band: tuple[float, float]) -> bool:
     )
 
 
-def _series(found: Sequence[tuple[Run, BandNoise]], scatter: float, false_alarms: float) -> Series:
-    runs, noise = zip(*found, strict=True)
+def _series(found: Sequence[Found], scatter: float, false_alarms: float) -> Series:
+    runs, noise = tuple(each[:2] for each in found), tuple(each[2] for each in found)
     usable = tuple(n for n, each in enumerate(noise) if 0 < each.low <= each.psd <= each.high)
     levels = [math.log(noise[n].psd) for n in usable]
     # A standard deviation of zero would be beyond any measurement.

@@ -61,9 +61,14 @@ class Place:
         """The database."""
         return RunStore(self.folder)
 
-    def runs(self) -> list[Run]:
-        """Return all runs of the place, by their time."""
-        return self.store.runs(None if self.bench is None else self.bench.name)
+    def runs(self, *, last: int | None = None, kept: bool = False) -> list[Run]:
+        """Return runs of the place by their time, as `RunStore.runs`."""
+        return self.store.runs(self.bench_name, last=last, kept=kept)
+
+    @property
+    def bench_name(self) -> str | None:
+        """Name of the bench; None where a folder was given."""
+        return None if self.bench is None else self.bench.name
 
 
 def service_lock(bench: Bench) -> Path:

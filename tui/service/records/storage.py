@@ -60,7 +60,7 @@ def tidy(
     keep_for = storage.keep_for or bench.recording.retention
     if keep_for is None and storage.keep_runs is None and storage.keep_free is None:
         return []
-    done = [run for run in store.runs(bench.name, RunState.DONE) if run.removed is None]
+    done = store.runs(bench.name, RunState.DONE, kept=True)
     removed = []
     for number, run in enumerate(done):
         n_newer = len(done) - 1 - number

@@ -12,7 +12,7 @@ import json
 import os
 import shutil
 import sqlite3
-from dataclasses import astuple, fields
+from dataclasses import astuple, fields, replace
 from datetime import date, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,15 @@ from typing import TYPE_CHECKING, Any
 from daq.bench.end_condition import EndCondition
 from daq.errors import HuddleError
 from daq.recording.storage.names import PRIVATE, sync_file
-from tui.service.records.run_state import UNFINISHED, BandNoise, Run, RunState, from_text, utc_text
+from tui.service.records.run_state import (
+    NEXT,
+    UNFINISHED,
+    BandNoise,
+    Run,
+    RunState,
+    from_text,
+    utc_text,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -33,6 +41,8 @@ EMPTY = "it is empty"
 _DAMAGE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 _BUSY = 10.0
 """Seconds that a change waits for another program's."""
+_STEP = 256
+"""Pages of a copy that are read at once."""
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS runs (
     key TEXT PRIMARY KEY, bench TEXT NOT NULL, entry TEXT NOT NULL, due TEXT NOT NULL,
@@ -45,12 +55,30 @@ CREATE TABLE IF NOT EXISTS noise (
     channel TEXT, unit TEXT, method TEXT, low_hz REAL, high_hz REAL, psd REAL, low REAL, high REAL);
 CREATE INDEX IF NOT EXISTS noise_by_run ON noise (run);
 """
+_INDEXES = """
+CREATE INDEX IF NOT EXISTS runs_by_time ON runs (due, entry);
+CREATE INDEX IF NOT EXISTS runs_by_state ON runs (bench, state, due);
+CREATE INDEX IF NOT EXISTS runs_pending ON runs (bench) WHERE untold != '[]';
+"""
+"""Made by whoever writes: in the schema, earlier versions would refuse the database."""
 _COLUMNS = (
     *("key", "bench", "entry", "due", "state", "reason", "verdict", "started", "ended"),
     *("duration", "target_cov", "queue", "parts", "attempts", "pinned", "removed", "untold"),
 )
 # `untold` holds Run.pending_hooks: renamed, earlier versions could not open the database.
 _NOISE = tuple(field.name for field in fields(BandNoise))
+_STATES = ", ".join(f"'{state}'" for state in RunState)
+_DATES = " OR ".join(
+    f"({name} IS NOT NULL AND julianday({name}) IS NULL)"
+    for name in ("started", "ended", "removed")
+)
+_WRONG_ROWS = (
+    "SELECT count(*) FROM runs WHERE julianday(due) IS NULL"  # noqa: S608 - our own words
+    f" OR {_DATES} OR state NOT IN ({_STATES}) OR NOT json_valid(parts) OR parts LIKE '%/%'"
+    " OR NOT json_valid(untold) OR typeof(duration) NOT IN ('real', 'integer')"
+)
+"""Rows of which SQLite does not know that they are damaged: it has no checksums."""
+_OVER = tuple(state for state in RunState if not NEXT[state])
 
 
 class StoreError(HuddleError):
@@ -67,6 +95,8 @@ class RunStore:
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / NAME
+        self._known: tuple[int, int, bytes] | None = (-1, -1, b"")  # not checked yet
+        """State of the file that was checked, with the changes made here since."""
 
     def save(self, run: Run) -> None:
         """Write a run in its present state, with the noise that it has found.
@@ -120,15 +150,106 @@ class RunStore:
                 "DELETE FROM runs WHERE key = ? AND state = ?", (run.key, RunState.DUE)
             )
 
-    def runs(self, bench: str | None = None, *states: RunState) -> list[Run]:
-        """Return runs by the time at which they were due, with their noise: of one bench, or all.
+    def runs(
+        self,
+        bench: str | None = None,
+        *states: RunState,
+        last: int | None = None,
+        kept: bool = False,
+    ) -> list[Run]:
+        """Return runs by the time at which they were due, without their noise.
+
+        Parameters
+        ----------
+        bench : str, optional
+            Of one bench; default: of all.
+        *states : RunState
+            In one of these states; default: in any.
+        last : int, optional
+            The last ones only.
+        kept : bool
+            Without those whose files were removed.
 
         Raises
         ------
         StoreError
             If the database cannot be read.
         """
-        where, values = [], []
+        return self._found(bench, states, last=last, condition="removed IS NULL" if kept else "")
+
+    def current(self, bench: str) -> list[Run]:
+        """Return what a service has to do with: runs not over, or with pending hooks, and the last.
+
+        With noise where hooks are pending: they receive it.
+        """
+        pending = self._found(bench, _OVER, condition="untold != '[]'")
+        found = {
+            run.key: run
+            for run in (
+                *self.runs(bench, *_OVER, last=1),
+                *(self.with_noise(run) for run in pending),
+                *self.runs(bench, RunState.DUE, *UNFINISHED),
+            )
+        }
+        return sorted(found.values(), key=lambda run: (run.due, run.entry))
+
+    def with_noise(self, run: Run) -> Run:
+        """Return a run with the noise that it found."""
+        rows = self._rows(
+            f"SELECT {', '.join(_NOISE)} FROM noise WHERE run = ? ORDER BY rowid",  # noqa: S608
+            run.key,
+        )
+        return replace(run, noise=tuple(BandNoise.of(*row) for row in rows))
+
+    def begun(self, bench: str) -> set[str]:
+        """Return the keys of all runs that are no longer due."""
+        rows = self._rows(
+            "SELECT key FROM runs WHERE bench = ? AND state != ?", bench, RunState.DUE
+        )
+        return {str(key) for (key,) in rows}
+
+    def parts(self) -> set[str]:
+        """Return the file names of the recordings of all runs."""
+        return {
+            _safe_name(name)
+            for (names,) in self._rows("SELECT parts FROM runs WHERE parts != '[]'")
+            for name in json.loads(names)
+        }
+
+    def noise(
+        self, bench: str | None = None, since: datetime | None = None
+    ) -> Iterator[tuple[str, datetime, BandNoise]]:
+        """Yield the noise that all runs have found by their time, with bench and due time."""
+        conditions, values = [], []
+        if bench is not None:
+            conditions.append("bench = ?")
+            values.append(bench)
+        if since is not None:
+            conditions.append("due >= ?")
+            values.append(str(utc_text(since)))
+        where = f" WHERE {' AND '.join(conditions)}" if conditions else ""
+        columns = ", ".join(f"noise.{name}" for name in _NOISE)
+        rows = self._rows(
+            f"SELECT bench, due, {columns} FROM runs CROSS JOIN noise ON noise.run = runs.key"  # noqa: S608
+            f"{where} ORDER BY due, entry, noise.rowid",
+            *values,
+        )
+        moments: dict[str, datetime] = {}
+        for name, due, *values_of_row in rows:
+            moment = moments.get(due)
+            if moment is None:
+                moment = moments[due] = datetime.fromisoformat(due)
+            yield name, moment, BandNoise.of(*values_of_row)
+
+    def _found(
+        self,
+        bench: str | None,
+        states: Sequence[RunState],
+        *,
+        condition: str = "",
+        last: int | None = None,
+    ) -> list[Run]:
+        where, values = [condition] if condition else [], []
         if bench is not None:
             where.append("bench = ?")
             values.append(bench)
@@ -136,53 +257,58 @@ class RunStore:
             where.append(f"state IN ({', '.join('?' * len(states))})")
             values += list(states)
         condition = f" WHERE {' AND '.join(where)}" if where else ""
+        order = "due, entry" if last is None else f"due DESC, entry DESC LIMIT {last:d}"
+        rows = self._rows(
+            f"SELECT {', '.join(_COLUMNS)} FROM runs{condition} ORDER BY {order}",  # noqa: S608
+            *values,
+        )
+        if last is not None:
+            rows.reverse()
+        try:
+            return [_run(dict(zip(_COLUMNS, row, strict=True))) for row in rows]
+        except (TypeError, ValueError) as error:
+            raise StoreError(
+                f"{self.path}: a row cannot be read ({error}); huddle serve restores the database:"
+                " recordings are not affected"
+            ) from error
+
+    def _rows(self, question: str, *values: str) -> list[tuple[Any, ...]]:
         if not self.path.exists():
             return []
         with self._opened() as database:
-            rows = database.execute(
-                f"SELECT {', '.join(_COLUMNS)} FROM runs{condition} ORDER BY due, entry",  # noqa: S608
-                values,
-            ).fetchall()
-            noise: dict[str, list[BandNoise]] = {}
-            for key, *values_of_row in database.execute(
-                f"SELECT run, {', '.join(_NOISE)} FROM noise"  # noqa: S608
-                f" WHERE run IN (SELECT key FROM runs{condition}) ORDER BY rowid",
-                values,
-            ):
-                noise.setdefault(key, []).append(BandNoise.of(*values_of_row))
-        return [
-            _run(dict(zip(_COLUMNS, row, strict=True)), tuple(noise.get(row[0], ())))
-            for row in rows
-        ]
-
-    def unfinished(self, bench: str) -> list[Run]:
-        """Return the runs that something has kept from their end."""
-        return self.runs(bench, *UNFINISHED)
+            return database.execute(question, values).fetchall()
 
     def damage(self) -> str:
         """Return what is wrong with the database; empty if nothing is, or it cannot be asked now.
 
         An empty database is damaged if its newest copy is not: runs are never removed from it.
         """
-        newest = next(iter(self.copies()), None)
+        newest, state = next(iter(self.copies()), None), self._state()
         try:
             found = _check(self.path)
         except FileNotFoundError:
-            return "" if newest is None else "it is missing"
+            found = "" if newest is None else "it is missing"
         except (sqlite3.Error, OSError) as error:
             code = getattr(error, "sqlite_errorcode", 0) & 0xFF
             return str(error) if code in _DAMAGE else ""
         if found == EMPTY and newest is None:
-            return ""
+            found = ""
+        if not found:
+            self._known = state
         return found
 
-    def state(self) -> tuple[int, int] | None:
-        """Return size and time of change of the file, to see whether it must be checked again."""
+    @property
+    def is_changed(self) -> bool:
+        """Whether anything but this object has changed the file since `damage` was asked."""
+        return self._state() != self._known
+
+    def _state(self) -> tuple[int, int, bytes] | None:
         try:
-            found = self.path.stat()
+            with self.path.open("rb") as file:
+                found, head = os.fstat(file.fileno()), file.read(28)
         except OSError:
             return None
-        return found.st_size, found.st_mtime_ns
+        return found.st_size, found.st_mtime_ns, head[24:]  # SQLite's counter of changes
 
     def copies(self) -> list[Path]:
         """Return the daily copies, the newest first."""
@@ -208,7 +334,8 @@ class RunStore:
                 contextlib.closing(sqlite3.connect(self.path, timeout=_BUSY)) as source,
                 contextlib.closing(sqlite3.connect(new)) as copied,
             ):
-                source.backup(copied)
+                # In steps, so that other connections write meanwhile.
+                source.backup(copied, pages=_STEP, sleep=0.0)
             if _check(new) == "":
                 sync_file(new)
                 new.replace(target)
@@ -261,8 +388,13 @@ class RunStore:
     def _changed(self) -> Iterator[sqlite3.Connection]:
         with self._opened() as database:
             database.execute("BEGIN IMMEDIATE")
+            before = self._state()
+            for index in filter(None, map(str.strip, _INDEXES.split(";"))):
+                database.execute(index)
             yield database
             database.execute("COMMIT")
+        if before == self._known:
+            self._known = self._state()
 
     @contextlib.contextmanager
     def _opened(self) -> Iterator[sqlite3.Connection]:
@@ -306,6 +438,9 @@ def _check(path: Path) -> str:
             return "; ".join(found)
         if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'runs'").fetchone():
             return EMPTY
+        (n_wrong,) = database.execute(_WRONG_ROWS).fetchone()
+        if n_wrong:
+            return f"{n_wrong} rows cannot be read"
         return "" if database.execute("SELECT 1 FROM runs LIMIT 1").fetchone() else EMPTY
 
 
@@ -332,7 +467,7 @@ def _row(run: Run) -> dict[str, Any]:
     }
 
 
-def _run(row: dict[str, Any], noise: tuple[BandNoise, ...]) -> Run:
+def _run(row: dict[str, Any]) -> Run:
     return Run(
         bench=row["bench"],
         entry=row["entry"],
@@ -350,7 +485,6 @@ def _run(row: dict[str, Any], noise: tuple[BandNoise, ...]) -> Run:
         pinned=bool(row["pinned"]),
         removed=from_text(row["removed"]),
         pending_hooks=tuple(json.loads(row["untold"])),
-        noise=noise,
     )
 
 
