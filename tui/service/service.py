@@ -420,14 +420,13 @@ class Service:
         """
         now = self._clock.now()
         try:
-            if self._store.is_changed and await asyncio.to_thread(self._damage):
-                await self._heal(now)
+            if self._store.is_changed:
+                damage = await asyncio.to_thread(damage_of, self._store)
+                if damage:
+                    await self._heal(now)
             await asyncio.to_thread(self._store.copy, now.date())
         except StoreError as error:
             _LOGGER.error("%s; it is tried again", error)  # noqa: TRY400 - its message says all
-
-    def _damage(self) -> str:
-        return damage_of(self._store)
 
     async def _heal(self, now: datetime) -> None:
         """Restore the database; changes of runs are written when that is done."""
