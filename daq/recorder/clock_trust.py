@@ -72,7 +72,7 @@ class ClockState:
     def text(self) -> str:
         """The state in words, for the event of a recording."""
         if not self.synchronised:
-            return "not synchronised (adjtimex)"
+            return "unverified: not synchronised (adjtimex)"
         return (
             f"synchronised: offset {self.offset * 1e3:+.3f} ms, estimated error"
             f" {self.error * 1e3:.3f} ms, at most {self.max_error * 1e3:.0f} ms (adjtimex)"
@@ -119,7 +119,7 @@ class ClockWatch:
         state: Callable[[], ClockState | None] = clock_state,
     ) -> None:
         self._clock, self._utc_ns, self._state = clock, utc_ns, state
-        self._ahead: float | None = None
+        self._ahead = 0.0
         self._reported = -math.inf
 
     def look(self) -> Event | None:
@@ -127,7 +127,7 @@ class ClockWatch:
         now = self._clock.now()
         at = now.monotonic_ns * 1e-9
         ahead = (self._utc_ns() - now.utc_ns) * 1e-9
-        step = 0.0 if self._ahead is None or self._clock.speed != 1.0 else ahead - self._ahead
+        step = ahead - self._ahead if self._clock.speed == 1.0 else 0.0
         self._ahead = ahead
         is_step = abs(step) > STEP
         if not is_step and at < self._reported + REPORT_INTERVAL:

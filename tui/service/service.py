@@ -42,6 +42,11 @@ STEP = 1.0
 """Seconds by which the clock is set at least: runs are then planned again."""
 MAX_ATTEMPTS = 5
 """Estimates of a run that may end without an outcome: one that kills its process is given up."""
+CLOCK_WAIT = timedelta(minutes=10)
+"""Longest time for which the first run waits for a synchronised clock."""
+CLOCK_INTERVAL = 2.0
+"""Seconds between two questions whether the clock is synchronised."""
+UNVERIFIED = "clock unverified: not synchronised when the run began"
 RETRY = 2.0
 """Seconds until an estimate without an outcome is tried again, doubled each time."""
 DISK_WAIT, DISK_PATIENCE = timedelta(hours=1), timedelta(days=2)
@@ -98,6 +103,9 @@ class Service:
         self._estimates: asyncio.Queue[Run] = asyncio.Queue()
         self._offset = 0.0  # of the clock against one that is never set
         self._inherited: dict[str, Run] = {}
+        self._is_trusted = False  # the clock, since a moment at which it was synchronised
+        self._plans_from: datetime | None = None
+        """First time of which runs are planned: the start of this service."""
         self._is_healing = False
         self._repeats: set[asyncio.Task[None]] = set()
         self.recording: Run | None = None
@@ -136,7 +144,6 @@ class Service:
             If the database cannot be used at the start.
         """
         await self._check_database()
-        self._offset = self._clock.now().timestamp() - self._clock.elapsed()
         # All long reading of the database is done in threads: the loop goes on.
         name = self.bench.name
         self._known = await asyncio.to_thread(self._store.begun, name)
@@ -146,8 +153,9 @@ class Service:
         keeper = asyncio.create_task(self._keep_database())
         workers = [asyncio.create_task(self._wait_for_runs()), recorder, estimator, keeper]
         try:
-            # One that ends has been asked to, or has failed.
-            done, _ = await asyncio.wait(workers, return_when=asyncio.FIRST_COMPLETED)
+            with self._clock.watched(self._wake.set):
+                # One that ends has been asked to, or has failed.
+                done, _ = await asyncio.wait(workers, return_when=asyncio.FIRST_COMPLETED)
             self.request_stop()
             if self.recording is not None:
                 await asyncio.wait({recorder})
@@ -161,8 +169,7 @@ class Service:
             self._write_unsaved()
 
     def _take_up(self, runs: list[Run]) -> None:
-        """Continue what an earlier service has left, and report what it has missed."""
-        now = self._clock.now()
+        """Continue what an earlier service has left, whatever the clock shows."""
         # A run whose estimate has failed before waits for the others.
         for run in sorted(runs, key=lambda run: run.attempts):
             if run.state is RunState.RECORDING:
@@ -173,24 +180,78 @@ class Service:
                 self._estimates.put_nowait(run)
             elif run.pending_hooks:
                 self._on_change(run)
-        planned = [run for run in runs if run.state is RunState.DUE]
-        for run in planned:
-            if run.due < now - GRACE:
-                self._miss(run, OFF)
-            else:
-                self._planned[run.key] = run
-        self._inherited = dict(self._planned)
-        if planned and min(run.due for run in planned) < now - GRACE:
-            self._miss_all(min(run.due for run in planned), now)
-        self._plan()
+        self._inherited = {run.key: run for run in runs if run.state is RunState.DUE}
 
-    def _plan(self) -> None:
+    async def _wait_for_clock(self) -> None:
+        """Wait for a synchronised clock, `CLOCK_WAIT` at most; simulated devices need none."""
+        begun, is_logged = self._clock.elapsed(), False
+        while not self.stop.is_set():
+            waited = self._clock.elapsed() - begun
+            self._is_trusted = self._is_synchronised()
+            if self._is_trusted or waited >= CLOCK_WAIT.total_seconds():
+                break
+            if not is_logged:
+                _LOGGER.warning(
+                    "the computer's clock is not synchronised; runs wait for it, %d minutes at"
+                    " most",
+                    CLOCK_WAIT.total_seconds() / 60,
+                )
+                is_logged = True
+            self._wake.clear()
+            await self._clock.sleep(CLOCK_INTERVAL, self._wake)
+        if is_logged and not self.stop.is_set():
+            _LOGGER.warning(
+                "the clock is %s",
+                "synchronised" if self._is_trusted else "not synchronised; runs are unverified",
+            )
+        now = self._clock.now()
+        self._offset = now.timestamp() - self._clock.elapsed()
+        self._plans_from = now - timedelta(seconds=self._clock.elapsed() - begun)
+
+    def _is_synchronised(self) -> bool:
+        return bool(self.bench.simulation) or self._clock.is_synchronised() is not False
+
+    def _plan_first(self) -> None:
+        """Plan the runs that are due since the start of this service."""
+        start = self._plans_from or self._clock.now()
+        self._planned = {
+            key: run for key, run in self._inherited.items() if run.due >= start - GRACE
+        }
+        self._report_missed(start)
+        self._plan(start)
+
+    def _report_missed(self, until: datetime) -> None:
+        """Report the runs that earlier services planned, and those since, once time is certain."""
+        if not self._is_trusted:
+            return
+        passed = [run for run in self._inherited.values() if run.due < until - GRACE]
+        for run in passed:
+            del self._inherited[run.key]
+            if run.key not in self._known:
+                self._miss(run, OFF)
+        if passed:  # and what was due after them, before this service
+            start = self._plans_from or until
+            self._miss_all(min(run.due for run in passed), min(start, until))
+
+    def _trust(self) -> None:
+        """Report what was missed before this service, as soon as the clock is synchronised."""
+        if not self._is_trusted and self._is_synchronised():
+            self._is_trusted = True
+            _LOGGER.info("the clock is synchronised")
+            self._report_missed(self._plans_from or self._clock.now())
+
+    def _grace(self, run: Run) -> timedelta:
+        """Return how late a run may begin: later if it was due while the clock was waited for."""
+        start = self._plans_from
+        if start is not None and start - GRACE <= run.due < start + CLOCK_WAIT:
+            return GRACE + CLOCK_WAIT
+        return GRACE
+
+    def _plan(self, start: datetime | None = None) -> None:
         """Have the next run of every entry in the database, and no other."""
         now = self._clock.now()
-        runs = {
-            run.key: run
-            for run in next_runs(self.bench, now - timedelta(microseconds=1), self._known)
-        }
+        after = (now if start is None else start) - timedelta(microseconds=1)
+        runs = {run.key: run for run in next_runs(self.bench, after, self._known)}
         for key in [key for key in self._planned if key not in runs]:
             run = self._planned.pop(key)
             if run.due > now:
@@ -203,11 +264,14 @@ class Service:
                 self._save(run)
 
     async def _wait_for_runs(self) -> None:
+        await self._wait_for_clock()
+        self._plan_first()
         while not self.stop.is_set():
             self._wake.clear()
             if self._wants_reload:
                 self._load_again()
             self._notice_step()
+            self._trust()
             self._write_unsaved()
             run, now = self.next_run, self._clock.now()
             left = MAX_SLEEP if run is None else (run.due - now).total_seconds()
@@ -215,9 +279,12 @@ class Service:
                 await self._clock.sleep(min(left, MAX_SLEEP), self._wake)
                 continue
             del self._planned[run.key]
-            if now - run.due > GRACE:
-                self._miss(run, OFF)
-                self._miss_all(run.due, now)
+            if now - run.due > self._grace(run):
+                if self._is_trusted:
+                    self._miss(run, OFF)
+                    self._miss_all(run.due, now)
+                else:
+                    self._forget(run)
             else:
                 self._begin(run)
             self._plan()
@@ -233,12 +300,14 @@ class Service:
             return
         now = self._clock.now()
         _LOGGER.warning("the clock was set by %+.1f s; the runs are planned again", step)
+        if self._plans_from is not None:
+            self._plans_from += timedelta(seconds=step)
         for run in list(self._planned.values()):
             if run.due < now - GRACE:
-                self._forget(self._planned.pop(run.key))
-        for run in self._inherited.values():
-            if run.due < now - GRACE and run.key not in self._known:
-                self._miss(run, OFF)
+                del self._planned[run.key]
+                if run.key not in self._inherited:
+                    self._forget(run)
+        self._report_missed(now)
         self._plan()
 
     def _forget(self, run: Run) -> None:
@@ -250,7 +319,7 @@ class Service:
     def _begin(self, run: Run) -> None:
         """Have a run recorded, unless another one is in its way for too long."""
         self._known.add(run.key)
-        if not run.queue and self._is_busy_beyond(run.due + GRACE):
+        if not run.queue and self._is_busy_beyond(run.due + self._grace(run)):
             self._miss(run, BUSY)
         else:
             self._windows.put_nowait(run)
@@ -275,6 +344,8 @@ class Service:
                     self._miss(run, reason)
                     continue
                 run = run.to(RunState.RECORDING, started=now)
+                if not self._is_trusted:
+                    run = run.because(UNVERIFIED)
                 self._note(run)
             window = self._window()
             self.recording, self.window = run, window
@@ -290,7 +361,7 @@ class Service:
 
     def _obstacle(self, run: Run, now: datetime) -> str:
         """Return why a run cannot start, or nothing."""
-        if not run.queue and now - run.due > GRACE:
+        if not run.queue and now - run.due > self._grace(run):
             return BUSY
         free, least = self.free(), self.bench.storage.min_free
         if free is not None and free < least:

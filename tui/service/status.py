@@ -6,8 +6,8 @@ import shutil
 from typing import TYPE_CHECKING, Any
 
 from daq.errors import HuddleError
-from daq.recorder.clock_trust import clock_state
 from daq.recording.control import ask
+from tui.service.clock import SystemTime
 from tui.service.processes.locks import is_held
 from tui.service.records.places import service_lock
 from tui.service.records.run_state import UNFINISHED, RunState, utc_text
@@ -47,7 +47,7 @@ def service_status(bench: Bench, runs: list[Run], now: datetime) -> dict[str, An
         "unfinished": sum(run.state in UNFINISHED for run in runs),
         "untold": sum(len(run.pending_hooks) for run in over),
         "disk": _disk(folder, bench.storage.min_free),
-        "clock": {"utc": utc_text(now), "synchronised": clock_is_synchronised()},
+        "clock": {"utc": utc_text(now), "synchronised": SystemTime().is_synchronised()},
     }
 
 
@@ -65,9 +65,3 @@ def _recording(run: Run, folder: Path) -> dict[str, Any]:
 def _disk(folder: Path, least: int) -> dict[str, Any]:
     usage = shutil.disk_usage(folder)
     return {"free_bytes": usage.free, "total_bytes": usage.total, "min_free_bytes": least}
-
-
-def clock_is_synchronised() -> bool | None:
-    """Return whether the kernel knows of something that keeps the clock right; None if unknown."""
-    state = clock_state()
-    return None if state is None else state.synchronised

@@ -48,7 +48,7 @@ def test_the_state_is_reported_at_the_start_and_every_hour() -> None:
     computer.state = ClockState(synchronised=False, offset=0.0, error=0.0, max_error=16.0)
     later = computer.after(900)
     assert later is not None
-    assert later.text == "not synchronised (adjtimex)"
+    assert later.text == "unverified: not synchronised (adjtimex)"
     computer.state = None
     unknown = computer.after(3600)
     assert unknown is not None
@@ -65,6 +65,12 @@ def test_a_step_is_reported_at_once_and_times_do_not_follow(step: float) -> None
     assert event.text.startswith(f"set by {step:+.3f} s; the times of this recording do not follow")
     assert event.received.utc_ns == UTC_NS + 4_000_000_000
     assert computer.after(2) is None
+
+
+def test_a_step_before_the_first_look_is_reported() -> None:
+    event = Computer().after(2, step=-3600.0)
+    assert event is not None
+    assert event.text.startswith("set by -3600.000 s")
 
 
 def test_a_simulated_bench_that_is_fast_has_no_steps() -> None:

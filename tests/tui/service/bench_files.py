@@ -51,6 +51,7 @@ class VirtualClock(SystemTime):
     def __init__(self, start: datetime = START) -> None:
         self.start = start
         self.set_by = timedelta()
+        self.synchronised: bool | None = True
 
     def now(self) -> datetime:
         """Return the time."""
@@ -60,6 +61,10 @@ class VirtualClock(SystemTime):
     def elapsed(self) -> float:
         """Return the time of the event loop."""
         return asyncio.get_running_loop().time()
+
+    def is_synchronised(self) -> bool | None:
+        """Return what the test says."""
+        return self.synchronised
 
 
 @dataclass

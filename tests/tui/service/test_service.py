@@ -398,7 +398,70 @@ async def test_a_run_planned_by_an_earlier_service_is_missed_once_the_clock_is_r
     await asyncio.sleep(60)
     service.request_stop()
     await task
-    assert place.states() == [("13:00", "missed"), ("15:00", "due")]
+    # The service began at 14:01:30.
+    assert place.states() == [("13:00", "missed"), ("14:00", "missed"), ("15:00", "due")]
+
+
+async def test_the_first_run_waits_for_a_synchronised_clock(tmp_path: Path) -> None:
+    """The clock is three days behind at the start, and set after seven minutes."""
+    place = Place(tmp_path)
+    await place.serve(60)  # plans 13:00
+    await asyncio.sleep(58 * 60)  # 12:59:30
+    place.clock.synchronised = False
+    place.clock.set_by -= timedelta(days=3)
+    service = place.service()
+    task = asyncio.create_task(service.run())
+    await asyncio.sleep(7 * 60)
+    assert (service.next_run, service.recording) == (None, None)
+    assert place.states() == [("13:00", "due")]
+    place.clock.set_by += timedelta(days=3)
+    place.clock.synchronised = True
+    await asyncio.sleep(60)
+    assert service.recording is not None
+    await asyncio.sleep(HOUR / 2)
+    service.request_stop()
+    await task
+    assert place.states() == [("13:00", "done"), ("14:00", "due")]
+    run = place.store.runs()[0]
+    assert run.reason == ""
+    assert run.started is not None
+    assert f"{run.started:%H:%M}" == "13:06"
+
+
+async def test_without_synchronisation_runs_begin_after_ten_minutes_and_say_so(
+    tmp_path: Path,
+) -> None:
+    place = Place(tmp_path)
+    await place.serve(60)
+    await asyncio.sleep(5.5 * HOUR)  # 17:31:30
+    place.clock.synchronised = False
+    service = place.service()
+    task = asyncio.create_task(service.run())
+    await asyncio.sleep(HOUR)  # 18:31:30
+    # What was missed is not reported by a clock that may be wrong.
+    assert place.states() == [("13:00", "due"), ("18:00", "done"), ("19:00", "due")]
+    run = place.store.runs()[1]
+    assert run.reason == "clock unverified: not synchronised when the run began"
+    place.clock.synchronised = True
+    await asyncio.sleep(60)
+    service.request_stop()
+    await task
+    missed = [(f"{hour}:00", "missed") for hour in range(13, 18)]
+    assert place.states() == [*missed, ("18:00", "done"), ("19:00", "due")]
+
+
+async def test_a_run_that_is_due_while_the_clock_is_waited_for_begins_late(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    await asyncio.sleep(59 * 60)  # 12:59:30
+    place.clock.synchronised = False
+    service = place.service()
+    task = asyncio.create_task(service.run())
+    await asyncio.sleep(9.9 * 60)
+    assert place.states() == []
+    await asyncio.sleep(20 * 60)
+    service.request_stop()
+    await task
+    assert place.states() == [("13:00", "done"), ("14:00", "due")]
 
 
 async def test_no_run_starts_on_a_full_disk_and_a_running_one_is_closed(
