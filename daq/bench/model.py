@@ -27,7 +27,7 @@ from daq.bench.masks.mask import NOISE_MODELS, Mask, check_points
 from daq.bench.response import PolesZeros, Response
 from daq.bench.tables.fields import Duration, Name, Number, PositiveNumber, Table
 from daq.bench.tables.toml_text import to_toml
-from daq.bench.tables.unattended import History, Hooks, Metrics, Schedule, Storage
+from daq.bench.tables.unattended import History, Hooks, Metrics, Schedule, Signing, Storage
 from daq.bench.units import DensityUnit
 
 Day: TypeAlias = dt.date
@@ -268,6 +268,7 @@ class Bench(Table):
     storage: Storage = Storage()
     hooks: Hooks = Hooks()
     metrics: Metrics | None = None
+    signing: Signing | None = None
     history: History = History()
     limits: tuple[Limit, ...] = ()
     simulation: dict[str, Any] = Field(default_factory=dict)

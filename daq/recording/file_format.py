@@ -25,7 +25,7 @@ FORMAT_VERSION = 2
 LIBVER = ("v110", "v110")
 """HDF5 file format of recordings."""
 
-PRIVATE_TABLES = ("hooks", "metrics")
+PRIVATE_TABLES = ("hooks", "metrics", "signing")
 """Tables of the bench file that are not recorded."""
 
 NO_COUNTER = -1

@@ -99,6 +99,7 @@ class Verification:
     """Datasets and attributes of a closed recording that differ from its manifest."""
     root_sha256: str = ""
     """SHA-256 of the manifest; empty if there is none."""
+    run_id: str = ""
 
     @property
     def intact(self) -> bool:
@@ -136,6 +137,7 @@ def verify(
             sensors,
             len(recording.events),
             recording.damaged_tables,
+            run_id=recording.run_id,
         )
     if not report.closed or being_written:
         return report
@@ -387,6 +389,7 @@ def _verified(path: Path) -> dict[str, Any]:
         "closed": report.closed,
         "damaged": [*damaged, *report.damaged_tables, *report.changed],
         "root_sha256": report.root_sha256,
+        "run_id": report.run_id,
     }
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from daq.estimation.recording_set import continuations
 from daq.protocols.block import EventKind
 from daq.recording.reader import Recording
+from daq.recording.signing import signed_by
 from daq.recording.storage.locking import is_being_written
 
 if TYPE_CHECKING:
@@ -92,6 +93,9 @@ class Source:
     sensors : tuple of RecordedSensor
     logged_events : tuple of LoggedEvent
         In time order.
+    signed_by : str
+        Id of the key of the signature beside the recording; empty if there is none, or it does not
+        fit. The contents are compared by ``huddle verify`` only.
     """
 
     path: Path
@@ -107,6 +111,7 @@ class Source:
     bench: Bench | None
     sensors: tuple[RecordedSensor, ...]
     logged_events: tuple[LoggedEvent, ...]
+    signed_by: str = ""
 
 
 def sources(paths: Sequence[str | Path]) -> tuple[Source, ...]:
@@ -169,6 +174,7 @@ def _source(recording: Recording, *, continued: bool) -> Source:
             for sensor in recording.sensors
         ),
         logged_events=tuple(logged_events),
+        signed_by=signed_by(path) if state == "closed" else "",
     )
 
 

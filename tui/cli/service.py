@@ -150,19 +150,53 @@ def pin(
     pin_runs(source, names, pinned=not remove)
 
 
-@examples("huddle verify lab.toml", "huddle verify recordings", "huddle verify a.h5 b.h5 --json -")
+@examples(
+    "huddle verify lab.toml", "huddle verify recordings", "huddle verify a.h5 --key lab.key.pub"
+)
 def verify(
     sources: Annotated[
         list[Path],
         typer.Argument(metavar="SOURCE", help="Recordings, bench files or folders."),
     ],
     *,
+    key: Annotated[
+        Path | None,
+        typer.Option(
+            "--key", metavar="FILE", help="Public key that must have signed every recording."
+        ),
+    ] = None,
     json: JsonOption = None,
 ) -> None:
-    """Verify the checksums of recordings, or of all recordings of a service.
+    """Verify the checksums and signatures of recordings, or of all recordings of a service.
 
-    The exit code is 3 if a recording is damaged or lost.
+    The exit code is 3 if a recording is damaged, lost or exchanged, or a signature does not fit.
     """
     from tui.commands.runs import verify_recordings
 
-    verify_recordings(sources, json=json)
+    verify_recordings(sources, key=key, json=json)
+
+
+@examples(
+    "huddle sign --new-key ~/lab.key",
+    "huddle sign lab.h5 --key ~/lab.key",
+)
+def sign(
+    recordings: Annotated[
+        list[Path] | None, typer.Argument(metavar="RECORDING", help="Closed recordings.")
+    ] = None,
+    *,
+    key: Annotated[
+        Path | None, typer.Option("--key", metavar="FILE", help="Private key (ed25519, PEM).")
+    ] = None,
+    new_key: Annotated[
+        Path | None,
+        typer.Option("--new-key", metavar="FILE", help="Make a key, and FILE.pub for others."),
+    ] = None,
+) -> None:
+    """Sign recordings with a private key, or make one.
+
+    A recording is verified before. Its signature is a file beside it (.sig).
+    """
+    from tui.commands.sign import sign_recordings
+
+    sign_recordings(recordings or [], key=key, new_key=new_key)

@@ -41,8 +41,9 @@ PANELS: dict[str, dict[str, tuple[str, str]]] = {
         "pin": ("service", "Protect runs from removal by the storage limits of the bench file."),
         "verify": (
             "service",
-            "Verify the checksums of recordings, or of all recordings of a service.",
+            "Verify the checksums and signatures of recordings, or of all recordings of a service.",
         ),
+        "sign": ("service", "Sign recordings with a private key, or make one."),
     },
     "Recordings": {
         "estimate": ("recordings", "Estimate the self-noise of every channel from recordings."),

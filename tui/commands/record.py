@@ -8,13 +8,14 @@ import subprocess
 import time
 from contextlib import contextmanager, nullcontext
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.live import Live
 
 from daq.bench.end_condition import NEVER, EndCondition
 from daq.devices.bench_file import load
-from daq.errors import WrongSettingError
+from daq.errors import HuddleError, WrongSettingError
 from daq.host_clock import SystemClock
 from daq.python_process import python_command
 from daq.recorder.recorder import run
@@ -26,8 +27,8 @@ from tui.wording.formatting import clock_time, roughly, several
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
+    from daq.bench.model import Bench
     from daq.recorder.recorder import RecorderStatus
 
 _LOGGER = logging.getLogger(__name__)
@@ -112,9 +113,24 @@ def record_bench(
         else:
             status = record(acknowledged=gaps.look)
     if status.closed:
+        _sign(bench, Path(status.path))
         closed = {"recording": status.path}
         _LOGGER.info("%s closed: %s", status.path, progress_line(status), extra=closed)
     write_json(json, status.to_dict())
+
+
+def _sign(bench: Bench, path: Path) -> None:
+    """Sign a recording if the bench file has a key; without, it is a recording nevertheless."""
+    if bench.signing is None:
+        return
+    from daq.recording.signing import key_of, sign  # noqa: PLC0415 - seldom needed
+
+    try:
+        key = key_of(bench)
+        if key is not None:
+            _LOGGER.info("%s: signed with key %s", path, sign(path, key).key_id)
+    except HuddleError as error:
+        _LOGGER.error("not signed: %s", error)  # noqa: TRY400 - its message says all
 
 
 @contextmanager

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from daq.errors import HuddleError, RecordingError
+from daq.recording.signing import problem, signature_of
 from daq.recording.storage.trial import trials
 from tui.output.console import check_places, for_people, write_json, write_text
 from tui.output.csv_text import csv_text
@@ -117,37 +118,50 @@ def runs_named(runs: Sequence[Run], name: str) -> list[Run]:
     return found
 
 
-def verify_recordings(sources: Sequence[Path], *, json: str | None) -> None:
+def verify_recordings(
+    sources: Sequence[Path], *, key: Path | None = None, json: str | None
+) -> None:
     """Walk the checksums of recordings, or of all that services have kept.
 
     Parameters
     ----------
     sources : sequence of path
         Recordings, bench files or folders.
+    key : Path, optional
+        Public key that must have signed every recording.
     json : str or None
 
     Raises
     ------
     RecordingError
-        If one is damaged or lost.
+        If one is damaged, lost, another one than the service made, or not signed with the key.
     """
     found = []
+    paths, known = _recordings(sources)
     # In children: a file that hangs or crashes HDF5 is damaged, and the others are verified.
-    for path, report in trials(_recordings(sources), "verify"):
+    for path, report in trials(paths, "verify"):
         damaged = ", ".join(report.get("damaged", ()))
         state = report.get("error") or (f"damaged: {damaged}" if damaged else "intact")
         if "fatal" in report:
             state = f"damaged: {report['fatal']}"
+        own = report.get("run_id", ""), report.get("root_sha256", "")
+        if state == "intact" and known.get(path, own) != own:
+            state = "exchanged: not the recording that the service has made under this name"
+        if state == "intact":
+            state = problem(path, *own, public=key) or state
+        signer = signature_of(path) if state == "intact" else None
+        if signer is not None:
+            state = f"intact, signed with key {signer.key_id}"
         found.append((path, state, report.get("root_sha256") or None))
         for_people(json).print(f"{path}: {state.removeprefix(f'{path}: ')}", soft_wrap=True)
-    bad = [path.name for path, state, _ in found if state != "intact"]
+    bad = [path.name for path, state, _ in found if not state.startswith("intact")]
     write_json(
         json,
         {
             "recordings": [
                 {
                     "path": str(path),
-                    "intact": state == "intact",
+                    "intact": state.startswith("intact"),
                     "state": state,
                     "root_sha256": root,
                 }
@@ -159,8 +173,12 @@ def verify_recordings(sources: Sequence[Path], *, json: str | None) -> None:
         raise RecordingError(f"{len(bad)} of {len(found)} recordings are damaged or lost")
 
 
-def _recordings(sources: Sequence[Path]) -> list[Path]:
+def _recordings(
+    sources: Sequence[Path],
+) -> tuple[list[Path], dict[Path, tuple[str, str]]]:
+    """Return recordings, and run id and root SHA-256 of those that services know."""
     found: list[Path] = []
+    known: dict[Path, tuple[str, str]] = {}
     for source in sources:
         if source.suffix.lower() in {".h5", ".hdf5"}:
             found.append(source)
@@ -174,4 +192,5 @@ def _recordings(sources: Sequence[Path]) -> list[Path]:
             continue
         runs = place.runs(kept=True)
         found += [place.folder / part for run in runs for part in run.parts]
-    return list(dict.fromkeys(found))
+        known |= {place.folder / part: own for part, own in place.store.identities().items()}
+    return list(dict.fromkeys(found)), known

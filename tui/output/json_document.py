@@ -145,6 +145,7 @@ def _recording(source: Source) -> dict[str, Any]:
         "file": source.path.name,
         "run_id": source.run_id,
         "sha256": source.sha256 or None,
+        "signed_by": source.signed_by or None,
         "bytes": source.n_bytes,
         "state": source.state.replace(" ", "-"),
         "software": source.software,

@@ -192,6 +192,7 @@ def _test_section(found: Sequence[Source]) -> Section:
                     ("Recorded by", source.software),
                     ("Run", source.run_id),
                     ("SHA-256", source.sha256 or "none: the file is still being written"),
+                    ("Signed with key", source.signed_by or "not signed"),
                 )
             )
         )

@@ -17,6 +17,7 @@ from datetime import timedelta
 from typing import TYPE_CHECKING
 
 from daq.errors import HuddleError
+from daq.recording.signing import SigningError, key_of
 from tui.service.healing import damage_of, heal
 from tui.service.hooks import events_of
 from tui.service.planning import GRACE, missed_runs, next_runs
@@ -401,6 +402,7 @@ class Service:
             self.bench.recording.report,
             self.bench.history.bands,
             run.record(),
+            self._key(),
         )
         try:
             outcome = await self._steps.finish(request)
@@ -421,11 +423,25 @@ class Service:
             return self._repeated(run.because(REFUSED), delay)
         for note in outcome.notes:
             run = run.because(note)
+        if outcome.identities:
+            try:
+                self._store.set_identities(run, outcome.identities)
+            except StoreError as error:
+                _LOGGER.error("%s", error)  # noqa: TRY400 - its message says all
         if outcome.error:
             return self._failed(run, outcome.error)
         return run.to(
             RunState.DONE, verdict=outcome.verdict, noise=outcome.noise, ended=self._clock.now()
         )
+
+    def _key(self) -> str | None:
+        """Return the key with which recordings are signed."""
+        try:
+            key = key_of(self.bench)
+        except SigningError as error:
+            _LOGGER.error("%s", error)  # noqa: TRY400 - its message says all
+            return None
+        return None if key is None else str(key)
 
     def _repeated(self, run: Run, delay: float) -> Run:
         """Queue the estimate of a run again after a delay in seconds."""

@@ -193,6 +193,13 @@ class Metrics(Table):
     address: Annotated[str, AfterValidator(_address)] = "127.0.0.1"
 
 
+class Signing(Table):
+    """How recordings are signed when they are closed."""
+
+    key: Annotated[str, Field(min_length=1)]
+    """Absolute path of a private key; ``${NAME}`` is a variable of the environment."""
+
+
 class History(Table):
     """What ``huddle serve`` keeps of each run for ``huddle history``."""
 

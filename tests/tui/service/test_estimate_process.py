@@ -13,7 +13,8 @@ from tui.service.processes.finish import OOM_SCORE
 from tui.service.processes.steps import FinishFailedError, outcome_of
 
 OUTCOME = (
-    '{"verdict": "pass", "notes": [], "noise": [], "error": "", "parts": [], "refused": false}'
+    '{"verdict": "pass", "notes": [], "noise": [], "error": "", "parts": [], "refused": false,'
+    ' "identities": []}'
 )
 
 

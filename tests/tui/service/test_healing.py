@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
 import math
 import sqlite3
@@ -12,12 +13,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from daq.protocols.block import HostTime
 from daq.recording.file_format import SensorLayout
+from daq.recording.signing import identity, make_key, problem, signed_by
 from daq.recording.writer import RecordingWriter
 from tests.tui.service.bench_files import START, Place
 from tests.tui.service.test_continuations import record
+from tui.cli.main import app
 from tui.service.healing import heal
 from tui.service.planning import next_runs
 from tui.service.processes.finish import Request, finish
@@ -134,6 +138,41 @@ def test_no_damaged_page_ends_a_service(tmp_path: Path, page: int) -> None:
     assert len(place.store.runs()) == 60
     place.store.save(first)
     assert len(place.store.runs()) == 61
+
+
+def test_verify_finds_recordings_that_were_exchanged(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    folder = place.bench.recording_directory
+    for number, name in enumerate(("a.h5", "b.h5")):
+        run = done_run(place, name)
+        run = replace(run, due=run.due + timedelta(hours=number))
+        place.store.save(run)
+        place.store.set_identities(run, [(name, *identity(folder / name))])
+    assert CliRunner().invoke(app, ["verify", str(folder)]).exit_code == 0
+    (folder / "a.h5").rename(folder / "c.h5")
+    (folder / "b.h5").rename(folder / "a.h5")
+    (folder / "c.h5").rename(folder / "b.h5")
+    said = CliRunner().invoke(app, ["verify", str(folder)], terminal_width=400)
+    assert said.exit_code == 3
+    assert said.stdout.count("exchanged: not the recording that the service has made") == 2
+
+
+def test_what_is_finished_is_signed_and_known(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    make_key(tmp_path / "key")
+    path = place.bench.recording_directory / "r.h5"
+    record(path, 12)
+    outcome = finish(Request([str(path)], {"segment": "2s"}, key=str(tmp_path / "key")))
+    assert outcome.notes == ()
+    assert outcome.identities == (("r.h5", *identity(path)),)
+    assert problem(path, *identity(path), public=tmp_path / "key.pub") == ""
+    found = json.loads(path.with_suffix(".json").read_text())
+    assert found["recordings"][0]["signed_by"] == signed_by(path)
+    unsigned = place.bench.recording_directory / "s.h5"
+    record(unsigned, 12)
+    outcome = finish(Request([str(unsigned)], {"segment": "2s"}, key=str(tmp_path / "none")))
+    assert len(outcome.identities) == 1
+    assert outcome.notes[0].startswith(f"s.h5: not signed: {tmp_path / 'none'}: cannot be read")
 
 
 @pytest.mark.virtual_time

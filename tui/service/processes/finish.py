@@ -25,6 +25,7 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
 from daq.recording.repair import repair
+from daq.recording.signing import identity, sign, signature_of
 from daq.results.band_summary import band_of, channel_means, judged_method
 from daq.results.decision.limits import judge
 from daq.results.sources import sources
@@ -39,7 +40,7 @@ from tui.service.records.parts import with_continuations
 from tui.service.records.run_state import RUN, BandNoise
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from daq.estimation.snapshot import Snapshot
 
@@ -68,6 +69,8 @@ class Request:
         Further bands in Hz whose noise is wanted.
     run : dict or None
         The run, as `Run.record` has it; it is stored with the result.
+    key : str or None
+        Private key for the recordings that are not signed yet.
     """
 
     parts: list[str]
@@ -75,6 +78,7 @@ class Request:
     report: str | None = None
     bands: tuple[tuple[float, float], ...] = ()
     run: dict[str, Any] | None = None
+    key: str | None = None
 
     def text(self) -> str:
         """Return the request as an argument."""
@@ -95,6 +99,8 @@ class Outcome:
     error: str = ""
     parts: tuple[str, ...] = ()
     refused: bool = False
+    identities: tuple[tuple[str, str, str], ...] = ()
+    """File name, run id and root SHA-256 of each closed recording."""
 
     @classmethod
     def of(cls, text: str) -> Outcome:
@@ -111,7 +117,8 @@ class Outcome:
                 BandNoise.of(*(each[name] for name in _NOISE)) for each in found.pop("noise")
             )
             notes, parts = tuple(found.pop("notes")), tuple(found.pop("parts"))
-            return cls(noise=noise, notes=notes, parts=parts, **found)
+            known = tuple((part, run, root) for part, run, root in found.pop("identities"))
+            return cls(noise=noise, notes=notes, parts=parts, identities=known, **found)
         except (AttributeError, KeyError, TypeError) as error:
             raise ValueError(f"no outcome: {error}") from None
 
@@ -135,11 +142,33 @@ def finish(request: Request, progress: Callable[[], object] = lambda: None) -> O
         outcome = _finished(replace(request, parts=[str(part) for part in parts]), progress)
     except (HuddleError, EstimatorError, OSError) as error:
         outcome = Outcome(error=str(error) or type(error).__name__, refused=is_of_disk(error))
-    return replace(outcome, parts=tuple(part.name for part in parts))
+    names = tuple(part.name for part in parts)
+    return replace(outcome, parts=names, identities=tuple(_identities(parts)))
+
+
+def _identities(parts: Sequence[Path]) -> Iterator[tuple[str, str, str]]:
+    """Yield file name, run id and root SHA-256 of the recordings that are closed."""
+    for part in parts:
+        with contextlib.suppress(HuddleError, OSError):
+            run_id, root = identity(part)
+            if root:
+                yield part.name, run_id, root
+
+
+def _signed(parts: Sequence[Path], key: Path) -> Iterator[str]:
+    """Sign recordings that are not signed yet; yield problems."""
+    for part in parts:
+        try:
+            if signature_of(part) is None:
+                sign(part, key)
+        except (HuddleError, OSError) as error:
+            yield f"{part.name}: not signed: {error}"
 
 
 def _finished(request: Request, progress: Callable[[], object]) -> Outcome:
     paths, notes, refused = _repaired([Path(part) for part in request.parts], progress)
+    if request.key is not None:
+        notes += _signed(paths, Path(request.key))
     table = EstimateTable.model_validate(request.options)
     names = table_keys()
     wanted = {names[key]: getattr(table, key) for key in table.model_fields_set}

@@ -56,11 +56,13 @@ CREATE TABLE IF NOT EXISTS noise (
 CREATE INDEX IF NOT EXISTS noise_by_run ON noise (run);
 """
 _INDEXES = """
+CREATE TABLE IF NOT EXISTS identities (
+    part TEXT PRIMARY KEY, run TEXT NOT NULL, run_id TEXT NOT NULL, root_sha256 TEXT NOT NULL);
 CREATE INDEX IF NOT EXISTS runs_by_time ON runs (due, entry);
 CREATE INDEX IF NOT EXISTS runs_by_state ON runs (bench, state, due);
 CREATE INDEX IF NOT EXISTS runs_pending ON runs (bench) WHERE untold != '[]';
 """
-"""Made by whoever writes: in the schema, earlier versions would refuse the database."""
+"""Made by whoever writes: with another version, earlier programs would refuse the database."""
 _COLUMNS = (
     *("key", "bench", "entry", "due", "state", "reason", "verdict", "started", "ended"),
     *("duration", "target_cov", "queue", "parts", "attempts", "pinned", "removed", "untold"),
@@ -142,6 +144,22 @@ class RunStore:
         """Write that the files of a run were removed."""
         with self._changed() as database:
             database.execute("UPDATE runs SET removed = ? WHERE key = ?", (utc_text(when), run.key))
+
+    def set_identities(self, run: Run, identities: Sequence[tuple[str, str, str]]) -> None:
+        """Write file name, run id and root SHA-256 of the recordings of a run."""
+        with self._changed() as database:
+            database.executemany(
+                "INSERT OR REPLACE INTO identities VALUES (?, ?, ?, ?)",
+                [(part, run.key, run_id, root) for part, run_id, root in identities],
+            )
+
+    def identities(self) -> dict[str, tuple[str, str]]:
+        """Return run id and root SHA-256 of recordings, by file name."""
+        known = "SELECT name FROM sqlite_master WHERE name = 'identities'"
+        if not self._rows(known):  # of an earlier version
+            return {}
+        rows = self._rows("SELECT part, run_id, root_sha256 FROM identities")
+        return {part: (run_id, root) for part, run_id, root in rows}
 
     def forget_planned(self, run: Run) -> None:
         """Remove a run that is no longer in the schedule, unless it has begun."""
