@@ -1,6 +1,8 @@
 #!/bin/sh
 # Installs huddle as a service: sudo deploy/install.sh lab.toml
 # Own user, own environment in /opt/huddle, bench file in /etc/huddle, recordings in /var/lib/huddle.
+# Packages come from a folder of deploy/wheelhouse.sh (WHEELHOUSE=FOLDER, or wheelhouse beside this
+# one; made if it is missing), without the network, each with its hash.
 # Can be run again, for another bench or a newer version. ROOT=FOLDER installs below that folder, for
 # a test or an image, and starts nothing.
 set -eu
@@ -18,7 +20,11 @@ if [ -z "$root" ] && ! id huddle >/dev/null 2>&1; then
 fi
 mkdir -p "$root/opt/huddle/docs" "$root/etc/huddle" "$root/etc/systemd/system"
 python3 -m venv "$root/opt/huddle/venv"
-"$root/opt/huddle/venv/bin/pip" install --quiet -c "$here/constraints.txt" "$here[fast,metrics,report]"
+wheelhouse=${WHEELHOUSE:-$here/wheelhouse}
+[ -f "$wheelhouse/requirements.txt" ] || \
+    PYTHON="$root/opt/huddle/venv/bin/python" "$here/deploy/wheelhouse.sh" "$wheelhouse"
+"$root/opt/huddle/venv/bin/pip" install --quiet --no-index --find-links "$wheelhouse" \
+    --require-hashes -r "$wheelhouse/requirements.txt"
 cp "$here/docs/service.md" "$root/opt/huddle/docs/"
 cp "$here/deploy/huddle@.service" "$root/etc/systemd/system/"
 # Recordings go where the service may write; a directory of the bench file's own must be absolute.
