@@ -90,7 +90,9 @@ def _expectation(details: ErrorDetails, model: type[BaseModel] | None) -> str:
     if kind == "missing":
         return f"is missing; expected {description or 'a value'}"
     if kind == "extra_forbidden":
-        return f"unknown key; {one_of(name, tuple(known))}"
+        return (
+            f"unknown key; {one_of(name, tuple(each.alias or key for key, each in known.items()))}"
+        )
     if kind == "string_too_short":
         return f"expected {description or 'a word'}"
     if kind == "too_short":

@@ -29,17 +29,21 @@ _MOST_STRANGERS = 16
 
 
 class DatagramStream(asyncio.DatagramProtocol):
-    """The datagrams of one UDP port. Made by :func:`open_datagrams`."""
+    """The datagrams of one UDP port. Made by :func:`open_datagrams`.
 
-    def __init__(self, label: str, clock: HostClock) -> None:
+    Anybody can send to a port. Until a host is known, datagrams of all hosts are read; :meth:`bind`
+    keeps that of the last one.
+    """
+
+    def __init__(self, label: str, clock: HostClock, sender: str | None = None) -> None:
         self.label = label
         self._clock = clock
-        self._waiting: deque[tuple[bytes, HostTime]] = deque(maxlen=MAX_UNREAD)
+        self._waiting: deque[tuple[bytes, HostTime, str]] = deque(maxlen=MAX_UNREAD)
         self._arrived = asyncio.Event()
         self._failure: Exception | None = None
-        self._sender: str | None = None
+        self._sender, self._last = sender, ""
         self.strangers: set[str] = set()
-        """Hosts other than the first; their datagrams are ignored."""
+        """Hosts other than the known one; their datagrams are ignored."""
         self._transport: asyncio.DatagramTransport
         self.log: StreamLog | None = None
         """Where everything read and sent is logged."""
@@ -49,14 +53,26 @@ class DatagramStream(asyncio.DatagramProtocol):
         self._transport = cast("asyncio.DatagramTransport", transport)
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
-        """Store a datagram and its arrival; ignore hosts other than the first."""
-        self._sender = self._sender or addr[0]
-        if addr[0] != self._sender:
-            if len(self.strangers) < _MOST_STRANGERS:
-                self.strangers.add(addr[0])
+        """Store a datagram and its arrival; ignore hosts other than the known one."""
+        if self._is_strange(addr[0]):
             return
-        self._waiting.append((data, self._clock.now()))
+        self._waiting.append((data, self._clock.now(), addr[0]))
         self._arrived.set()
+
+    def _is_strange(self, host: str) -> bool:
+        if self._sender in {None, host}:
+            return False
+        if len(self.strangers) < _MOST_STRANGERS:
+            self.strangers.add(host)
+        return True
+
+    def bind(self) -> None:
+        """Know the host of the datagram that was read last, if none is known: it was valid."""
+        if self._sender is None:
+            self._sender = self._last
+            kept = [each for each in self._waiting if not self._is_strange(each[2])]
+            self._waiting.clear()
+            self._waiting.extend(kept)
 
     def error_received(self, exc: Exception) -> None:
         """Store the failure: the other end refuses datagrams."""
@@ -79,7 +95,7 @@ class DatagramStream(asyncio.DatagramProtocol):
                 )
             self._arrived.clear()
             await self._arrived.wait()
-        received, at = self._waiting.popleft()
+        received, at, self._last = self._waiting.popleft()
         if self.log is not None:
             self.log.received(received, at)
         return received, at
@@ -87,7 +103,7 @@ class DatagramStream(asyncio.DatagramProtocol):
     def discard(self) -> None:
         """Discard unread datagrams."""
         if self.log is not None:
-            self.log.unread(b"".join(received for received, _ in self._waiting))
+            self.log.unread(b"".join(received for received, *_ in self._waiting))
         self._waiting.clear()
 
     def send(self, payload: bytes) -> None:
@@ -100,7 +116,7 @@ class DatagramStream(asyncio.DatagramProtocol):
 
 @contextlib.asynccontextmanager
 async def open_datagrams(
-    address: str, clock: HostClock, *, listen: bool, label: str
+    address: str, clock: HostClock, *, listen: bool, label: str, sender: str | None = None
 ) -> AsyncIterator[DatagramStream]:
     """Open a UDP port and close it on exit.
 
@@ -112,6 +128,8 @@ async def open_datagrams(
         Whether to listen on the address instead of connecting to it.
     label
         Start of every error message, with sensor and port.
+    sender
+        Address of the only host whose datagrams are read.
 
     Raises
     ------
@@ -125,7 +143,7 @@ async def open_datagrams(
     try:
         where = host_and_port(address)
         transport, stream = await asyncio.get_running_loop().create_datagram_endpoint(
-            lambda: DatagramStream(label, clock),
+            lambda: DatagramStream(label, clock, sender),
             local_addr=where if listen else None,
             remote_addr=None if listen else where,
         )

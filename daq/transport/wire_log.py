@@ -146,6 +146,9 @@ class ReplayedStream(ByteStream):
         await asyncio.sleep(0)
         return bytes.fromhex(line.text), line.at
 
+    def bind(self) -> None:
+        """Do nothing: the log has the datagrams of the known host."""
+
     async def write(self, payload: bytes) -> None:
         """Compare what is sent with what was sent."""
         self.send(payload)

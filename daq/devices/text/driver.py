@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import fields, replace
+from ipaddress import ip_address
 from typing import TYPE_CHECKING, Annotated, Literal, Protocol
 
 from pydantic import (
@@ -89,6 +90,12 @@ class TextSettings(BaseModel):
     """Bits of samples written in hexadecimal, two's complement."""
     device_time: bool | None = None
     """Whether the device's time is used as clock, instead of the arrival."""
+    from_: str | None = Field(
+        None,
+        alias="from",
+        description="IP address of the device, for a port udp://…; default: the host of the first"
+        " packet that can be read.",
+    )
     start: str = ""
     """Command that starts the device."""
     stop: str = ""
@@ -108,6 +115,16 @@ class TextSettings(BaseModel):
                 'expected "epoch", "millis", "micros", or date and time in a format of Python\'s'
                 ' strptime, such as "%Y-%m-%d %H:%M:%S.%f"'
             )
+        return value
+
+    @field_validator("from_")
+    @classmethod
+    def _is_address(cls, value: str | None) -> str | None:
+        if value is not None:
+            try:
+                ip_address(value)
+            except ValueError:
+                raise ValueError('expected an IP address, such as "192.168.1.20"') from None
         return value
 
     def format_for(self, sensor: Sensor) -> TextFormat:
@@ -201,6 +218,8 @@ class _DatagramSource:
     async def receive(self) -> list[Block | Event]:
         received, at = await self._stream.read()
         found = self._decoder.receive_datagram(received, at)
+        if any(isinstance(item, Block) for item in found):
+            self._stream.bind()
         for host in sorted(self._stream.strangers - self._told):
             self._told.add(host)
             text = f"datagrams from {host} are ignored: another device sends to this port"
@@ -302,6 +321,9 @@ def _checked(sensors: Sequence[Sensor]) -> tuple[Sensor, TextSettings, TextForma
     """Return the sensor, its settings and format; raise BenchFileError if they are invalid."""
     sensor = only(sensors, "text comes from one")
     settings = TextSettings.model_validate(sensor.settings)
+    if settings.from_ is not None and not sensor.port.startswith("udp://"):
+        expected = f"is for ports udp://…, not {sensor.port}: leave it out"
+        raise BenchFileError(FileFault("settings.from", expected, settings.from_, sensor.name))
     for key in ("start", "stop"):
         if sensor.port.startswith("udp://") and (value := getattr(settings, key)):
             expected = f"nothing can be sent to {sensor.port}: leave it out"
@@ -315,7 +337,9 @@ async def _opened(
 ) -> AsyncIterator[_Source]:
     port = sensor.port
     if port.startswith("udp://"):
-        async with open_datagrams(port, clock, listen=True, label=label) as datagrams:
+        async with open_datagrams(
+            port, clock, listen=True, label=label, sender=settings.from_
+        ) as datagrams:
             yield _DatagramSource(datagrams, decoder, sensor.name)
     else:
         async with open_port(

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import socket
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
+from daq.bench.model import Channel, Sensor
 from daq.devices.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError
-from daq.protocols.block import BlockFlag, Event
+from daq.protocols.block import Block, BlockFlag, Event, EventKind
 from daq.transport.address import host_and_port
 from sim_devices.world.world import World
 from tests.daq.devices import reading
@@ -21,8 +23,6 @@ from tests.sim_devices.simulated_bench import device, scenario, sensors, spec
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from daq.bench.model import Sensor
-    from daq.protocols.block import Block
     from sim_devices.server.launch import RunningDevice
 
 pytestmark = pytest.mark.devices
@@ -130,6 +130,77 @@ async def test_another_device_on_the_same_port_is_ignored(
     assert said == "datagrams from 127.0.0.2 are ignored: another device sends to this port"
     assert counts
     assert 777777777 not in counts
+
+
+async def test_a_stray_byte_does_not_take_the_port() -> None:
+    """The first packet comes from another host, and is none of the device's."""
+    one, packet = own_port(), b"{'EHZ', 1582315130.292, 7, 8}"
+    where = host_and_port(one.port)
+    async with reading.reading(DRIVER, [one], speed=SPEED) as items:
+        with hosts("127.0.0.2", "127.0.0.3") as (stranger, device):
+            stranger.sendto(b"x", where)
+            device.sendto(packet, where)
+            unreadable, block = await anext(items), await anext(items)
+            stranger.sendto(packet.replace(b"7", b"9"), where)
+            device.sendto(packet.replace(b"292", b"492"), where)
+            found = [await anext(items), await anext(items)]
+    assert isinstance(unreadable, Event)
+    assert unreadable.kind is EventKind.CHECKSUM
+    assert isinstance(block, Block)
+    assert block.counts[:, 0].tolist() == [7, 8]
+    (said,) = [item.text for item in found if isinstance(item, Event)]
+    assert said == "datagrams from 127.0.0.2 are ignored: another device sends to this port"
+    (second,) = [item for item in found if isinstance(item, Block)]
+    assert second.counts[:, 0].tolist() == [7, 8]
+
+
+async def test_only_the_stated_host_is_read() -> None:
+    one = own_port(**{"from": "127.0.0.3"})
+    where = host_and_port(one.port)
+    async with reading.reading(DRIVER, [one], speed=SPEED) as items:
+        with hosts("127.0.0.2", "127.0.0.3") as (stranger, device):
+            stranger.sendto(b"{'EHZ', 1582315130.292, 9, 9}", where)
+            device.sendto(b"{'EHZ', 1582315130.292, 7, 8}", where)
+            found = [await anext(items), await anext(items)]
+    (block,) = [item for item in found if isinstance(item, Block)]
+    assert block.counts[:, 0].tolist() == [7, 8]
+
+
+def test_a_wrong_host_is_a_fault_of_the_file() -> None:
+    with pytest.raises(ValueError, match="expected an IP address"):
+        DRIVER.settings.model_validate({"from": "shake.local"})
+    one = own_port(**{"from": "127.0.0.3"}).model_copy(update={"port": "/dev/ttyUSB0"})
+    with pytest.raises(BenchFileError, match="is for ports udp://"):
+        DRIVER.check([one])
+
+
+def own_port(**settings: object) -> Sensor:
+    """Return a sensor on a free port."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        number = free.getsockname()[1]
+    return Sensor(
+        name="S",
+        driver="text",
+        port=f"udp://0.0.0.0:{number}",
+        sampling_rate=10.0,
+        channels=(Channel(name="EHZ", sensitivity=1.0),),
+        settings={"preset": "raspberry-shake", **settings},
+    )
+
+
+@contextlib.contextmanager
+def hosts(*addresses: str) -> Iterator[list[socket.socket]]:
+    """Return sockets with these addresses of this computer."""
+    with contextlib.ExitStack() as opened:
+        found = []
+        for address in addresses:
+            found.append(opened.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)))
+            try:
+                found[-1].bind((address, 0))
+            except OSError:
+                pytest.skip("this system has one loopback address only")
+        yield found
 
 
 async def test_a_device_is_started_and_stopped_by_its_commands(
