@@ -149,12 +149,12 @@ def outcome(path: Path, expected: str) -> str:
         return "refused"
     if not intact:
         return "damage named"
-    if not _plain_h5py_reads(path):
+    if not plain_h5py_reads(path):
         return "intact but unreadable"
     return "read as it was" if found == expected else "changed silently"
 
 
-def _plain_h5py_reads(path: Path) -> bool:
+def plain_h5py_reads(path: Path) -> bool:
     """Return whether a program that knows nothing of huddle can read all objects of a file."""
 
     def read(_: str, found: h5py.Group | h5py.Dataset) -> None:

@@ -77,6 +77,8 @@ def differences(file: h5py.File, *, progress: Callable[[], object] = lambda: Non
     NotARecordingError, OSError, RuntimeError
         If a group or attribute cannot be read, or an object is one that no recording has.
     """
+    # Also indexes that nothing here needs: other programs visit objects by them.
+    file.visititems(lambda _name, _found: None)
     changed = []
     for name in (MANIFEST, RESULTS_MANIFEST):
         found = computed(file, name, progress=progress)
