@@ -49,6 +49,8 @@ LEAKS = 3.0
 """Standard deviations by which the noise of larger sub-blocks is above that of smaller ones, from
 which they are not used."""
 ROUNDS = 6
+SETTLED = 1e-3
+"""Change of ln psi in a round, of weights only, from which there is no further round."""
 SAMPLED = 15
 """Sub-blocks of a block by which the number of resolved dimensions is decided."""
 _STEP = 1.5  # of ln psi in one round
@@ -66,39 +68,56 @@ class Pooled:
         block are too few.
     cumulants : float64, shape (3, n_freqs, n_channels)
         Of `noise`, as `estimator.levels.interval.interval` takes them.
-    resolved : int64, shape (n_freqs,)
-        Number of dimensions whose directions are those of the bin's own sub-block.
-    averages : float64, shape (n_freqs,)
-        Averages of the sub-block.
     """
 
     noise: FloatArray
     cumulants: FloatArray
-    resolved: IntArray
-    averages: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Parts:
-    """Sub-blocks of some blocks; bins are counted from the first of the chosen ones.
+    """Sub-blocks of some blocks.
 
-    ``block`` has the block of each sub-block (n_parts,), ``first`` the first sub-block of each
-    block (n_blocks,), ``part`` the sub-block of each bin (n_bins,), ``share`` the weight of a
-    sub-block in its block, ``averages`` what it is worth, ``whole`` what its block is worth.
+    ``bins`` are those of the blocks, ``start`` the first of each sub-block among these, and
+    ``count`` their number. ``block`` has the block of each sub-block, ``first`` the first sub-block
+    of each block; ``share`` is the weight of a sub-block in its block, ``averages`` what it is
+    worth, ``whole`` what its block is worth.
     """
 
+    bins: IntArray
+    start: IntArray
+    count: IntArray
     block: IntArray
     first: IntArray
-    start: IntArray
-    part: IntArray
     share: FloatArray
     averages: FloatArray
     whole: FloatArray
 
     def mean(self, values: _Array) -> _Array:
         """Return the weighted mean over the sub-blocks of each block."""
+        if len(self.first) == len(self.block):
+            return values
         weight = self.share.reshape(-1, *[1] * (values.ndim - 1))
         return np.add.reduceat(weight * values, self.first)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """Directions of the motion, and the noise, in some blocks.
+
+    ``projector`` and ``white``, the whitened mean matrix, are those of the sub-blocks. ``gain``
+    corrects for the averages that directions take, ``left`` are those that are left. ``resolved``,
+    ``psi`` of the weights, and ``level``, the mean noise, are those of the blocks.
+    """
+
+    parts: _Parts
+    projector: ComplexArray
+    white: ComplexArray
+    gain: FloatArray
+    left: FloatArray
+    resolved: IntArray
+    psi: FloatArray
+    level: FloatArray
 
 
 def blocks_of(frequency: FloatArray, *, per_octave: int = 3, least: int = LEAST_BINS) -> IntArray:
@@ -154,46 +173,51 @@ def pooled_noise(
         Of averages k bins apart, 1 at k = 0.
     """
     n_freqs, p = matrix.shape[:2]
-    found = Pooled(
-        np.full((n_freqs, p), np.nan),
-        np.full((3, n_freqs, p), np.nan),
-        np.zeros(n_freqs, np.int64),
-        np.zeros(n_freqs),
-    )
-    sensor = np.repeat(np.arange(len(dims)), dims)
+    found = Pooled(np.full((n_freqs, p), np.nan), np.full((3, n_freqs, p), np.nan))
     edges = np.flatnonzero(np.diff(block, prepend=-1, append=-1))
     sizes = np.diff(edges)
-    dimensions = n_dims[edges[:-1]]
-    least = max(ENOUGH, 1.5 * p)
     table = worth(int(sizes.max(initial=1)), correlation)
-    enough = int(np.searchsorted(n_effective * table[1:], least)) + 1
-    possible = n_effective * table[np.minimum(sizes, len(table) - 1)] > 1.2 * p
-    open_blocks = np.flatnonzero(possible)
+    some = np.flatnonzero(n_effective * table[sizes] > 1.2 * p)
+    if not len(some):
+        return found
+    begin, sizes, q = edges[some], sizes[some], n_dims[edges[some]]
+    sensor = np.repeat(np.arange(len(dims)), dims)
+
+    def cut(of: IntArray, k: IntArray) -> tuple[_Parts, ComplexArray]:
+        parts = _parts(begin[of], sizes[of], k, n_effective * table)
+        summed = np.add.reduceat(matrix[parts.bins], parts.start)
+        return parts, summed / parts.count[:, None, None]
+
+    at = np.arange(len(some))
+    parts, mean = cut(at, sizes)
+    psi = 1 / np.einsum("bii->bi", np.linalg.inv(mean)).real
+    fit = _fitted(mean, parts, q, psi, None, n_effective)
+    _read(found, matrix, fit)
+    level, psi, best = fit.level.copy(), fit.psi.copy(), fit.resolved.copy()
+    enough = int(np.searchsorted(n_effective * table[1:], max(ENOUGH, 1.5 * p))) + 1
     k = np.minimum(enough, sizes)
-    best = np.full(len(sizes), -1)
-    level, psi = np.full((len(sizes), p), np.inf), np.ones((len(sizes), p))
-    while len(open_blocks):
-        some = _bins(edges, open_blocks)
-        parts = _parts(sizes[open_blocks], k[open_blocks], n_effective, table)
-        q = dimensions[open_blocks]
-        result = _of_parts(matrix[some], parts, q, sensor, n_effective=n_effective)
-        # a strong dimension whose response varies looks like a further one in a larger sub-block;
-        # what leaks of it makes the noise larger
-        larger = ((result.level - level[open_blocks]) / psi[open_blocks]).mean(axis=1)
-        leaks = larger > LEAKS / np.sqrt(p * parts.whole)
-        better = (result.resolved > best[open_blocks]) & ~leaks
-        best[open_blocks[better]] = result.resolved[better]
-        use = np.repeat(better, sizes[open_blocks])
-        here = some[use]
-        found.noise[here] = result.noise[use]
-        found.cumulants[:, here] = result.cumulants[:, use]
-        found.resolved[here] = np.repeat(result.resolved, sizes[open_blocks])[use]
-        found.averages[here] = parts.averages[parts.part][use]
-        level[open_blocks[better]] = result.level[better]
-        psi[open_blocks[better]] = result.psi[better]
-        k[open_blocks] *= 2
-        wanted = (best[open_blocks] < q) & (sizes[open_blocks] // k[open_blocks] >= LEAST_PARTS)
-        open_blocks = open_blocks[wanted]
+    largest = k * 2 ** np.log2(np.maximum(sizes // (k * LEAST_PARTS), 1)).astype(np.int64)
+    # what the largest sub-blocks do not resolve, smaller ones do not either
+    parts, mean = cut(at, largest)
+    at = at[_n_resolved(_white(mean, psi[parts.block]), parts, q, sensor) > 0]
+    while len(at):
+        parts, mean = cut(at, k[at])
+        r = _n_resolved(_white(mean, psi[at][parts.block]), parts, q[at], sensor)
+        more = at[r > best[at]]
+        if len(more):
+            parts, mean = cut(more, k[more])
+            fit = _fitted(mean, parts, q[more], psi[more], sensor, n_effective)
+            # a strong dimension whose response varies looks like a further one in a larger
+            # sub-block; what leaks of it makes the noise larger
+            larger = ((fit.level - level[more]) / psi[more]).mean(axis=1)
+            leaks = larger > LEAKS / np.sqrt(p * parts.whole)
+            better = (fit.resolved > best[more]) & ~leaks
+            _read(found, matrix, fit, better)
+            here = more[better]
+            level[here], psi[here] = fit.level[better], fit.psi[better]
+            best[here] = fit.resolved[better]
+        k[at] *= 2
+        at = at[(best[at] < q[at]) & (k[at] <= largest[at])]
     return found
 
 
@@ -236,135 +260,162 @@ def unresolved_blocks(
     s = 1 / np.sqrt(psi[block[sample.ravel()]])
     X = matrix[sample.ravel()] * s[:, :, None] * s[:, None, :]
     sensor = np.repeat(np.arange(len(dims)), dims)
-    averages = np.full(len(first), n_effective)
     q = n_dims[first]
-    r = _n_resolved(X, np.arange(sample.size).reshape(sample.shape), averages, q, sensor)
+    r = _stand_out(X.reshape(*sample.shape, *X.shape[1:]), n_effective, q, sensor)
     few = n_effective < FEW * q  # directions of their own cost a bin more than a tenth in width
     return np.asarray((r < q) | few | ~np.logical_or.reduceat(known.all(axis=1), first))
 
 
-def _bins(edges: IntArray, some: IntArray) -> IntArray:
-    return np.concatenate([np.arange(edges[b], edges[b + 1]) for b in some.tolist()])
-
-
-def _parts(sizes: IntArray, k: IntArray, n_effective: float, table: FloatArray) -> _Parts:
-    """Cut blocks of so many bins into sub-blocks of about k bins."""
+def _parts(begin: IntArray, sizes: IntArray, k: IntArray, worth_of: FloatArray) -> _Parts:
+    """Cut blocks, given by first bin and number of bins, into sub-blocks of about k bins."""
     number = np.maximum(1, sizes // np.maximum(k, 1))
     block = np.repeat(np.arange(len(sizes)), number)
     first = np.cumsum(number) - number
     order = np.arange(len(block)) - first[block]
     small, extra = np.divmod(sizes, number)
     count = small[block] + (order < extra[block])
-    start = np.cumsum(count) - count
-    part = np.repeat(np.arange(len(block)), count)
+    shift = begin - (np.cumsum(sizes) - sizes)
     return _Parts(
+        bins=np.arange(int(sizes.sum())) + np.repeat(shift, sizes),
+        start=np.cumsum(count) - count,
+        count=count,
         block=block,
         first=first,
-        start=start,
-        part=part,
         share=count / sizes[block],
-        averages=n_effective * table[count],
-        whole=n_effective * table[sizes],
+        averages=worth_of[count],
+        whole=worth_of[sizes],
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Found:
-    """``level`` and ``psi``, shape (n_blocks, p), are the mean noise and that of the weights."""
+def _fitted(
+    mean: ComplexArray,
+    parts: _Parts,
+    q: IntArray,
+    psi: FloatArray,
+    sensor: IntArray | None,
+    n_effective: float,
+) -> _Fit:
+    """Find directions and noise of blocks in a few rounds; no dimension resolved without `sensor`.
 
-    noise: FloatArray
-    cumulants: FloatArray
-    resolved: IntArray
-    level: FloatArray
-    psi: FloatArray
-
-
-def _of_parts(
-    matrix: ComplexArray, parts: _Parts, q: IntArray, sensor: IntArray, *, n_effective: float
-) -> _Found:
-    p = matrix.shape[1]
-    eye = np.eye(p)
-    S = np.add.reduceat(matrix, parts.start) / np.bincount(parts.part)[:, None, None]
-    M = parts.mean(S)
-    total = np.einsum("bii->bi", M).real
-    psi = 1 / np.einsum("bii->bi", np.linalg.inv(M)).real
+    `mean` are the matrices of the sub-blocks.
+    """
+    p = mean.shape[1]
     own, N, whole = parts.block, parts.averages, parts.whole
-    sample = _sample(parts)
+    total = np.einsum("bii->bi", parts.mean(mean)).real
     column = np.arange(p)[::-1]  # eigenvalues ascend: the leading one is the last
+    r = np.zeros(len(q), np.int64)
     for turn in range(ROUNDS):
-        s = 1 / np.sqrt(psi)
-        X = S * s[own, :, None] * s[own, None, :]
-        r = _n_resolved(X, sample, N[parts.first], q, sensor)
-        leading = np.linalg.eigh(X)[1]
-        V = leading * (column < r[own, None])[:, None, :]
-        P = eye - V @ V.conj().swapaxes(1, 2)
+        X = _white(mean, psi[own])
+        P = np.broadcast_to(np.eye(p), X.shape)
+        if sensor is not None:
+            r = _n_resolved(X, parts, q, sensor)
+            V = np.linalg.eigh(X)[1] * (column < r[own, None])[:, None, :]
+            P = P - V @ V.conj().swapaxes(1, 2)
         g = N / (N - r[own])
         weak = q - r
         Q = P
         if weak.any():
-            T = parts.mean(g[:, None, None] * (P @ X @ P))
+            T = X if sensor is None else parts.mean(g[:, None, None] * (P @ X @ P))
             A = np.linalg.eigh(T)[1] * (column < weak[:, None])[:, None, :]
             PA = P @ A[own]
             gram = A[own].conj().swapaxes(1, 2) @ PA
             unused = (column >= weak[own, None]).astype(float)
-            gram += unused[:, :, None] * eye
+            gram += unused[:, :, None] * np.eye(p)
             Q = P - PA @ np.linalg.solve(gram, PA.conj().swapaxes(1, 2))
         loss = 1 + weak / np.maximum(whole - q, 1.0)
-        if turn == ROUNDS - 1:
-            break
-        J = parts.mean(np.abs(Q) ** 2)
-        y = parts.mean(g[:, None] * np.einsum("bij,bjk,bki->bi", Q, X, Q, optimize=True).real)
-        x = psi * _solved(J, y) * loss[:, None]
+        y = g[:, None] * np.einsum("bij,bij->bi", Q @ X, Q.conj()).real
+        inverse = _inverse(parts.mean(np.abs(Q) ** 2))
+        x = psi * loss[:, None] * np.einsum("bij,bj->bi", inverse, parts.mean(y))
         kept = parts.mean(np.einsum("bii->bi", Q).real)
         floor = 0.5 * psi / np.maximum(kept, 1e-9) / np.sqrt(whole)[:, None]
         new = np.maximum(np.maximum(x, floor), _FLOOR * total)
-        psi = psi * np.exp(np.clip(np.log(new / psi), -_STEP, _STEP))
+        step = np.clip(np.log(new / psi), -_STEP, _STEP)
+        if turn == ROUNDS - 1 or np.abs(step).max() < SETTLED:
+            break
+        psi = psi * np.exp(step)
+    noise = np.einsum("bij,bj->bi", _inverse(np.abs(Q) ** 2), y)
+    return _Fit(
+        parts=parts,
+        projector=Q,
+        white=X,
+        gain=g * loss[own],
+        left=n_effective * (1 - r[own] / N - weak[own] / whole[own]),
+        resolved=r,
+        psi=psi,
+        level=loss[:, None] * psi * parts.mean(noise),
+    )
+
+
+def _read(found: Pooled, matrix: ComplexArray, fit: _Fit, wanted: BoolArray | None = None) -> None:
+    """Write noise and cumulants of the bins of some blocks: of all, or of the wanted ones."""
+    parts, Q = fit.parts, fit.projector
+    at = np.repeat(np.arange(len(parts.count)), parts.count)
+    psi = fit.psi[parts.block]
+    # y of a bin is linear in its matrix
     inverse = _inverse(np.abs(Q) ** 2)
-    at = parts.part
-    s_bin = s[own[at]]
-    white = matrix * s_bin[:, :, None] * s_bin[:, None, :]
-    y = np.einsum("fij,fij->fi", Q[at] @ white, Q[at].conj()).real * g[at, None]
-    gain = loss[own[at], None] * psi[own[at]]
-    noise = gain * np.einsum("fij,fj->fi", inverse[at], y)
-    traces = _traces(inverse, Q, X * g[:, None, None])
-    left = n_effective * (1 - r[own] / N - weak[own] / whole[own])
-    scaled = np.stack([traces[m] / left[:, None] ** (m + 1) for m in range(3)])
-    powers = np.stack([psi[own] ** m for m in (2, 3, 4)])
-    count = np.bincount(at)[:, None]
-    middle = np.add.reduceat(noise, parts.start) / count
-    cumulants = moved((scaled * powers)[:, at], noise - middle[at])
-    return _Found(noise, cumulants, r, np.asarray(parts.mean(middle)), psi)
+    if len(parts.block) == len(parts.first):  # few: directions that all bins of a block share
+        n, p = psi.shape
+        outer = Q.swapaxes(1, 2)[:, :, :, None].conj() * Q.swapaxes(1, 2)[:, :, None, :]
+        s = 1 / np.sqrt(psi)
+        outer *= (s[:, :, None] * s[:, None, :])[:, None]
+        per = ((fit.gain[:, None] * psi)[:, :, None] * inverse) @ outer.reshape(n, p, p * p)
+        flat = matrix[parts.bins].reshape(-1, p * p).view(np.float64)
+        of = np.split(flat, parts.start[1:])
+        taken = per.conj().view(np.float64).swapaxes(1, 2)
+        noise = np.concatenate([some @ by for some, by in zip(of, taken, strict=True)])
+    else:
+        white = _white(matrix[parts.bins], psi[at])
+        y = np.einsum("fij,fij->fi", Q[at] @ white, Q[at].conj()).real * fit.gain[at, None]
+        noise = psi[at] * np.einsum("fij,fj->fi", inverse[at], y)
+    projected = Q @ fit.white @ Q * fit.gain[:, None, None]
+    traces = _traces(inverse, projected)
+    scaled = np.stack([traces[m] * psi ** (m + 2) / fit.left[:, None] ** (m + 1) for m in range(3)])
+    middle = np.add.reduceat(noise, parts.start) / parts.count[:, None]
+    cumulants = moved(scaled[:, at], noise - middle[at])
+    use = np.ones(len(at), np.bool_) if wanted is None else wanted[parts.block][at]
+    found.noise[parts.bins[use]] = noise[use]
+    found.cumulants[:, parts.bins[use]] = cumulants[:, use]
 
 
-def _sample(parts: _Parts) -> IntArray:
-    """Return up to `SAMPLED` sub-blocks of each block, shape (n_blocks, SAMPLED)."""
-    number = np.bincount(parts.block)
-    at = (np.arange(SAMPLED) + 0.5) / SAMPLED
-    return np.asarray(parts.first[:, None] + np.floor(at * number[:, None]).astype(np.int64))
+def _white(matrix: ComplexArray, psi: FloatArray) -> ComplexArray:
+    s = 1 / np.sqrt(psi)
+    return matrix * s[:, :, None] * s[:, None, :]
 
 
-def _n_resolved(
-    X: ComplexArray, sample: IntArray, averages: FloatArray, q: IntArray, sensor: IntArray
+def _n_resolved(X: ComplexArray, parts: _Parts, q: IntArray, sensor: IntArray) -> IntArray:
+    """Return how many dimensions stand out in the median of up to `SAMPLED` sub-blocks."""
+    number = np.diff(parts.first, append=len(parts.block))
+    at = (np.arange(min(SAMPLED, int(number.max()))) + 0.5) / min(SAMPLED, int(number.max()))
+    sample = parts.first[:, None] + np.floor(at * number[:, None]).astype(np.int64)
+    return _stand_out(X[sample], parts.averages[parts.first], q, sensor)
+
+
+def _stand_out(
+    X: ComplexArray, averages: FloatArray | float, q: IntArray, sensor: IntArray
 ) -> IntArray:
-    """Return how many dimensions stand out in each block, whichever sensor is left out."""
+    """Return how many dimensions stand out in each block, whichever sensor is left out.
+
+    X are whitened matrices, shape (n_blocks, n_sampled, p, p).
+    """
     most = int(q.max(initial=0))
     r = q.copy()
-    if most == 0:
-        return r
-    some = X[sample.ravel()]
     number = np.arange(most)
+    averages = np.broadcast_to(averages, r.shape)
     for i in range(int(sensor[-1]) + 1):
+        left = np.flatnonzero(r > 0)
+        if not len(left):
+            break
         keep = np.flatnonzero(sensor != i)
-        w = np.linalg.eigvalsh(some[:, keep[:, None], keep])[:, ::-1]
-        w = np.median(w.reshape(*sample.shape, -1), axis=1)
+        w = np.linalg.eigvalsh(X[left][:, :, keep[:, None], keep])[:, :, ::-1]
+        w = np.median(w, axis=1)
         w = np.pad(w, ((0, 0), (0, max(0, most + 1 - w.shape[1]))), constant_values=1.0)
-        edge = OUTSTANDING * (1 + np.sqrt(len(keep) / averages)) ** 2
-        out = (w[:, :most] > edge[:, None]) & (number < q[:, None])
+        edge = OUTSTANDING * (1 + np.sqrt(len(keep) / averages[left])) ** 2
+        out = (w[:, :most] > edge[:, None]) & (number < q[left, None])
         stands = np.cumprod(out, axis=1).sum(axis=1)
         apart = w[:, :most] - 1 >= APART * (w[:, 1 : most + 1] - 1)
         # the last one that stands apart from the next, at or below those that stand out
         last = np.where(apart & (number < stands[:, None]), number + 1, 0).max(axis=1)
-        r = np.minimum(r, np.where(stands < q, last, stands))
+        r[left] = np.minimum(r[left], np.where(stands < q[left], last, stands))
     return r
 
 
@@ -375,25 +426,18 @@ def _inverse(J: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(scaled) / (D[:, :, None] * D[:, None, :]))
 
 
-def _solved(J: FloatArray, y: FloatArray) -> FloatArray:
-    return np.asarray(np.einsum("bij,bj->bi", _inverse(J), y))
-
-
-def _traces(inverse: FloatArray, Q: ComplexArray, X: ComplexArray) -> FloatArray:
+def _traces(inverse: FloatArray, projected: ComplexArray) -> FloatArray:
     """Return ``tr((M_i X)**k)``, k = 2, 3, 4, of each channel's differential M_i.
 
-    ``M_i = sum_j inverse_ij q_j q_j*`` with q_j the columns of Q. Shape (3, n, p).
+    ``M_i = Q diag(inverse_i) Q``, so that with ``Y = Q X Q``, `projected`, these are the traces of
+    the powers of ``diag(inverse_i) Y``. Shape (3, n, p).
     """
-    columns = Q.swapaxes(1, 2)
-    outer = columns[:, :, :, None] * columns[:, :, None, :].conj()  # (n, j, p, p)
-    n, p = Q.shape[:2]
-    M = (inverse @ outer.reshape(n, p, p * p)).reshape(n, p, p, p)
-    K = M @ X[:, None]
-    K2 = K @ K
+    B = inverse[:, :, :, None] * projected[:, None]
+    twice = B @ B
     return np.stack(
         [
-            np.einsum("nimm->ni", K2).real,
-            np.einsum("niml,nilm->ni", K, K2).real,
-            np.einsum("niml,nilm->ni", K2, K2).real,
+            np.einsum("nimm->ni", twice).real,
+            np.einsum("niml,nilm->ni", B, twice).real,
+            np.einsum("niml,nilm->ni", twice, twice).real,
         ]
     )
