@@ -40,11 +40,11 @@ def run(*, smallest: bool = False) -> list[Row]:
         )
         rows.append(
             Row(
-                f"levels and intervals of 30 bands × 9 channels, {name}, over three-sensor",
-                whole / method,
-                "×",
-                note=f"{len(frequency)} frequencies; {whole / (9 * N_BANDS) * 1e6:.0f} µs"
-                f" a channel-band, {method / (9 * N_BANDS) * 1e6:.0f} of them three-sensor",
+                f"levels and intervals of 30 bands × 9 channels, {name}, without the method",
+                (whole - method) / (9 * N_BANDS) * 1e6,
+                "µs a channel-band",
+                at_most=50.0,
+                note=f"{len(frequency)} frequencies; with the method {whole / method:.2f} times it",
             )
         )
     return rows

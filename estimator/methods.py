@@ -189,14 +189,14 @@ def _with_neighbours(
     steps = [np.diff(each[rows], prepend=-1) != 0 for each in (blocks, n_dims)]
     number = np.cumsum(steps[0] | steps[1]) - 1
     psd = given.psd[rows[:, None], columns]
+    matrix = given.matrix[rows[:, None, None], columns[:, None], columns]
     rest, _ = unpredicted(
-        given.matrix[rows[:, None, None], columns[:, None], columns],
+        matrix,
         dims=live,
         n_effective=np.full(len(rows), n_effective),
     )
     scale = _scale(psd, rest * psd, number, n_effective)
     amplitude = np.sqrt(psd / scale)
-    matrix = given.matrix[rows[:, None, None], columns[:, None], columns]
     matrix = matrix * amplitude[:, :, None] * amplitude[:, None, :]
     share = found.noise_psd[rows[:, None], columns] / scale
     scatter = found.cumulants[0][rows[:, None], columns] / scale**2

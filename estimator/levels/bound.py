@@ -49,19 +49,20 @@ def unpredicted(
     averages = np.full(psd.shape, np.nan)
     good = np.isfinite(csm).all(axis=(1, 2)) & (psd > 0).all(axis=1)
     scale = 1 / np.sqrt(np.where(good[:, None], psd, 1.0))
+    unit = csm * scale[:, :, None] * scale[:, None, :]
     for i in range(len(dims)):
         own, others = np.flatnonzero(sensor == i), np.flatnonzero(sensor != i)
         left = n_effective - len(others)
         some = np.flatnonzero(good & (left > LEAST_AVERAGES))
         if not len(some) or not len(others):
             continue
-        rows = csm[some] * scale[some, :, None] * scale[some, None, :]
+        rows = unit if len(some) == len(unit) else unit[some]
         within, towards = rows[:, others[:, None], others], rows[:, others[:, None], own]
         try:
             predicted = np.linalg.solve(within, towards)
         except np.linalg.LinAlgError:
             continue
-        rest = 1 - np.einsum("fmr,fmr->fr", towards.conj(), predicted).real
+        rest = 1 - (towards.real * predicted.real + towards.imag * predicted.imag).sum(axis=1)
         gain = (n_effective / left)[some, None]
         level[np.ix_(some, own)] = np.where(rest > 0, rest * gain, np.nan)
         averages[np.ix_(some, own)] = left[some, None]
