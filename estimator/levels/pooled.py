@@ -191,7 +191,7 @@ def pooled_noise(
     at = np.arange(len(some))
     parts, mean = cut(at, sizes)
     psi = 1 / np.einsum("bii->bi", np.linalg.inv(mean)).real
-    fit = _fitted(mean, parts, q, psi, None, n_effective)
+    fit = _fitted(mean, parts, q, psi, n_effective=n_effective)
     _read(found, matrix, fit)
     level, psi, best = fit.level.copy(), fit.psi.copy(), fit.resolved.copy()
     enough = int(np.searchsorted(n_effective * table[1:], max(ENOUGH, 1.5 * p))) + 1
@@ -206,7 +206,7 @@ def pooled_noise(
         more = at[r > best[at]]
         if len(more):
             parts, mean = cut(more, k[more])
-            fit = _fitted(mean, parts, q[more], psi[more], sensor, n_effective)
+            fit = _fitted(mean, parts, q[more], psi[more], sensor=sensor, n_effective=n_effective)
             # a strong dimension whose response varies looks like a further one in a larger
             # sub-block; what leaks of it makes the noise larger
             larger = ((fit.level - level[more]) / psi[more]).mean(axis=1)
@@ -292,8 +292,9 @@ def _fitted(
     parts: _Parts,
     q: IntArray,
     psi: FloatArray,
-    sensor: IntArray | None,
+    *,
     n_effective: float,
+    sensor: IntArray | None = None,
 ) -> _Fit:
     """Find directions and noise of blocks in a few rounds; no dimension resolved without `sensor`.
 
