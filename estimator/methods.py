@@ -31,6 +31,10 @@ AT_ZERO = 0.05
 """Share of a block's bins at which the likelihood is largest at zero noise, from which neighbours
 count."""
 
+EQUATIONS = 2
+"""Equations of like channels over their number, from which pooled directions of further dimensions
+give every noise: with six sensors of one channel and three dimensions the tails are heavy."""
+
 Method: TypeAlias = "Callable[..., SelfNoise]"
 """``method(csm, *, dims, n_effective, correct, **options)``."""
 
@@ -169,8 +173,10 @@ def _with_neighbours(
 ) -> SelfNoise:
     """Return a result whose bins take the directions of the motion from neighbours where needed.
 
-    They do in blocks whose bins do not resolve all dimensions, and where the likelihood of a
-    channel is largest at zero noise at some. `blocks` is negative at bins that have no neighbours.
+    They do in blocks whose bins do not resolve all dimensions, where the likelihood of a channel is
+    largest at zero noise at some, and where motion has more dimensions than sensors have channels,
+    if the sensors are enough: bins alone do not divide the noise well among channels then. `blocks`
+    is negative at bins that have no neighbours.
     """
     missing = Flag.DEAD_CHANNEL | Flag.DUPLICATE | Flag.NO_COUNTERPART
     given = coherency(csm, dims)
@@ -183,7 +189,10 @@ def _with_neighbours(
     live = tuple(int(n) for n in left if n)
     usual = _shared(live)
     fits = bool(usual) and max(live) == usual
-    rows = np.flatnonzero(good & (n_dims <= usual) & fits)
+    # parallel sensors give one problem for each channel, with its share of the dimensions
+    alike = len(live) - -(-n_dims // max(usual, 1))
+    further = (n_dims > usual) & (alike > 0) & (alike**2 >= EQUATIONS * len(live))
+    rows = np.flatnonzero(good & ((n_dims <= usual) | further) & fits)
     if not len(rows):
         return found
     steps = [np.diff(each[rows], prepend=-1) != 0 for each in (blocks, n_dims)]
@@ -205,7 +214,7 @@ def _with_neighbours(
     )
     at_zero = ((found.flags[rows] & (Flag.BOUNDARY | Flag.UNRESOLVED)) != 0).any(axis=1)
     often = np.bincount(number, at_zero) > AT_ZERO * np.bincount(number)
-    wanted = (unresolved | often)[number]
+    wanted = (unresolved | often)[number] | further[rows]
     if not wanted.any():
         return found
     pooled = pooled_noise(

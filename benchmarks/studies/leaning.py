@@ -94,10 +94,10 @@ def random_benches(n_benches: int) -> None:
 
 def plumb() -> None:
     """Print what single-axis sensors 1° off plumb at SNR 5e4 give."""
-    print("| sensors | covered | median upper end, dB | median estimate / truth | method |")
-    print("|---|---|---|---|---|")
+    print("| sensors | covered | upper end, dB | half-width, dB | estimate / truth | method |")
+    print("|---|---|---|---|---|---|")
     for n_sensors in (3, 5, 6, 7, 12):
-        held, ends, ratios, method = [], [], [], ""
+        held, ends, halves, ratios, method = [], [], [], [], ""
         for number in range(20):
             rng = np.random.default_rng([29, n_sensors, number])
             samples = leaning(rng, n_sensors=n_sensors, n_channels=1, degrees=1.0, snr=5e4)
@@ -106,11 +106,13 @@ def plumb() -> None:
             for band in BANDS:
                 for mean in channel_means(noise, snapshot, SETTINGS, band):
                     held.append(float(mean.low[0]) <= TRUTH <= float(mean.high[0]))
-                    ends.append(10 * np.log10(float(mean.high[0]) / TRUTH))
+                    low, high = max(float(mean.low[0]), 0.0), float(mean.high[0])
+                    ends.append(10 * np.log10(high / TRUTH))
+                    halves.append(5 * np.log10(high / low) if low else np.inf)
                     ratios.append(float(mean.mean[0]) / TRUTH)
         print(
             f"| {n_sensors} | {np.mean(held):.3f} | {np.median(ends):.2f} |"
-            f" {np.median(ratios):.2f} | {method} |",
+            f" {np.median(halves):.2f} | {np.median(ratios):.2f} | {method} |",
             flush=True,
         )
 

@@ -146,6 +146,7 @@ class Found:
     passed: float
     failed: float
     quiet: float
+    least: float
 
 
 def study(scene: Scene, n_draws: int, *, seed: int = 17) -> Found:
@@ -160,7 +161,7 @@ def study(scene: Scene, n_draws: int, *, seed: int = 17) -> Found:
     truth = np.add.reduceat(psd[: EDGES[-1]], EDGES[:-1]) / np.diff(EDGES)[:, None]
     dims = (scene.n_channels,) * scene.n_sensors
     inner = slice(int(EDGES[0]), int(EDGES[-1]))
-    bands, bins, joint, width, passed, failed, quiet = ([] for _ in range(7))
+    bands, bins, joint, width, passed, failed, quiet, least = ([] for _ in range(8))
     for _ in range(n_draws):
         axes = directions(scene, rng)
         spectra = CrossSpectra(settings, len(axes))
@@ -184,15 +185,18 @@ def study(scene: Scene, n_draws: int, *, seed: int = 17) -> Found:
         factor = 10 ** (JUDGED_DB / 10)
         passed.append(np.all(strict[1] <= factor * truth))
         failed.append(np.any(strict[0] >= truth / factor, axis=0).all())
-        quiet.append((high / truth)[:, truth[0] == truth[0].min()])
-        plain = not (scene.ripple or scene.colour or scene.noise_colour)
-        if plain and len(set(scene.noise)) == 1:
-            power = np.where(np.arange(axes.shape[1]) < scene.strong, 1e3, 1.0) * scene.snr * 2
-            csm = ((axes * power) @ axes.T + np.diag(truth[0])).astype(complex)[None]
-            worth = np.array([_worth(b, correlation) for b in np.diff(EDGES)])
-            bound = np.concatenate(
-                [cramer_rao_cov(csm, truth[:1], n_effective=n_effective * w) for w in worth]
-            )
+        quietest = truth[0] == truth[0].min()
+        quiet.append((high / truth)[:, quietest])
+        if scene.ripple or scene.colour or scene.noise_colour:
+            continue
+        power = np.where(np.arange(axes.shape[1]) < scene.strong, 1e3, 1.0) * scene.snr * 2
+        csm = ((axes * power) @ axes.T + np.diag(truth[0])).astype(complex)[None]
+        worth = np.array([_worth(b, correlation) for b in np.diff(EDGES)])
+        bound = np.concatenate(
+            [cramer_rao_cov(csm, truth[:1], n_effective=n_effective * w) for w in worth]
+        )
+        least.append(1 + NORMAL_95 * bound[:, quietest])
+        if len(set(scene.noise)) == 1:
             ends = interval(np.ones_like(bound), like_psd(np.ones_like(bound), bound), NORMAL_95)
             known = np.isfinite(high) & np.isfinite(ends[1])
             ratio = (high - low) / truth / (ends[1] - ends[0])
@@ -205,6 +209,7 @@ def study(scene: Scene, n_draws: int, *, seed: int = 17) -> Found:
         passed=float(np.mean(passed)),
         failed=float(np.mean(failed)),
         quiet=float(np.median(np.concatenate(quiet))),
+        least=float(np.median(np.concatenate(least))) if least else float("nan"),
     )
 
 
@@ -217,14 +222,16 @@ def _worth(count: int, correlation: FloatArray) -> float:
 def main(n_draws: int) -> None:
     """Print a row for each scene."""
     print(f"{n_draws} draws a scene; three-sensor; 9 bands of about a third of an octave\n")
-    print("| scene | bands | bins | all bands | width | PASS | FAIL | upper end |")
-    print("|---|---|---|---|---|---|---|---|")
+    print("| scene | bands | bins | all bands | width | PASS | FAIL | upper end | least |")
+    print("|---|---|---|---|---|---|---|---|---|")
     for scene in SCENES:
         found = study(replace(scene), n_draws)
         width = "" if np.isnan(found.width) else f"{found.width:.2f}"
+        least = "" if np.isnan(found.least) else f"{found.least:.1f}"
         print(
             f"| {scene.name} | {found.bands:.3f} | {found.bins:.3f} | {found.joint:.2f} |"
-            f" {width} | {found.passed:.2f} | {found.failed:.2f} | {found.quiet:.1f} |",
+            f" {width} | {found.passed:.2f} | {found.failed:.2f} | {found.quiet:.1f} |"
+            f" {least} |",
             flush=True,
         )
 

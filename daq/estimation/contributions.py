@@ -17,7 +17,7 @@ from estimator.levels.contributions import Contribution, Source, contribution, w
 from estimator.levels.interval import NORMAL_95
 from estimator.likelihood.dimension import most_testable
 from estimator.likelihood.gradients import misfit
-from estimator.self_noise.result import SelfNoise
+from estimator.self_noise.result import Flag, SelfNoise
 
 if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
@@ -91,24 +91,30 @@ def _dimensions(snapshot: Snapshot, method: str) -> tuple[FloatArray, BoolArray]
     """Return the doubt of the chosen dimensions as a share, and where dimensions were chosen.
 
     Both of shape (n_freqs,). The doubt is common to the frequencies of a band: what gradients of
-    the motion leave unexplained, and the bias of many free factors, of second order in the c.o.v.
+    the motion leave unexplained, the bias of many free factors, of second order in the c.o.v., and
+    for pooled directions a dimension at the edge of what the band shows.
     """
     frequency = snapshot.frequency
     share, explained = np.zeros(len(frequency)), np.zeros(len(frequency), np.bool_)
     if method != "maximum-likelihood":
         return share, explained
+    pooled = ((snapshot.results[method].flags & Flag.POOLED) != 0).any(axis=1)
     for choice in snapshot.diagnostics.dimensions:
         inside = (frequency >= choice.low) & (frequency <= choice.high)
         explained |= inside
         if choice.is_biased or choice.is_undetermined:
             share[inside] = math.inf
         elif choice.n_factors > choice.usual and math.isfinite(choice.cov):
+            n_channels = sum(snapshot.dims)
             error = (
-                misfit(choice.test, sum(snapshot.dims), snapshot.n_effective)
+                misfit(choice.test, n_channels, snapshot.n_effective)
                 if choice.gradients
                 else SECOND_ORDER * choice.cov**2
             )
-            share[inside] = NORMAL_95 * error
+            # pooled directions are linear in the averages: a dimension more or less counts
+            averages = snapshot.n_effective * choice.test.n_frequencies / choice.test.spread
+            edge = 2 * math.sqrt(n_channels / averages) / (n_channels - choice.n_factors)
+            share[inside] = np.where(pooled[inside], edge, NORMAL_95 * error)
     return share, explained
 
 

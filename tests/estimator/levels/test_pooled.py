@@ -149,3 +149,27 @@ def test_correlated_neighbours_are_worth_fewer_bins() -> None:
     assert table[2] == pytest.approx(2 / (1 + 4 / 9))
     assert table[100] == pytest.approx(100 / (1 + 2 * (4 / 9 * 0.99 + 1 / 36 * 0.98)))
     np.testing.assert_allclose(worth(9, ONE), np.arange(10))
+
+
+def test_eight_sensors_off_plumb_are_known_although_motion_has_more_dimensions() -> None:
+    """One channel each, 1 degree (rms) off plumb; single bins give 0 or twice the noise to some."""
+    held, ratios, noise = [], [], np.ones(8)
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        axes = np.column_stack([np.ones(8), 0.0123 * rng.standard_normal((8, 2))])
+        csm = 5e4 * axes @ axes.T + np.eye(8)
+        found = self_noise(
+            "maximum-likelihood",
+            drawn(rng, np.broadcast_to(csm, (N_BINS, 8, 8)).astype(np.complex128), 200),
+            dims=(1,) * 8,
+            n_effective=200,
+            n_factors=3,
+            blocks=np.zeros(N_BINS, np.int64),
+        )
+        level = band_levels(found.noise_psd, found.cumulants, EDGES, ONE)
+        low, high = level.interval()
+        assert (found.flags & Flag.POOLED).all()
+        held.append((low[0] <= noise) & (noise <= high[0]))
+        ratios.append(level.mean[0])
+    assert np.mean(held) > 0.95 - 4 * np.sqrt(0.05 * 0.95 / 96)
+    assert np.mean(ratios) == pytest.approx(1, abs=0.02)
