@@ -27,7 +27,7 @@ SCENES = {
 
 def run(*, smallest: bool = False) -> list[Row]:
     """Measure."""
-    frequency = 0.2 * np.arange(101 if smallest else 501)
+    frequency = 0.2 * np.arange(101 if smallest else 501, dtype=np.float64)
     rows = []
     for name, snr in SCENES.items():
         rng = np.random.default_rng(1)

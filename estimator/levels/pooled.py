@@ -186,7 +186,7 @@ def pooled_noise(
     def cut(of: IntArray, k: IntArray) -> tuple[_Parts, ComplexArray]:
         parts = _parts(begin[of], sizes[of], k, n_effective * table)
         summed = np.add.reduceat(matrix[parts.bins], parts.start)
-        return parts, summed / parts.count[:, None, None]
+        return parts, np.asarray(summed / parts.count[:, None, None])
 
     at = np.arange(len(some))
     parts, mean = cut(at, sizes)
@@ -307,7 +307,7 @@ def _fitted(
     r = np.zeros(len(q), np.int64)
     for turn in range(ROUNDS):
         X = _white(mean, psi[own])
-        P = np.broadcast_to(np.eye(p), X.shape)
+        P = np.broadcast_to(np.eye(p, dtype=np.complex128), X.shape)
         if sensor is not None:
             r = _n_resolved(X, parts, q, sensor)
             V = np.linalg.eigh(X)[1] * (column < r[own, None])[:, None, :]
