@@ -45,6 +45,10 @@ biased it by up to 57 %."""
 MIN_BINS = 8
 MAX_BINS = 64
 """Maximum number of tested frequencies per band: of more, every second, third, …"""
+FIRST_LOOK = 8
+"""Dimensions are tried at every so many frequencies first; there the test often rejects them."""
+HOPELESS = 1e-12
+"""p value of the first look that all other frequencies would hardly outweigh."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +68,6 @@ class BandDimension:
         the band is undetermined.
     test : BandTest
         Test of the chosen dimension.
-    tried : tuple of BandTest
-        Tests of 0, 1, … `n_factors` factors.
     cov : float
         Median c.o.v. of the noise at one frequency with `n_factors`; infinite if they leave the
         noise undetermined.
@@ -84,7 +86,6 @@ class BandDimension:
     usual: int
     accepted: bool
     test: BandTest
-    tried: tuple[BandTest, ...]
     cov: float
     usual_cov: float
     n_sensors: int = MIN_DETERMINED_SENSORS
@@ -197,18 +198,30 @@ def choose_dimension(
     )
     r = HANN_HALF if neighbours is None else neighbours
     open_bands = list(stride)
-    tried: dict[int, list[BandTest]] = {b: [] for b in open_bands}
+    tests: dict[int, BandTest] = {}
+    chosen = dict.fromkeys(open_bands, 0)
     cov: dict[int, float] = {}
     usual_cov: dict[int, float] = {}
     for q in range(most + 1):
-        fit = search.fit(q, open_bands if q != usual else list(tried))
-        for b in open_bands:
+        hopeless = []
+        if q not in {usual, most}:
+            look = search.fit(q, open_bands, every=FIRST_LOOK)
+            for b in open_bands:
+                distant = r[FIRST_LOOK * stride[b] - 1 :: FIRST_LOOK * stride[b]]
+                test = pool(look.test, look.number == b, neighbours=distant)
+                if test.p_value < HOPELESS:
+                    hopeless.append(b)
+        some = [b for b in open_bands if b not in hopeless]
+        if not some and q != usual:
+            continue
+        fit = search.fit(q, some if q != usual else list(chosen))
+        for b in some:
             distant = r[stride[b] - 1 :: stride[b]]
-            tried[b].append(pool(fit.test, fit.number == b, neighbours=distant))
-            cov[b] = fit.median_cov(b)
-        open_bands = [b for b in open_bands if not tried[b][-1].p_value > level]
+            tests[b] = pool(fit.test, fit.number == b, neighbours=distant)
+            chosen[b], cov[b] = q, fit.median_cov(b)
+        open_bands = [b for b in open_bands if b in hopeless or not tests[b].p_value > level]
         if q == usual:
-            usual_cov = {b: fit.median_cov(b) for b in tried}
+            usual_cov = {b: fit.median_cov(b) for b in chosen}
             search.expect(fit, open_bands)
         if not open_bands and q >= usual:
             break
@@ -216,19 +229,17 @@ def choose_dimension(
         BandDimension(
             low=float(frequency[number == b][0]),
             high=float(frequency[number == b][-1]),
-            n_factors=len(tests) - 1,
+            n_factors=q,
             usual=usual,
             accepted=b not in open_bands
-            and not (len(tests) - 1 > usual and len(there.sensors) < MIN_DETERMINED_SENSORS),
+            and not (q > usual and len(there.sensors) < MIN_DETERMINED_SENSORS),
             n_sensors=len(there.sensors),
-            test=tests[-1],
-            tried=tuple(tests),
+            test=tests[b],
             cov=cov[b],
             usual_cov=usual_cov.get(b, float("nan")),
         )
-        for b, tests in tried.items()
+        for b, q in chosen.items()
     )
-    chosen = {b: len(tests) - 1 for b, tests in tried.items()}
     return np.array([chosen[int(b)] for b in number]), choices
 
 
@@ -286,9 +297,9 @@ class _Search:
         self._n_effective = n_effective
         self._expected = 1 / psd  # in units of the coherency matrix
 
-    def fit(self, q: int, some: list[int]) -> _Fit:
-        """Maximise the likelihood of q factors in these bands."""
-        rows = np.flatnonzero(np.isin(self._number, some))
+    def fit(self, q: int, some: list[int], *, every: int = 1) -> _Fit:
+        """Maximise the likelihood of q factors in these bands, at every so many frequencies."""
+        rows = np.flatnonzero(np.isin(self._number, some))[every // 2 :: every]
         if q <= self._usual:
             maximum = maximise(self._matrix[rows], q)
         else:
