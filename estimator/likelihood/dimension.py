@@ -68,6 +68,8 @@ class BandDimension:
         the band is undetermined.
     test : BandTest
         Test of the chosen dimension.
+    tried : tuple of BandTest
+        Tests of 0, 1, … `n_factors` factors; of fewer frequencies where these reject them clearly.
     cov : float
         Median c.o.v. of the noise at one frequency with `n_factors`; infinite if they leave the
         noise undetermined.
@@ -86,6 +88,7 @@ class BandDimension:
     usual: int
     accepted: bool
     test: BandTest
+    tried: tuple[BandTest, ...]
     cov: float
     usual_cov: float
     n_sensors: int = MIN_DETERMINED_SENSORS
@@ -198,8 +201,7 @@ def choose_dimension(
     )
     r = HANN_HALF if neighbours is None else neighbours
     open_bands = list(stride)
-    tests: dict[int, BandTest] = {}
-    chosen = dict.fromkeys(open_bands, 0)
+    tried: dict[int, list[BandTest]] = {b: [] for b in open_bands}
     cov: dict[int, float] = {}
     usual_cov: dict[int, float] = {}
     for q in range(most + 1):
@@ -211,17 +213,18 @@ def choose_dimension(
                 test = pool(look.test, look.number == b, neighbours=distant)
                 if test.p_value < HOPELESS:
                     hopeless.append(b)
+                    tried[b].append(test)
         some = [b for b in open_bands if b not in hopeless]
         if not some and q != usual:
             continue
-        fit = search.fit(q, some if q != usual else list(chosen))
+        fit = search.fit(q, some if q != usual else list(tried))
         for b in some:
             distant = r[stride[b] - 1 :: stride[b]]
-            tests[b] = pool(fit.test, fit.number == b, neighbours=distant)
-            chosen[b], cov[b] = q, fit.median_cov(b)
-        open_bands = [b for b in open_bands if b in hopeless or not tests[b].p_value > level]
+            tried[b].append(pool(fit.test, fit.number == b, neighbours=distant))
+            cov[b] = fit.median_cov(b)
+        open_bands = [b for b in open_bands if not tried[b][-1].p_value > level]
         if q == usual:
-            usual_cov = {b: fit.median_cov(b) for b in chosen}
+            usual_cov = {b: fit.median_cov(b) for b in tried}
             search.expect(fit, open_bands)
         if not open_bands and q >= usual:
             break
@@ -229,17 +232,19 @@ def choose_dimension(
         BandDimension(
             low=float(frequency[number == b][0]),
             high=float(frequency[number == b][-1]),
-            n_factors=q,
+            n_factors=len(tests) - 1,
             usual=usual,
             accepted=b not in open_bands
-            and not (q > usual and len(there.sensors) < MIN_DETERMINED_SENSORS),
+            and not (len(tests) - 1 > usual and len(there.sensors) < MIN_DETERMINED_SENSORS),
             n_sensors=len(there.sensors),
-            test=tests[b],
+            test=tests[-1],
+            tried=tuple(tests),
             cov=cov[b],
             usual_cov=usual_cov.get(b, float("nan")),
         )
-        for b, q in chosen.items()
+        for b, tests in tried.items()
     )
+    chosen = {b: len(tests) - 1 for b, tests in tried.items()}
     return np.array([chosen[int(b)] for b in number]), choices
 
 

@@ -68,6 +68,7 @@ def test_incoherent_motion_is_explained_by_more_dimensions() -> None:
     assert not any(choice.is_biased for choice in choices)
     for choice in choices[2:]:
         assert choice.cov > choice.usual_cov  # the price
+        assert all(test.p_value < 0.05 for test in choice.tried[:-1])
 
 
 def test_unequal_sensors_keep_the_ratios_of_their_noise() -> None:

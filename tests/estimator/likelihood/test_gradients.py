@@ -42,6 +42,7 @@ def choice(band: int, *, usual: bool, n_sensors: int = N) -> BandDimension:
         usual=3,
         accepted=True,
         test=test,
+        tried=(test,),
         cov=0.035 if usual else 0.15,
         usual_cov=0.035,
         n_sensors=n_sensors,

@@ -258,6 +258,7 @@ def with_further_dimensions(cov: float, *, accepted: bool) -> Snapshot:
         usual=3,
         accepted=accepted,
         test=test,
+        tried=(test,),
         cov=cov,
         usual_cov=0.03,
     )
