@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
+from daq.bench.driver_rules import Checking
 from daq.bench.model import Channel, Sensor
 from daq.devices.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError
@@ -170,6 +171,7 @@ def test_a_wrong_host_is_a_fault_of_the_file() -> None:
     with pytest.raises(ValueError, match="expected an IP address"):
         DRIVER.settings.model_validate({"from": "shake.local"})
     one = own_port(**{"from": "127.0.0.3"}).model_copy(update={"port": "/dev/ttyUSB0"})
+    assert isinstance(DRIVER, Checking)
     with pytest.raises(BenchFileError, match="is for ports udp://"):
         DRIVER.check([one])
 
