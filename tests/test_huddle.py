@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from scipy import signal
 from typer.testing import CliRunner
 
 import huddle
+from daq.bench.units import canonical, cf_unit
 from daq.errors import ArrayError, ImportFormatError, WrongSettingError
 from estimator.errors import BandError
 from tui.cli.main import app
@@ -207,6 +209,55 @@ def test_data_arrays_keep_their_unit_and_times() -> None:
         np.testing.assert_array_equal(found.noise_psd, expected.noise_psd)
         assert found.snapshot.start_utc_ns == int(start.astype(np.int64))
     assert huddle.self_noise(dataset, sample_unit="nm/s", segment="1s").unit == "nm/s"
+
+
+def test_all_sensors_in_one_are_the_sensors_one_by_one() -> None:
+    sensors = triaxial()
+    expected = huddle.self_noise(sensors, fs=RATE, channels="XYZ", sample_unit="m/s²").noise_psd
+    whole = np.stack(list(sensors.values()))
+    of_array = huddle.self_noise(whole, fs=RATE, sample_unit="m s-2")
+    assert of_array.sensors == ("1", "2", "3")
+    assert of_array.unit == "m/s²"
+    np.testing.assert_array_equal(of_array.noise_psd, expected)
+    times = pd.date_range("2026-11-21", periods=whole.shape[1], freq="10ms", tz="Europe/Berlin")
+    coords = {"sensor": list("ABC"), "time": times.tz_convert(None), "channel": list("XYZ")}
+    array = xr.DataArray(whole, coords=coords, dims=tuple(coords), attrs={"units": "m s-2"})
+    frame = pd.concat(
+        {name: pd.DataFrame(each, times, list("XYZ")) for name, each in sensors.items()}, axis=1
+    )
+    frame.attrs["units"] = "m s-2"
+    timed = {name: frame[name] for name in sensors}
+    results = [huddle.self_noise(each) for each in (array, frame, timed)]
+    for each in results:
+        assert [label.name for label in each.channels][:4] == ["A.X", "A.Y", "A.Z", "B.X"]
+        assert each.unit == "m/s²"
+        np.testing.assert_array_equal(each.noise_psd, results[0].noise_psd)
+        assert each.snapshot.start_utc_ns == pd.Timestamp("2026-11-20T23:00").value
+    np.testing.assert_allclose(results[0].noise_psd, expected, rtol=1e-9)
+    with pytest.raises(ArrayError, match=r"a ndarray of shape .* an array .sensor, time, channel"):
+        huddle.self_noise(whole[0], fs=RATE)
+
+
+def test_a_window_may_be_a_tuple_of_scipy() -> None:
+    sensors = triaxial()
+    tuples, texts = (
+        huddle.self_noise(sensors, fs=RATE, window=window).noise_psd
+        for window in (("kaiser", 8.5), "kaiser,8.5")
+    )
+    np.testing.assert_array_equal(tuples, texts)
+    with pytest.raises(WrongSettingError, match=r"window=.*kaiser.*above 0"):
+        huddle.self_noise(sensors, fs=RATE, window=("kaiser", -1.0))
+
+
+@pytest.mark.parametrize(
+    ("unit", "cf"),
+    [("m/s²", "m s-2"), ("nm/s", "nm s-1"), ("µg", "1e-6 standard_free_fall"), ("m", "m")],
+)
+def test_units_of_the_cf_conventions_are_understood(unit: str, cf: str) -> None:
+    assert cf_unit(unit) == cf
+    assert canonical(cf) == unit
+    assert canonical("m s^-2") == canonical("m  s**-2") == "m/s²"
+    assert cf_unit("furlong") == canonical("furlong") == "furlong"
 
 
 def test_numbers_of_numpy_are_options() -> None:

@@ -125,7 +125,9 @@ def trend(value: object) -> str:
 
 
 def window(value: object) -> str:
-    """Return the name of a window, with its parameter."""
+    """Return the name of a window, with its parameter; also of a tuple, as scipy takes it."""
+    if isinstance(value, (list, tuple)) and len(value) == 2 and isinstance(value[0], str):
+        value = f"{value[0]},{float(value[1])!r}" if isinstance(value[1], (int, float)) else value
     name, _, parameter = str(value).partition(",")
     if not isinstance(value, str) or name not in PARAMETRIC_WINDOWS:
         return one_of(value, WINDOWS)

@@ -42,15 +42,34 @@ _SPELLINGS = {
     "cm/s²": "Gal",
 }
 """By what they are in small letters, where those cannot be mistaken."""
+_CF = {
+    **{unit: unit.replace("/s²", " s-2").replace("/s", " s-1") for unit in _MOTION},
+    "g": "standard_free_fall",  # "g" is a gram there
+    "mg": "1e-3 standard_free_fall",
+    "µg": "1e-6 standard_free_fall",
+    "ng": "1e-9 standard_free_fall",
+    "Gal": "cm s-2",
+    "counts": "count",
+}
+_FROM_CF = {spelled: unit for unit, spelled in _CF.items()}
+"""Units as the CF conventions (UDUNITS) spell them, and back."""
 
 
 def canonical(unit: str) -> str:
-    """Return the unit as this program spells it: ``M/S^2`` is ``m/s²``, ``ug`` is ``µg``."""
+    """Return the unit as this program spells it: ``M/S^2`` and ``m s-2`` are ``m/s²``."""
+    powers = " ".join(unit.replace("^-", "-").replace("**-", "-").replace("μ", "µ").split())
+    if powers in _FROM_CF:
+        return _FROM_CF[powers]
     spelled = unit.strip().replace("**2", "²").replace("^2", "²").replace("s2", "s²")
     spelled = spelled.replace("S**2", "²").replace("S2", "S²").replace("μ", "µ")
     if spelled in _MOTION:
         return spelled
     return _SPELLINGS.get(spelled.lower(), spelled)
+
+
+def cf_unit(unit: str) -> str:
+    """Return a unit as the CF conventions spell it, ``m s-2``; one that is not known as it is."""
+    return _CF.get(canonical(unit), unit)
 
 
 def is_motion(unit: str) -> bool:

@@ -33,6 +33,8 @@ NAME = "arrays"
 COUNTS = "counts"
 TIME = "time"
 """Dimension of a DataArray along which samples follow each other."""
+SENSOR = "sensor"
+"""Dimension of a DataArray of all sensors along which sensors follow each other."""
 _SAME_RATE = 1e-4  # by which a stated rate may differ from that of the time coordinate
 _EVEN = 0.1  # samples by which a time coordinate may be off an even one
 
@@ -70,9 +72,10 @@ def recording_of_arrays(
 
     Parameters
     ----------
-    sensors : mapping of str to array, or ObsPy Stream
-        Samples of each sensor by its name. A Stream as a whole holds one sensor for each
-        network, station and location.
+    sensors : mapping of str to array, array, DataArray, DataFrame or ObsPy Stream
+        Samples of each sensor by its name. An array as a whole has the axes sensor, time and
+        channel; a DataFrame as a whole has columns of two levels, sensor and channel; a Stream as
+        a whole holds one sensor for each network, station and location.
     sampling_rate : float or mapping of str to float, optional
         In Hz; not needed where the arrays have times.
     channels : sequence of str, optional
@@ -101,13 +104,51 @@ def _sensors(sensors: object, rate: object, channels: Sequence[str] | None) -> l
         found = _of_stream(sensors)
         return [_of_traces(foreign, rate, channels) for foreign in found]
     if not isinstance(sensors, Mapping):
-        raise ArrayError(
-            f"sensors: {_described(sensors)}; expected a dictionary of arrays by the name of the"
-            ' sensor, as in {"A": a, "B": b, "C": c}'
-        )
+        sensors = _by_sensor(sensors)
     if not sensors:
         raise ArrayError("sensors: an empty dictionary; expected an array for each sensor")
     return [_sensor(name, value, rate, channels) for name, value in sensors.items()]
+
+
+def _by_sensor(whole: Any) -> Mapping[Any, Any]:  # noqa: ANN401 - whatever it is
+    """Return the samples of each sensor of an array, DataArray or DataFrame of all."""
+    if _is_data_array(whole) and SENSOR in whole.dims and SENSOR in whole.coords:
+        names = [str(name) for name in whole.coords[SENSOR].values]
+        if len(set(names)) == len(names):
+            return {
+                name: whole.isel({SENSOR: number}, drop=True) for number, name in enumerate(names)
+            }
+    if _is_frame(whole) and getattr(whole.columns, "nlevels", 1) == 2:
+        return {name: whole[name] for name in dict.fromkeys(whole.columns.get_level_values(0))}
+    if isinstance(whole, np.ndarray) and whole.ndim == 3:
+        return {str(number): each for number, each in enumerate(whole, start=1)}
+    raise ArrayError(
+        f"sensors: {_described(whole)}; expected a dictionary of arrays by the name of the"
+        ' sensor, as in {"A": a, "B": b, "C": c}, an array (sensor, time, channel), a DataArray'
+        f" with a coordinate {SENSOR!r}, or a DataFrame with columns of two levels, sensor and"
+        " channel"
+    )
+
+
+def _is_data_array(value: Any) -> bool:  # noqa: ANN401 - whatever it is
+    return hasattr(value, "dims") and hasattr(value, "coords")
+
+
+def _is_frame(value: Any) -> bool:  # noqa: ANN401 - whatever it is
+    """Whether a value is a DataFrame or Series."""
+    return hasattr(value, "index") and hasattr(value, "to_numpy")
+
+
+def _of_frame(
+    frame: Any,  # noqa: ANN401 - of pandas
+) -> tuple[Samples, Samples | None, Sequence[str] | None, str]:
+    """Return samples, times of a DatetimeIndex, names of the channels, and the unit."""
+    index = frame.index.to_numpy()
+    if hasattr(frame.index, "tz_convert") and frame.index.tz is not None:
+        index = frame.index.tz_convert("UTC").tz_localize(None).to_numpy()
+    labels = [str(label) for label in frame.columns] if hasattr(frame, "columns") else None
+    times = index if index.dtype.kind in "mM" else None
+    return frame.to_numpy(), times, labels, str(frame.attrs.get("units", ""))
 
 
 def _sensor(name: object, value: Any, rate: object, channels: Sequence[str] | None) -> _Sensor:  # noqa: ANN401 - whatever it is
@@ -128,8 +169,9 @@ def _sensor(name: object, value: Any, rate: object, channels: Sequence[str] | No
         return _of_traces(replace(found[0], name=name), rate, channels)
     times = None
     names, unit = channels, ""
-    if hasattr(value, "dims") and hasattr(value, "coords"):
-        value, times, labels, unit = _of_data_array(name, value)
+    if _is_data_array(value) or _is_frame(value):
+        described = _of_data_array(name, value) if _is_data_array(value) else _of_frame(value)
+        value, times, labels, unit = described
         names = labels if channels is None else channels
     samples = _samples(name, value)
     start_utc_ns, found_rate = (0, None) if times is None else _lattice(name, times)

@@ -31,7 +31,7 @@ _MIN_SENSORS = {"two-channel": 2, "all": 2}
 
 
 def self_noise(
-    sensors: Mapping[Any, Any],
+    sensors: object,
     fs: float | Mapping[str, float] | None = None,
     *,
     channels: Sequence[str] | None = None,
@@ -45,12 +45,16 @@ def self_noise(
 
     Parameters
     ----------
-    sensors : mapping of str to array, or ObsPy Stream
+    sensors : mapping of str to array, array, DataArray, DataFrame or ObsPy Stream
         Samples of each sensor by its name: an array of shape (n_samples, n_channels) or
-        (n_samples,), of integers or floats; an xarray DataArray with the dimension ``time``; an
-        ObsPy Stream or Trace. An ObsPy Stream as a whole holds one sensor for each network, station
-        and location. Samples that are NaN or infinite are gaps: the segments that they touch are
-        left out.
+        (n_samples,), of integers or floats; an xarray DataArray with the dimension ``time``; a
+        pandas DataFrame or Series, whose DatetimeIndex says the times; an ObsPy Stream or Trace.
+        Or all sensors in one: an array of shape (n_sensors, n_samples, n_channels); a DataArray
+        with the dimensions ``sensor``, ``time`` and channel; a DataFrame with columns of two
+        levels, sensor and channel; an ObsPy Stream, with one sensor for each network, station and
+        location. The attribute ``units`` is read in any spelling, ``m s-2`` of the CF conventions
+        among them. Samples that are NaN or infinite are gaps: the segments that they touch are left
+        out.
     fs : float or mapping of str to float, optional
         Sampling rate in Hz, of all sensors or of each. Not needed where the samples have times.
     channels : sequence of str, optional
@@ -142,8 +146,9 @@ def estimate(
         frequency resolution.
     overlap : float
         Overlap between consecutive segments, as a fraction of their length (default 0.5).
-    window : str
-        Window of each segment: ``"hann"`` (default), ``"blackman"``, ``"kaiser,8"``, …
+    window : str or tuple
+        Window of each segment: ``"hann"`` (default), ``"blackman"``, ``"kaiser,8"``, …; or a tuple
+        as scipy takes it, ``("kaiser", 8)``.
     detrend : str
         Trend removed from each segment: ``"none"``, ``"constant"`` (default) or ``"linear"``.
     correct : bool

@@ -28,7 +28,7 @@ class EstimateOptions(TypedDict, total=False):
     method: str | Sequence[str]
     segment: str | float
     overlap: float
-    window: str
+    window: str | tuple[str, float]
     detrend: str
     correct: bool
     clocks: str
