@@ -6,8 +6,9 @@
 >>> result.noise_psd.shape
 (1001, 6)
 
-`self_noise` estimates arrays, `estimate` recordings; `open` reads a recording, `simulate` makes
-samples whose noise is known, `plan` says how long to record. ``python -m huddle`` is the command.
+`self_noise` estimates arrays and what `read` finds in files of other programs, `estimate`
+recordings; `open` reads a recording, `simulate` makes samples whose noise is known, `plan` says how
+long to record. ``python -m huddle`` is the command.
 
 Nothing heavy is imported before it is used. Types are visible to type checkers.
 """
@@ -26,7 +27,12 @@ if TYPE_CHECKING:  # as in tui/resources/huddle.pyi
     from tui.notebook.estimates import estimate, self_noise
     from tui.notebook.options import EstimateOptions
     from tui.notebook.planning import RecordingPlan, plan
-    from tui.notebook.recording import RecordingFile, open  # noqa: A004 - huddle.open
+    from tui.notebook.recording import (
+        RecordingFile,
+        Waveforms,
+        open,  # noqa: A004 - huddle.open
+        read,
+    )
     from tui.notebook.result import Result
     from tui.notebook.simulation import Simulation, simulate
 
@@ -38,9 +44,11 @@ __all__ = [
     "RecordingPlan",
     "Result",
     "Simulation",
+    "Waveforms",
     "estimate",
     "open",
     "plan",
+    "read",
     "self_noise",
     "simulate",
 ]
@@ -53,9 +61,11 @@ _MODULES = {
     "RecordingPlan": "tui.notebook.planning",
     "Result": "tui.notebook.result",
     "Simulation": "tui.notebook.simulation",
+    "Waveforms": "tui.notebook.recording",
     "estimate": "tui.notebook.estimates",
     "open": "tui.notebook.recording",
     "plan": "tui.notebook.planning",
+    "read": "tui.notebook.recording",
     "self_noise": "tui.notebook.estimates",
     "simulate": "tui.notebook.simulation",
 }

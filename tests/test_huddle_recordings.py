@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import huddle
-from daq.errors import WrongSettingError
+from daq.errors import ArrayError, WrongSettingError
 from tests.test_huddle import RATE, command, imported, triaxial
 
 if TYPE_CHECKING:
@@ -43,6 +43,65 @@ def test_a_recording_is_opened_read_and_estimated(tmp_path: Path) -> None:
     np.testing.assert_array_equal(same.noise_psd, result.noise_psd)
     with pytest.raises(WrongSettingError, match="start='soon': expected UTC as in"):
         huddle.estimate(path, start="soon")
+
+
+def test_files_are_estimated_as_their_import(tmp_path: Path) -> None:
+    rng = np.random.default_rng(8)
+    motion = rng.normal(0, 1000, (30_000, 3))
+    counts = {name: np.round(motion + rng.normal(0, 9, motion.shape)) for name in "ABC"}
+    counts["B"] = counts["B"].astype(np.float64)
+    counts["B"][700:750] = np.nan
+    np.savez(tmp_path / "some.npz", sampling_rate=RATE, **counts)  # type: ignore[arg-type]
+    command("import", str(tmp_path / "some.npz"), "--out", str(tmp_path / "some.h5"))
+    expected = huddle.estimate(tmp_path / "some.h5", segment="2s")
+    waveforms = huddle.read(tmp_path / "some.npz")
+    for result in (waveforms.estimate(segment="2s"), huddle.self_noise(waveforms, segment="2s")):
+        for name in ("noise_psd", "noise_low", "noise_high", "csm", "data_psd"):
+            np.testing.assert_array_equal(getattr(result, name), getattr(expected, name))
+    with huddle.open(tmp_path / "some.h5") as recording:
+        for span in ({}, {"start": 6.5, "end": "8s"}, {"start": 7.2}, {"end": 7.1}, {"start": 900}):
+            first, last = (
+                int(100 * float(str(span.get(key, value)).rstrip("s")))
+                for key, value in (("start", 0), ("end", 300))
+            )
+            for each in (recording, waveforms):
+                for name, array in counts.items():
+                    found = each.samples(name, **span)
+                    np.testing.assert_array_equal(found, array[first:last])
+    assert "A: 1 2 3 at 100 Hz, 30000 samples" in repr(waveforms)
+    assert waveforms.calibrations[0] == "A.1: 1 counts per counts (none)"
+    frame = waveforms.to_frame("B", start=6, end=9)
+    assert (frame.index[1] - frame.index[0]).total_seconds() == 1 / RATE
+    labelled = waveforms.to_xarray("B", start=6, end=9)
+    assert labelled.attrs["units"] == "count"
+    np.testing.assert_array_equal(labelled, frame)
+    np.testing.assert_array_equal(labelled.time, frame.index)
+    with pytest.raises(ArrayError, match=r"as arguments of huddle\.read"):
+        huddle.self_noise(waveforms, fs=RATE)
+    with pytest.raises(WrongSettingError, match="expected at least one file"):
+        huddle.read()
+
+
+def test_read_takes_responses_by_code(tmp_path: Path) -> None:
+    obspy = pytest.importorskip("obspy")
+    inventory = obspy.read_inventory()
+    stream = obspy.read()
+    stream.write(str(tmp_path / "bw.mseed"), format="MSEED")
+    inventory.write(str(tmp_path / "bw.xml"), format="STATIONXML")
+    by_file = huddle.read(tmp_path / "bw.mseed", response=tmp_path / "bw.xml")
+    by_object = huddle.read(tmp_path / "bw.mseed", response=inventory)
+    (name,) = by_file.sensors
+    assert by_file.units(name) == ("m/s",) * 3
+    whole = by_file.samples(name)
+    np.testing.assert_array_equal(whole, by_object.samples(name))
+    trace = stream.select(channel=by_file.channels(name)[0])[0]
+    gain = inventory.get_response(trace.id, trace.stats.starttime).instrument_sensitivity.value
+    np.testing.assert_allclose(whole[:, 0], trace.data / gain, rtol=1e-3)
+    frame = by_file.to_frame(name)
+    assert frame.index[0].value == trace.stats.starttime.ns
+    later = trace.stats.starttime + 1
+    some = by_file.samples(name, start=later.datetime, end=(later + 2).datetime)
+    np.testing.assert_array_equal(some, whole[100:300])
 
 
 def test_a_simulation_is_estimated_from_memory_and_from_its_recording(tmp_path: Path) -> None:

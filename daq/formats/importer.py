@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from heapq import merge
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from daq.bench.tables.fields import check_name
 from daq.bench.units import canonical
 from daq.errors import ImportFormatError, WrongSettingError
 from daq.formats.assembly import Columns
+from daq.formats.memory import RecordingInMemory, SensorInMemory
 from daq.formats.readers.fdsn import FDSN, fetch
 from daq.formats.readers.packed import is_packed, unpacked
 from daq.formats.sources import Selection, open_sources
@@ -171,7 +172,7 @@ class _Sources:
 
     given: Sequence[str | Path]
     files: Sequence[str | Path]
-    responses: Sequence[Path]
+    responses: Sequence[Any]
     folder: Path
 
     def named(self, foreign: ForeignSensor) -> ForeignSensor:
@@ -182,7 +183,7 @@ class _Sources:
 
 
 def _fetched(
-    sources: Sequence[str | Path], responses: Sequence[Path], selection: Selection, folder: Path
+    sources: Sequence[str | Path], responses: Sequence[Any], selection: Selection, folder: Path
 ) -> _Sources:
     """Fetch and unpack; given responses have precedence over those of a centre."""
     files: list[str | Path] = []
@@ -217,15 +218,7 @@ def _import(
     found = {name: sources.named(sensor) for name, sensor in opened.sensors.items()}
     if bench is not None:
         found = _ordered(found, bench)
-    responses = None
-    if sources.responses or response_for:
-        from daq.formats.response import Responses  # noqa: PLC0415 - ObsPy is an extra
-
-        responses = Responses(sources.responses, response_for)
-    taken: list[Taken] = []
-    described = {
-        name: _described(sensor, bench, responses, taken) for name, sensor in found.items()
-    }
+    described, taken = _all_described(found, bench, _responses(sources.responses, response_for))
     written = _bench(out, bench, tuple(described.values()), estimate)
     start = min(sensor.stretches[0].start_utc_ns for sensor in found.values())
     with ArrayWriter(
@@ -241,8 +234,60 @@ def _import(
         tuple(_imported(sensor) for sensor in found.values()),
         opened.problems,
         opened.left_aside,
-        tuple(taken),
+        taken,
     )
+
+
+def open_files(
+    sources: Sequence[str | Path],
+    folder: Path,
+    *,
+    response: Sequence[Any] = (),
+    response_for: Sequence[tuple[str, Any]] = (),
+    sampling_rate: float | None = None,
+    selection: Selection | None = None,
+) -> tuple[RecordingInMemory, ImportResult]:
+    """Return what `import_files` would write, as a recording that reads the files when asked.
+
+    Parameters
+    ----------
+    sources : sequence of str or Path
+    folder : Path
+        Takes what is fetched or unpacked; must exist as long as the recording is read.
+    response, response_for, sampling_rate, selection
+        As `import_files` takes them; a response may also be an inventory of ObsPy.
+
+    Raises
+    ------
+    ImportFormatError
+        No file is understood, or files and responses do not fit together.
+    """
+    fetched = _fetched(sources, response, selection or Selection(), folder)
+    opened = open_sources(fetched.files, selection, sampling_rate=sampling_rate)
+    found = {name: fetched.named(sensor) for name, sensor in opened.sensors.items()}
+    described, taken = _all_described(found, None, _responses(fetched.responses, response_for))
+    sensors = [SensorInMemory(each, described[name].channels) for name, each in found.items()]
+    imported = tuple(_imported(each) for each in found.values())
+    result = ImportResult(imported, opened.problems, opened.left_aside, taken)
+    return RecordingInMemory(sensors, _origin(sources)), result
+
+
+def _responses(given: Sequence[Any], response_for: Sequence[tuple[str, Any]]) -> Responses | None:
+    if not given and not response_for:
+        return None
+    from daq.formats.response import Responses  # noqa: PLC0415 - ObsPy is an extra
+
+    return Responses(given, response_for)
+
+
+def _all_described(
+    found: dict[str, ForeignSensor], bench: Bench | None, responses: Responses | None
+) -> tuple[dict[str, Sensor], tuple[Taken, ...]]:
+    taken: list[Taken] = []
+    described = {
+        name: _described(sensor, bench, responses, taken) for name, sensor in found.items()
+    }
+    return described, tuple(taken)
 
 
 def _origin(sources: Sequence[str | Path]) -> str:

@@ -13,6 +13,7 @@ from daq.errors import ArrayError, WrongSettingError
 from daq.estimation.estimation import Estimation
 from daq.estimation.settings import Settings, check_fit
 from daq.formats.arrays import COUNTS, recording_of_arrays
+from daq.formats.memory import RecordingInMemory
 from daq.recording.reader import Recording
 from tui.notebook.options import EstimateOptions, Time, called, moment, settings_of
 from tui.notebook.result import Result
@@ -46,9 +47,10 @@ def self_noise(
     Parameters
     ----------
     sensors : mapping of str to array, array, DataArray, DataFrame or ObsPy Stream
-        Samples of each sensor by its name: an array of shape (n_samples, n_channels) or
-        (n_samples,), of integers or floats; an xarray DataArray with the dimension ``time``; a
-        pandas DataFrame or Series, whose DatetimeIndex says the times; an ObsPy Stream or Trace.
+        What `huddle.read` returns; or samples of each sensor by its name: an array of shape
+        (n_samples, n_channels) or (n_samples,), of integers or floats; an xarray DataArray with the
+        dimension ``time``; a pandas DataFrame or Series, whose DatetimeIndex says the times; an
+        ObsPy Stream or Trace.
         Or all sensors in one: an array of shape (n_sensors, n_samples, n_channels); a DataArray
         with the dimensions ``sensor``, ``time`` and channel; a DataFrame with columns of two
         levels, sensor and channel; an ObsPy Stream, with one sensor for each network, station and
@@ -106,9 +108,16 @@ def self_noise(
             f"sample_unit={sample_unit!r} and a response: samples with a unit have no response;"
             " expected one of the two"
         )
-    recording = recording_of_arrays(
-        sensors, fs, channels=channels, unit=sample_unit, responses=_responses(response)
-    )
+    recording = getattr(sensors, "recording", None)  # of huddle.read
+    if not isinstance(recording, RecordingInMemory):
+        recording = recording_of_arrays(
+            sensors, fs, channels=channels, unit=sample_unit, responses=_responses(response)
+        )
+    elif any(given is not None for given in (fs, channels, sample_unit, response)):
+        raise ArrayError(
+            "fs, channels, sample_unit or response with what huddle.read returned; expected them"
+            " as arguments of huddle.read"
+        )
     _check_sensors(recording.sensors, settings)
     _check_units(recording.sensors, settings)
     check_fit(settings, recording.sensors, called=called)
@@ -231,6 +240,15 @@ def _result(recordings: Sequence[ReadableRecording], settings: Settings) -> Resu
         return Result(estimation.finish(), settings)
 
 
+def response_sources(given: object) -> tuple[list[Any], list[tuple[str, Any]]]:
+    """Return responses for the channels of their codes, and those with patterns."""
+    if given is None:
+        return [], []
+    if isinstance(given, dict):
+        return [], [(name, each) for name, value in given.items() for each in _sources(value)]
+    return _sources(given), []
+
+
 def _responses(given: object) -> Responses | None:
     """Return responses as the import takes them.
 
@@ -239,14 +257,12 @@ def _responses(given: object) -> Responses | None:
     ImportFormatError
         ObsPy is not installed, or a file holds no response.
     """
-    if given is None:
+    some, assigned = response_sources(given)
+    if not some and not assigned:
         return None
     from daq.formats.response import Responses  # noqa: PLC0415 - ObsPy is an extra
 
-    if isinstance(given, dict):
-        assigned = [(name, each) for name, value in given.items() for each in _sources(value)]
-        return Responses([], assigned)
-    return Responses(_sources(given))
+    return Responses(some, assigned)
 
 
 def _sources(given: Any) -> list[Any]:  # noqa: ANN401 - paths, or inventories: ObsPy has no types

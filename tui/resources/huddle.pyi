@@ -11,7 +11,9 @@ from tui.notebook.options import EstimateOptions as EstimateOptions
 from tui.notebook.planning import RecordingPlan as RecordingPlan
 from tui.notebook.planning import plan as plan
 from tui.notebook.recording import RecordingFile as RecordingFile
+from tui.notebook.recording import Waveforms as Waveforms
 from tui.notebook.recording import open as open  # noqa: A004 - huddle.open
+from tui.notebook.recording import read as read
 from tui.notebook.result import Result as Result
 from tui.notebook.simulation import Simulation as Simulation
 from tui.notebook.simulation import simulate as simulate
