@@ -8,7 +8,8 @@
 
 `self_noise` estimates arrays and what `read` finds in files of other programs, `estimate`
 recordings; `open` reads a recording, `simulate` makes samples whose noise is known, `plan` says how
-long to record. ``python -m huddle`` is the command.
+long to record. `calibrate`, `export` and `report` do what the commands of that name do.
+``python -m huddle`` is the command.
 
 Nothing heavy is imported before it is used. Types are visible to type checkers.
 """
@@ -35,6 +36,7 @@ if TYPE_CHECKING:  # as in tui/resources/huddle.pyi
     )
     from tui.notebook.result import Result
     from tui.notebook.simulation import Simulation, simulate
+    from tui.notebook.verbs import calibrate, export, load, noise_model, report
 
 __all__ = [
     "EstimateOptions",
@@ -45,10 +47,15 @@ __all__ = [
     "Result",
     "Simulation",
     "Waveforms",
+    "calibrate",
     "estimate",
+    "export",
+    "load",
+    "noise_model",
     "open",
     "plan",
     "read",
+    "report",
     "self_noise",
     "simulate",
 ]
@@ -62,10 +69,15 @@ _MODULES = {
     "Result": "tui.notebook.result",
     "Simulation": "tui.notebook.simulation",
     "Waveforms": "tui.notebook.recording",
+    "calibrate": "tui.notebook.verbs",
     "estimate": "tui.notebook.estimates",
+    "export": "tui.notebook.verbs",
+    "load": "tui.notebook.verbs",
+    "noise_model": "tui.notebook.verbs",
     "open": "tui.notebook.recording",
     "plan": "tui.notebook.planning",
     "read": "tui.notebook.recording",
+    "report": "tui.notebook.verbs",
     "self_noise": "tui.notebook.estimates",
     "simulate": "tui.notebook.simulation",
 }

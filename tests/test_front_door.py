@@ -18,7 +18,7 @@ import huddle
 from daq.bench.estimate_settings import table_keys
 from daq.python_process import python_command
 from tests.test_architecture import modules_after
-from tui.notebook import estimates, planning, recording, simulation
+from tui.notebook import estimates, planning, recording, simulation, verbs
 from tui.notebook.options import EstimateOptions
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[1]
 
 
-@pytest.mark.parametrize("module", [huddle, estimates, planning, recording, simulation])
+@pytest.mark.parametrize("module", [huddle, estimates, planning, recording, simulation, verbs])
 def test_the_examples_in_the_documentation_run(
     module: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

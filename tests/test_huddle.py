@@ -6,6 +6,7 @@ import json
 import sys
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pandas as pd
@@ -277,10 +278,9 @@ def test_sensors_may_have_different_numbers_of_channels() -> None:
     result = huddle.self_noise(sensors, fs=RATE)
     assert result.noise_psd.shape == (501, 10)
     dataset = result.to_xarray()
-    assert dataset.sizes == {"estimate": 1, "sensor": 4, "channel": 3, "frequency": 501}
-    assert np.isnan(dataset.noise_psd.sel(sensor="D", channel="2")).all()
+    assert dataset.noise_psd.sizes == {"estimate": 1, "trace": 10, "frequency": 501}
     np.testing.assert_array_equal(
-        dataset.noise_psd.sel(estimate="three-sensor", sensor="D", channel="1"),
+        dataset.noise_psd.sel(estimate="three-sensor", trace="D.1"),
         result["D", "1"].noise_psd,
     )
 
@@ -396,14 +396,16 @@ def test_methods_can_be_changed(result: huddle.Result) -> None:
 
 def test_labels_and_numbers_go_into_xarray_and_pandas(result: huddle.Result) -> None:
     dataset = result.to_xarray()
-    assert tuple(dataset.noise_psd.dims) == ("estimate", "sensor", "channel", "frequency")
-    assert dataset.noise_psd.attrs["units"] == "(counts)²/Hz"
+    assert tuple(dataset.noise_psd.dims) == ("estimate", "trace", "frequency")
+    assert dataset.noise_psd.attrs["units"] == "(count)2 Hz-1"
     frame = result.to_frame()
     assert len(frame) == len(result.methods) * 9 * len(result.frequency)
     for method in result.methods:
         expected = result.with_method(method)
         for column, label in enumerate(result.channels):
-            chosen = {"sensor": label.sensor, "channel": label.channel}
+            chosen = {"trace": label.name}
+            assert dataset.sensor.sel(chosen).item() == label.sensor
+            assert dataset.channel.sel(chosen).item() == label.channel
             rows = frame[
                 (frame.method == method)
                 & (frame.sensor == label.sensor)
@@ -416,11 +418,80 @@ def test_labels_and_numbers_go_into_xarray_and_pandas(result: huddle.Result) -> 
                 np.testing.assert_array_equal(dataset[name].sel(by_method).to_numpy(), curve)
 
 
-def test_a_dataset_can_be_stored(result: huddle.Result, tmp_path: Path) -> None:
+def test_a_result_can_be_saved_and_loaded(result: huddle.Result, tmp_path: Path) -> None:
     dataset = result.to_xarray()
-    dataset.to_netcdf(tmp_path / "noise.nc", engine="h5netcdf")
-    with xr.open_dataset(tmp_path / "noise.nc", engine="h5netcdf") as stored:
-        np.testing.assert_array_equal(stored.noise_psd, dataset.noise_psd)
+    result.save(tmp_path / "noise.nc")
+    stored = huddle.load(tmp_path / "noise.nc")
+    assert set(stored.variables) == set(dataset.variables)
+    for name, values in dataset.variables.items():
+        np.testing.assert_array_equal(stored[name], values)
+        assert stored[name].attrs.get("units") == values.attrs.get("units")
+    assert stored.attrs["Conventions"].startswith("CF-")
+    with pytest.raises(OSError, match=r"none\.nc"):
+        huddle.load(tmp_path / "none.nc")
+
+
+def test_a_dataset_has_the_matrix_and_what_made_motion_of_counts() -> None:
+    sensors = triaxial()
+    found = huddle.self_noise(sensors, fs=RATE, channels="XYZ", segment="2s")
+    dataset = found.to_xarray()
+    whole = (dataset.csm_real + 1j * dataset.csm_imag).transpose("frequency", ...)
+    np.testing.assert_array_equal(whole, found.csm)
+    _, expected = signal.coherence(
+        sensors["A"][:, 0], sensors["B"][:, 0], RATE, "hann", 200, detrend="constant"
+    )
+    pair = dataset.coherence.sel(trace="A.X", other_trace="B.X")
+    np.testing.assert_allclose(pair[1:-1], expected[1:-1], rtol=1e-9)
+    np.testing.assert_array_equal(dataset.response_amplitude, 1)
+
+
+def test_an_interval_has_any_confidence(result: huddle.Result) -> None:
+    low, high = result.interval()
+    np.testing.assert_allclose(low, result.noise_low, rtol=1e-9)
+    np.testing.assert_allclose(high, result.noise_high, rtol=1e-9)
+    narrow, wide = result.band(5, 40, confidence=0.68), result.band(5, 40, confidence=0.99)
+    usual = result.band(5, 40)
+    assert (narrow.noise_high < usual.noise_high).all()
+    assert (usual.noise_high < wide.noise_high).all()
+    assert (wide.noise_low < usual.noise_low).all()
+    assert "with its 68 % interval" in repr(narrow)
+    for wrong in (0, 1, 95):
+        with pytest.raises(WrongSettingError, match=f"confidence={wrong}: expected a fraction"):
+            result.interval(wrong)
+
+
+def test_a_notebook_shows_the_table(result: huddle.Result) -> None:
+    tree = ET.fromstring(f"<html>{result._repr_html_()}</html>")  # noqa: S314 - our own
+    rows = ["".join(row.itertext()) for row in tree.iter("tr")]
+    assert len(rows) == 10
+    assert all(name in row for name, row in zip("AAABBBCCC", rows[1:], strict=True))
+    caption = tree.find("table/caption")
+    assert caption is not None
+    assert caption.text == repr(result).splitlines()[0]
+
+
+def test_noise_is_drawn_on_axes_that_exist(result: huddle.Result) -> None:
+    pyplot = pytest.importorskip("matplotlib.pyplot")
+    drawn, axes = pyplot.subplots()
+    assert result.plot(ax=axes) is drawn
+    assert len(axes.lines) == 9
+    np.testing.assert_allclose(10 ** (axes.lines[4].get_ydata() / 10), result.noise_psd[1:, 4])
+    with pytest.raises(WrongSettingError, match="counts"):
+        result.plot(ax=axes, models="nlnm")
+    pyplot.close(drawn)
+
+
+def test_noise_models_are_those_of_peterson() -> None:
+    obspy = pytest.importorskip("obspy.signal.spectral_estimation")
+    for name, of_obspy in (("nlnm", obspy.get_nlnm), ("nhnm", obspy.get_nhnm)):
+        periods, level = of_obspy()
+        found = 10 * np.log10(huddle.noise_model(name, 1 / periods[1:-1]))
+        np.testing.assert_allclose(found, level[1:-1], atol=0.15)
+    velocity = huddle.noise_model("nlnm", [1.0], unit="m/s")
+    expected = huddle.noise_model("nlnm", [1.0]) / (2 * np.pi) ** 2
+    np.testing.assert_allclose(velocity, expected)
+    with pytest.raises(WrongSettingError, match="'nlmn'"):
+        huddle.noise_model("nlmn", [1.0])
 
 
 def test_a_figure_has_an_axis_for_each_channel(result: huddle.Result, tmp_path: Path) -> None:

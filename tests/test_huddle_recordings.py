@@ -12,6 +12,8 @@ import pytest
 import huddle
 from daq.errors import ArrayError, WrongSettingError
 from tests.test_huddle import RATE, command, imported, triaxial
+from tui.output.console import finite
+from tui.output.json_document import calibration_document
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -183,3 +185,35 @@ def test_a_plan_is_that_of_the_command(tmp_path: Path) -> None:
     ):
         with pytest.raises(WrongSettingError, match=said):
             huddle.plan(snr=250, **wrong)
+
+
+def test_commands_are_functions_with_their_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "fig9.h5"
+    huddle.simulate("fig9", duration="2min").write(path)
+    result = huddle.estimate(path, segment="2s")
+    told = json.loads(command("calibrate", str(path), "--segment", "2s", "--json", "-"))
+    found = huddle.calibrate(result)
+    assert found.reference == 0
+    again = huddle.calibrate(path, segment="2s", confidence=0.99)
+    assert again.confidence == 0.99
+    stated = finite(calibration_document(found, result.snapshot))
+    assert json.loads(json.dumps(stated)) == told
+    for suffix in (".csv", ".npz", ".nc"):
+        huddle.export(result, tmp_path / f"a{suffix}")
+        kind = "netcdf" if suffix == ".nc" else suffix[1:]
+        command("export", str(path), "--segment", "2s", "--format", kind, "-o",
+                str(tmp_path / f"b{suffix}"))  # fmt: skip
+    assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
+    with np.load(tmp_path / "a.npz") as ours, np.load(tmp_path / "b.npz") as theirs:
+        for name in theirs:
+            np.testing.assert_array_equal(ours[name], theirs[name])
+    assert huddle.load(tmp_path / "a.nc").identical(huddle.load(tmp_path / "b.nc"))
+    huddle.report(result, tmp_path / "a.html", models="nlnm")
+    assert "NLNM" in (tmp_path / "a.html").read_text(encoding="utf-8")
+    with pytest.raises(WrongSettingError, match=r"a\.xyz: expected a name that ends in \.csv"):
+        huddle.export(result, tmp_path / "a.xyz")
+    with pytest.raises(WrongSettingError, match="segment with a Result"):
+        huddle.calibrate(result, segment="1s")
+    arrays = huddle.self_noise(triaxial(), fs=RATE)
+    with pytest.raises(WrongSettingError, match="the estimate is of arrays"):
+        huddle.report(arrays, tmp_path / "b.html")

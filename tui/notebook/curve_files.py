@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import os
 import warnings
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -21,7 +22,8 @@ from tui.output.extras import load
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from pathlib import Path
+
+    import xarray as xr
 
     from daq.estimation.snapshot import Snapshot
 
@@ -71,6 +73,18 @@ def _parquet(snapshot: Snapshot, path: Path, said: Said) -> None:
 def _netcdf(snapshot: Snapshot, path: Path, said: Said) -> None:
     load("h5netcdf")
     to_xarray(snapshot, said).to_netcdf(path, engine="h5netcdf")
+
+
+def write_dataset(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
+    """Write a Dataset as netCDF; the file has its name when it is complete."""
+    load("h5netcdf")
+    out = Path(path)
+    part = out.with_name(f".{out.name}.part")
+    try:
+        dataset.to_netcdf(part, engine="h5netcdf")
+        part.replace(out)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def _arrays(snapshot: Snapshot) -> dict[str, Any]:

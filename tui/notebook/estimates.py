@@ -21,6 +21,7 @@ from tui.notebook.result import Result
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from daq.bench.model import Channel
     from daq.formats.response import Responses
     from daq.recording.interface import ReadableRecording, ReadableSensor
 
@@ -227,17 +228,26 @@ def estimate(
         bench = recording.bench
         settings = settings_of(Settings.of(bench), options)
         check_fit(settings, recording.sensors, called=called)
-        created = recording.created
+        created, recorded = recording.created, _recorded(recording)
     settings = replace(
         settings, start=moment("start", start, created), end=moment("end", end, created)
     )
     with Estimation(paths, settings) as estimation:
-        return Result(estimation.finish(), settings, bench, paths)
+        return Result(estimation.finish(), settings, bench, paths, recorded)
 
 
 def _result(recordings: Sequence[ReadableRecording], settings: Settings) -> Result:
     with Estimation(recordings, settings) as estimation:
-        return Result(estimation.finish(), settings)
+        return Result(estimation.finish(), settings, recorded=_recorded(recordings[0]))
+
+
+def _recorded(recording: ReadableRecording) -> dict[str, Channel]:
+    """Return what each channel is, by its name with that of its sensor."""
+    return {
+        f"{sensor.name}.{channel.name}": channel
+        for sensor in recording.sensors
+        for channel in sensor.channels
+    }
 
 
 def response_sources(given: object) -> tuple[list[Any], list[tuple[str, Any]]]:

@@ -3,28 +3,33 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daq.bench.masks.mask_file import masks_named
 from daq.bench.units import levels_db
 from daq.errors import WrongSettingError
-from daq.results.band_summary import band_of, channel_means
 from daq.results.sources import uncounted_events
+from daq.results.band_summary import band_of, levels
 from estimator.levels.bands import band_edges
 from tui.notebook import text
 from tui.output.extras import load
 from tui.wording.facts import known
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    import os
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     import pandas as pd
     import xarray as xr
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from daq.bench.model import Bench
+    from daq.bench.masks.mask import Mask
+    from daq.bench.model import Bench, Channel
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import ChannelLabel, Snapshot
     from daq.estimation.snapshot_diagnostics import (
@@ -36,17 +41,43 @@ if TYPE_CHECKING:
     from tui.wording.facts import Known
 
 
-def figure(snapshot: Snapshot, settings: Settings, bench: Bench | None, width: float) -> Figure:
+def figure(
+    snapshot: Snapshot,
+    settings: Settings,
+    bench: Bench | None,
+    *,
+    models: Sequence[Mask],
+    width: float,
+) -> Figure:
     """Return a figure with an axis for each channel, sensors below each other."""
     pyplot = load("matplotlib.pyplot")
     from tui.report.figures.curves import noise_plots  # noqa: PLC0415 - loads matplotlib
     from tui.report.figures.drawing import look, stack, stack_height  # noqa: PLC0415
 
     with look():
-        plots = noise_plots(snapshot, settings, bench)
+        plots = noise_plots(snapshot, settings, bench, models)
         drawn: Figure = pyplot.figure(figsize=(width, stack_height(plots)), facecolor="white")
         stack(plots, drawn, margin=0.1)
     return drawn
+
+
+def draw(axes: Axes, snapshot: Snapshot, models: Sequence[Mask]) -> None:
+    """Draw the noise of every channel, with its interval, and noise models on axes that exist."""
+    noise = next(iter(snapshot.results.values()))
+    frequency = snapshot.frequency[1:]  # the axis is logarithmic
+    for column, label in enumerate(snapshot.channels):
+        psd, low, high = (
+            levels_db(each[1:, column]) for each in (noise.noise_psd, noise.low, noise.high)
+        )
+        (line,) = axes.plot(frequency, psd, label=label.name)
+        axes.fill_between(frequency, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
+    for mask in models:
+        at = mask.points(frequency)
+        at = at[(at >= frequency[0]) & (at <= frequency[-1])]
+        axes.plot(at, levels_db(mask.at(at, snapshot.unit)), "--", color="0.4", label=mask.name)
+    axes.set_xscale("log")
+    axes.set_xlabel("frequency (Hz)")
+    axes.set_ylabel(f"dB re 1 ({snapshot.unit})²/Hz")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,8 +114,10 @@ class BandNoise:
     channels : tuple of ChannelLabel
         Sensor, channel and unit of each value.
     data_psd, noise_psd, noise_low, noise_high : float64, shape (n_channels,)
-        Means over the band of the samples' PSD and of the noise PSD, and the 95 % interval of the
+        Means over the band of the samples' PSD and of the noise PSD, and the interval of the
         latter, in unit**2/Hz.
+    confidence : float
+        Of the interval.
     """
 
     low_hz: float
@@ -95,6 +128,7 @@ class BandNoise:
     noise_psd: FloatArray
     noise_low: FloatArray
     noise_high: FloatArray
+    confidence: float = 0.95
 
     @property
     def noise_db(self) -> FloatArray:
@@ -109,6 +143,7 @@ class BandNoise:
             self.noise_high,
             span=(self.low_hz, self.high_hz),
             method=self.method,
+            confidence=self.confidence,
         )
 
 
@@ -132,11 +167,13 @@ class Result:
         settings: Settings,
         bench: Bench | None = None,
         recordings: Sequence[Path] = (),
+        recorded: Mapping[str, Channel] | None = None,
     ) -> None:
         self.snapshot = snapshot
         self.settings = settings
         self._bench = bench
         self._recordings = tuple(recordings)
+        self._recorded = recorded
 
     @property
     def method(self) -> str:
@@ -243,11 +280,24 @@ class Result:
         return uncounted_events(self.snapshot.clocks)
 
     @property
+    def bench(self) -> Bench | None:
+        """The bench in the recording, if it was one."""
+        return self._bench
+
+    @property
+    def recordings(self) -> tuple[Path, ...]:
+        """The recordings that were estimated; none for arrays."""
+        return self._recordings
+
+    @property
     def _noise(self) -> SelfNoise:
         return self.snapshot.results[self.method]
 
     def __repr__(self) -> str:
         return text.result(self.snapshot, self.settings)
+
+    def _repr_html_(self) -> str:
+        return text.html(self.snapshot, self.settings)
 
     def __getitem__(self, label: tuple[str, str]) -> ChannelNoise:
         """Return one channel, by sensor and channel: ``result["A", "X"]``."""
@@ -282,15 +332,37 @@ class Result:
             )
         results = {method: self.snapshot.results[method]} | self.snapshot.results
         snapshot = replace(self.snapshot, results=results)
-        return Result(snapshot, self.settings, self._bench, self._recordings)
+        return Result(snapshot, self.settings, self._bench, self._recordings, self._recorded)
 
-    def band(self, low: float | None = None, high: float | None = None) -> BandNoise:
+    def interval(self, confidence: float = 0.95) -> tuple[FloatArray, FloatArray]:
+        """Return the ends of the interval of the noise at every frequency, at any confidence.
+
+        With everything that widens it. With 0.95 they are `noise_low` and `noise_high`.
+
+        Parameters
+        ----------
+        confidence : float
+            Between 0 and 1.
+
+        Returns
+        -------
+        low, high : float64, shape (n_freqs, n_channels)
+        """
+        quantile = _quantile(confidence)
+        edges = np.arange(len(self.frequency) + 1)
+        return levels(self._noise, self.snapshot, self.settings, edges).ends(quantile)
+
+    def band(
+        self, low: float | None = None, high: float | None = None, *, confidence: float = 0.95
+    ) -> BandNoise:
         """Return the mean noise of every channel in a band.
 
         Parameters
         ----------
         low, high : float, optional
             In Hz; as the option ``band`` of the estimate, or all usable frequencies, if not given.
+        confidence : float
+            Of the interval, between 0 and 1.
 
         Raises
         ------
@@ -299,44 +371,81 @@ class Result:
         """
         usual = band_of(self.settings, self.snapshot)
         band = (usual[0] if low is None else low, usual[1] if high is None else high)
-        means = channel_means(self._noise, self.snapshot, self.settings, band)
-        inside = slice(*band_edges(self.frequency, band))
+        edges = band_edges(self.frequency, band)
+        found = levels(self._noise, self.snapshot, self.settings, edges)
+        noise_low, noise_high = found.ends(_quantile(confidence))
+        inside = slice(*edges)
         width = np.gradient(self.frequency)[inside]
         return BandNoise(
             *band,
             self.method,
             self.channels,
             np.average(self.data_psd[inside], axis=0, weights=width),
-            np.array([float(each.mean[0]) for each in means]),
-            np.array([float(each.low[0]) for each in means]),
-            np.array([float(each.high[0]) for each in means]),
+            found.mean[0],
+            noise_low[0],
+            noise_high[0],
+            confidence,
         )
 
-    def plot(self, *, width: float = 7.0) -> Figure:
+    def plot(
+        self, *, ax: Axes | None = None, models: str | Sequence[str] = (), width: float = 7.0
+    ) -> Figure:
         """Draw PSD of samples and noise, with its interval, against frequency.
 
         Needs matplotlib: ``pip install 'huddle-bench[report]'``.
 
         Parameters
         ----------
+        ax : matplotlib Axes, optional
+            Draw the noise of every channel there, in place of a figure with an axis for each.
+        models : str or sequence of str
+            Noise models to draw: ``"nlnm"``, ``"nhnm"``, ``"alnm"``, ``"ahnm"``, or CSV files.
         width : float
             Of the figure, in inches.
         """
-        from tui.notebook.result import figure  # noqa: PLC0415 - loads matplotlib
+        from tui.notebook.result import draw, figure  # noqa: PLC0415 - loads matplotlib
 
-        return figure(self.snapshot, self.settings, self._bench, width)
+        masks = masks_named(models if isinstance(models, str) else ",".join(models))
+        for mask in masks:
+            mask.check_unit(self.unit)
+        if ax is None:
+            bench, settings = self._bench, self.settings
+            return figure(self.snapshot, settings, bench, models=masks, width=width)
+        draw(ax, self.snapshot, masks)
+        drawn = ax.get_figure(root=True)
+        if drawn is None:
+            raise WrongSettingError("ax: axes of no figure; expected axes of a figure")
+        return drawn
 
     def to_xarray(self) -> xr.Dataset:
-        """Return the spectra with the dimensions estimate, sensor, channel and frequency.
+        """Return the spectra with the dimensions estimate, trace and frequency.
 
-        The dimension ``estimate`` names the method. NaN where a sensor has no channel of a name
-        that others have. Attributes say by which program, with which settings and from which span
-        of time, and what each flag means. Needs xarray: ``pip install 'huddle-bench[notebook]'``.
+        The dimension ``estimate`` names the method, ``trace`` sensor and channel, which are
+        coordinates too. ``csm_real`` and ``csm_imag`` are the cross-spectral matrix, with
+        ``coherence``; ``response_amplitude`` and ``response_phase`` what the samples were divided
+        by to be motion. Attributes say by which program, with which settings and from which span
+        of time, and what each flag means. Units are those of the CF conventions. Needs xarray:
+        ``pip install 'huddle-bench[notebook]'``.
         """
         from tui.notebook.tables import to_xarray  # noqa: PLC0415 - loads xarray
         from tui.output.json_document import provenance  # noqa: PLC0415 - seldom needed
 
-        return to_xarray(self.snapshot, provenance(self.snapshot, self.settings))
+        said = provenance(self.snapshot, self.settings)
+        return to_xarray(self.snapshot, said, self._recorded, matrix=True)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write what `to_xarray` returns to a netCDF file; `huddle.load` reads it.
+
+        The attributes of the file have the SHA-256 of the recordings, too. A file that was there is
+        replaced when the new one is complete. Needs h5netcdf: ``pip install
+        'huddle-bench[notebook]'``.
+        """
+        from daq.results.sources import sources  # noqa: PLC0415 - seldom needed
+        from tui.notebook.curve_files import write_dataset  # noqa: PLC0415
+        from tui.output.json_document import provenance  # noqa: PLC0415
+
+        said = provenance(self.snapshot, self.settings, sources(self._recordings))
+        write_dataset(self.to_xarray().assign_attrs(said), path)
 
     def to_frame(self) -> pd.DataFrame:
         """Return the spectra as a tidy table: a row a method, channel and frequency.
@@ -365,3 +474,16 @@ class Result:
             sources=sources(self._recordings),
             verdict=judge(self._bench, self.snapshot, self.settings),
         )
+
+
+def _quantile(confidence: float) -> float:
+    """Return the standard deviations to either end of an interval.
+
+    Raises
+    ------
+    WrongSettingError
+        The confidence is not between 0 and 1.
+    """
+    if not 0 < confidence < 1:
+        raise WrongSettingError(f"confidence={confidence!r}: expected a fraction such as 0.95")
+    return NormalDist().inv_cdf(0.5 + confidence / 2)

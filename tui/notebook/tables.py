@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daq.bench.units import cf_unit
 from estimator.self_noise.result import Flag
 from tui.output.extras import load
 
@@ -14,8 +15,8 @@ if TYPE_CHECKING:
 
     import pandas as pd
     import xarray as xr
-    from numpy.typing import NDArray
 
+    from daq.bench.model import Channel
     from daq.estimation.snapshot import Snapshot
 
 _CURVES = {"noise_psd": "noise_psd", "noise_low": "low", "noise_high": "high", "cov": "cov"}
@@ -27,10 +28,22 @@ _LONG_NAMES = {
     "data_psd": "one-sided power spectral density of the samples",
     "cov": "coefficient of variation of the self-noise",
     "flags": "sum of flags",
+    "csm_real": "real part of E[X conj(Y)], X of trace and Y of other_trace, one-sided",
+    "csm_imag": "imaginary part of E[X conj(Y)], X of trace and Y of other_trace, one-sided",
+    "coherence": "magnitude-squared coherence of trace and other_trace",
+    "response_amplitude": "counts that a unit of motion gives, in response_unit",
+    "response_phase": "phase of the counts against the motion",
 }
+_AXES = ("estimate", "trace", "frequency")
 
 
-def to_xarray(snapshot: Snapshot, said: Mapping[str, str]) -> xr.Dataset:
+def to_xarray(
+    snapshot: Snapshot,
+    said: Mapping[str, str],
+    channels: Mapping[str, Channel] | None = None,
+    *,
+    matrix: bool = False,
+) -> xr.Dataset:
     """Return the spectra of all methods; see `tui.notebook.result.Result.to_xarray`.
 
     Parameters
@@ -38,37 +51,50 @@ def to_xarray(snapshot: Snapshot, said: Mapping[str, str]) -> xr.Dataset:
     snapshot : Snapshot
     said : mapping of str to str
         Attributes: what made the estimate.
+    channels : mapping of str to Channel, optional
+        Sensitivity and response by ``sensor.channel``.
+    matrix : bool
+        Whether the cross-spectral matrix and the coherence are in it.
     """
     xarray = load("xarray")
-    labels = snapshot.channels
-    sensors = list(snapshot.sensor_names)
-    channels = list(dict.fromkeys(label.channel for label in labels))
-    rows = [sensors.index(label.sensor) for label in labels]
-    columns = [channels.index(label.channel) for label in labels]
-
-    def spread(values: NDArray[Any]) -> NDArray[Any]:
-        """Return values by sensor, channel and frequency."""
-        shape = (len(sensors), len(channels), len(snapshot.frequency))
-        empty = np.nan if values.dtype.kind == "f" else 0
-        whole = np.full(shape, empty, dtype=values.dtype)
-        whole[rows, columns] = values.T
-        return whole
-
-    axes = ("sensor", "channel", "frequency")
-    results = snapshot.results.values()
+    labels, results = snapshot.channels, snapshot.results.values()
+    density = f"({cf_unit(snapshot.unit)})2 Hz-1"
     variables: dict[str, Any] = {
-        name: (("estimate", *axes), np.stack([spread(getattr(each, field)) for each in results]))
+        name: (_AXES, np.stack([getattr(each, field).T for each in results]))
         for name, field in {**_CURVES, "flags": "flags"}.items()
     }
-    variables["data_psd"] = (axes, spread(snapshot.data_psd))
+    variables["data_psd"] = (_AXES[1:], snapshot.data_psd.T)
+    coords: dict[str, Any] = {
+        "estimate": list(snapshot.results),  # "method" is an argument of sel()
+        "trace": [label.name for label in labels],
+        "sensor": ("trace", [label.sensor for label in labels]),
+        "channel": ("trace", [label.channel for label in labels]),
+        "frequency": ("frequency", snapshot.frequency, {"units": "Hz"}),
+    }
+    if matrix:
+        csm = np.moveaxis(snapshot.csm, 0, -1)
+        power = np.einsum("ppf->pf", csm).real
+        with np.errstate(divide="ignore", invalid="ignore"):
+            coherence = np.abs(csm) ** 2 / (power[:, np.newaxis] * power)
+        pair = ("trace", "other_trace", "frequency")
+        coords["other_trace"] = coords["trace"]
+        # netCDF has no complex numbers.
+        variables |= {"csm_real": (pair, csm.real), "csm_imag": (pair, csm.imag)}
+        variables["coherence"] = (pair, coherence)
+    if channels is not None:
+        gain = np.full((len(labels), len(snapshot.frequency)), np.nan, np.complex128)
+        for row, label in enumerate(labels):
+            channel = channels[label.name]
+            gain[row] = channel.sensitivity
+            if channel.response is not None:
+                gain[row] *= channel.response.at(snapshot.frequency)
+        variables["response_amplitude"] = (_AXES[1:], np.abs(gain))
+        variables["response_phase"] = (_AXES[1:], np.angle(gain))
+        units = [cf_unit(channels[label.name].unit) for label in labels]
+        coords["response_unit"] = ("trace", [f"count ({unit})-1" for unit in units])
     found: xr.Dataset = xarray.Dataset(
         variables,
-        coords={
-            "estimate": list(snapshot.results),  # "method" is an argument of sel()
-            "sensor": sensors,
-            "channel": channels,
-            "frequency": ("frequency", snapshot.frequency, {"units": "Hz"}),
-        },
+        coords=coords,
         attrs={
             "Conventions": "CF-1.11",
             **said,
@@ -77,11 +103,15 @@ def to_xarray(snapshot: Snapshot, said: Mapping[str, str]) -> xr.Dataset:
             "unit_of_motion": snapshot.unit,
         },
     )
-    for name, long_name in _LONG_NAMES.items():
-        found[name].attrs["long_name"] = long_name
-        if name.endswith(("psd", "low", "high")):
-            found[name].attrs["units"] = f"({snapshot.unit})²/Hz"
-    found["cov"].attrs["units"] = "1"
+    for name in variables:
+        found[name].attrs["long_name"] = _LONG_NAMES[name]
+        if name.endswith(("psd", "low", "high")) or name.startswith("csm"):
+            found[name].attrs["units"] = density
+    for name in ("cov", "coherence"):
+        if name in variables:
+            found[name].attrs["units"] = "1"
+    if "response_phase" in variables:
+        found["response_phase"].attrs["units"] = "rad"
     masks = np.array([int(flag) for flag in Flag], found["flags"].dtype)
     found["flags"].attrs |= {
         "flag_masks": masks,

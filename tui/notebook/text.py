@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+from html import escape
+from itertools import chain, repeat
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -40,6 +42,34 @@ def result(snapshot: Snapshot, settings: Settings) -> str:
     return rendered(parts)
 
 
+def html(snapshot: Snapshot, settings: Settings) -> str:
+    """Return the table that ``huddle estimate`` prints, as HTML."""
+    try:
+        title, table = (
+            results.result_title(snapshot, settings),
+            results.result_table(snapshot, settings),
+        )
+    except BandError as error:
+        return f"<p>Self-noise: {escape(str(error))}</p>"
+    columns = [[column.header, *column.cells] for column in table.columns]
+    header, *rows = [
+        "".join(f"<{tag}>{escape(_plain(cell))}</{tag}>" for cell in row)
+        for tag, row in zip(chain(["th"], repeat("td")), zip(*columns, strict=True), strict=False)
+    ]
+    body = "".join(f"<tr>{row}</tr>" for row in rows)
+    below = "".join(
+        f"<p>{escape(line)}</p>" for line in (*remarks(snapshot, settings), *advice(snapshot))
+    )
+    return (
+        f"<table><caption>{escape(title.plain)}</caption><thead><tr>{header}</tr></thead>"
+        f"<tbody>{body}</tbody></table>{below}"
+    )
+
+
+def _plain(cell: object) -> str:
+    return cell.plain if isinstance(cell, Text) else str(cell)
+
+
 def band(
     labels: Sequence[ChannelLabel],
     data_psd: FloatArray,
@@ -48,6 +78,7 @@ def band(
     *,
     span: tuple[float, float],
     method: str,
+    confidence: float = 0.95,
 ) -> str:
     """Return a table of channels with their means over a band."""
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
@@ -60,7 +91,7 @@ def band(
         table.add_row(*map(Text, (*cells, level_with_error(float(mean), float(high)))))
     title = (
         f"Self-noise, mean over {span[0]:.3g} to {span[1]:.3g} Hz, dB re 1"
-        f" ({labels[0].unit})²/Hz, with its 95 % interval"
+        f" ({labels[0].unit})²/Hz, with its {100 * confidence:g} % interval"
     )
     return rendered([Text(title), table])
 

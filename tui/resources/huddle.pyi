@@ -17,5 +17,10 @@ from tui.notebook.recording import read as read
 from tui.notebook.result import Result as Result
 from tui.notebook.simulation import Simulation as Simulation
 from tui.notebook.simulation import simulate as simulate
+from tui.notebook.verbs import calibrate as calibrate
+from tui.notebook.verbs import export as export
+from tui.notebook.verbs import load as load
+from tui.notebook.verbs import noise_model as noise_model
+from tui.notebook.verbs import report as report
 
 __version__: str

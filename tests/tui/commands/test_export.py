@@ -243,9 +243,9 @@ def test_netcdf(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
     assert run(recording, "--format", "netcdf", "-o", tmp_path / "a.nc").exit_code == ExitCode.DONE
     with xr.open_dataset(tmp_path / "a.nc", engine="h5netcdf") as found:
         (method,) = snapshot.results
-        rear = found["noise_psd"].sel(estimate=method, sensor="rear", channel="X")
+        rear = found["noise_psd"].sel(estimate=method, trace="rear.X")
         np.testing.assert_array_equal(rear, snapshot.results[method].noise_psd[:, 2])
-        assert found["noise_psd"].attrs["units"] == "(m/s²)²/Hz"
+        assert found["noise_psd"].attrs["units"] == "(m s-2)2 Hz-1"
 
 
 def test_mat_and_numpy(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
