@@ -320,7 +320,8 @@ def _described(
         said = Taken(name, "none" if unit == "counts" else "file", 1.0, unit)
         if own is not None:
             channel = Channel(name=name, sensitivity=own.sensitivity, unit=canonical(own.unit))
-            said = Taken(name, "file", own.sensitivity, channel.unit, (own.origin,))
+            origin: Literal["file", "none"] = "none" if channel.unit == "counts" else "file"
+            said = Taken(name, origin, own.sensitivity, channel.unit, (own.origin,))
         channels.append(channel)
         found.append(said)
     sensor = Sensor(

@@ -2,7 +2,8 @@
 
 A sensor is ``network.station.location``, its channels are the channel codes. In SEG-2 and SEG-Y
 every trace is a sensor with one channel, named by the number of the trace. Samples stay counts; the
-calibrations that K-NET, Kinemetrics EVT, GSE2 and SEG-2 carry come along.
+calibrations that K-NET, Kinemetrics EVT, GSE2, SEG-2 and RefTek 130 carry come along. The factor of
+SAC is not taken, and said: some writers put counts per unit there, others units per count.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ FORMATS = (
 """Waveform formats that are read, by ObsPy's names, in the order in which they are tried."""
 _NUMBERED = {"SEGY", "SEG2"}
 """Formats whose traces have numbers and no codes."""
+_VOLTS = {"v": 1.0, "mv": 1e-3, "uv": 1e-6, "nv": 1e-9}
 _EVT_FULL_SCALE = 1 << 23
 _HEAD = 4096
 _RESPONSES = (b"B050F03", b"FDSNStationXML")  # RESP, StationXML
@@ -121,18 +123,40 @@ def _traces(stream: Stream, fallback: str, *, numbered: bool) -> list[Trace]:
 def _calibration(stats: Any) -> Calibration | None:  # noqa: ANN401 - ObsPy has no types
     """Return what the header of a trace says a count is; None where that is unknown."""
     kind = str(stats.get("_format", ""))
+    found = None
     if kind == "KNET":
-        return Calibration.of_count(float(stats.calib), "m/s²", "scale factor of K-NET")
-    if kind == "KINEMETRICS_EVT":
-        return _kinemetrics(stats.kinemetrics_evt)
-    if kind == "GSE2":
-        return _gse2(float(stats.calib), float(stats.gse2.calper), str(stats.gse2.instype))
-    if kind == "SEG2" and "DESCALING_FACTOR" in stats.seg2:
+        found = Calibration.of_count(float(stats.calib), "m/s²", "scale factor of K-NET")
+    elif kind == "KINEMETRICS_EVT":
+        found = _kinemetrics(stats.kinemetrics_evt)
+    elif kind == "GSE2":
+        found = _gse2(float(stats.calib), float(stats.gse2.calper), str(stats.gse2.instype))
+    elif kind == "SEG2" and "DESCALING_FACTOR" in stats.seg2:
         stacked = str(stats.seg2.get("STACK", "1")).strip()
         origin = "descaling factor of SEG-2, at the receiver"
         origin += "" if stacked in {"", "1"} else f"; a stack of {stacked}"
-        return Calibration.of_count(1e-3 * float(stats.calib), "V", origin)
-    return None
+        found = Calibration.of_count(1e-3 * float(stats.calib), "V", origin)
+    elif kind == "REFTEK130":
+        found = _reftek(stats.reftek130)
+    elif kind == "SAC" and float(stats.sac.get("scale", 1.0)) not in {0.0, 1.0}:
+        origin = (
+            f"SCALE {float(stats.sac.scale):g} of SAC not taken: counts per unit, or units per"
+            " count; expected --response or --bench"
+        )
+        found = Calibration(1.0, "counts", origin)
+    return found
+
+
+def _reftek(header: Any) -> Calibration | None:  # noqa: ANN401 - see above
+    """Return V of a count, from the bit weight at unity gain; at others files do not agree."""
+    number = int(header.channel_number)
+    weight = str(header.channel_true_bit_weights[number] or "").split()
+    if str(header.channel_gain_code[number]).strip() != "1" or len(weight) != 2:
+        return None
+    try:
+        size = float(weight[0]) * _VOLTS[weight[1].lower()]
+    except (KeyError, ValueError):
+        return None
+    return Calibration.of_count(size, "V", "bit weight of RefTek 130, at the digitizer")
 
 
 def _kinemetrics(header: Any) -> Calibration | None:  # noqa: ANN401 - see above

@@ -11,6 +11,7 @@ import pytest
 from daq.bench.loading import parse
 from daq.errors import ImportFormatError
 from daq.formats.importer import import_files
+from daq.formats.readers.waveforms import _reftek
 from daq.formats.sources import open_sources
 from daq.recording.reader import Recording
 
@@ -56,6 +57,7 @@ def taken(tmp_path: Path, *paths: Path, **options: Any) -> tuple[Taken, ...]:  #
         ("BI008_MEMA-04823.evt", 2.5 / 2**23 / 2.5 * 9.80665, "m/s²"),
         ("loc_RJOB20050831023349.z", 0.0949e-9 * 2 * np.pi / 1.0, "m/s"),
         ("20180307_031245000.0.seg2", 0.001199e-3, "V"),
+        ("230000005_0036EE80_cropped.rt130", 2.760e-6, "V"),
     ],
 )
 def test_a_count_is_what_the_file_says(
@@ -73,6 +75,35 @@ def test_a_count_is_what_the_file_says(
         np.testing.assert_array_equal(
             recording.sensors[0].counts()[:, 0], obspy.read(str(path))[0].data
         )
+
+
+def test_a_factor_of_two_meanings_is_not_taken_and_said(tmp_path: Path) -> None:
+    for scale, said in ((6.3e8, True), (1.0, False)):
+        trace = obspy.Trace(np.arange(400, dtype=np.float32), {"station": "A", "channel": "HHZ"})
+        trace.stats.sac = {"scale": scale}
+        trace.write(str(tmp_path / "a.sac"), format="SAC")
+        (only,) = taken(tmp_path, tmp_path / "a.sac")
+        assert (only.origin, only.sensitivity, only.unit) == ("none", 1.0, "counts")
+        assert ("SCALE 6.3e+08 of SAC not taken" in "".join(only.notes)) == said
+        (tmp_path / "a.h5").unlink()
+
+
+def test_bit_weights_count_at_unity_gain_alone() -> None:
+    weights, gains = ("2.760 uV", "178.6 mV", "x", None), ("1", "32", "1", "1")
+    found = [
+        _reftek(
+            obspy.core.AttribDict(
+                channel_number=number, channel_true_bit_weights=weights, channel_gain_code=gains
+            )
+        )
+        for number in range(4)
+    ]
+    assert [None if each is None else round(1 / each.sensitivity, 9) for each in found] == [
+        2.76e-6,
+        None,
+        None,
+        None,
+    ]
 
 
 def test_serial_numbers_come_along(tmp_path: Path) -> None:
