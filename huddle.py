@@ -8,7 +8,7 @@
 
 `self_noise` estimates arrays and what `read` finds in files of other programs, `estimate`
 recordings; `open` reads a recording, `simulate` makes samples whose noise is known, `plan` says how
-long to record. `calibrate`, `export` and `report` do what the commands of that name do.
+long to record. `calibrate`, `export`, `report` and `archive` do what the commands of that name do.
 ``python -m huddle`` is the command.
 
 Nothing heavy is imported before it is used. Types are visible to type checkers.
@@ -36,7 +36,7 @@ if TYPE_CHECKING:  # as in tui/resources/huddle.pyi
     )
     from tui.notebook.result import Result
     from tui.notebook.simulation import Simulation, simulate
-    from tui.notebook.verbs import calibrate, export, load, noise_model, report
+    from tui.notebook.verbs import archive, calibrate, export, load, noise_model, report
 
 __all__ = [
     "EstimateOptions",
@@ -47,6 +47,7 @@ __all__ = [
     "Result",
     "Simulation",
     "Waveforms",
+    "archive",
     "calibrate",
     "estimate",
     "export",
@@ -69,6 +70,7 @@ _MODULES = {
     "Result": "tui.notebook.result",
     "Simulation": "tui.notebook.simulation",
     "Waveforms": "tui.notebook.recording",
+    "archive": "tui.notebook.verbs",
     "calibrate": "tui.notebook.verbs",
     "estimate": "tui.notebook.estimates",
     "export": "tui.notebook.verbs",

@@ -217,3 +217,27 @@ def test_commands_are_functions_with_their_numbers(tmp_path: Path) -> None:
     arrays = huddle.self_noise(triaxial(), fs=RATE)
     with pytest.raises(WrongSettingError, match="the estimate is of arrays"):
         huddle.report(arrays, tmp_path / "b.html")
+
+
+def test_an_archive_answers_as_the_command(tmp_path: Path) -> None:
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    for seed in (1, 2):
+        huddle.simulate("fig9", duration="1min", seed=seed).write(folder / f"{seed}.h5")
+    (folder / "broken.h5").write_bytes(b"no recording")
+    ours = huddle.archive(folder, store=tmp_path / "ours", segment="2s")
+    assert "broken.h5" in ours.problems[0]
+    again = huddle.archive(store=tmp_path / "ours")
+    (folder / "broken.h5").unlink()
+    command("archive", str(folder), "--store", str(tmp_path / "theirs"), "--segment", "2s")
+    theirs = huddle.archive(store=tmp_path / "theirs")
+    assert not theirs.problems
+    for each in (ours, again):
+        for method, noise in theirs.pooled.results.items():
+            np.testing.assert_array_equal(each.pooled.results[method].noise_psd, noise.noise_psd)
+    with pytest.raises(WrongSettingError, match="stretch='week': expected one of"):
+        huddle.archive(folder, stretch="week")
+    with pytest.raises(WrongSettingError, match="time_zone='Nowhere'"):
+        huddle.archive(folder, time_zone="Nowhere")
+    with pytest.raises(huddle.HuddleError, match="no archive there"):
+        huddle.archive(store=tmp_path / "none")

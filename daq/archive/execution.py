@@ -14,16 +14,81 @@ from ipaddress import ip_address
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from daq.archive.task import Outcome, Task, run
-from daq.errors import ArchiveError
+from daq.archive.plan import Plan
+from daq.archive.store import Store
+from daq.archive.task import Outcome, Task, run, software_version
+from daq.errors import ArchiveError, HuddleError
+from daq.estimation.segments.segment_pass import Pass
 from daq.python_process import python_command
+from daq.recording.reader import Recording
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Sequence
+    from pathlib import Path
     from types import ModuleType
+
+    from daq.estimation.settings import Settings
 
 _LOGGER = logging.getLogger(__name__)
 CONNECT_SECONDS = 10.0
+
+
+def begun(
+    folder: Path,
+    paths: Sequence[Path],
+    stretch: str | None,
+    settings_for: Callable[[Path], Settings],
+    check: Callable[[Plan], object],
+) -> Store:
+    """Begin an archive with the settings and sensors of the first recording that can be read.
+
+    Parameters
+    ----------
+    folder : Path
+    paths : sequence of Path
+    stretch : str or None
+        ``hour`` (default) or ``day``.
+    settings_for : callable
+        Returns the settings for a recording.
+    check : callable
+        Raises if the options do not fit the plan, before there is a folder.
+
+    Raises
+    ------
+    ArchiveError
+        With the reason for each recording.
+    """
+    if not paths:
+        raise ArchiveError(f"{folder}: no archive there; give recordings to begin one")
+    errors = []
+    for path in paths:
+        try:
+            settings = settings_for(path)
+            with Recording.open(path) as recording:
+                plan = Plan.of(Pass(recording, settings), settings, stretch or "hour")
+            check(plan)
+        except (OSError, HuddleError) as error:
+            if isinstance(error, HuddleError) and error.is_usage_error:
+                raise
+            errors.append(str(error))
+        else:
+            return Store.create(folder, plan)
+    raise ArchiveError("\n".join(errors))
+
+
+def tasks_of(archive: Store, new: Sequence[tuple[str, Path]]) -> list[Task]:
+    """Return a task for each recording that is not in an archive yet."""
+    plan, software = archive.plan.to_json(), software_version()
+    return [
+        Task(str(path.resolve()), str(archive.path_of(run_id).resolve()), plan, software)
+        for run_id, path in new
+    ]
+
+
+def failure_of(outcome: Outcome) -> str:
+    """Return what a task failed of, with its recording; empty if it did not."""
+    failure, source = outcome.failure, outcome.source
+    return failure if not failure or source in failure else f"{source}: {failure}"
 
 
 def carried_out(tasks: Sequence[Task], *, jobs: int = 1) -> Generator[Outcome]:

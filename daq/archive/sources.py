@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daq.archive.store import PLAN_FILE
+from daq.archive.store import FOLDER, PLAN_FILE
 from daq.archive.task import origin_of
 from daq.errors import HuddleError, RecordingError
 from daq.recording.reader import Recording
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
-    from pathlib import Path
 
     from daq.archive.store import Entry
 
@@ -34,6 +34,14 @@ class Sorted:
     new: list[tuple[str, Path]] = field(default_factory=list)
     current: list[Path] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
+
+
+def folder_for(sources: Sequence[Path]) -> Path:
+    """Return where the archive of recordings is, or is to be, unless said otherwise."""
+    if not sources:
+        return Path(FOLDER)
+    first = sources[0]
+    return (first if first.is_dir() else first.parent) / FOLDER
 
 
 def recordings_in(sources: Iterable[Path], *, leave_out: Path) -> list[Path]:

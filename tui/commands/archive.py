@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import zoneinfo
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from daq.archive.answers import answer
-from daq.archive.execution import carried_out, on_cluster
-from daq.archive.plan import STRETCHES, Plan
-from daq.archive.sources import recordings_in, sort
-from daq.archive.store import FOLDER, Store
-from daq.archive.task import Task, software_version
+from daq.archive.execution import begun, carried_out, failure_of, on_cluster, tasks_of
+from daq.archive.plan import STRETCHES
+from daq.archive.sources import folder_for, recordings_in, sort
+from daq.archive.store import Store
 from daq.bench.masks.mask_file import masks_named
-from daq.errors import ArchiveError, HuddleError
-from daq.estimation.segments.segment_pass import Pass
-from daq.recording.reader import Recording
 from tui.output.archive.document import archive_document, days_csv
 from tui.output.archive.tables import (
     course_table,
@@ -42,6 +37,7 @@ from tui.wording.formatting import several
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+    from pathlib import Path
 
     from daq.archive.sources import Sorted
     from daq.archive.task import Outcome
@@ -83,9 +79,18 @@ def archive_recordings(
     if scheduler is not None:
         require("distributed")
     masks = masks_named(models)
-    folder = _folder(store, sources)
+    folder = folder_for(sources) if store is None else store
     paths = recordings_in(sources, leave_out=folder)
-    archive = Store.open(folder) or _begun(folder, paths, stretch, wanted)
+    archive = Store.open(folder)
+    if archive is None and not paths:
+        raise typer.BadParameter(f"{folder}: no archive there; give recordings to begin one")
+    archive = archive or begun(
+        folder,
+        paths,
+        stretch,
+        lambda path: settings_for(path, **wanted)[0],
+        lambda plan: plan.changed(wanted, stretch),
+    )
     settings = archive.plan.changed(wanted, stretch)
 
     failures = _take_new(archive, paths, jobs=jobs, scheduler=scheduler) if paths else []
@@ -131,41 +136,6 @@ def archive_recordings(
         raise typer.Exit(ExitCode.TROUBLE)
 
 
-def _folder(store: Path | None, sources: Sequence[Path]) -> Path:
-    """Return where the archive is, or is to be."""
-    if store is not None:
-        return store
-    if not sources:
-        return Path(FOLDER)
-    first = sources[0]
-    return (first if first.is_dir() else first.parent) / FOLDER
-
-
-def _begun(
-    folder: Path,
-    paths: Sequence[Path],
-    stretch: str | None,
-    wanted: dict[str, Any],
-) -> Store:
-    """Begin an archive with the settings and sensors of the first recording that can be read."""
-    if not paths:
-        raise typer.BadParameter(f"{folder}: no archive there; give recordings to begin one")
-    errors = []
-    for path in paths:
-        try:
-            settings, _ = settings_for(path, **wanted)
-            with Recording.open(path) as recording:
-                plan = Plan.of(Pass(recording, settings), settings, stretch or "hour")
-            plan.changed(wanted, stretch)
-        except (OSError, HuddleError) as error:
-            if isinstance(error, HuddleError) and error.is_usage_error:
-                raise
-            errors.append(str(error))
-        else:
-            return Store.create(folder, plan)
-    raise ArchiveError("\n".join(errors))
-
-
 def _take_new(
     archive: Store, paths: Sequence[Path], *, jobs: int, scheduler: str | None
 ) -> list[str]:
@@ -185,9 +155,7 @@ def _take_new(
         failures = list(found.failures)
         for outcome in _with_progress(archive, found, jobs=jobs, scheduler=scheduler):
             if outcome.failure:
-                source = outcome.source
-                failure = outcome.failure
-                failures.append(failure if source in failure else f"{source}: {failure}")
+                failures.append(failure_of(outcome))
             elif not outcome.closed:
                 screen.print(
                     f"{outcome.source}: not closed; taken as far as it goes, and again when it has"
@@ -200,11 +168,7 @@ def _with_progress(
     archive: Store, found: Sorted, *, jobs: int, scheduler: str | None
 ) -> Iterator[Outcome]:
     """Carry out tasks, showing how many are done and the time left."""
-    plan, software = archive.plan.to_json(), software_version()
-    tasks = [
-        Task(str(path.resolve()), str(archive.path_of(run_id).resolve()), plan, software)
-        for run_id, path in found.new
-    ]
+    tasks = tasks_of(archive, found.new)
     if not tasks:
         return
     sizes = {

@@ -53,10 +53,20 @@ def settings_of(settings: Settings, options: Mapping[str, object]) -> Settings:
     WrongSettingError
         If an option is unknown, has a wrong value, or does not fit the others.
     """
+    return with_changes(settings, changes_of(options), called=called)
+
+
+def changes_of(options: Mapping[str, object]) -> dict[str, object]:
+    """Return the values of options, checked, by the name of their fields.
+
+    Raises
+    ------
+    WrongSettingError
+        If an option is unknown, or has a wrong value.
+    """
     names = table_keys()
     changes = {names[_known(key)]: value for key, value in options.items()}
-    checked = {name: _checked(name, value) for name, value in changes.items() if value is not None}
-    return with_changes(settings, checked, called=called)
+    return {name: _checked(name, value) for name, value in changes.items() if value is not None}
 
 
 def called(name: str) -> str:

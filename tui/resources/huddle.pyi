@@ -17,6 +17,7 @@ from tui.notebook.recording import read as read
 from tui.notebook.result import Result as Result
 from tui.notebook.simulation import Simulation as Simulation
 from tui.notebook.simulation import simulate as simulate
+from tui.notebook.verbs import archive as archive
 from tui.notebook.verbs import calibrate as calibrate
 from tui.notebook.verbs import export as export
 from tui.notebook.verbs import load as load
