@@ -11,8 +11,8 @@ import numpy as np
 from daq.bench.masks.mask_file import masks_named
 from daq.bench.units import levels_db
 from daq.errors import WrongSettingError
-from daq.results.sources import uncounted_events
 from daq.results.band_summary import band_of, levels
+from daq.results.sources import uncounted_events
 from estimator.levels.bands import band_edges
 from tui.notebook import text
 from tui.output.extras import load

@@ -57,9 +57,8 @@ def html(snapshot: Snapshot, settings: Settings) -> str:
         for tag, row in zip(chain(["th"], repeat("td")), zip(*columns, strict=True), strict=False)
     ]
     body = "".join(f"<tr>{row}</tr>" for row in rows)
-    below = "".join(
-        f"<p>{escape(line)}</p>" for line in (*remarks(snapshot, settings), *advice(snapshot))
-    )
+    lines = (results.averages_line(snapshot), *(each.line for each in known(snapshot, settings)))
+    below = "".join(f"<p>{escape(line)}</p>" for line in lines)
     return (
         f"<table><caption>{escape(title.plain)}</caption><thead><tr>{header}</tr></thead>"
         f"<tbody>{body}</tbody></table>{below}"
