@@ -212,6 +212,15 @@ def test_commands_are_functions_with_their_numbers(tmp_path: Path) -> None:
     assert "NLNM" in (tmp_path / "a.html").read_text(encoding="utf-8")
     with pytest.raises(WrongSettingError, match=r"a\.xyz: expected a name that ends in \.csv"):
         huddle.export(result, tmp_path / "a.xyz")
+    huddle.export(path, tmp_path / "a.mseed")
+    command("export", str(path), "--format", "mseed", "-o", str(tmp_path / "b.mseed"))
+    assert (tmp_path / "a.mseed").read_bytes() == (tmp_path / "b.mseed").read_bytes()
+    again_read = huddle.read(tmp_path / "a.mseed", response=tmp_path / "a.xml")
+    with huddle.open(path) as recording:
+        for ours, theirs in zip(recording.sensors, again_read.sensors, strict=True):
+            np.testing.assert_array_equal(recording.samples(ours), again_read.samples(theirs))
+    with pytest.raises(WrongSettingError, match="expected its path in place of an estimate"):
+        huddle.export(result, tmp_path / "c.mseed")
     with pytest.raises(WrongSettingError, match="segment with a Result"):
         huddle.calibrate(result, segment="1s")
     arrays = huddle.self_noise(triaxial(), fs=RATE)

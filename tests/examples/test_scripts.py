@@ -44,6 +44,17 @@ def test_noise_from_arrays(tmp_path: Path) -> None:
     assert (tmp_path / "noise.svg").stat().st_size > 10_000
 
 
+@pytest.mark.long
+def test_miniseed_to_noise(tmp_path: Path) -> None:
+    pytest.importorskip("obspy")
+    printed = run("miniseed_to_noise.py", tmp_path)
+    assert "XX.A.HNX: 1e+11 counts per m/s² (response, simulated" in printed
+    share = re.search(r"(\d+)% of the intervals from 1 to 20 Hz contain the true noise", printed)
+    assert share is not None
+    assert 93 <= int(share[1]) <= 97
+    assert (tmp_path / "noise.csv").stat().st_size > 10_000
+
+
 def command(arguments: list[str], *, check: bool) -> None:
     """Run a command of an example in this process: six processes would import everything anew."""
     assert arguments[:4] == [sys.executable, "-P", "-m", "huddle"]

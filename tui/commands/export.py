@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from daq.recording.reader import Recording
 from daq.results.sources import sources
 from tui.commands.estimate import estimated
-from tui.notebook.curve_files import WRITERS, write_curves
+from tui.notebook.curve_files import MINISEED, WRITERS, write_curves, write_samples
 from tui.output.console import for_people, write_json
 from tui.output.json_document import provenance
 from tui.wording.formatting import several
@@ -18,8 +17,6 @@ from tui.wording.formatting import several
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
-
-MINISEED = "mseed"
 
 
 def export_recordings(
@@ -60,18 +57,7 @@ def export_recordings(
 
 
 def _export_samples(file: Path, out: Path, json: str | None) -> None:
-    from daq.formats.miniseed_export import export_miniseed  # noqa: PLC0415 - ObsPy is an extra
-
-    station = out.with_suffix(".xml")
-    parts = [path.with_name(f".{path.name}.part") for path in (out, station)]
-    try:
-        with Recording.open(file) as recording:
-            written = export_miniseed(recording, *parts)
-        for part, path in zip(parts, (out, station), strict=True):
-            part.replace(path)
-    finally:
-        for part in parts:
-            part.unlink(missing_ok=True)
+    written, station = write_samples(file, out)
     screen = for_people(json)
     for name, codes in written.codes.items():
         full = f"{codes.network}.{codes.station}.{codes.location}.{codes.channel}"

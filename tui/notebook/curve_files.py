@@ -1,4 +1,4 @@
-"""Curves in files of other programs: tidy CSV and Parquet, netCDF, MAT, NumPy, UFF 58.
+"""Curves and samples in files of other programs: tidy CSV, Parquet, netCDF, MAT, NumPy, UFF 58.
 
 A tidy table has one row for each method, channel and frequency. All densities are one-sided, in
 unit²/Hz; the unit is in a column, an attribute or a variable of every file. What made the estimate
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from daq.recording.reader import Recording
 from tui.notebook.tables import to_frame, to_xarray
 from tui.output.csv_text import csv_text
 from tui.output.extras import load
@@ -26,9 +27,11 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from daq.estimation.snapshot import Snapshot
+    from daq.formats.miniseed_export import Exported
 
     Said: TypeAlias = dict[str, str]
 
+MINISEED = "mseed"
 _COLUMNS = ("noise_psd", "noise_low", "noise_high", "cov")
 _FIELDS = ("noise_psd", "low", "high", "cov")
 _PSD = 9
@@ -218,3 +221,40 @@ def write_curves(snapshot: Snapshot, kind: str, path: Path, said: Said) -> None:
             _csv_metadata(path, said)
     finally:
         part.unlink(missing_ok=True)
+
+
+def write_samples(file: Path, out: Path) -> tuple[Exported, Path]:
+    """Write all samples of a recording as miniSEED, with StationXML beside it.
+
+    Both files have their names when they are complete.
+
+    Parameters
+    ----------
+    file, out : Path
+
+    Returns
+    -------
+    written : Exported
+    station : Path
+        The StationXML file.
+
+    Raises
+    ------
+    MissingPackageError
+        ObsPy is not installed.
+    RecordingError, OSError
+        The recording cannot be read, or a file not be written.
+    """
+    from daq.formats.miniseed_export import export_miniseed  # noqa: PLC0415 - ObsPy is an extra
+
+    station = out.with_suffix(".xml")
+    parts = [path.with_name(f".{path.name}.part") for path in (out, station)]
+    try:
+        with Recording.open(file) as recording:
+            written = export_miniseed(recording, *parts)
+        for part, path in zip(parts, (out, station), strict=True):
+            part.replace(path)
+    finally:
+        for part in parts:
+            part.unlink(missing_ok=True)
+    return written, station

@@ -26,7 +26,7 @@ from daq.recording.reader import Recording
 from daq.results.calibration import CONFIDENCE
 from daq.results.calibration import calibrate as calibrated
 from daq.results.sources import sources
-from tui.notebook.curve_files import WRITERS, write_curves
+from tui.notebook.curve_files import MINISEED, WRITERS, write_curves, write_samples
 from tui.notebook.estimates import PathLike, estimate
 from tui.notebook.options import called, changes_of, settings_of
 from tui.notebook.result import Result
@@ -107,7 +107,7 @@ def export(
     kind: str | None = None,
     **options: Unpack[EstimateOptions],
 ) -> None:
-    """Write the noise curves to a file of another program, as ``huddle export`` does.
+    """Write noise curves, or samples, to a file of another program, as ``huddle export`` does.
 
     Parameters
     ----------
@@ -115,8 +115,8 @@ def export(
         An estimate, or recordings to estimate.
     path : path
     kind : str, optional
-        ``csv``, ``parquet``, ``netcdf``, ``mat``, ``npz`` or ``uff58``; by the suffix, if not
-        given.
+        ``csv``, ``parquet``, ``netcdf``, ``mat``, ``npz`` or ``uff58``; or ``mseed``, all samples
+        of one recording with StationXML beside them; by the suffix, if not given.
     **options
         Options of the estimate: those of `huddle.estimate`.
 
@@ -139,10 +139,20 @@ def export(
     if kind is None:
         of_suffix = {suffix: name for name, (suffix, _) in WRITERS.items()}
         kind = of_suffix.get(out.suffix.lower(), "")
+        kind = MINISEED if out.suffix.lower() == ".mseed" else kind
+    if kind == MINISEED:
+        if options or not isinstance(result, (str, os.PathLike)):
+            raise WrongSettingError(
+                f"{out}: miniSEED holds all samples of one recording; expected its path in place of"
+                " an estimate, and no options"
+            )
+        write_samples(Path(result), out)
+        return
     if kind not in WRITERS:
         suffixes = ", ".join(suffix for suffix, _ in WRITERS.values())
         raise WrongSettingError(
-            f"{out}: expected a name that ends in {suffixes}, or kind= one of {', '.join(WRITERS)}"
+            f"{out}: expected a name that ends in {suffixes} or .mseed, or kind= one of"
+            f" {', '.join((*WRITERS, MINISEED))}"
         )
     found = _result(result, options)
     said = provenance(found.snapshot, found.settings, sources(found.recordings))
