@@ -80,6 +80,8 @@ def test_files_are_estimated_as_their_import(tmp_path: Path) -> None:
     np.testing.assert_array_equal(labelled.time, frame.index)
     with pytest.raises(ArrayError, match=r"as arguments of huddle\.read"):
         huddle.self_noise(waveforms, fs=RATE)
+    with pytest.raises(WrongSettingError, match=r"some\.h5: a recording; huddle\.open reads it"):
+        huddle.read(tmp_path / "some.h5")
     with pytest.raises(WrongSettingError, match="expected at least one file"):
         huddle.read()
 

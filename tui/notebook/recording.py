@@ -375,6 +375,11 @@ def read(
     """
     if not paths:
         raise WrongSettingError("paths: none given; expected at least one file")
+    for path in paths:
+        if Path(path).suffix.lower() in {".h5", ".hdf5"}:
+            raise WrongSettingError(
+                f"{os.fspath(path)}: a recording; huddle.open reads it, huddle.estimate estimates it"
+            )
     some, assigned = response_sources(response)
     began, ended = (
         None if at is None else round(at.timestamp() * 1e6) * 1000
