@@ -378,7 +378,8 @@ def read(
     for path in paths:
         if Path(path).suffix.lower() in {".h5", ".hdf5"}:
             raise WrongSettingError(
-                f"{os.fspath(path)}: a recording; huddle.open reads it, huddle.estimate estimates it"
+                f"{os.fspath(path)}: a recording; huddle.open reads it, huddle.estimate estimates"
+                " its noise"
             )
     some, assigned = response_sources(response)
     began, ended = (
