@@ -5,13 +5,14 @@ fails where the whole interval of one band is above it. The intervals hold for a
 and bands together (Bonferroni): of tests with all channels just at the mask, one in forty fails.
 
 Noise that is below zero for certain is wrong, so it decides nothing. Of a channel that is clipped,
-or was dead for a while, the estimate is an upper bound.
+or was dead for a while, the estimate is an upper bound. Where the motion contradicts a channel's
+sensitivity, the verdict must be the same with either, or the channel is not decided.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import NormalDist
 from typing import TYPE_CHECKING
 
@@ -59,7 +60,8 @@ class Comparison:
 
     `outer_low` and `outer_high` are the ends of the interval with all that widens it; `low` and
     `high` those by the scatter of the estimate alone, `no_clocks` the ends without what the clocks
-    do. NaN in bands without an estimate.
+    do. NaN in bands without an estimate. `gains` has what the channel reads of the motion of the
+    others, in place of 1; empty where the motion does not contradict its sensitivity.
     """
 
     centre: FloatArray
@@ -75,9 +77,18 @@ class Comparison:
     is_alone: BoolArray
     is_withdrawn: BoolArray
     is_faulty: bool
+    gains: tuple[float, ...] = ()
 
     def judged(self) -> Judged:
         """Return the verdict, and the band where the channel does worst."""
+        own = self._judged()
+        for gain in self.gains:  # the noise is divided by its square, or the mask multiplied
+            other = replace(self, mask=self.mask * gain**2, gains=())
+            if other.judged().verdict is not own.verdict:
+                return Judged(Verdict.NOT_DECIDED, own.band, Obstacle.SENSITIVITY)
+        return own
+
+    def _judged(self) -> Judged:
         known = np.isfinite(self.mean)
         if not known.any():
             why = Obstacle.NO_ESTIMATE if self.centre.size else Obstacle.OUTSIDE_SPECTRUM

@@ -32,6 +32,8 @@ class Obstacle(enum.StrEnum):
     """A sensor records none of the motion that the others share: no noise can be told from it."""
     FAULTY_CHANNEL = "faulty-channel"
     """The channel is clipped or was dead for a while: its noise is lower than the estimate."""
+    SENSITIVITY = "sensitivity"
+    """The motion contradicts the channel's sensitivity, and the verdict depends on it."""
     MODEL_MISFIT = "model-misfit"
     """One common motion does not explain the averages: the estimate may be too far off."""
     CLOCKS = "clocks"

@@ -233,11 +233,18 @@ def _band_means(snapshot: Snapshot, settings: Settings) -> list[dict[str, Any]]:
 def verdict_document(found: TestVerdict | None) -> dict[str, Any]:
     """Return the verdict on the limits of the bench file; null where it has none."""
     if found is None:
-        return {"verdict": None, "obstacles": [], "record_for": None, "limits": []}
+        return {
+            "verdict": None,
+            "obstacles": [],
+            "sensitivities": [],
+            "record_for": None,
+            "limits": [],
+        }
     prediction = found.prediction
     return {
         "verdict": found.verdict,
         "obstacles": list(found.obstacles),
+        "sensitivities": plain(found.sensitivities),
         "record_for": None
         if prediction is None
         else {

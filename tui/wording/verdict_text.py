@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from estimator.checks.sensitivities import Cause
 from estimator.decision.comparison import MIN_AVERAGES
 from estimator.decision.decision_time import LIKELY
 from estimator.decision.verdict import Obstacle, Verdict
@@ -13,7 +14,7 @@ from tui.wording.formatting import level, listed, roughly, several, signed
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from daq.results.decision.verdict import LimitResult, TestVerdict
+    from daq.results.decision.verdict import LimitResult, TestVerdict, WrongSensitivity
     from estimator.decision.verdict import Prediction
 
 WORDS: Mapping[Verdict, str] = {
@@ -40,6 +41,7 @@ OBSTACLES: Mapping[Obstacle, str] = {
     "advice, and record again.",
     Obstacle.FAULTY_CHANNEL: "{channels}: clipped or temporarily dead, so the noise is lower "
     "than estimated. Remove the cause and record again.",
+    Obstacle.SENSITIVITY: "{sensitivities}",
     Obstacle.MODEL_MISFIT: "{channels}: one common motion does not explain what the sensors have "
     "in common, and the noise estimate may be wrong by more than the margin. Follow the advice and "
     "record again.",
@@ -51,6 +53,14 @@ OBSTACLES: Mapping[Obstacle, str] = {
     Obstacle.SPANS_LIMIT: "The uncertainty of {channels} spans the limit.",
 }
 """What keeps a test from a decision, and what to do."""
+CAUSES: Mapping[Cause, str] = {
+    Cause.GRAVITY: "g in place of m/s², or the reverse",
+    Cause.FACTOR_TWO: "a factor of 2, as between single-ended and differential inputs",
+    Cause.GAIN_SWITCH: "another position of a gain switch, or another multiple of the unit",
+}
+"""What makes a sensitivity wrong by a factor."""
+ALIKE = 0.05
+"""Difference of the gains of a sensor's channels up to which they are one gain."""
 
 
 def headline(found: TestVerdict) -> str:
@@ -82,6 +92,36 @@ def what_to_do(found: TestVerdict) -> list[str]:
         return []
     lines = [_obstacle(each, found) for each in found.obstacles]
     return lines + ([record_for(found.prediction)] if found.prediction is not None else [])
+
+
+def wrong_sensitivities(found: Sequence[WrongSensitivity]) -> list[str]:
+    """Return a sentence for each sensor, or for each of its channels that differ."""
+    of_sensors: dict[str, list[WrongSensitivity]] = {}
+    for each in found:
+        of_sensors.setdefault(each.sensor, []).append(each)
+    lines = []
+    for sensor, channels in of_sensors.items():
+        gains = [each.gain for each in channels]
+        is_one = len(channels) > 1 and max(gains) <= (1 + ALIKE) * min(gains)
+        if is_one:
+            mean = math.exp(math.fsum(map(math.log, gains)) / len(gains))
+            lines.append(_sensitivity(sensor, mean, channels[0]))
+        else:
+            lines += [_sensitivity(each.name, each.gain, each) for each in channels]
+    return lines
+
+
+def _sensitivity(name: str, gain: float, about: WrongSensitivity) -> str:
+    cause = "" if about.cause is None else f" ({CAUSES[about.cause]})"
+    if not about.against:
+        return (
+            f"{name} reads {gain:.3g} of the other sensors{cause}, and no two of them agree: "
+            "correct the sensitivities, or give their certificates."
+        )
+    return (
+        f"{name} reads {gain:.3g} of {listed(about.against)}{cause}: correct its sensitivity, or "
+        "give its certificate."
+    )
 
 
 def not_judged(found: TestVerdict) -> list[str]:
@@ -165,6 +205,7 @@ def _obstacle(obstacle: Obstacle, found: TestVerdict) -> str:
         channels=listed(_channels(concerned)) if concerned else "the channels",
         limits=listed(list(dict.fromkeys(each.limit for each in concerned)) or ["the limits"]),
         averages=MIN_AVERAGES,
+        sensitivities=" ".join(wrong_sensitivities(found.sensitivities)),
     )
 
 

@@ -8,14 +8,15 @@ quantile that holds for all channels, limits and bands together.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daq.results.band_summary import Spectrum, averages_at, highest_known, judged_method
-from daq.results.decision.verdict import LimitResult, TestVerdict
+from daq.results.decision.verdict import LimitResult, TestVerdict, WrongSensitivity
 from daq.results.partners import without_partners
+from estimator.checks.sensitivities import TOLERANCE, wrong_gains
 from estimator.decision.comparison import (
     Comparison,
     Judged,
@@ -28,12 +29,15 @@ from estimator.decision.verdict import Obstacle, Verdict
 from estimator.levels.contributions import Source
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
     from numpy.typing import NDArray
 
     from daq.bench.model import Bench, Limit
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import ChannelLabel, Snapshot
     from daq.results.band_summary import Levels
+    from estimator.checks.sensitivities import WrongGain
     from estimator.types import FloatArray
 
 
@@ -49,6 +53,7 @@ def judge(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> TestVe
     known: dict[bytes, _Columns] = {}  # limits often share their bands
     found: list[Comparison] = []
     judged: list[Judged] = []
+    doubted = _doubted(bench, snapshot)
     limits: list[LimitResult] = []
     for each in bands:
         columns = known.get(each.edges.tobytes())
@@ -56,7 +61,12 @@ def judge(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> TestVe
             columns = _Columns.of(spectrum.levels(each.edges), quantile)
             known[each.edges.tobytes()] = columns
         for column in each.columns:
-            found.append(each.comparison(bench, snapshot, columns, column))
+            found.append(
+                replace(
+                    each.comparison(bench, snapshot, columns, column),
+                    gains=doubted[column].alternatives if column in doubted else (),
+                )
+            )
             judged.append(found[-1].judged())
             limits.append(each.result(snapshot.channels[column], method, found[-1], judged[-1]))
     verdict, obstacles = whole(
@@ -65,7 +75,50 @@ def judge(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> TestVe
     left = None
     if verdict is Verdict.NOT_DECIDED:
         left = prediction(found, obstacles, quantile=quantile, elapsed=snapshot.elapsed)
-    return TestVerdict(verdict, tuple(limits), obstacles, left)
+    return TestVerdict(verdict, tuple(limits), obstacles, left, _named(snapshot, doubted.values()))
+
+
+def _doubted(bench: Bench, snapshot: Snapshot) -> dict[int, WrongGain]:
+    """Return the channels whose sensitivity the motion contradicts, by column.
+
+    A channel with a certificate that agrees with its sensitivity is not doubted.
+    """
+    diagnosis = snapshot.diagnostics.diagnosis
+    if diagnosis is None:
+        return {}
+    faulty = {*snapshot.diagnostics.clipped, *snapshot.diagnostics.stood_still}
+    found = wrong_gains(
+        diagnosis.responses, snapshot.dims, certified=_certified(bench, snapshot.channels)
+    )
+    return {each.channel: each for each in found if each.channel not in faulty}
+
+
+def _certified(bench: Bench, labels: Sequence[ChannelLabel]) -> set[int]:
+    """Return the columns of channels with a certificate that agrees with the bench file."""
+    certified = {
+        (sensor.name, channel.name)
+        for sensor in bench.sensors
+        for channel in sensor.channels
+        if channel.certificate is not None
+        and abs(channel.sensitivity / channel.certificate.value - 1) <= TOLERANCE
+    }
+    return {n for n, label in enumerate(labels) if (label.sensor, label.channel) in certified}
+
+
+def _named(snapshot: Snapshot, found: Iterable[WrongGain]) -> tuple[WrongSensitivity, ...]:
+    """Return wrong gains with the names of their channels, and of the sensors that agree."""
+    sensors = list(dict.fromkeys(label.sensor for label in snapshot.channels))
+    return tuple(
+        WrongSensitivity(
+            sensor=snapshot.channels[each.channel].sensor,
+            channel=snapshot.channels[each.channel].channel,
+            gain=each.gain,
+            error=each.error,
+            against=tuple(sensors[n] for n in each.against),
+            cause=each.cause,
+        )
+        for each in found
+    )
 
 
 def concerns(limit: Limit, label: ChannelLabel) -> bool:

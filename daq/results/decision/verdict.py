@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from daq.bench.units import decibels
 
 if TYPE_CHECKING:
+    from estimator.checks.sensitivities import Cause
     from estimator.decision.verdict import Obstacle, Prediction, Verdict
 
 
@@ -77,6 +78,34 @@ class LimitResult:
 
 
 @dataclass(frozen=True, slots=True)
+class WrongSensitivity:
+    """A channel that reads more or less of the common motion than the other sensors.
+
+    Attributes
+    ----------
+    sensor, channel : str
+    gain, error : float
+        Motion that the channel reads over that which the others read, and its standard error.
+    against : tuple of str
+        The sensors that agree; empty where no majority does.
+    cause : Cause or None
+        What is likely to be wrong.
+    """
+
+    sensor: str
+    channel: str
+    gain: float
+    error: float
+    against: tuple[str, ...]
+    cause: Cause | None = None
+
+    @property
+    def name(self) -> str:
+        """Sensor and channel, as in ``A.X``: to be read, not to be taken apart."""
+        return f"{self.sensor}.{self.channel}"
+
+
+@dataclass(frozen=True, slots=True)
 class TestVerdict:
     """What a huddle test says of the limits of its bench file.
 
@@ -90,12 +119,15 @@ class TestVerdict:
     prediction : Prediction or None
         Where a longer recording of the same kind would decide; None where something else is
         missing.
+    sensitivities : tuple of WrongSensitivity
+        Channels whose sensitivity the motion contradicts.
     """
 
     verdict: Verdict
     limits: tuple[LimitResult, ...]
     obstacles: tuple[Obstacle, ...] = ()
     prediction: Prediction | None = None
+    sensitivities: tuple[WrongSensitivity, ...] = ()
 
     __test__ = False  # for pytest
 
