@@ -17,6 +17,9 @@ from daq.devices.text.format import MessageFinder
 from daq.devices.text.guess import guess_settings
 from daq.errors import DeviceError, NoAnswerError, NotConnectedError, WrongDeviceError
 from daq.preflight.arrivals import arrivals
+from daq.preflight.findings import CheckRow, Outcome
+from daq.preflight.preflight import check_list
+from daq.preflight.preview import LENGTH, SensorPreview
 from daq.protocols.block import Block, BlockFlag, Event
 from daq.protocols.errors import RemoteProtocolError
 from daq.recorder.connection import patience_of
@@ -118,7 +121,7 @@ async def probe(
     DeviceError
         As the driver raises it.
     """
-    found, errors = await _probe(sensors, clock, duration=duration)
+    found, _, errors = await _probe(sensors, clock, duration=duration)
     if errors:
         raise errors[0]
     return tuple(found)
@@ -126,8 +129,8 @@ async def probe(
 
 async def _probe(
     sensors: Sequence[Sensor], clock: HostClock, *, duration: float
-) -> tuple[list[SensorCheck], list[DeviceError]]:
-    """Return the checks of the sensors that deliver samples, and the errors of the others."""
+) -> tuple[list[SensorCheck], list[SensorPreview], list[DeviceError]]:
+    """Return the checks of the sensors that deliver samples, previews of all, and the errors."""
     blocks: dict[str, list[Block]] = {sensor.name: [] for sensor in sensors}
     events: dict[str, list[Event]] = {sensor.name: [] for sensor in sensors}
     wanted = {s.name: max(MIN_SAMPLES, round(duration * s.sampling_rate)) for s in sensors}
@@ -135,7 +138,7 @@ async def _probe(
     async with driver_type(sensors[0].driver).open(sensors, clock) as session:
         patience, hint = patience_of(session), getattr(session, "hint", "")
         information = {one.sensor: one for one in session.information}
-        errors = list(_identity_errors(sensors, information))
+        troubles = dict(_identity_errors(sensors, information))
         awaited = {name: n for name, n in wanted.items() if not information[name].trouble}
         async with contextlib.aclosing(
             cast("AsyncGenerator[Block | Event]", session.read())  # other iterators need no closing
@@ -156,57 +159,116 @@ async def _probe(
     for sensor in sensors:
         if not blocks[sensor.name] and not information[sensor.name].trouble:
             reported = "; ".join(f"{event.kind}: {event.text}" for event in events[sensor.name])
-            errors.append(
+            troubles.setdefault(
+                sensor.name,
                 NoAnswerError(
                     f"sensor {sensor.name!r} on {sensor.port}: no samples in"
                     f" {patience:g} s{hint and f'; {hint}'}"
                     f"{reported and f'; it reported: {reported}'}"
-                )
+                ),
             )
     found = [
         _check(one, information[one.name], blocks[one.name], events[one.name])
         for one in sensors
         if blocks[one.name]
     ]
-    return found, errors
+    previews = [
+        SensorPreview.of(
+            one,
+            information[one.name],
+            blocks[one.name],
+            trouble=str(troubles.get(one.name, "")),
+        )
+        for one in sensors
+    ]
+    return found, previews, list(troubles.values())
 
 
 def _identity_errors(
     sensors: Sequence[Sensor], information: Mapping[str, DeviceInformation]
-) -> Iterator[DeviceError]:
-    """Yield an error for each device that does not reply, or is not the expected one."""
+) -> Iterator[tuple[str, DeviceError]]:
+    """Yield the name of each sensor whose device does not reply or is another, and the error."""
     for sensor in sensors:
         found = information[sensor.name]
         if found.trouble:
-            yield NoAnswerError(found.trouble)
+            yield sensor.name, NoAnswerError(found.trouble)
             continue
         try:
             check_identity(sensor, found)
         except WrongDeviceError as error:
-            yield error
+            yield sensor.name, error
+
+
+@dataclass(frozen=True, slots=True)
+class Examination:
+    """What all devices of a bench are, and the check list."""
+
+    found: tuple[SensorCheck, ...]
+    errors: tuple[DeviceError, ...]
+    rows: tuple[CheckRow, ...]
+
+    @property
+    def failures(self) -> tuple[CheckRow, ...]:
+        """The rows that keep a test from starting."""
+        return tuple(row for row in self.rows if row.outcome is Outcome.FAILED)
+
+
+async def examine(
+    bench: Bench, clock: HostClock, *, seconds: float = LENGTH, duration: float | None = None
+) -> Examination:
+    """Probe all ports of a bench at the same time, and make the check list.
+
+    Parameters
+    ----------
+    bench : Bench
+    clock : HostClock
+    seconds : float
+        Of samples to read from each sensor.
+    duration : float, optional
+        Of the recording that is wanted, in s; default: that of the bench file.
+    """
+    found, previews, errors = await _probe_bench(bench, clock, duration=seconds)
+    rows = check_list(bench, previews, duration=duration)
+    return Examination(tuple(found), tuple(errors), rows)
 
 
 async def probe_bench(
     bench: Bench, clock: HostClock, *, duration: float = 1.0
 ) -> tuple[list[SensorCheck], list[DeviceError]]:
     """Probe all ports of a bench at the same time; return checks and errors."""
+    found, _, errors = await _probe_bench(bench, clock, duration=duration)
+    return found, errors
+
+
+async def _probe_bench(
+    bench: Bench, clock: HostClock, *, duration: float
+) -> tuple[list[SensorCheck], list[SensorPreview], list[DeviceError]]:
+    """Return checks, a preview of every sensor in the order of the bench file, and errors."""
     answers = await asyncio.gather(
         *(_probe(sensors, clock, duration=duration) for sensors in bench.ports().values()),
         return_exceptions=True,
     )
     found: list[SensorCheck] = []
     errors: list[DeviceError] = []
-    for port, answer in zip(bench.ports(), answers, strict=True):
+    previews: dict[str, SensorPreview] = {}
+    for (port, sensors), answer in zip(bench.ports().items(), answers, strict=True):
+        if isinstance(answer, RemoteProtocolError):
+            answer = DeviceError(f"port {port}: {answer}")  # noqa: PLW2901
         if isinstance(answer, DeviceError):
             errors.append(answer)
-        elif isinstance(answer, RemoteProtocolError):
-            errors.append(DeviceError(f"port {port}: {answer}"))
+            text = str(with_owner(answer, bench.sensors))
+            previews |= {s.name: SensorPreview.of(s, None, trouble=text) for s in sensors}
         elif isinstance(answer, BaseException):
             raise answer
         else:
             found.extend(answer[0])
-            errors.extend(answer[1])
-    return found, [with_owner(error, bench.sensors) for error in errors]
+            previews |= {each.sensor.name: each for each in answer[1]}
+            errors.extend(answer[2])
+    return (
+        found,
+        [previews[sensor.name] for sensor in bench.sensors],
+        [with_owner(error, bench.sensors) for error in errors],
+    )
 
 
 @dataclass(frozen=True, slots=True)

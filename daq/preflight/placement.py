@@ -7,6 +7,7 @@ does. Which of several sensors is reflected, the others say.
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.model import Channel
+    from daq.preflight.common_motion import CommonMotion
     from daq.preflight.preview import SensorPreview
 
 LOW_CORRELATION, HIGH_CORRELATION = 0.3, 0.7
@@ -30,8 +32,8 @@ MIN_OFFSET = 0.5
 """Difference in m/s² from gravity, and from none, that is called an offset."""
 ALONG = 0.8
 """Part of a direction from which on it is that of one channel."""
-FITS = 0.8
-"""Part of a channel's motion that another sensor's must explain, to compare their directions."""
+SOME_CORRELATION = 0.5
+"""Correlation with another sensor from which on a sensor shares motion."""
 
 
 def gravity(each: SensorPreview) -> Iterator[Finding]:
@@ -64,16 +66,19 @@ def _is_vertical(channel: Channel) -> bool:
     return (channel.direction or "").lower() in {"up", "down", "vertical", "z"}
 
 
-def placed_wrongly(able: Sequence[SensorPreview]) -> Iterator[Finding]:
-    """Yield the sensors that share no motion where others do, and those that are reflected.
+def strongest_correlations(able: Sequence[SensorPreview]) -> NDArray[np.float64]:
+    """Return the correlation of the channels of two sensors that move most alike.
 
     Parameters
     ----------
     able : sequence of SensorPreview
         With enough samples.
+
+    Returns
+    -------
+    float64, shape (n_sensors, n_sensors)
+        Zero on the diagonal.
     """
-    if len(able) < 3:
-        return
     end_ns = min(each.last_ns for each in able)
     slow = [_slow(each, end_ns) for each in able]
     n_rows = min(len(rows) for rows in slow)
@@ -85,43 +90,46 @@ def placed_wrongly(able: Sequence[SensorPreview]) -> Iterator[Finding]:
                 both = np.corrcoef(first.T, second.T)
                 d = first.shape[1]
                 strongest[i, j] = strongest[j, i] = np.abs(both[:d, d:]).max()
+    return strongest
+
+
+def alone(able: Sequence[SensorPreview]) -> Iterator[Finding]:
+    """Yield the sensors that share no motion where others do, and those of which that is unsure."""
+    if len(able) < 3:
+        yield Finding(Problem.TOO_FEW_SENSORS)
+        return
+    strongest = strongest_correlations(able)
     for i, each in enumerate(able):
         others = np.delete(np.delete(strongest, i, 0), i, 1)
-        if others.max() >= HIGH_CORRELATION and strongest[i].max() < LOW_CORRELATION:
-            yield Finding(Problem.ALONE, each.sensor.name, value=float(strongest[i].max()))
-    yield from _reflected(able, slow)
+        most = float(strongest[i].max())
+        if most < LOW_CORRELATION and others.max() >= HIGH_CORRELATION:
+            yield Finding(Problem.ALONE, each.sensor.name, value=most)
+        elif most < SOME_CORRELATION:
+            yield Finding(Problem.NOT_COMPARABLE, each.sensor.name)
 
 
-def _reflected(
-    able: Sequence[SensorPreview], slow: Sequence[NDArray[np.float64]]
-) -> Iterator[Finding]:
+def wrong_polarity(motion: CommonMotion) -> Iterator[Finding]:
     """Yield the sensors whose motion is a reflection of that of all others, which agree."""
-    whole = [
-        n
-        for n, each in enumerate(able)
-        if slow[n].shape[1] == 3 == each.sensor.n_main_channels  # none of them is dead
-    ]
-    turns = {(i, j): _turn(slow[i], slow[j]) for i in whole for j in whole if i != j}
-    for j in whole:
-        seen = [turns[i, j] for i in whole if i != j]
-        among = [turns[i, k] for i in whole for k in whole if i != k and j not in (i, k)]
-        if len(seen) < 2 or not all(turn is not None and np.linalg.det(turn) < 0 for turn in seen):
+    places = range(len(motion.sensors))
+    if len(places) < 3:
+        yield Finding(Problem.TOO_FEW_SENSORS)
+        return
+    turns = {(i, j): motion.turn(i, j) for i in places for j in places if i != j}
+    hands = {
+        pair: 0.0 if turn is None else float(np.sign(np.linalg.det(turn)))
+        for pair, turn in turns.items()
+    }
+    for j in places:
+        each = motion.sensors[j]
+        seen = [turn for i in places if i != j and (turn := turns[i, j]) is not None]
+        if not seen:
+            yield Finding(Problem.NOT_COMPARABLE, each.sensor.name)
             continue
-        if not all(turn is not None and np.linalg.det(turn) > 0 for turn in among):
+        if len(seen) < 2 or not all(hands[i, j] <= 0 for i in places if i != j):
             continue
-        yield _what_is_reflected(able[j], [turn for turn in seen if turn is not None])
-
-
-def _turn(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return the directions of a sensor's channels as seen by another, shape (3, 3), of length 1.
-
-    None where the motion is too weak, or too much of one direction, to see them.
-    """
-    solved, *_ = np.linalg.lstsq(first, second, rcond=None)
-    left = ((second - first @ solved) ** 2).sum(axis=0)
-    if (left > (1 - FITS) * (second**2).sum(axis=0)).any():
-        return None
-    return np.asarray(solved.T / np.linalg.norm(solved.T, axis=1)[:, None])
+        among = [hands[i, k] for i in places for k in places if i != k and j not in (i, k)]
+        if among and min(among) >= 0 and max(among) > 0:
+            yield _what_is_reflected(each, seen)
 
 
 def _what_is_reflected(each: SensorPreview, seen: Sequence[NDArray[np.float64]]) -> Finding:
@@ -131,13 +139,14 @@ def _what_is_reflected(each: SensorPreview, seen: Sequence[NDArray[np.float64]])
     """
     name = each.sensor.name
     names = [channel.name for channel in each.sensor.channels if not channel.auxiliary]
-    for a, b in ((0, 1), (0, 2), (1, 2)):
-        order = [0, 1, 2]
+    d = len(names)
+    for a, b in itertools.combinations(range(d), 2):
+        order = list(range(d))
         order[a], order[b] = b, a
-        if all(turn[range(3), order].min() > ALONG for turn in seen):
+        if all(turn[range(d), order].min() > ALONG for turn in seen):
             return Finding(Problem.SWAPPED, name, f"{names[a]} and {names[b]}")
-    for c in range(3):
-        signs = np.where(np.arange(3) == c, -1, 1)
+    for c in range(d):
+        signs = np.where(np.arange(d) == c, -1, 1)
         if all((np.diag(turn) * signs).min() > ALONG for turn in seen):
             return Finding(Problem.REVERSED, name, names[c])
     return Finding(Problem.REFLECTED, name)

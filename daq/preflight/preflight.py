@@ -1,94 +1,274 @@
-"""Checks of a bench before a test, from some seconds of its samples."""
+"""The check list before a test, from some seconds of samples: one function for every command."""
 
 from __future__ import annotations
 
+import math
+import shutil
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.preflight.findings import Finding, Problem
-from daq.preflight.placement import gravity, placed_wrongly
+from daq.bench.units import in_acceleration
+from daq.errors import WrongDeviceError
+from daq.preflight.common_motion import MIN_RATE, CommonMotion, main_samples
+from daq.preflight.findings import Check, CheckRow, Finding, Problem
+from daq.preflight.placement import alone, gravity, wrong_polarity
+from daq.recorder.device_identity import check_identity
+from estimator.checks.sensitivities import wrong_gains
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
+    from daq.bench.model import Bench
     from daq.preflight.preview import SensorPreview
 
 MIN_SECONDS = 4.0
 """Seconds of samples that the checks need."""
+MIN_SAMPLES = 8
+"""Samples without which nothing can be said of a channel, however slow its sensor is."""
 RATE_ERROR = 0.02
 """Difference from the sampling rate of the bench file, as a fraction, from which on it is wrong."""
 MAINS = (50.0, 60.0)
 """Frequencies of mains in Hz."""
-HUM_SHARE = 0.5
-"""Share of a channel's power above 1 Hz at a frequency of mains from which on it hums."""
+HUM_SHARE, HUM_RATIO = 0.5, 4.0
+"""Share of a channel's power above 1 Hz at a frequency of mains from which on it may hum; power
+there over that of the other sensors, the median, from which on it does."""
 CLOCK_ERROR, SIGNIFICANCE = 1e-3, 4.0
 """Difference of a rate, as a fraction, from which on the clock is poor; standard errors it takes.
 """
 UNEVEN = 0.1
 """Standard deviation of arrival times in s from which on clocks are hard to compare."""
+MISSING_SHARE = 0.01
+"""Share of missing samples from which on a port is bad."""
+NEAR = 0.9
+"""Share of the full scale from which on a channel may clip in a test."""
+BYTES_PER_VALUE = 4
+"""Of a count on the disk, before compression."""
+OPEN_END = 3600.0
+"""Seconds of a recording without a duration that the disk must have room for."""
 
 
 def is_complete(sensors: Sequence[SensorPreview]) -> bool:
     """Return whether each sensor has enough samples, or a reason why it has none."""
-    return all(
-        each.trouble or len(each.samples) >= MIN_SECONDS * each.sensor.sampling_rate
-        for each in sensors
+    return all(each.trouble or _has_enough(each) for each in sensors)
+
+
+def check_list(
+    bench: Bench, sensors: Sequence[SensorPreview], *, duration: float | None = None
+) -> tuple[CheckRow, ...]:
+    """Return the check list of a bench: a row for each finding, or one for a check without any.
+
+    Parameters
+    ----------
+    bench : Bench
+        For the place of its recordings.
+    sensors : sequence of SensorPreview
+        In the order of the bench file.
+    duration : float, optional
+        Of the recording in s; default: that of the bench file.
+    """
+    able = [each for each in sensors if not each.trouble and _has_enough(each)]
+    fast = [each for each in able if each.sensor.sampling_rate >= MIN_RATE]
+    motion = CommonMotion.of(
+        [each for each in fast if (np.ptp(main_samples(each), axis=0) > 0).all()]
+    )
+    waiting = [_of(Problem.TOO_FEW_SAMPLES, each) for each in sensors if each not in able]
+    slow = [_of(Problem.TOO_SLOW, each) for each in able if each not in fast]
+    at_rest = [one for each in able for one in gravity(each)]
+    found: dict[Check, list[Finding]] = {
+        Check.PORTS: [one for each in sensors for one in _port(each)],
+        Check.IDENTITY: [one for each in sensors for one in _identity(each)],
+        Check.RATES: [one for each in sensors for one in _rate(each)],
+        Check.CHANNELS: [*(one for each in able for one in _dead(each)), *waiting],
+        Check.LEVELS: [*(one for each in able for one in _levels(each)), *waiting],
+        Check.HUM: [*_hum(able), *waiting],
+        Check.MOTION: [*alone(fast), *waiting, *slow],
+        Check.SENSITIVITIES: [
+            *_sensitivities(motion),
+            *(one for one in at_rest if one.problem is Problem.OFFSET),
+            *waiting,
+            *slow,
+        ],
+        Check.POLARITY: [*wrong_polarity(motion), *waiting, *slow],
+        Check.CLOCKS: [one for each in sensors for one in _clock(each)],
+        Check.DISK: list(_disk(bench, duration)),
+    }
+    polarity = found[Check.POLARITY]
+    polarity += [
+        one
+        for one in at_rest
+        if one.problem is Problem.SWAPPED and one.sensor not in {known.sensor for known in polarity}
+    ]
+    return tuple(
+        row
+        for check, several in found.items()
+        for row in ([CheckRow(check, one) for one in several] or [CheckRow(check)])
     )
 
 
-def check_before_test(sensors: Sequence[SensorPreview]) -> tuple[Finding, ...]:
-    """Return what is wrong with the sensors, in the order of the bench file."""
-    found = [finding for each in sensors for finding in _of_sensor(each)]
-    able = [
-        each
-        for each in sensors
-        if not each.trouble and len(each.samples) >= MIN_SECONDS * each.sensor.sampling_rate
-    ]
-    return (*found, *(one for each in able for one in gravity(each)), *placed_wrongly(able))
+def _of(problem: Problem, each: SensorPreview, value: float = math.nan) -> Finding:
+    return Finding(problem, each.sensor.name, value=value)
 
 
-def _of_sensor(each: SensorPreview) -> Iterator[Finding]:
-    name, rate = each.sensor.name, each.sensor.sampling_rate
-    if each.trouble:
-        yield Finding(Problem.TROUBLE, name, text=each.trouble)
+def _has_enough(each: SensorPreview) -> bool:
+    return len(each.samples) >= max(MIN_SAMPLES, MIN_SECONDS * each.sensor.sampling_rate)
+
+
+def _is_wrong_device(each: SensorPreview) -> bool:
+    if each.information is None or each.information.trouble:
+        return False
+    try:
+        check_identity(each.sensor, each.information)
+    except WrongDeviceError:
+        return True
+    return False
+
+
+def _port(each: SensorPreview) -> Iterator[Finding]:
+    if each.trouble and not _is_wrong_device(each):
+        yield Finding(Problem.TROUBLE, each.sensor.name, text=each.trouble)
+    elif len(each.samples) == 0 and not each.trouble:
+        yield _of(Problem.NO_SAMPLES, each)
+
+
+def _identity(each: SensorPreview) -> Iterator[Finding]:
+    if each.information is None:
+        yield _of(Problem.TOO_FEW_SAMPLES, each)
+    elif _is_wrong_device(each):
+        yield Finding(Problem.WRONG_DEVICE, each.sensor.name, text=each.trouble)
+    elif not each.information.serial_number:
+        yield _of(Problem.NO_SERIAL_NUMBER, each)
+    elif not each.sensor.serial_number:
+        yield _of(Problem.NOT_IN_FILE, each)
+
+
+def _rate(each: SensorPreview) -> Iterator[Finding]:
+    rate, n_samples = each.sensor.sampling_rate, len(each.samples)
+    if each.trouble or not n_samples:
+        yield _of(Problem.TOO_FEW_SAMPLES, each)
         return
-    if len(each.samples) == 0:
-        yield Finding(Problem.NO_SAMPLES, name)
+    if each.measured_rate is None:
+        yield _of(Problem.UNEVEN, each, each.arrival_scatter)
+    elif abs(each.measured_rate / rate - 1) > max(RATE_ERROR, SIGNIFICANCE * each.rate_error):
+        yield replace(_of(Problem.RATE, each, each.measured_rate), wanted=rate)
+    if each.n_missing > MISSING_SHARE * (n_samples + each.n_missing):
+        yield _of(Problem.MISSING, each, each.n_missing)
+
+
+def _clock(each: SensorPreview) -> Iterator[Finding]:
+    if each.trouble or not len(each.samples):
+        yield _of(Problem.TOO_FEW_SAMPLES, each)
         return
-    off = 0.0 if each.measured_rate is None else each.measured_rate / rate - 1
-    if each.measured_rate is not None and abs(off) > RATE_ERROR:
-        yield Finding(Problem.RATE, name, value=each.measured_rate)
-    elif abs(off) > max(CLOCK_ERROR, SIGNIFICANCE * each.rate_error):
-        yield Finding(Problem.CLOCK, name, value=off * 1e6)
-    if each.arrival_scatter > UNEVEN:
-        yield Finding(Problem.UNEVEN, name, value=each.arrival_scatter)
-    if each.n_missing:
-        yield Finding(Problem.MISSING, name, value=each.n_missing)
-    if each.is_clipping:
-        yield Finding(Problem.CLIPPING, name)
+    if each.measured_rate is None or each.arrival_scatter > UNEVEN:
+        yield _of(Problem.UNEVEN, each, each.arrival_scatter)
+        return
+    off = each.measured_rate / each.sensor.sampling_rate - 1
+    seconds = len(each.samples) / each.sensor.sampling_rate
+    error = max(each.rate_error, each.arrival_scatter / seconds)
+    if CLOCK_ERROR < abs(off) <= RATE_ERROR and abs(off) > SIGNIFICANCE * error:
+        yield _of(Problem.CLOCK, each, off * 1e6)
+    elif SIGNIFICANCE * error > RATE_ERROR:
+        yield _of(Problem.UNEVEN, each, each.arrival_scatter)
+
+
+def _dead(each: SensorPreview) -> Iterator[Finding]:
     for channel, values in zip(each.sensor.channels, each.samples.T, strict=True):
-        if channel.auxiliary:
+        if not channel.auxiliary and np.ptp(values) == 0:
+            yield Finding(Problem.DEAD, each.sensor.name, channel.name)
+
+
+def _levels(each: SensorPreview) -> Iterator[Finding]:
+    if each.is_clipping:
+        yield _of(Problem.CLIPPING, each)
+        return
+    sheet = each.sensor.data_sheet
+    if sheet is None or sheet.full_scale is None:
+        yield _of(Problem.NO_FULL_SCALE, each)
+        return
+    for channel, values in zip(each.sensor.channels, each.samples.T, strict=True):
+        if channel.auxiliary or (sheet.channels and channel.name not in sheet.channels):
             continue
-        if np.ptp(values) == 0:
-            yield Finding(Problem.DEAD, name, channel.name)
-        elif (hum := _hum(values, rate)) is not None:
-            yield Finding(Problem.HUM, name, channel.name, value=hum)
+        own, of_sheet = in_acceleration(channel.unit), in_acceleration(sheet.unit or channel.unit)
+        scale = 1.0 if own is None or of_sheet is None else own / of_sheet
+        share = float(np.abs(values).max()) * scale / sheet.full_scale
+        if share > NEAR:
+            yield Finding(Problem.NEAR_FULL_SCALE, each.sensor.name, channel.name, value=share)
 
 
-def _hum(values: NDArray[np.float64], rate: float) -> float | None:
-    """Return the frequency of mains that has most of the power above 1 Hz; None if none has."""
-    if len(values) < MIN_SECONDS * rate:
-        return None
-    window = np.hanning(len(values))
-    power = np.abs(np.fft.rfft((values - values.mean()) * window)) ** 2
-    frequency = np.fft.rfftfreq(len(values), 1 / rate)
-    whole = power[frequency > 1.0].sum()
+def _hum(able: Sequence[SensorPreview]) -> Iterator[Finding]:
+    """Yield channels that hum more than the other sensors; hum of all may be motion."""
+    yield from (_of(Problem.TOO_SLOW, e) for e in able if e.sensor.sampling_rate <= 2 * min(MAINS))
+    fast = [each for each in able if each.sensor.sampling_rate > 2 * min(MAINS)]
     for mains in MAINS:
-        if mains < rate / 2 and whole > 0:
-            near = np.abs(frequency - mains) <= 1.0
-            if power[near].sum() > HUM_SHARE * whole:
-                return mains
-    return None
+        known = [each for each in fast if mains < each.sensor.sampling_rate / 2]
+        spectra = [_at_mains(each, mains) for each in known]
+        totals = [float(power.sum()) for power, _ in spectra]
+        for n, each in enumerate(known):
+            others = totals[:n] + totals[n + 1 :]
+            power, share = spectra[n]
+            main = [channel.name for channel in each.sensor.channels if not channel.auxiliary]
+            for place in np.flatnonzero(share > HUM_SHARE).tolist():
+                is_more = bool(others) and power[place] > HUM_RATIO * float(np.median(others))
+                problem = Problem.HUM if is_more else Problem.COMMON_HUM
+                yield Finding(problem, each.sensor.name, main[place], value=mains)
+
+
+def _at_mains(each: SensorPreview, mains: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the power of each channel near a frequency, and its share of that above 1 Hz."""
+    values, rate = main_samples(each), each.sensor.sampling_rate
+    window = np.hanning(len(values))[:, None]
+    power = np.abs(np.fft.rfft((values - values.mean(axis=0)) * window, axis=0)) ** 2
+    power /= (window**2).sum() * rate
+    frequency = np.fft.rfftfreq(len(values), 1 / rate)
+    near = power[np.abs(frequency - mains) <= 1.0].sum(axis=0)
+    whole = power[frequency > 1.0].sum(axis=0)
+    share = np.divide(near, whole, out=np.zeros_like(near), where=whole > 0)
+    return near * (rate / len(values)), share
+
+
+def _sensitivities(motion: CommonMotion) -> Iterator[Finding]:
+    if len(motion.sensors) < 3:
+        yield Finding(Problem.TOO_FEW_SENSORS)
+        return
+    compared = {place for each in motion.responses for place in (each.first, each.second)}
+    for place, each in enumerate(motion.sensors):
+        if place not in compared:
+            yield _of(Problem.NOT_COMPARABLE, each)
+    names = [
+        (each.sensor.name, channel.name)
+        for each in motion.sensors
+        for channel in each.sensor.channels
+        if not channel.auxiliary
+    ]
+    for gain in wrong_gains(motion.responses, motion.dims):
+        sensor, channel = names[gain.channel]
+        yield Finding(
+            Problem.SENSITIVITY,
+            sensor,
+            channel,
+            value=gain.gain,
+            against=tuple(motion.sensors[n].sensor.name for n in gain.against),
+            cause=gain.cause,
+        )
+
+
+def _disk(bench: Bench, duration: float | None) -> Iterator[Finding]:
+    """Yield a finding where the disk has no room; the folder need not exist yet."""
+    seconds = duration or bench.recording.duration or OPEN_END
+    wanted = sum(
+        BYTES_PER_VALUE * len(sensor.channels) * sensor.sampling_rate * seconds
+        for sensor in bench.sensors
+    )
+    folder = bench.recording_directory.absolute()
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    try:
+        free = shutil.disk_usage(folder).free
+    except OSError:
+        yield Finding(Problem.DISK_UNKNOWN)
+        return
+    if free < wanted:
+        yield Finding(Problem.DISK_FULL, value=free, wanted=wanted)

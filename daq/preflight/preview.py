@@ -79,6 +79,34 @@ class SensorPreview:
     n_missing: int = 0
     trouble: str = ""
 
+    @classmethod
+    def of(
+        cls,
+        sensor: Sensor,
+        information: DeviceInformation | None,
+        blocks: Sequence[Block] = (),
+        *,
+        trouble: str = "",
+    ) -> SensorPreview:
+        """Return a sensor by its latest blocks."""
+        if not blocks:
+            none = np.empty((0, len(sensor.channels)))
+            return cls(sensor, information, none, trouble=trouble)
+        counts = np.concatenate([block.counts for block in blocks]).astype(np.float64)
+        arrived = arrivals(blocks)
+        return cls(
+            sensor,
+            information,
+            counts / [channel.sensitivity for channel in sensor.channels],
+            last_ns=blocks[-1].received.monotonic_ns,
+            measured_rate=arrived.rate,
+            rate_error=arrived.error,
+            arrival_scatter=arrived.scatter,
+            is_clipping=any(BlockFlag.CLIPPED in block.flags for block in blocks),
+            n_missing=blocks[-1].end_sample - blocks[0].first_sample - len(counts),
+            trouble=trouble,
+        )
+
 
 class _SensorBuffer:
     """The latest blocks of one sensor."""
@@ -102,23 +130,8 @@ class _SensorBuffer:
             self._n_samples -= self._blocks.popleft().n_samples
 
     def preview(self) -> SensorPreview:
-        blocks = list(self._blocks)
-        if not blocks:
-            none = np.empty((0, len(self.sensor.channels)))
-            return SensorPreview(self.sensor, self.information, none, trouble=self.trouble)
-        counts = np.concatenate([block.counts for block in blocks]).astype(np.float64)
-        arrived = arrivals(blocks)
-        return SensorPreview(
-            self.sensor,
-            self.information,
-            counts / [channel.sensitivity for channel in self.sensor.channels],
-            last_ns=blocks[-1].received.monotonic_ns,
-            measured_rate=arrived.rate,
-            rate_error=arrived.error,
-            arrival_scatter=arrived.scatter,
-            is_clipping=any(BlockFlag.CLIPPED in block.flags for block in blocks),
-            n_missing=blocks[-1].end_sample - blocks[0].first_sample - len(counts),
-            trouble=self.trouble,
+        return SensorPreview.of(
+            self.sensor, self.information, list(self._blocks), trouble=self.trouble
         )
 
 

@@ -3,7 +3,7 @@
 # ruff: noqa: PLC0415 - what a subcommand needs is imported when it runs
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeAlias
 
 import typer
 
@@ -22,6 +22,11 @@ from tui.cli.options import (
     StartOption,
     with_estimate_options,
 )
+
+AnywayOption: TypeAlias = Annotated[
+    bool,
+    typer.Option("--anyway", help="Record even where the check list fails (see huddle check)."),
+]
 
 
 @examples("huddle tui lab.toml", "huddle tui recordings/lab-20261121T030000Z.h5")
@@ -98,6 +103,7 @@ def run(
         bool,
         typer.Option("--until-decided", help="Stop when all limits of the bench are decided."),
     ] = False,
+    anyway: AnywayOption = False,
     out: OutOption = None,
     diagnostics: DiagnosticsOption = False,
     report: Annotated[
@@ -112,6 +118,9 @@ def run(
 ) -> None:
     """Run one huddle test: record, estimate live, print the result.
 
+    First the command reads the sensors for 10 s and makes the check list of
+    huddle check. If a check fails, nothing is recorded.
+
     The recorder is a separate process; the estimate reads its file.
     Ctrl-C stops the recorder, and the command prints the result. Ctrl-C
     during the final estimate finishes it first; a second Ctrl-C aborts.
@@ -123,6 +132,7 @@ def run(
         bench,
         end=EndCondition(duration, until_cov, until_decided),
         out=out,
+        anyway=anyway,
         diagnostics=diagnostics,
         report=report,
         json=json,

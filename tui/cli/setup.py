@@ -60,10 +60,12 @@ def check(
     ] = False,
     json: JsonOption = None,
 ) -> None:
-    """Validate a bench file, then identify every device and read a few samples.
+    """Validate a bench file, then identify every device and make the check list.
 
     The command reports all errors in the file together, and all devices that
-    do not answer.
+    do not answer. It reads 10 s of samples and checks ports, serial numbers,
+    rates, channels, levels, hum, common motion, sensitivities, polarity,
+    clocks and disk. The exit code is 1 if a check fails.
     """
     from tui.commands.check import check_bench, check_port
 

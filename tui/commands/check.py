@@ -14,12 +14,26 @@ from daq.bench.durations import format_duration
 from daq.bench.editing import set_sensor_values
 from daq.bench.tables.toml_text import to_toml
 from daq.devices.bench_file import load
-from daq.errors import NoAnswerError
+from daq.errors import DeviceError, NoAnswerError
 from daq.host_clock import SystemClock
-from daq.preflight.device_check import discover, probe_bench, search_description
+from daq.preflight.device_check import (
+    Examination,
+    discover,
+    examine,
+    search_description,
+)
 from daq.transport.serial_ports import stable_path
 from tui.commands.drivers import print_others, summaries
-from tui.output.console import check_places, console, for_people, write_json, write_text
+from tui.output import check_list
+from tui.output.console import (
+    check_places,
+    console,
+    for_people,
+    notices,
+    write_json,
+    write_text,
+)
+from tui.output.exit_codes import ExitCode
 from tui.output.json_values import plain
 from tui.simulation.host_time import host_time
 from tui.wording.formatting import signed
@@ -29,7 +43,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.bench.model import Bench
-    from daq.errors import DeviceError
     from daq.preflight.device_check import DiscoveredDevice, SensorCheck
 
 
@@ -65,12 +78,9 @@ def check_bench(path: Path, *, devices: bool, write: bool = False, json: str | N
     bench = load(path)
     screen = for_people(json)
     screen.print(_summary(bench))
-    found: list[SensorCheck] = []
-    errors: list[DeviceError] = []
+    examined = examined_bench(bench) if devices else Examination((), (), ())
+    found = examined.found
     if devices:
-        clock, loop_factory = host_time(bench)
-        with asyncio.Runner(loop_factory=loop_factory) as runner:
-            found, errors = runner.run(probe_bench(bench, clock))
         if found:
             screen.print(_device_table(found))
             expected = {sensor.name: sensor.serial_number for sensor in bench.sensors}
@@ -78,6 +88,8 @@ def check_bench(path: Path, *, devices: bool, write: bool = False, json: str | N
                 for remark in remarks(entry, expected[entry.information.sensor]):
                     screen.print(f"  {entry.information.sensor}: {remark}")
             screen.print(_channel_table(found))
+        for line in check_list.lines(examined.rows):
+            screen.print(line)
     if write and (identities := new_identities(bench, found)):
         set_sensor_values(path, identities)
         for name, values in identities.items():
@@ -88,11 +100,45 @@ def check_bench(path: Path, *, devices: bool, write: bool = False, json: str | N
         {
             "bench": bench.name,
             "sensors": plain(found),
-            "errors": [str(error) for error in errors],
+            "checks": check_list.document(examined.rows),
+            "errors": [str(error) for error in examined.errors],
         },
     )
-    if errors:
-        raise ExceptionGroup("devices in trouble", errors)
+    if examined.errors:
+        raise ExceptionGroup("devices in trouble", examined.errors)
+    if examined.failures:
+        raise typer.Exit(ExitCode.LIMIT_NOT_MET)
+
+
+def examined_bench(bench: Bench, *, duration: float | None = None) -> Examination:
+    """Return the check list of a bench, whose ports are free again afterwards."""
+    clock, loop_factory = host_time(bench)
+    with asyncio.Runner(loop_factory=loop_factory) as runner:
+        return runner.run(examine(bench, clock, duration=duration))
+
+
+def check_before_test(
+    bench: Bench, *, duration: float | None = None, anyway: bool, refuse: bool = True
+) -> None:
+    """Make the check list before a recording, and print what is wrong.
+
+    Raises
+    ------
+    DeviceError
+        Where `refuse` is set: with what is wrong, unless it is to be recorded anyway.
+    ExceptionGroup
+        Likewise, with the errors of devices that cannot be read.
+    """
+    examined = examined_bench(bench, duration=duration)
+    lines = check_list.lines(examined.rows, failures_only=True)
+    if refuse and not anyway:
+        if examined.errors:
+            raise ExceptionGroup("devices in trouble", examined.errors)
+        if lines:
+            wrong = "; ".join(line.plain for line in lines)
+            raise DeviceError(f"the check list fails: {wrong}; --anyway records nevertheless")
+    for line in lines:
+        notices().print(line)
 
 
 def new_identities(bench: Bench, found: Sequence[SensorCheck]) -> dict[str, dict[str, str]]:

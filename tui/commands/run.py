@@ -26,6 +26,7 @@ from daq.recording.storage.names import recording_path
 from daq.results.decision.limits import judge
 from daq.results.precision import precision
 from daq.results.store import store_results
+from tui.commands.check import check_before_test
 from tui.commands.estimate import exit_with, show_result
 from tui.commands.report import checked, write_report
 from tui.output.console import check_places, for_people, hint, progress
@@ -63,9 +64,12 @@ def run_test(
     csv: str | None,
     diagnostics: bool = False,
     report: Path | None = None,
+    anyway: bool = False,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Run one huddle test and show its result.
+
+    The check list comes first. It must not fail, unless the test is to be made `anyway`.
 
     Raises
     ------
@@ -89,6 +93,7 @@ def run_test(
         checked(report)
     elif bench.recording.report is not None:
         report = out.with_suffix(f".{bench.recording.report}")
+    check_before_test(bench, duration=end.duration, anyway=anyway)
     recorder = RecorderProcess(path, out, end=end, settings=settings)
     try:
         recorder.wait_for_file()

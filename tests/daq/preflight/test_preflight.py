@@ -1,4 +1,4 @@
-"""Checks before a test: what is found in samples whose faults are known."""
+"""The check list: what is found in samples whose faults are known, and what is not checked."""
 
 from __future__ import annotations
 
@@ -6,37 +6,69 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from daq.preflight.findings import Problem
-from daq.preflight.preflight import check_before_test, is_complete
+from daq.bench.model import DataSheet
+from daq.devices.interface import DeviceInformation
+from daq.preflight.findings import Check, CheckRow, Finding, Outcome, Problem
+from daq.preflight.preflight import check_list, is_complete
 from daq.preflight.preview import SensorPreview
+from estimator.checks.sensitivities import Cause
 from tests.tui.example_snapshot import demo_bench
 
 RATE = 200.0
-SENSORS = demo_bench().sensors
+BENCH = demo_bench()
+SENSORS = tuple(
+    each.model_copy(
+        update={"serial_number": f"S{each.name}", "data_sheet": DataSheet(full_scale=100.0)}
+    )
+    for each in BENCH.sensors
+)
 
 
-def previews(seconds: float = 10.0, *, shared: float = 1e-3) -> list[SensorPreview]:
-    """Return three sensors in one motion, turned a little, each with its own noise."""
-    rng = np.random.default_rng(3)
+def previews(
+    seconds: float = 10.0, *, shared: float = 1e-3, turned: bool = False, seed: int = 3
+) -> list[SensorPreview]:
+    """Return three sensors in one motion, each with its own noise."""
+    rng = np.random.default_rng(seed)
     n = round(seconds * RATE)
     motion = shared * np.cumsum(rng.normal(size=(n, 3)), axis=0) * 0.05
+    turns = Rotation.random(3, rng=seed).as_matrix() if turned else np.stack([np.eye(3)] * 3)
     return [
         SensorPreview(
             sensor,
-            None,
-            motion + 1e-5 * rng.normal(size=(n, 3)),
+            DeviceInformation(sensor.name, serial_number=sensor.serial_number),
+            motion @ turn.T + 1e-5 * rng.normal(size=(n, 3)),
             last_ns=10**10,
             measured_rate=RATE,
         )
-        for sensor in SENSORS
+        for sensor, turn in zip(SENSORS, turns, strict=True)
     ]
 
 
-def test_a_sound_bench_has_no_findings() -> None:
-    assert check_before_test(previews()) == ()
+def findings(sensors: list[SensorPreview]) -> list[Finding]:
+    return [row.finding for row in check_list(BENCH, sensors) if row.finding is not None]
+
+
+def failures(sensors: list[SensorPreview]) -> list[tuple[Problem, str, str]]:
+    rows = check_list(BENCH, sensors)
+    found = [row.finding for row in rows if row.outcome is Outcome.FAILED]
+    return [(each.problem, each.sensor, each.channel) for each in found if each is not None]
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("seed", range(5))
+def test_a_sound_bench_passes_every_check(seed: int, turned: bool) -> None:
+    assert check_list(BENCH, previews(turned=turned, seed=seed)) == tuple(map(CheckRow, Check))
+
+
+def test_enough_samples_are_awaited() -> None:
     assert is_complete(previews())
     assert not is_complete(previews(2.0))
+    rows = check_list(BENCH, previews(2.0))
+    unknown = {row.check for row in rows if row.outcome is Outcome.NOT_CHECKED}
+    assert unknown >= {Check.CHANNELS, Check.HUM, Check.SENSITIVITIES, Check.POLARITY, Check.MOTION}
+    assert all(row.outcome is not Outcome.FAILED for row in rows)
 
 
 def test_each_fault_is_found_where_it_is() -> None:
@@ -45,63 +77,121 @@ def test_each_fault_is_found_where_it_is() -> None:
     samples[:, 1] = 7.0
     at = np.arange(len(b.samples)) / RATE
     hums = b.samples + np.array([0.0, 0.0, 1.0]) * np.sin(2 * np.pi * 50 * at)[:, None]
-    found = check_before_test(
-        [
-            replace(a, samples=samples, measured_rate=190.0, n_missing=12),
-            replace(b, samples=hums, is_clipping=True),
-            replace(c, trouble="sensor 'C' on /dev/ttyUSB2: no answer"),
-        ]
-    )
-    assert [(f.problem, f.sensor, f.channel) for f in found] == [
+    sensors = [
+        replace(a, samples=samples, measured_rate=190.0, n_missing=120),
+        replace(b, samples=hums, is_clipping=True),
+        replace(c, trouble="sensor 'C' on /dev/ttyUSB2: no answer", information=None),
+    ]
+    assert failures(sensors) == [
+        (Problem.TROUBLE, "C", ""),
         (Problem.RATE, "A", ""),
         (Problem.MISSING, "A", ""),
         (Problem.DEAD, "A", "Y"),
         (Problem.CLIPPING, "B", ""),
         (Problem.HUM, "B", "Z"),
-        (Problem.TROUBLE, "C", ""),
     ]
-    assert [f.prevents for f in found] == [True, False, True, True, False, True]
+    # Two sensors without a third say nothing of each other.
+    unknown = {
+        row.check for row in check_list(BENCH, sensors) if row.outcome is Outcome.NOT_CHECKED
+    }
+    assert unknown >= {Check.SENSITIVITIES, Check.POLARITY, Check.MOTION, Check.IDENTITY}
     silent = replace(a, samples=a.samples[:0])
-    assert check_before_test([silent])[0].problem is Problem.NO_SAMPLES
+    assert failures([silent, b, c])[0] == (Problem.NO_SAMPLES, "A", "")
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("late", [0, 30])
+def test_a_channel_in_g_is_named_with_its_factor(late: int, turned: bool) -> None:
+    a, b, c = previews(turned=turned)
+    b = replace(b, samples=b.samples * np.array([1, 1 / 9.80665, 1]))
+    n = len(b.samples) - late
+    b = replace(b, samples=b.samples[:n], last_ns=10**10 - late * 5_000_000)
+    found = [each for each in findings([a, b, c]) if each.problem is Problem.SENSITIVITY]
+    assert [(each.sensor, each.channel, each.against) for each in found] == [("B", "Y", ("A", "C"))]
+    assert found[0].value == pytest.approx(1 / 9.80665, rel=0.03)
+    assert found[0].cause is Cause.GRAVITY
+
+
+@pytest.mark.parametrize(("factor", "cause"), [(2.0, Cause.FACTOR_TWO), (10.4, Cause.GAIN_SWITCH)])
+def test_a_whole_sensor_may_be_off(factor: float, cause: Cause) -> None:
+    a, b, c = previews(turned=True)
+    found = failures([a, b, replace(c, samples=c.samples * factor)])
+    assert found == [(Problem.SENSITIVITY, "C", name) for name in "XYZ"]
+    (one, *_) = findings([a, b, replace(c, samples=c.samples * factor)])
+    assert one.cause is cause
+
+
+def test_weak_motion_shows_no_sensitivities() -> None:
+    sensors = previews(shared=1e-9)
+    assert failures(sensors) == []
+    unknown = {row.check for row in check_list(BENCH, sensors) if row.finding is not None}
+    assert unknown == {Check.MOTION, Check.SENSITIVITIES, Check.POLARITY}
 
 
 @pytest.mark.parametrize("late", [0, 30])
 def test_a_sensor_on_another_floor_is_found_however_late_its_samples_are(late: int) -> None:
     a, b, c = previews()
     b = replace(b, samples=b.samples[: len(b.samples) - late], last_ns=10**10 - late * 5_000_000)
-    assert check_before_test([a, b, c]) == ()
+    assert findings([a, b, c]) == []
     other = np.random.default_rng(9).normal(size=c.samples.shape) * 1e-3
-    (found,) = check_before_test([a, b, replace(c, samples=other)])
-    assert (found.problem, found.sensor) == (Problem.ALONE, "C")
+    assert (Problem.ALONE, "C", "") in failures([a, b, replace(c, samples=other)])
 
 
-def test_where_no_sensor_shares_motion_none_is_called_alone() -> None:
-    assert check_before_test(previews(shared=1e-9)) == ()
-
-
-def test_poor_clocks_and_offsets_are_found_and_prevent_nothing() -> None:
+def test_identities_are_compared_and_unknown_ones_are_no_success() -> None:
     a, b, c = previews()
-    found = check_before_test(
+    other = replace(a, information=DeviceInformation("A", serial_number="X"), trouble="expected SA")
+    rows = check_list(BENCH, [other, replace(b, information=DeviceInformation("B")), c])
+    found = [row.finding for row in rows if row.check is Check.IDENTITY]
+    assert [each and each.problem for each in found] == [
+        Problem.WRONG_DEVICE,
+        Problem.NO_SERIAL_NUMBER,
+    ]
+    assert [row for row in rows if row.check is Check.PORTS] == [CheckRow(Check.PORTS)]
+
+
+def test_levels_near_full_scale_and_unknown_ones() -> None:
+    a, b, c = previews()
+    found = findings(
         [
-            replace(a, measured_rate=RATE * 1.004, rate_error=5e-4, arrival_scatter=0.3),
-            replace(b, samples=b.samples + np.array([0.0, 0.0, 9.8]), measured_rate=RATE * 1.004),
-            replace(
-                c,
-                samples=c.samples + np.array([7.0, 0.0, 1.0]),
-                measured_rate=199.9,
-                rate_error=1e-3,
-            ),
+            replace(a, samples=a.samples + np.array([0, 95.0, 0])),
+            replace(b, sensor=b.sensor.model_copy(update={"data_sheet": None})),
+            c,
         ]
     )
-    assert [(f.problem, f.sensor) for f in found] == [
-        (Problem.CLOCK, "A"),
-        (Problem.UNEVEN, "A"),
-        (Problem.CLOCK, "B"),
-        (Problem.OFFSET, "C"),
-    ]
-    assert found[0].value == pytest.approx(4000)
-    assert found[3].value == pytest.approx(50**0.5, abs=0.01)
-    assert not any(f.prevents for f in found)
+    assert found[0].problem is Problem.NEAR_FULL_SCALE
+    assert (found[0].sensor, found[0].channel) == ("A", "Y")
+    assert found[0].value == pytest.approx(0.95, abs=0.01)
+    assert (Problem.NO_FULL_SCALE, "B") in {(each.problem, each.sensor) for each in found}
+
+
+def test_mains_of_all_sensors_may_be_motion() -> None:
+    at = np.arange(2000) / RATE
+    mains = np.sin(2 * np.pi * 50 * at)[:, None]
+    found = findings([replace(each, samples=each.samples + mains) for each in previews()])
+    assert {each.problem for each in found} == {Problem.COMMON_HUM}
+
+
+def test_poor_clocks_are_found_and_uneven_ones_are_unknown() -> None:
+    a, b, c = previews()
+    found = findings(
+        [
+            replace(a, measured_rate=RATE * 1.004, rate_error=5e-4, arrival_scatter=0.3),
+            replace(b, measured_rate=RATE * 1.004),
+            replace(c, measured_rate=199.9, rate_error=1e-3),
+        ]
+    )
+    assert [(f.problem, f.sensor) for f in found] == [(Problem.UNEVEN, "A"), (Problem.CLOCK, "B")]
+    assert found[1].value == pytest.approx(4000)
+
+
+def test_an_offset_is_neither_right_nor_wrong() -> None:
+    a, b, c = previews()
+    up, tilted = np.array([0.0, 0.0, 9.8]), np.array([7.0, 0.0, 1.0])
+    (found,) = findings(
+        [a, replace(b, samples=b.samples + up), replace(c, samples=c.samples + tilted)]
+    )
+    assert (found.problem, found.sensor) == (Problem.OFFSET, "C")
+    assert found.value == pytest.approx(50**0.5, abs=0.01)
 
 
 @pytest.mark.parametrize(
@@ -118,15 +208,34 @@ def test_swapped_and_reversed_channels_are_told_from_turned_sensors(
     columns: list[int], signs: list[int], problem: Problem | None, channel: str
 ) -> None:
     a, b, c = previews()
-    found = check_before_test([a, replace(b, samples=b.samples[:, columns] * signs), c])
-    wanted = [] if problem is None else [(problem, "B", channel)]
-    assert [(f.problem, f.sensor, f.channel) for f in found] == wanted
+    found = failures([a, replace(b, samples=b.samples[:, columns] * signs), c])
+    assert found == ([] if problem is None else [(problem, "B", channel)])
 
 
 def test_a_vertical_channel_without_gravity_has_been_swapped() -> None:
     a, b, c = previews()  # A has directions: Z is up
-    (found,) = check_before_test([replace(a, samples=a.samples + np.array([9.8, 0.1, 0.2])), b, c])
-    assert (found.problem, found.sensor, found.channel) == (Problem.SWAPPED, "A", "Z and X")
-    assert (
-        check_before_test([replace(a, samples=a.samples + np.array([0.3, 0.1, 9.8])), b, c]) == ()
-    )
+    (found,) = failures([replace(a, samples=a.samples + np.array([9.8, 0.1, 0.2])), b, c])
+    assert found == (Problem.SWAPPED, "A", "Z and X")
+    assert failures([replace(a, samples=a.samples + np.array([0.3, 0.1, 9.8])), b, c]) == []
+
+
+def test_single_channels_upside_down_are_reversed() -> None:
+    vertical = [
+        replace(
+            each,
+            sensor=each.sensor.model_copy(update={"channels": each.sensor.channels[2:]}),
+            samples=each.samples[:, 2:],
+        )
+        for each in previews()
+    ]
+    assert failures(vertical) == []
+    a, b, c = vertical
+    assert failures([a, b, replace(c, samples=-c.samples)]) == [(Problem.REVERSED, "C", "Z")]
+
+
+def test_a_disk_without_room_fails() -> None:
+    year = check_list(BENCH, previews(), duration=1e13)
+    (found,) = (row.finding for row in year if row.check is Check.DISK)
+    assert found is not None
+    assert found.problem is Problem.DISK_FULL
+    assert found.wanted == pytest.approx(4 * 9 * 200 * 1e13)

@@ -9,17 +9,18 @@ from rich.cells import cell_len
 from rich.style import Style
 from rich.text import Text
 
-from daq.preflight.findings import Problem
-from daq.preflight.preflight import check_before_test, is_complete
+from daq.preflight.findings import Check, Outcome
+from daq.preflight.preflight import check_list, is_complete
 from tui.application.test_view.braille import DOTS, FIRST
+from tui.output.check_list import lines as check_lines
 from tui.wording.formatting import listed, readings
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
+    from collections.abc import Collection, Sequence
 
     from numpy.typing import NDArray
 
-    from daq.preflight.findings import Finding
+    from daq.bench.model import Bench
     from daq.preflight.preview import SensorPreview
     from tui.application.state import State
 
@@ -98,30 +99,6 @@ def trace(values: NDArray[np.float64], *, width: int) -> str:
 MUTED, GOOD, DOUBTFUL, BAD = "#9aa5b8", "green", "yellow", "bold #ff6b6b"
 LEAST_TRACE, WIDEST_TRACE = 12, 60  # columns
 NUMBERS = {"Hz", "°C"}
-ADVICE: Mapping[Problem, str] = {
-    Problem.TROUBLE: "{text}",
-    Problem.NO_SAMPLES: "{sensor} answers and sends no samples: check its settings",
-    Problem.RATE: "{sensor} sends {value:.1f} samples a second, the bench file says another rate:"
-    " correct sampling_rate",
-    Problem.MISSING: "{sensor} misses {value:.0f} samples: check cable and port",
-    Problem.CLIPPING: "{sensor} is clipping: reduce the motion, or check its mounting and range",
-    Problem.DEAD: "{sensor}.{channel} does not change: nothing is connected, or it is dead",
-    Problem.HUM: "{sensor}.{channel} hums: most of its power is at {value:.0f} Hz; check grounding"
-    " and shielding",
-    Problem.CLOCK: "{sensor}: its clock is off by {value:+.0f} ppm: correct sampling_rate if that"
-    " stays",
-    Problem.UNEVEN: "{sensor}: samples arrive unevenly, by {value:.2f} s: use a port of its own, no"
-    " hub",
-    Problem.OFFSET: "{sensor} measures {value:.3g} m/s² at rest, expected 9.8 (gravity) or 0: check"
-    " sensitivity and unit",
-    Problem.SWAPPED: "{sensor}: {channel} have traded places: check wiring, or the order of"
-    " channels",
-    Problem.REVERSED: "{sensor}.{channel} is reversed against the other sensors: check its wiring",
-    Problem.REFLECTED: "{sensor}: channels are swapped or reversed, no way to turn it explains its"
-    " motion: check wiring, or the order of channels",
-    Problem.ALONE: "{sensor} shares no motion with the other sensors: is it on the same floor?",
-}
-"""What is wrong, and what to do."""
 
 
 def sensors_of_bench(state: State, *, chosen: str = "") -> Text:
@@ -245,23 +222,21 @@ def _readings(
     return cells, f"{title}, {found}" if len(set(units)) == 1 else title
 
 
-def checks(sensors: Sequence[SensorPreview]) -> list[Text]:
-    """Return what the checks find, the worst first; the last line says whether all is ready."""
-    found = check_before_test(sensors)
-    lines = [
-        Text(f"▲ {sentence(each)}", BAD if each.prevents else DOUBTFUL)
-        for each in sorted(found, key=lambda each: not each.prevents)
-    ]
-    preventing = list(dict.fromkeys(each.sensor for each in found if each.prevents))
+def checks(bench: Bench, sensors: Sequence[SensorPreview]) -> list[Text]:
+    """Return the check list, the worst first; the last line says whether all is ready."""
+    rows = check_list(bench, sensors)
+    order = [Outcome.FAILED, Outcome.NOT_CHECKED, Outcome.PASSED]
+    lines = check_lines(sorted(rows, key=lambda row: order.index(row.outcome)))
+    failing = [row for row in rows if row.outcome is Outcome.FAILED]
+    unknown = {row.check for row in rows if row.outcome is Outcome.NOT_CHECKED}
     if not is_complete(sensors):
-        return [*lines, Text("checking …", MUTED)]
-    if preventing:
-        return [*lines, Text(f"not ready: put {listed(preventing)} right first", BAD)]
+        shown = [line for line in lines if not line.plain.startswith("?")]
+        return [*shown, Text("checking …", MUTED)]
+    if failing:
+        named = list(dict.fromkeys(row.finding.sensor for row in failing if row.finding))
+        who = listed(named) if all(named) else "the bench"
+        return [*lines, Text(f"not ready: put {who} right first", BAD)]
+    if unknown:
+        left = listed([each.value for each in Check if each in unknown])
+        return [*lines, Text(f"nothing wrong is known, not checked: {left}", DOUBTFUL)]
     return [*lines, Text("✓ ready: s starts a test", f"bold {GOOD}")]
-
-
-def sentence(finding: Finding) -> str:
-    """Return a finding with what to do."""
-    return ADVICE[finding.problem].format(
-        sensor=finding.sensor, channel=finding.channel, value=finding.value, text=finding.text
-    )

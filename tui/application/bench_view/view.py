@@ -243,7 +243,8 @@ class BenchView(View):
     def _on_preview(self, message: PreviewUpdated) -> None:
         if self._ended is not None and not self._is_frozen:
             self._sensors = message.sensors
-            if self._n_updates % CHECKED_EVERY == 0:
-                self._findings = checks(self._sensors)
+            bench = self.state.bench
+            if self._n_updates % CHECKED_EVERY == 0 and bench is not None:
+                self._findings = checks(bench, self._sensors)
             self._n_updates += 1
             self.show(self.state)

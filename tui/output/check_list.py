@@ -1,0 +1,146 @@
+"""The check list before a test in sentences, as lines and as JSON."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rich.text import Text
+
+from daq.preflight.findings import Check, Outcome, Problem
+from tui.output.json_values import plain
+from tui.wording.formatting import listed
+from tui.wording.verdict_text import CAUSES
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from daq.preflight.findings import CheckRow, Finding
+
+MARKS: Mapping[Outcome, str] = {Outcome.PASSED: "✓", Outcome.FAILED: "✗", Outcome.NOT_CHECKED: "?"}
+STYLES: Mapping[Outcome, str] = {
+    Outcome.PASSED: "green",
+    Outcome.FAILED: "bold #ff6b6b",
+    Outcome.NOT_CHECKED: "yellow",
+}
+PASSED: Mapping[Check, str] = {
+    Check.PORTS: "every sensor answers and sends samples",
+    Check.IDENTITY: "the serial numbers are those of the bench file",
+    Check.RATES: "the sampling rates are those of the bench file, and no samples are missing",
+    Check.CHANNELS: "every channel changes",
+    Check.LEVELS: "no channel is near its full scale",
+    Check.HUM: "no channel hums",
+    Check.MOTION: "all sensors share one motion",
+    Check.SENSITIVITIES: "within 5 % of the common motion",
+    Check.POLARITY: "no channel is reversed or swapped",
+    Check.CLOCKS: "no clock is off by more than 1000 ppm",
+    Check.DISK: "there is room for the recording",
+}
+SENTENCES: Mapping[Problem, str] = {
+    Problem.TROUBLE: "{text}",
+    Problem.NO_SAMPLES: "{sensor} answers and sends no samples: check its settings",
+    Problem.WRONG_DEVICE: "{text}",
+    Problem.RATE: "{sensor} sends {value:.1f} samples a second, expected {wanted:g}: correct"
+    " sampling_rate",
+    Problem.MISSING: "{sensor} misses {value:.0f} samples: check cable and port",
+    Problem.CLIPPING: "{sensor} is clipping: reduce the motion, or check its mounting and range",
+    Problem.NEAR_FULL_SCALE: "{sensor}.{channel} reaches {value:.0%} of its full scale: reduce the"
+    " motion, or choose a larger range",
+    Problem.DEAD: "{sensor}.{channel} does not change: nothing is connected, or it is dead",
+    Problem.HUM: "{sensor}.{channel} hums: most of its power is at {value:.0f} Hz, and the other"
+    " sensors have less; check grounding and shielding",
+    Problem.CLOCK: "{sensor}: its clock is off by {value:+.0f} ppm: correct sampling_rate if that"
+    " stays",
+    Problem.SWAPPED: "{sensor}: {channel} have traded places: check wiring, or the order of"
+    " channels",
+    Problem.REVERSED: "{sensor}.{channel} is reversed against the other sensors: check its wiring",
+    Problem.REFLECTED: "{sensor}: channels are swapped or reversed, no way to turn it explains its"
+    " motion: check wiring, or the order of channels",
+    Problem.ALONE: "{sensor} shares no motion with the other sensors: is it on the same floor?",
+    Problem.DISK_FULL: "{free} are free, the recording takes {needed}: make room",
+    Problem.OFFSET: "not certain, because {sensor} measures {value:.3g} m/s² at rest, expected 9.8"
+    " (gravity) or 0: check sensitivity and unit",
+    Problem.COMMON_HUM: "not certain, because all sensors have most of {channel} at {value:.0f} Hz:"
+    " hum, or motion of machines ({sensor})",
+    Problem.NO_SERIAL_NUMBER: "not checked, because {sensor} states no serial number",
+    Problem.NOT_IN_FILE: "not checked, because the bench file has no serial number of {sensor}:"
+    " huddle check --write adds it",
+    Problem.NO_FULL_SCALE: "not checked, because the bench file has no full scale of {sensor}: give"
+    " full_scale in its data_sheet",
+    Problem.UNEVEN: "not checked, because the samples of {sensor} arrive unevenly",
+    Problem.TOO_FEW_SAMPLES: "not checked, because {sensor} has not sent enough samples",
+    Problem.TOO_SLOW: "not checked, because {sensor} is sampled too slowly",
+    Problem.TOO_FEW_SENSORS: "not checked, because fewer than three sensors can be compared",
+    Problem.NOT_COMPARABLE: "not checked, because the motion of {sensor} cannot be compared: it is"
+    " too weak, or its channels are others",
+    Problem.DISK_UNKNOWN: "not checked, because the free space is not known",
+}
+MERGED = frozenset(
+    {
+        Problem.NO_SERIAL_NUMBER, Problem.NOT_IN_FILE, Problem.NO_FULL_SCALE, Problem.UNEVEN,
+        Problem.TOO_FEW_SAMPLES, Problem.TOO_SLOW, Problem.NOT_COMPARABLE,
+    }
+)  # fmt: skip
+"""Problems of several sensors that are one line."""
+
+
+def sentence(finding: Finding, sensors: Sequence[str] = ()) -> str:
+    """Return a finding with what to do; `sensors` are all of which it is true."""
+    if finding.problem is Problem.SENSITIVITY:
+        cause = "" if finding.cause is None else f" ({CAUSES[finding.cause]})"
+        others = listed(finding.against) if finding.against else "the others, which do not agree"
+        return (
+            f"{finding.sensor}.{finding.channel} reads {finding.value:.3g} of {others}{cause}:"
+            " correct its sensitivity"
+        )
+    return SENTENCES[finding.problem].format(
+        sensor=listed(sensors or [finding.sensor]),
+        channel=finding.channel,
+        value=finding.value,
+        wanted=finding.wanted,
+        text=finding.text,
+        free=_size(finding.value),
+        needed=_size(finding.wanted),
+    )
+
+
+def lines(rows: Iterable[CheckRow], *, failures_only: bool = False) -> list[Text]:
+    """Return the list, a line a row; what cannot be checked of several sensors is one line."""
+    sensors: dict[tuple[Check, Problem], list[str]] = {}
+    chosen = [row for row in rows if not failures_only or row.outcome is Outcome.FAILED]
+    for row in chosen:
+        if row.finding is not None and row.finding.problem in MERGED:
+            sensors.setdefault((row.check, row.finding.problem), []).append(row.finding.sensor)
+    found = []
+    for row in chosen:
+        about, together = row.finding, None
+        if about is not None and about.problem in MERGED:
+            together = sensors.pop((row.check, about.problem), None)
+            if together is None:
+                continue
+        text = PASSED[row.check] if about is None else sentence(about, together or ())
+        found.append(
+            Text.assemble(
+                (f"{MARKS[row.outcome]} ", STYLES[row.outcome]), f"{row.check:<13} ", text
+            )
+        )
+    return found
+
+
+def document(rows: Iterable[CheckRow]) -> list[dict[str, Any]]:
+    """Return the rows for JSON, each with its sentence."""
+    found = []
+    for row in rows:
+        text = PASSED[row.check] if row.finding is None else sentence(row.finding)
+        found.append(
+            {
+                "check": row.check.value,
+                "outcome": row.outcome.value,
+                "text": text,
+                "finding": plain(row.finding),
+            }
+        )
+    return found
+
+
+def _size(n_bytes: float) -> str:
+    return f"{n_bytes / 1e9:.3g} GB"
