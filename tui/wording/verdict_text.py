@@ -87,9 +87,12 @@ def headline(found: TestVerdict) -> str:
 
 
 def what_to_do(found: TestVerdict) -> list[str]:
-    """Return what keeps a test from a decision, and how long to record; empty where decided."""
+    """Return what keeps a test from a decision, and how long to record.
+
+    Where it is decided, only sensitivities that are wrong.
+    """
     if found.verdict is not Verdict.NOT_DECIDED:
-        return []
+        return wrong_sensitivities(found.sensitivities)
     lines = [_obstacle(each, found) for each in found.obstacles]
     return lines + ([record_for(found.prediction)] if found.prediction is not None else [])
 

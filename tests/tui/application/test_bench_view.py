@@ -26,11 +26,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+MOTION = np.random.default_rng(1).normal(size=(2000, 3)).cumsum(axis=0) * 1e-4
 SOUND = tuple(
     SensorPreview(
         sensor,
         DeviceInformation(sensor.name, "A352AD10", f"S{n}", "1.4", 200.0, 25.0),
-        np.random.default_rng(1).normal(size=(2000, 3)).cumsum(axis=0) * 1e-4 * (1 + n),
+        MOTION + 1e-6 * np.random.default_rng(n).normal(size=(2000, 3)),
         last_ns=10**10,
         measured_rate=200.0 + n / 10,
     )

@@ -12,7 +12,7 @@ from rich.text import Text
 from daq.preflight.findings import Check, Outcome
 from daq.preflight.preflight import check_list, is_complete
 from tui.application.test_view.braille import DOTS, FIRST
-from tui.output.check_list import lines as check_lines
+from tui.output.check_list import sentence
 from tui.wording.formatting import listed, readings
 
 if TYPE_CHECKING:
@@ -223,20 +223,21 @@ def _readings(
 
 
 def checks(bench: Bench, sensors: Sequence[SensorPreview]) -> list[Text]:
-    """Return the check list, the worst first; the last line says whether all is ready."""
+    """Return what the check list finds; the last line says whether all is ready.
+
+    Rows that passed are not shown, and what is not checked is named in the last line.
+    """
     rows = check_list(bench, sensors)
-    order = [Outcome.FAILED, Outcome.NOT_CHECKED, Outcome.PASSED]
-    lines = check_lines(sorted(rows, key=lambda row: order.index(row.outcome)))
-    failing = [row for row in rows if row.outcome is Outcome.FAILED]
+    failing = [row.finding for row in rows if row.outcome is Outcome.FAILED and row.finding]
     unknown = {row.check for row in rows if row.outcome is Outcome.NOT_CHECKED}
+    lines = [Text(f"✗ {sentence(each)}", BAD) for each in failing]
     if not is_complete(sensors):
-        shown = [line for line in lines if not line.plain.startswith("?")]
-        return [*shown, Text("checking …", MUTED)]
+        return [*lines, Text("checking …", MUTED)]
     if failing:
-        named = list(dict.fromkeys(row.finding.sensor for row in failing if row.finding))
-        who = listed(named) if all(named) else "the bench"
-        return [*lines, Text(f"not ready: put {who} right first", BAD)]
+        wrong = {each.sensor for each in failing}
+        named = [e.sensor.name for e in sensors if e.sensor.name in wrong] or ["the bench"]
+        return [*lines, Text(f"not ready: put {listed(named)} right first", BAD)]
     if unknown:
         left = listed([each.value for each in Check if each in unknown])
-        return [*lines, Text(f"nothing wrong is known, not checked: {left}", DOUBTFUL)]
-    return [*lines, Text("✓ ready: s starts a test", f"bold {GOOD}")]
+        return [Text(f"? nothing wrong is seen; not checked: {left}", DOUBTFUL)]
+    return [Text("✓ ready: s starts a test", f"bold {GOOD}")]
