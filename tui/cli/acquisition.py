@@ -166,6 +166,10 @@ def record(
         bool,
         typer.Option("--until-stopped", help="Ignore the duration of the bench file."),
     ] = False,
+    check: Annotated[
+        bool,
+        typer.Option("--check", help="Make the check list first; record nothing if a check fails."),
+    ] = False,
     wire_log: Annotated[
         Path | None,
         typer.Option(
@@ -196,6 +200,7 @@ def record(
         estimate=estimate,
         until_stopped=until_stopped,
         operator=operator,
+        check=check,
         wire_log=wire_log,
         out=out,
         json=json,
@@ -232,13 +237,16 @@ def serve(
     show: Annotated[
         bool, typer.Option("--list", help="Show the times of the next runs, and exit.")
     ] = False,
+    anyway: AnywayOption = False,
     json: JsonOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Run huddle tests on the schedule of the bench file, until Ctrl-C.
 
-    Options of the estimate apply to every run.
+    Before each run, the check list of huddle check is made. If a check fails,
+    it is tried again for five minutes; then the run fails, and the hook
+    on_failed says why. Options of the estimate apply to every run.
     """
     from tui.commands.serve import serve_bench
 
-    serve_bench(bench, show=show, json=json, wanted=wanted)
+    serve_bench(bench, show=show, json=json, anyway=anyway, wanted=wanted)

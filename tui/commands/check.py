@@ -117,26 +117,24 @@ def examined_bench(bench: Bench, *, duration: float | None = None) -> Examinatio
         return runner.run(examine(bench, clock, duration=duration))
 
 
-def check_before_test(
-    bench: Bench, *, duration: float | None = None, anyway: bool, refuse: bool = True
-) -> None:
+def check_before_test(bench: Bench, *, duration: float | None = None, anyway: bool) -> None:
     """Make the check list before a recording, and print what is wrong.
 
     Raises
     ------
     DeviceError
-        Where `refuse` is set: with what is wrong, unless it is to be recorded anyway.
+        With what is wrong, unless it is to be recorded anyway.
     ExceptionGroup
         Likewise, with the errors of devices that cannot be read.
     """
     examined = examined_bench(bench, duration=duration)
     lines = check_list.lines(examined.rows, failures_only=True)
-    if refuse and not anyway:
+    if not anyway:
         if examined.errors:
             raise ExceptionGroup("devices in trouble", examined.errors)
         if lines:
             wrong = "; ".join(line.plain for line in lines)
-            raise DeviceError(f"the check list fails: {wrong}; --anyway records nevertheless")
+            raise DeviceError(f"the check list fails: {wrong}; huddle run --anyway records anyway")
     for line in lines:
         notices().print(line)
 

@@ -46,6 +46,7 @@ def record_bench(
     estimate: str | None = None,
     out: Path | None,
     json: str | None,
+    check: bool = False,
     wire_log: Path | None = None,
 ) -> None:
     """Record a bench until the duration has passed, or until SIGINT or SIGTERM.
@@ -68,6 +69,8 @@ def record_bench(
         Settings of the estimate in place of those of the bench file, as its table in JSON.
     out : Path, optional
     json : str, optional
+    check : bool
+        Whether the check list is made first, and nothing is recorded if it fails.
     wire_log : Path, optional
         New file for every byte that ports receive and send.
 
@@ -87,6 +90,10 @@ def record_bench(
         duration = bench.recording.duration
     if out is None:
         out = recording_path(bench, SystemClock().now())
+    if check:
+        from tui.commands.check import check_before_test  # noqa: PLC0415 - loads the estimator
+
+        check_before_test(bench, duration=duration, anyway=False)
     clock, loop_factory = host_time(bench)
     attributes = {"until": until.estimated.text, "estimate": estimate or ""}
     record = partial(

@@ -90,9 +90,16 @@ class AlreadyServedError(HuddleError):
 
 
 def serve_bench(
-    path: Path, *, show: bool, json: str | None, wanted: Mapping[str, object] | None = None
+    path: Path,
+    *,
+    show: bool,
+    json: str | None,
+    anyway: bool = False,
+    wanted: Mapping[str, object] | None = None,
 ) -> None:
     """Run huddle tests on the schedule of the bench file, until SIGINT or SIGTERM.
+
+    With `anyway`, runs start whatever the check list says.
 
     Raises
     ------
@@ -116,7 +123,7 @@ def serve_bench(
         }
         write_json(json, document)
         return
-    asyncio.run(serve(path, bench, wanted))
+    asyncio.run(serve(path, bench, wanted, anyway=anyway))
 
 
 def accepted(path: Path, wanted: Mapping[str, object]) -> Bench:
@@ -159,7 +166,12 @@ def accepted(path: Path, wanted: Mapping[str, object]) -> Bench:
 
 
 async def serve(
-    path: Path, bench: Bench, wanted: Mapping[str, object], *, clock: Clock | None = None
+    path: Path,
+    bench: Bench,
+    wanted: Mapping[str, object],
+    *,
+    clock: Clock | None = None,
+    anyway: bool = False,
 ) -> None:
     """Serve a bench until SIGINT or SIGTERM; SIGHUP reads its file again.
 
@@ -188,7 +200,7 @@ async def serve(
         hook_runner = HookRunner(lambda: service.bench.hooks, store, folder, clock)
         service = Service(
             bench,
-            steps=lambda bench: ProcessSteps(bench, _snapshot(bench, path)),
+            steps=lambda bench: ProcessSteps(bench, _snapshot(bench, path), anyway=anyway),
             store=store,
             clock=clock,
             options=options_table(wanted),

@@ -106,6 +106,15 @@ class Window:
                     return run
                 if self._rest() < (self._shortest if run.parts else 0.0):
                     break
+                if not run.parts and (wrong := await self._steps.check()):
+                    _LOGGER.warning("the check list fails: %s", wrong)
+                    run = run.because(f"the check list fails: {wrong}")
+                    self._save(run)
+                    if self._clock.elapsed() - begun > START.total_seconds():
+                        break
+                    run = await self._pause(run, wait)
+                    wait = min(2 * wait, MAX_RETRY)
+                    continue
                 run, recorder = self._started(run)
             if recorder is not None:
                 end, text = await self._followed(recorder)

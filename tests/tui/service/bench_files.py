@@ -121,6 +121,8 @@ class FakeSteps:
     is_stuck: bool = False
     refuses: bool = False
     refuses_first: int = 0
+    wrong: list[str] = field(default_factory=list)
+    """What the next check lists say; nothing fails afterwards."""
     started: list[tuple[str, float]] = field(default_factory=list)
     until: list[str] = field(default_factory=list)
     finished: list[Request] = field(default_factory=list)
@@ -128,6 +130,10 @@ class FakeSteps:
     def new_part(self, at: datetime) -> str:
         """Return a name."""
         return f"lab-{at:%H%M%S}-{len(self.started)}.h5"
+
+    async def check(self) -> str:
+        """Say what the test wants."""
+        return self.wrong.pop(0) if self.wrong else ""
 
     def start(self, part: str, seconds: float, until: EndCondition) -> Recorder:
         """Start one."""

@@ -175,6 +175,22 @@ async def test_a_cable_that_is_plugged_in_soon_costs_the_beginning_only(tmp_path
     assert [seconds for _, seconds in place.steps.started] == [600, 592, 579]
 
 
+async def test_a_run_waits_for_its_check_list_and_fails_with_what_is_wrong(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    place.steps.wrong = ["sensitivities: B.X reads 0.102 of A and C"]
+    await place.serve(1.2 * HOUR)
+    run = place.store.runs()[0]
+    reason = "the check list fails: sensitivities: B.X reads 0.102 of A and C"
+    assert (run.state, run.reason, len(run.parts)) == (RunState.DONE, reason, 1)
+    place.steps.wrong = ["polarity: C.Z is reversed"] * 20
+    await place.serve(1.0 * HOUR)
+    run = place.store.runs()[0]
+    assert (run.state, run.parts) == (RunState.FAILED, ())
+    assert run.reason == "the check list fails: polarity: C.Z is reversed"
+    assert run.ended is not None
+    assert START_LIMIT < run.ended - run.due < 2 * START_LIMIT
+
+
 async def test_an_estimate_that_the_disk_refuses_is_made_again(tmp_path: Path) -> None:
     place = Place(tmp_path)
     refused = Outcome(error="cannot be rewritten", refused=True)

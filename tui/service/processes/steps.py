@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
 POLL = 0.2
 """Seconds between looks at a process."""
 _LONG = 60.0
+CHECK_TIMEOUT = 120.0
+"""Seconds after which a check list is given up."""
 SILENCE = 600.0
 """Seconds without progress after which an estimate is ended."""
 
@@ -72,6 +75,10 @@ class Steps(Protocol):
         """Take a file name for a new recording."""
         ...
 
+    async def check(self) -> str:
+        """Make the check list; return what fails, empty where nothing does."""
+        ...
+
     def start(self, part: str, seconds: float, until: EndCondition) -> Recorder:
         """Start a recorder."""
         ...
@@ -98,10 +105,12 @@ class ProcessSteps:
         Where recordings go and by what names.
     bench_path : Path
         Bench file for recorders.
+    anyway : bool
+        Whether runs start whatever the check list says.
     """
 
-    def __init__(self, bench: Bench, bench_path: Path) -> None:
-        self._bench, self._bench_path = bench, bench_path
+    def __init__(self, bench: Bench, bench_path: Path, *, anyway: bool = False) -> None:
+        self._bench, self._bench_path, self._anyway = bench, bench_path, anyway
         self._folder = bench.recording_directory
 
     def new_part(self, at: datetime) -> str:
@@ -124,6 +133,34 @@ class ProcessSteps:
         except OSError as error:
             raise RecordingError(f"{first.parent}: cannot be written: {error.strerror}") from error
         raise AssertionError
+
+    async def check(self) -> str:
+        """Make the check list in a process; return what fails, empty where nothing does."""
+        if self._anyway:
+            return ""
+        process = await asyncio.create_subprocess_exec(
+            *python_command("tui", "check", str(self._bench_path), "--json", "-"),
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+        )
+        try:
+            async with asyncio.timeout(CHECK_TIMEOUT):
+                output, errors = await process.communicate()
+        except TimeoutError:
+            return f"the check list took more than {CHECK_TIMEOUT:g} s"
+        finally:
+            if process.returncode is None:
+                process.kill()
+                await process.wait()
+        try:
+            rows = json.loads(output)["checks"]
+        except (ValueError, KeyError):
+            told = errors.decode("utf-8", "replace").strip().splitlines()
+            return f"the check list could not be made: {told[-1] if told else 'no message'}"
+        return "; ".join(
+            f"{row['check']}: {row['text']}" for row in rows if row["outcome"] == "failed"
+        )
 
     def start(self, part: str, seconds: float, until: EndCondition) -> Recorder:
         """Start a recorder, which stops after a time, or by its live estimate before.
