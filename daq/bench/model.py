@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
+import hashlib
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -322,6 +323,12 @@ class Bench(Table):
     def simulated_clock(self) -> str:
         """File of the clock by which simulated devices run; empty for a bench of real ones."""
         return str(self.simulation.get("clock", ""))
+
+    @property
+    def identity(self) -> str:
+        """Hash of the drivers, ports and serial numbers: two benches with one are one bench."""
+        devices = sorted((each.driver, each.port, each.serial_number) for each in self.sensors)
+        return hashlib.sha256(repr(devices).encode()).hexdigest()
 
     def sensor(self, name: str) -> Sensor:
         """Return the sensor of this name."""

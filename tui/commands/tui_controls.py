@@ -48,8 +48,8 @@ if TYPE_CHECKING:
     from tui.application.controls import Preview
     from tui.application.plan import TestPlan
 
-LATEST = 3
-"""How many of the newest recordings are looked at."""
+LATEST = 16
+"""How many of the newest recordings are looked at: several benches may have one folder."""
 
 
 def running_recording(bench: Bench) -> Path | None:
@@ -58,7 +58,19 @@ def running_recording(bench: Bench) -> Path | None:
     if not folder.is_dir():
         return None
     files = sorted(folder.glob("*.h5"), key=lambda path: path.stat().st_mtime, reverse=True)
-    return next((first_part(path) for path in files[:LATEST] if _runs(path, bench.name)), None)
+    return next((first_part(path) for path in files[:LATEST] if _runs(path, bench)), None)
+
+
+def is_of(path: Path, bench: Bench) -> bool:
+    """Return whether a recording was made with the drivers, ports and serial numbers of a bench.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be read.
+    """
+    with Recording.open(path) as recording:
+        return recording.bench is not None and recording.bench.identity == bench.identity
 
 
 def first_part(path: Path) -> Path:
@@ -87,11 +99,13 @@ def _part(path: Path) -> tuple[str, tuple[Path, str]]:
         return "", (path, "")
 
 
-def _runs(path: Path, name: str) -> bool:
+def _runs(path: Path, bench: Bench) -> bool:
     try:
         with Recording.open(path) as recording:
-            if recording.closed or recording.bench is None or recording.bench.name != name:
+            if recording.closed:
                 return False
+        if not is_of(path, bench):
+            return False
         ask(path, "status")
     except HuddleError:
         return False
@@ -178,6 +192,31 @@ class BenchControls(_Controls):
         self.started.append(recorder)
         recorder.wait_for_file()
         return out
+
+    def stop(self, path: Path) -> None:
+        """Ask the recorder of a file of this bench to stop."""
+        self._check_own(path)
+        super().stop(path)
+
+    def mark(self, path: Path, text: str) -> None:
+        """Ask the recorder of a file of this bench to record a remark."""
+        self._check_own(path)
+        super().mark(path, text)
+
+    def _check_own(self, path: Path) -> None:
+        """Raise an error if a recording is another bench's: it is only shown here.
+
+        Raises
+        ------
+        HuddleError
+            If it has other drivers, ports or serial numbers, or cannot be read.
+        """
+        if any(each.out == path for each in self.started) or is_of(path, self.bench):
+            return
+        raise HuddleError(
+            f"{path.name} is recorded by another bench, and is only shown here: stop it from the"
+            f" window of that bench, or by huddle tui {path}"
+        )
 
     def find_running(self) -> Path | None:
         """Return the file of a running recorder of this bench, if there is one."""

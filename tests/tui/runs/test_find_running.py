@@ -7,10 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from daq.errors import HuddleError
+from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
 from daq.recording.storage.names import continuation_names, continued_name
-from tests.tui.example_snapshot import growing
-from tui.commands.tui_controls import first_part
+from tests.tui.example_snapshot import demo_bench, growing
+from tui.commands.tui_controls import BenchControls, first_part, is_of
 
 
 def parts_in(folder: Path, *names: str) -> list[Path]:
@@ -79,3 +81,29 @@ def test_a_name_that_ends_in_a_date_costs_no_more_files(
 
     monkeypatch.setattr(Recording, "open", counted)
     assert first_part(second) == tmp_path / "run.h5"
+
+
+def test_a_bench_is_known_by_its_devices_not_by_its_name(tmp_path: Path) -> None:
+    (path,) = parts_in(tmp_path, "run.h5")
+    bench = demo_bench()
+    assert is_of(path, bench)
+    assert is_of(path, bench.model_copy(update={"name": "renamed"}))
+    first, *others = bench.sensors
+    for change in ({"port": "/dev/ttyUSB7"}, {"serial_number": "S1"}, {"driver": "text"}):
+        changed = (first.model_copy(update=change), *others)
+        assert not is_of(path, bench.model_copy(update={"sensors": changed}))
+
+
+def test_a_recording_of_another_bench_cannot_be_stopped_or_marked(tmp_path: Path) -> None:
+    (path,) = parts_in(tmp_path, "run.h5")
+    first, *others = demo_bench().sensors
+    sensors = (first.model_copy(update={"port": "/dev/ttyUSB7"}), *others)
+    bench = demo_bench().model_copy(update={"sensors": sensors})  # of the same name
+    controls = BenchControls(tmp_path / "lab.toml", bench, Settings.of(bench))
+    with pytest.raises(HuddleError, match=r"run\.h5 is recorded by another bench"):
+        controls.stop(path)
+    with pytest.raises(HuddleError, match=r"run\.h5 is recorded by another bench"):
+        controls.mark(path, "door")
+    own = BenchControls(tmp_path / "lab.toml", demo_bench(), Settings.of(bench))
+    with pytest.raises(HuddleError, match="no recorder"):  # nobody records it any more
+        own.stop(path)

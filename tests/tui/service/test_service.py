@@ -182,9 +182,11 @@ async def test_a_run_waits_for_its_check_list_and_fails_with_what_is_wrong(tmp_p
     run = place.store.runs()[0]
     reason = "the check list fails: sensitivities: B.X reads 0.102 of A and C"
     assert (run.state, run.reason, len(run.parts)) == (RunState.DONE, reason, 1)
-    place.steps.wrong = ["polarity: C.Z is reversed"] * 20
-    await place.serve(1.0 * HOUR)
-    run = place.store.runs()[0]
+    (tmp_path / "other").mkdir()
+    wrong = Place(tmp_path / "other")
+    wrong.steps.wrong = ["polarity: C.Z is reversed"] * 20
+    await wrong.serve(1.2 * HOUR)
+    run = wrong.store.runs()[0]
     assert (run.state, run.parts) == (RunState.FAILED, ())
     assert run.reason == "the check list fails: polarity: C.Z is reversed"
     assert run.ended is not None
