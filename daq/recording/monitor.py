@@ -38,6 +38,7 @@ class SensorStatus:
     sampling_rate : float
         In Hz.
     n_samples, n_gaps, n_missing : int
+        A sensor that is lost has one gap more, which grows until it sends again.
     state : SensorState
     overdue_for : float
         Time since the last block of a sensor that is late or lost; 0 in other states.
@@ -140,9 +141,12 @@ class RecordingMonitor:
             elapsed=elapsed,
             started_utc_ns=self._first.created_at.utc_ns,
             closed=recording.closed,
-            sensors=tuple(replace(s, overdue_for=s.overdue_for + since_latest) for s in sensors)
-            if since_latest
-            else sensors,
+            sensors=tuple(
+                _with_open_gap(replace(s, overdue_for=s.overdue_for + since_latest))
+                if s.state.is_overdue
+                else s
+                for s in sensors
+            ),
             events=self._events,
             ends_in=None if duration is None else max(0.0, duration - elapsed),
         )
@@ -244,6 +248,14 @@ class RecordingMonitor:
         if (latest_ns - blocks.last_ns) * _NS > SILENT_AFTER:
             return SensorState.SILENT, blocks.last_ns, ""
         return SensorState.LIVE, latest_ns, ""
+
+
+def _with_open_gap(sensor: SensorStatus) -> SensorStatus:
+    """Return a sensor with the samples that it should have sent since it was lost."""
+    if not sensor.state.is_lost:
+        return sensor
+    missing = round(sensor.overdue_for * sensor.sampling_rate)
+    return replace(sensor, n_gaps=sensor.n_gaps + 1, n_missing=sensor.n_missing + missing)
 
 
 class _BlockSummary:

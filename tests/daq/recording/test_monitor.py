@@ -45,6 +45,9 @@ def test_states_of_sensors_are_those_of_blocks_and_events(tmp_path: Path) -> Non
         bench.say("B", "stalled", 12.5, "no block for 6.5 s")
         seen = look()["B"]
         assert (seen.state, seen.reason) == ("stalled", "no block for 6.5 s")
+        assert seen.n_gaps == 1
+        assert seen.n_missing == pytest.approx(6.5 * seen.sampling_rate, rel=0.05)
+        assert look()["A"].n_missing == 0
         bench.say("B", "connected", 12.8)
         assert look()["B"].state == "waiting"
         bench.send("B", 14)
@@ -74,6 +77,10 @@ def test_time_goes_on_when_every_sensor_is_lost(tmp_path: Path) -> None:
         assert later.elapsed == pytest.approx(lost.elapsed + 60 * speed)
         assert [s.overdue_for for s in later.sensors] == pytest.approx(
             [s.overdue_for + 60 * speed for s in lost.sensors]
+        )
+        rate = lost.sensors[0].sampling_rate
+        assert [s.n_missing for s in later.sensors] == pytest.approx(
+            [s.n_missing + 60 * speed * rate for s in lost.sensors]
         )
 
 
