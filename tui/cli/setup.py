@@ -13,18 +13,33 @@ from tui.cli.options import BenchArgument, JsonOption, SpeedOption
 from tui.cli.options import duration as read_duration
 
 
-@examples("huddle init", "huddle init -o lab.toml")
+@examples("huddle init", "huddle init -o lab.toml", "huddle init --discover -o lab.toml")
 def init(
     *,
     out: Annotated[
         Path, typer.Option("--out", "-o", metavar="FILE", help="Bench file to write.")
     ] = Path("bench.toml"),
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    discover: Annotated[
+        bool,
+        typer.Option("--discover", help="Search the serial ports, and write the devices found."),
+    ] = False,
+    port: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--port", metavar="PORT", help="With --discover: search this port; may be repeated."
+        ),
+    ] = None,
 ) -> None:
     """Write a commented bench file to fill in."""
-    from tui.commands.check import write_template
+    from tui.commands.check import write_discovered, write_template
 
-    write_template(out, force=force)
+    if port and not discover:
+        raise typer.BadParameter("--port needs --discover")
+    if discover:
+        write_discovered(out, port or (), force=force)
+    else:
+        write_template(out, force=force)
 
 
 @examples(

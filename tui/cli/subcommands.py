@@ -10,7 +10,7 @@ PANELS: dict[str, dict[str, tuple[str, str]]] = {
         "init": ("setup", "Write a commented bench file to fill in."),
         "check": (
             "setup",
-            "Validate a bench file, then identify every device and read a few samples.",
+            "Validate a bench file, then identify every device and make the check list.",
         ),
         "plan": ("setup", "Compute the duration of recording for a target precision, by method."),
         "tui": ("acquisition", "Open the application: start, watch and stop a huddle test."),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import string
+import sys
 from collections import Counter
 from importlib import resources
 from typing import TYPE_CHECKING
@@ -13,8 +15,9 @@ from rich.table import Table
 from daq.bench.durations import format_duration
 from daq.bench.editing import set_sensor_values
 from daq.bench.tables.toml_text import to_toml
-from daq.devices.bench_file import load
-from daq.errors import DeviceError, NoAnswerError
+from daq.devices.bench_file import load, parse
+from daq.devices.epson.commands import COUNTS_PER_UNIT
+from daq.errors import BenchFileError, DeviceError, HuddleError, NoAnswerError
 from daq.host_clock import SystemClock
 from daq.preflight.device_check import (
     Examination,
@@ -22,7 +25,7 @@ from daq.preflight.device_check import (
     examine,
     search_description,
 )
-from daq.transport.serial_ports import stable_path
+from daq.transport.serial_ports import serial_ports, stable_path
 from tui.commands.drivers import print_others, summaries
 from tui.output import check_list
 from tui.output.console import (
@@ -36,7 +39,7 @@ from tui.output.console import (
 from tui.output.exit_codes import ExitCode
 from tui.output.json_values import plain
 from tui.simulation.host_time import host_time
-from tui.wording.formatting import signed
+from tui.wording.formatting import listed, several, signed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -61,6 +64,136 @@ def write_template(out: Path, *, force: bool) -> None:
     write_text(str(out), text)
     console().print(f"{out} written. Fill in ports and sensitivities, then: huddle check {out}")
     print_others(text)
+
+
+def write_discovered(out: Path, ports: Sequence[str], *, force: bool) -> None:
+    """Look for devices on ports, and write a commented bench file that reads them.
+
+    On a terminal, names, operator and a noise limit are asked for. Without `ports`, all serial
+    ports are searched.
+
+    Raises
+    ------
+    typer.BadParameter
+        The file exists, or its folder does not.
+    NoAnswerError
+        No port has a device that huddle can read.
+    """
+    if out.exists() and not force:
+        raise typer.BadParameter(f"{out}: exists already; --force replaces it")
+    check_places(str(out))
+    searched = list(ports) or [port.path for port in serial_ports()]
+    screen = console()
+    found: list[DiscoveredDevice] = []
+    for port, answer in zip(searched, asyncio.run(_discover_all(searched)), strict=True):
+        if isinstance(answer, HuddleError):
+            screen.print(f"{port}: {answer}")
+            continue
+        if isinstance(answer, BaseException):
+            raise answer
+        for device in answer:
+            about = device.information
+            what = device.remark if about is None else f"{about.model} {about.serial_number}"
+            screen.print(f"{port}: {device.driver}, {what}")
+        if not answer:
+            screen.print(f"{port}: no reply")
+        found += answer
+    known = [device for device in found if _channels_of(device)]
+    if not known:
+        where = listed(searched) if searched else "this computer has no serial ports: --port"
+        raise NoAnswerError(f"no device that huddle can read by itself ({where})")
+    is_asked = sys.stdin.isatty() and sys.stdout.isatty()
+    operator = typer.prompt("Operator", default="", show_default=False) if is_asked else ""
+    names = [
+        string.ascii_uppercase[n % 26] + (str(n // 26) if n > 25 else "") for n in range(len(known))
+    ]
+    if is_asked:
+        names = [
+            typer.prompt(f"Name of the sensor on {device.port}", default=name)
+            for device, name in zip(known, names, strict=True)
+        ]
+    limit = ""
+    if is_asked:
+        limit = typer.prompt(
+            "Limit of the noise from 1 to 50 Hz in µg/√Hz (empty: none)",
+            default="",
+            show_default=False,
+        )
+    text = _bench_text(out.stem, known, names, operator=operator, limit=limit)
+    write_text(str(out), text)
+    screen.print(f"{out} written with {several(len(known), 'sensor')}. Next: huddle check {out}")
+    try:
+        parse(text, out)
+    except BenchFileError as error:  # a bench of two sensors waits for its third
+        screen.print(f"To be completed: {error}")
+
+
+async def _discover_all(ports: Sequence[str]) -> list[list[DiscoveredDevice] | BaseException]:
+    return await asyncio.gather(
+        *(discover(port, SystemClock()) for port in ports), return_exceptions=True
+    )
+
+
+def _channels_of(device: DiscoveredDevice) -> list[dict[str, object]]:
+    """Return the channels of a device as tables; none where its registers are not known."""
+    if device.driver == "epson":
+        return [
+            {"name": axis, "sensitivity": round(COUNTS_PER_UNIT, 1), "unit": "m/s²"}
+            for axis in "XYZ"
+        ]
+    places = device.settings.get("columns") or device.settings.get("channel_names") or ()
+    return [
+        {"name": place if isinstance(place, str) else f"column {place}", "sensitivity": 1.0}
+        for place in places
+    ]
+
+
+def _bench_text(
+    name: str,
+    devices: Sequence[DiscoveredDevice],
+    names: Sequence[str],
+    *,
+    operator: str,
+    limit: str,
+) -> str:
+    """Return a bench file with the comments of the template, and these sensors."""
+    template = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
+    head, _, rest = template.partition(
+        "# ----------------------------------------------------------------------------- sensors\n"
+    )
+    rest = rest[rest.index("# ----", 1) :]
+    rest = rest[: rest.index("# ---", rest.index("# [[limits]]"))].rstrip() + "\n"
+    head = head.replace(
+        'name = "bench"', f"name = {to_toml({'n': name}).partition('= ')[2].strip()}"
+    )
+    head = head.replace('operator = ""', to_toml({"operator": operator}).strip())
+    head = "".join(line for line in head.splitlines(True) if "simulates these" not in line)
+    sensors = []
+    for device, sensor in zip(devices, names, strict=True):
+        about = device.information
+        table = {
+            "name": sensor,
+            "model": "" if about is None else about.model,
+            "serial_number": "" if about is None else about.serial_number,
+            "driver": device.driver,
+            "port": stable_path(device.port),
+            "channels": _channels_of(device),
+            "settings": device.settings,
+        }
+        comment = f"# {device.port}: {device.remark or 'answered as ' + device.driver}\n"
+        if device.driver == "text":
+            comment += "# Fill in sampling_rate and the sensitivities, in counts per unit.\n"
+        sensors.append(comment + to_toml({"sensors": [table]}))
+    text = head + "\n".join(sensors) + "\n" + rest
+    if limit.strip():
+        mask = {
+            "name": "limit",
+            "unit": "µg/√Hz",
+            "frequency": [1.0, 50.0],
+            "psd": [float(limit)] * 2,
+        }
+        text += "\n" + to_toml({"limits": [mask]})
+    return text
 
 
 def check_bench(path: Path, *, devices: bool, write: bool = False, json: str | None) -> None:

@@ -1,0 +1,49 @@
+"""``huddle init --discover``: a bench file from what answers on ports."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+from typer.testing import CliRunner
+
+from daq.devices.bench_file import load
+from tests.devices import serving
+from tests.sim_devices.simulated_bench import bench_of, device, spec
+from tui.cli.main import app
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = pytest.mark.devices
+TABLES = [
+    device(name, serial_number=number)
+    for name, number in (("A", "A0000007"), ("B", "B0000001"), ("C", "C0000002"))
+]
+
+
+def test_what_answers_is_in_the_bench_file_with_its_comments(tmp_path: Path) -> None:
+    out = tmp_path / "first.toml"
+    with serving(spec(*TABLES, speed=4.0, sampling_rate=200.0)) as running:
+        ports = [sensor.port for sensor in bench_of(running, TABLES).sensors]
+        options = [each for port in (*ports, "/dev/ttyNotThere") for each in ("--port", port)]
+        found = CliRunner().invoke(app, ["init", "--discover", *options, "-o", str(out)])
+    assert found.exit_code == 0, found.output
+    assert "/dev/ttyNotThere" in found.output
+    bench = load(out)
+    assert [(s.name, s.serial_number, s.port) for s in bench.sensors] == [
+        ("A", "A0000007", ports[0]),
+        ("B", "B0000001", ports[1]),
+        ("C", "C0000002", ports[2]),
+    ]
+    assert [channel.name for channel in bench.sensors[0].channels] == ["X", "Y", "Z"]
+    assert bench.sensors[0].channels[0].sensitivity == pytest.approx(2**24 / 9.80665, rel=1e-6)
+    assert "wanted c.o.v. in the worst third" in out.read_text(encoding="utf-8")
+
+
+def test_nothing_is_written_where_nothing_answers(tmp_path: Path) -> None:
+    out = tmp_path / "first.toml"
+    options = ["init", "--discover", "--port", "/dev/ttyNotThere", "-o", str(out)]
+    found = CliRunner().invoke(app, options)
+    assert found.exit_code != 0
+    assert not out.exists()
