@@ -2,6 +2,7 @@
 
 # ruff: noqa: PLC0415 - what a subcommand needs is imported when it runs
 
+import sys
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
@@ -62,8 +63,17 @@ def tui(
     """Open the application: start, watch and stop a huddle test.
 
     Closing the application does not stop a recording. Opening it again shows
-    the running recording.
+    the running recording. Without a bench file, or with an empty or missing
+    one, the ports are searched and a bench file is written first.
     """
+    is_first = source is None and not any(Path().glob("*.toml"))
+    if source is not None and source.suffix == ".toml":
+        is_first = not source.exists() or source.stat().st_size == 0
+    if is_first and sys.stdin.isatty() and sys.stdout.isatty():
+        from tui.commands.check import write_discovered
+
+        source = Path("bench.toml") if source is None else source
+        write_discovered(source, (), force=True)
     if source is None:
         there = sorted(path.name for path in Path().glob("*.toml"))
         here = f"; this folder has {', '.join(there)}" if there else ""

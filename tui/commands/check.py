@@ -84,6 +84,15 @@ def write_discovered(out: Path, ports: Sequence[str], *, force: bool) -> None:
     check_places(str(out))
     searched = list(ports) or [port.path for port in serial_ports()]
     screen = console()
+    is_asked = sys.stdin.isatty() and sys.stdout.isatty()
+    if is_asked and not ports:
+        screen.print(f"Serial ports: {', '.join(searched) or 'none'}")
+        others = typer.prompt(
+            "Other ports to search, such as socket://host:port (empty: none)",
+            default="",
+            show_default=False,
+        )
+        searched += others.split()
     found: list[DiscoveredDevice] = []
     for port, answer in zip(searched, asyncio.run(_discover_all(searched)), strict=True):
         if isinstance(answer, HuddleError):
@@ -102,7 +111,6 @@ def write_discovered(out: Path, ports: Sequence[str], *, force: bool) -> None:
     if not known:
         where = listed(searched) if searched else "this computer has no serial ports: --port"
         raise NoAnswerError(f"no device that huddle can read by itself ({where})")
-    is_asked = sys.stdin.isatty() and sys.stdout.isatty()
     operator = typer.prompt("Operator", default="", show_default=False) if is_asked else ""
     names = [
         string.ascii_uppercase[n % 26] + (str(n // 26) if n > 25 else "") for n in range(len(known))
