@@ -124,7 +124,7 @@ def drive(session: Session) -> None:
     """Do the whole test."""
     session.see("p checks the sensors")
     session.press("p")
-    session.see("ready: s starts a test")
+    session.see("nothing wrong is seen")
     session.keep(
         "Before the test",
         "`p` reads the sensors without recording. The last line says that all is ready.",
