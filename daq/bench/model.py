@@ -26,6 +26,7 @@ from pydantic_core import core_schema
 from daq.bench.estimate_settings import OPTIONS, EstimateSettings, table_keys, to_table
 from daq.bench.masks.mask import NOISE_MODELS, Mask, check_points
 from daq.bench.response import PolesZeros, Response
+from daq.bench.tables.certificate import CertificateTable, Customer, Laboratory
 from daq.bench.tables.fields import Duration, Name, Number, PositiveNumber, Table
 from daq.bench.tables.toml_text import to_toml
 from daq.bench.tables.unattended import History, Hooks, Metrics, Schedule, Signing, Storage
@@ -138,6 +139,7 @@ class Sensor(Table):
 
     name: Name = Field(description="the sensor's name")
     model: str = ""
+    manufacturer: str = ""
     serial_number: str = ""
     driver: str = Field(description="the name of a driver")
     port: str = Field(min_length=1, description="a port, such as /dev/ttyUSB0")
@@ -272,6 +274,9 @@ class Bench(Table):
     signing: Signing | None = None
     history: History = History()
     limits: tuple[Limit, ...] = ()
+    laboratory: Laboratory = Laboratory()
+    customer: Customer = Customer()
+    certificate: CertificateTable = CertificateTable()
     simulation: dict[str, Any] = Field(default_factory=dict)
     """Handed to the simulated devices unread, but for ``speed`` and ``clock``."""
 
@@ -329,6 +334,11 @@ class Bench(Table):
         """Hash of the drivers, ports and serial numbers: two benches with one are one bench."""
         devices = sorted((each.driver, each.port, each.serial_number) for each in self.sensors)
         return hashlib.sha256(repr(devices).encode()).hexdigest()
+
+    @property
+    def runs_simulated(self) -> bool:
+        """Whether its ports are those of simulated devices, by their clock or their speed."""
+        return bool(self.simulated_clock) or self.speed != 1.0
 
     def sensor(self, name: str) -> Sensor:
         """Return the sensor of this name."""

@@ -198,6 +198,8 @@ class Snapshot:
         Sensors that a live estimate leaves out, because all would take too much memory.
     axis_tolerances : tuple of float
         Angle by which axes of each sensor may be off, rms, in radians; empty: not at all.
+    simulated : bool
+        Whether a sensor was simulated: the noise is that of no real one.
     """
 
     frequency: FloatArray
@@ -224,6 +226,7 @@ class Snapshot:
     bridged: Bridged | None = None
     not_estimated: tuple[str, ...] = ()
     axis_tolerances: tuple[float, ...] = ()
+    simulated: bool = False
 
     @property
     def sensor_names(self) -> tuple[str, ...]:

@@ -176,6 +176,7 @@ class SnapshotBuilder:
             bridged=_bridged(passes, estimates.results),
             not_estimated=left,
             axis_tolerances=self._axes,
+            simulated=any(recording.simulated for recording in recordings),
             quantisation_psd=(
                 quantisation_psd(frequency, channels, self._unit, _counting_rates(latest))
                 if final

@@ -122,6 +122,7 @@ class RecordingInMemory:
         self.sensors = tuple(sensors)
         self.path = Path(name)
         self.run_id = name
+        self.simulated = False
         start = min(int(sensor.blocks["device_counter"][0]) for sensor in sensors)
         self.created_at = HostTime(start, start)
 

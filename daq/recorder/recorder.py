@@ -34,10 +34,11 @@ from daq.recorder.connection import CLOSE_TIMEOUT, Connection
 from daq.recorder.device_identity import with_owner
 from daq.recording import control
 from daq.recording.control import Command
-from daq.recording.file_format import SensorLayout
+from daq.recording.file_format import SIMULATED, SensorLayout
 from daq.recording.storage.names import CONTINUES, continuation_names
 from daq.recording.storage.writing_thread import WritingThread
 from daq.recording.writer import RecordingWriter
+from daq.transport.ports import is_simulated
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -289,6 +290,8 @@ class _Recorder:
         )
         attributes: dict[str, str | float] = {} if duration is None else {"duration": duration}
         attributes |= self._attributes
+        if self._bench.runs_simulated or any(map(is_simulated, self._bench.ports())):
+            attributes[SIMULATED] = 1
         writer = self._new_file(self._path, created=self._started, attributes=attributes)
         writer.event(Event("", EventKind.STARTED, f"{len(ordered)} sensors", self._started))
         _LOGGER.info("recording to %s", self._path, extra={"recording": str(self._path)})

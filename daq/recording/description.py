@@ -31,6 +31,7 @@ _DESCRIPTION, _TABLE, _COUNTS = range(3)
 _FILE = (
     *("format", "format_version", "run_id", "created", "created_utc_ns", "created_monotonic_ns"),
     *("software", "bench", "operator", "location", "duration", "until", "estimate", "origin"),
+    "simulated",
 )
 _SENSOR = ("model", "serial_number", "driver", "port", "clock", "sampling_rate")
 _SAMPLES = ("channels", "sensitivity", "unit", "direction", "auxiliary", "response")

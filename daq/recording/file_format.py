@@ -25,6 +25,10 @@ FORMAT_VERSION = 2
 LIBVER = ("v110", "v110")
 """HDF5 file format of recordings."""
 
+SIMULATED = "simulated"
+"""Origin of a recording made without devices, and the driver of its sensors; the attribute that
+marks a recording of simulated devices."""
+
 PRIVATE_TABLES = ("hooks", "metrics", "signing")
 """Tables of the bench file that are not recorded."""
 

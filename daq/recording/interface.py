@@ -97,6 +97,10 @@ class ReadableRecording(Protocol):
         """The bench that was recorded, if there is one."""
 
     @property
+    def simulated(self) -> bool:
+        """Whether a sensor of the recording was simulated."""
+
+    @property
     def closed(self) -> bool:
         """Whether the recording is complete."""
 

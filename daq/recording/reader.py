@@ -24,6 +24,7 @@ from daq.errors import BenchFileError, NotARecordingError
 from daq.protocols.block import Event, EventKind, HostTime
 from daq.recording import file_format
 from daq.recording.description import damaged_tables, result_crc32
+from daq.recording.file_format import SIMULATED
 from daq.recording.sensor_record import CommittedRows, SensorRecord
 from daq.recording.storage import trial
 from daq.recording.storage.journal import journal_path
@@ -74,6 +75,8 @@ class Recording:
         )
         """What of the live estimate ends the run; the process that records obeys it."""
         self._estimate = text(attributes, "estimate") if "estimate" in attributes else ""
+        self._marked_simulated = bool(attributes.get("simulated", 0))
+        self._origin = text(attributes, "origin") if "origin" in attributes else ""
         self.continues = text(attributes, CONTINUES) if CONTINUES in attributes else ""
         """The ``run_id`` of the recording that this one continues; empty for most."""
         self._committed = dataset(file, "committed", np.dtype("<i8"))
@@ -126,6 +129,16 @@ class Recording:
             raise NotARecordingError(
                 f"{error}; its journal has what was acknowledged: huddle repair {path}"
             ) from error
+
+    @cached_property
+    def simulated(self) -> bool:
+        """Whether a sensor was simulated; also of recordings older than the attribute."""
+        return (
+            self._marked_simulated
+            or self._origin == SIMULATED
+            or any(sensor.driver == SIMULATED for sensor in self.sensors)
+            or (self.bench is not None and self.bench.runs_simulated)
+        )
 
     @cached_property
     def bench(self) -> Bench | None:

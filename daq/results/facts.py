@@ -85,6 +85,13 @@ class Finding(Fact):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SensorsSimulated(Fact):
+    """A sensor was simulated: the noise is that of a model, not of instruments."""
+
+    name: ClassVar[str] = "sensors-simulated"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MethodRefused(Fact):
     """A method gives no result.
 

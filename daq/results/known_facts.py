@@ -40,6 +40,7 @@ from daq.results.facts import (
     SamplesUncounted,
     SegmentsExcluded,
     SensorLost,
+    SensorsSimulated,
     SharedNoiseNotSearched,
     StatedTimesDrift,
     StatedTimesUnchecked,
@@ -137,7 +138,9 @@ def _findings(snapshot: Snapshot) -> Iterator[Fact]:
 
 
 def _recording(snapshot: Snapshot) -> Iterator[Fact]:
-    """Yield what the recordings lack."""
+    """Yield what the recordings are of, and what they lack."""
+    if snapshot.simulated:
+        yield SensorsSimulated(rank=Rank.TO_KNOW)
     for sensor in snapshot.sensors:
         if sensor.is_lost:
             yield _lost(snapshot, sensor)

@@ -91,6 +91,8 @@ class Source:
         recorder that was killed, and not repaired since.
     bench : Bench or None
     sensors : tuple of RecordedSensor
+    simulated : bool
+        Whether a sensor was simulated.
     logged_events : tuple of LoggedEvent
         In time order.
     signed_by : str
@@ -110,6 +112,7 @@ class Source:
     state: State
     bench: Bench | None
     sensors: tuple[RecordedSensor, ...]
+    simulated: bool
     logged_events: tuple[LoggedEvent, ...]
     signed_by: str = ""
 
@@ -173,6 +176,7 @@ def _source(recording: Recording, *, continued: bool) -> Source:
             )
             for sensor in recording.sensors
         ),
+        simulated=recording.simulated,
         logged_events=tuple(logged_events),
         signed_by=signed_by(path) if state == "closed" else "",
     )

@@ -18,6 +18,10 @@ counter shows the loss.
 from __future__ import annotations
 
 import contextlib
+import json
+import os
+import tempfile
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daq.errors import NotConnectedError
@@ -84,3 +88,17 @@ async def open_port(
         yield stream
     finally:
         await wire.close()
+
+
+def is_simulated(port: str) -> bool:
+    """Whether simulated devices on this machine serve the port now, whatever the bench file says.
+
+    A simulated device speaks the real protocol: nothing in its bytes says that it is simulated.
+    So its server lists its ports in a file of its folder (``sim_devices.server.launch``).
+    """
+    for file in Path(tempfile.gettempdir()).glob("huddle-*/simulated-ports.json"):
+        with contextlib.suppress(OSError, ValueError):  # of another user, or just removed
+            served = json.loads(file.read_text(encoding="utf-8"))
+            if port in served or os.path.realpath(port) in map(os.path.realpath, served):
+                return True
+    return False

@@ -140,22 +140,26 @@ def report(
         ),
     ] = None,
     models: ModelsOption = "",
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace a file that has other content.")
+    ] = False,
     start: StartOption = None,
     end: EndOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
-    """Write the calibration report of a huddle test as HTML or PDF.
+    """Write the calibration report of a huddle test as HTML or PDF: a draft of the certificate.
 
     It contains the noise of every channel with its uncertainty, the
     verdict on the limits of the bench file, alignment, clocks, events, and a
     place to sign. The report of a growing recording is preliminary.
+    huddle issue makes the numbered certificate.
 
     Options not given come from the bench file inside the recording.
     The exit code is 1 if a limit is not met, and 4 if that is not decided.
     """
     from tui.commands.report import report_recordings
 
-    report_recordings(files, out=out, models=models, start=start, end=end, **wanted)
+    report_recordings(files, out=out, models=models, force=force, start=start, end=end, **wanted)
 
 
 @examples(

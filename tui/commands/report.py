@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from daq.bench.masks.mask import Mask
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from tui.report.writing import Taken
 
 SUFFIXES = (".html", ".htm", ".pdf")
 _COLOURS = {"good": "green", "bad": "red", "doubtful": "yellow"}
@@ -31,6 +32,7 @@ def report_recordings(
     *,
     out: Path | None,
     models: str,
+    force: bool,
     start: str | None,
     end: str | None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
@@ -45,7 +47,15 @@ def report_recordings(
     masks = masks_named(models)
     out = checked(files[0].with_suffix(".html") if out is None else out)
     snapshot, settings, bench = estimated(files, start=start, end=end, **wanted)
-    write_report(snapshot, out, recordings=files, settings=settings, models=masks, screen=console())
+    write_report(
+        snapshot,
+        out,
+        recordings=files,
+        settings=settings,
+        models=masks,
+        taken="replace" if force else "refuse",
+        screen=console(),
+    )
     exit_with(judge(bench, snapshot, settings))
 
 
@@ -73,6 +83,7 @@ def write_report(
     recordings: Sequence[Path],
     settings: Settings,
     models: Sequence[Mask] = (),
+    taken: Taken = "beside",
     screen: Console,
 ) -> None:
     """Write a report, and print its verdict and name.
@@ -85,6 +96,13 @@ def write_report(
     from tui.report.writing import write  # noqa: PLC0415 - matplotlib only where there is a report
 
     with notices().status("writing the report"):
-        report = write(snapshot, out, recordings=recordings, settings=settings, models=models)
+        report, out = write(
+            snapshot,
+            out,
+            recordings=recordings,
+            settings=settings,
+            models=models,
+            taken=taken,
+        )
     screen.print(report.verdict.text, style=_COLOURS.get(report.verdict.tone))
     screen.print(f"{out} written", soft_wrap=True)

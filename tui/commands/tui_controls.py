@@ -439,7 +439,9 @@ def _report(
     from tui.report.writing import write  # noqa: PLC0415 - loads matplotlib
 
     out = (folder or path.parent) / f"{path.stem}.html"
-    write(snapshot, out, recordings=[path], settings=settings, models=models)
+    _, out = write(
+        snapshot, out, recordings=[path], settings=settings, models=models, taken="beside"
+    )
     return out
 
 

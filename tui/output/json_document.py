@@ -152,6 +152,7 @@ def _recording(source: Source) -> dict[str, Any]:
         "operator": source.operator or None,
         "location": source.location or None,
         "bench": None if source.bench is None else source.bench.name,
+        "simulated": source.simulated,
         "started": source.started.isoformat(),
         "last_block": source.last.isoformat(),
         "sensors": [

@@ -77,6 +77,8 @@ def averages_line(snapshot: Snapshot) -> str:
     )
     if len(snapshot.octaves) > 1:
         text += f" above {snapshot.octaves[-1].low:.3g} Hz"
+    if snapshot.simulated:
+        text += ", simulated sensors"
     return text
 
 

@@ -21,6 +21,13 @@ from tui.output.calibration import (
     sensitivity_table,
     title,
 )
+from tui.report.certificate import (
+    Issue,
+    manufacturers,
+    notices,
+    parties_section,
+    watermark,
+)
 from tui.report.evidence import (
     alignment_section,
     clocks_section,
@@ -114,6 +121,9 @@ def report_of(
     settings: Settings,
     found: Sequence[Source],
     models: Sequence[Mask] = (),
+    *,
+    issue: Issue | None = None,
+    about: Bench | None = None,
 ) -> Report:
     """Return the whole report.
 
@@ -127,6 +137,10 @@ def report_of(
         The recordings it was made from.
     models : sequence of Mask
         Noise models to show beside the noise.
+    issue : Issue, optional
+        Of a certificate; without it the report is a draft.
+    about : Bench, optional
+        Where laboratory, customer and sensors are described; default: the recorded bench.
     """
     bench = found[0].bench
     judged = judge(bench, snapshot, settings)
@@ -139,10 +153,12 @@ def report_of(
             f"Of a recording whose recorder was killed (huddle repair closes it). {sentence.text}"
         )
         sentence = Paragraph(text, "bad" if sentence.tone == "bad" else "doubtful")
+    about = bench if about is None else about
     sections = [
+        parties_section(found, about, issue),
         _test_section(found),
         facts_section(known(snapshot, settings)),
-        _sensors_section(snapshot, found),
+        _sensors_section(snapshot, found, about),
         limits_section(snapshot, judged),
         noise_section(snapshot, settings, bench, models),
         parameters_section(snapshot, settings, bench),
@@ -160,10 +176,13 @@ def report_of(
     start = found[0].started
     name = found[0].path.stem if bench is None else bench.name
     return Report(
-        title="Calibration report: self-noise",
+        title="Calibration certificate: self-noise" if issue else "Calibration report: self-noise",
         subtitle=f"Huddle test {name}" + (f", {utc_time(start)}" if is_known(start) else ""),
         verdict=sentence,
         sections=tuple(section for section in sections if section is not None),
+        notices=notices(found, settings, about, issue),
+        watermark=watermark(found, issue),
+        number="" if issue is None else issue.name,
     )
 
 
@@ -199,12 +218,14 @@ def _test_section(found: Sequence[Source]) -> Section:
     return Section("The test", tuple(parts))
 
 
-def _sensors_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
+def _sensors_section(snapshot: Snapshot, found: Sequence[Source], about: Bench | None) -> Section:
+    makers = manufacturers(about)
     sensors = found[-1].sensors
     clocks = {clock.sensor: clock for clock in snapshot.clocks}
     rows = tuple(
         (
             sensor.name,
+            makers.get(sensor.name, "not given"),
             sensor.model or "not given",
             sensor.serial_number or "not given",
             sensor.driver,
@@ -214,14 +235,15 @@ def _sensors_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
         for sensor in sensors
     )
     header = (
-        "sensor", "model", "serial number", "driver", "nominal rate (Hz)", "actual rate (Hz)",
+        "sensor", "manufacturer", "model", "serial number", "driver", "nominal rate (Hz)",
+        "actual rate (Hz)",
     )  # fmt: skip
     channels = Table(
         ("sensor", "channels", "sensitivity (counts per unit)", "unit", "response"),
         tuple(row for sensor in sensors for row in _channel_rows(sensor)),
         left=frozenset({0, 1, 3, 4}),
     )
-    return Section("Sensors", (Table(header, rows, left=frozenset({0, 1, 2, 3})), channels))
+    return Section("Sensors", (Table(header, rows, left=frozenset({0, 1, 2, 3, 4})), channels))
 
 
 def _actual_rate(sensor: RecordedSensor, clock: ClockState | None) -> str:

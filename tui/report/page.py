@@ -64,7 +64,9 @@ def page(report: Report) -> str:
         report=report,
         light=_LIGHT,
         dark=_DARK,
-        footer=_css_string(report.subtitle),
+        footer=_css_string(
+            f"{report.number}   {report.subtitle}" if report.number else report.subtitle
+        ),
         kind_of=lambda part: type(part).__name__,
         picture_of=partial(_picture, count(1)),
     )

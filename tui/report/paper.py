@@ -92,7 +92,8 @@ class _Paper(FPDF):
         self.set_section_title_styles(
             TextStyle(_FAMILY, "B", HEADING, color=drawing.INK, t_margin=0.16, b_margin=0.05)
         )
-        self._subtitle = report.subtitle
+        self._foot = f"{report.number}   {report.subtitle}" if report.number else report.subtitle
+        self._watermark = report.watermark
 
     def file_id(self) -> str:
         """Return no identifier: it would hold the time."""
@@ -102,8 +103,18 @@ class _Paper(FPDF):
         """Set the foot of a page."""
         self.set_y(-0.5)
         self._style(6.5, "quiet")
-        self.cell(INNER - 0.8, text=self._subtitle)
-        self.cell(0.8, text=f"{self.page_no()} / {{nb}}", align="R")
+        self.cell(INNER - 0.8, text=self._foot)
+        self.cell(0.8, text=f"page {self.page_no()} of {{nb}}", align="R")
+
+    def header(self) -> None:
+        """Set the watermark, under everything else: pale enough to read the page in grey."""
+        if not self._watermark:
+            return
+        with self.local_context(), self.rotation(55, self.w / 2, self.h / 2):
+            self.set_font(_FAMILY, "B", min(96.0, 900.0 / len(self._watermark)))
+            self.set_text_color(236, 236, 236)
+            half = self.get_string_width(self._watermark) / 2
+            self.text(self.w / 2 - half, self.h / 2 + 0.4, self._watermark)
 
     def _style(self, size: float, tone: Tone = "plain", *, bold: bool = False) -> None:
         self.set_font(_FAMILY, "B" if bold else "", size)
@@ -138,6 +149,9 @@ class _Paper(FPDF):
         title.s = "/H1"
         self.lines(report.subtitle, TEXT, "quiet")
         self.ln(0.12)
+        for notice in report.notices:
+            self.lines(notice.text, TEXT, notice.tone, bold=notice.tone != "plain")
+            self.ln(0.06)
         top = self.y
         self.lines(report.verdict.text, 10.0, report.verdict.tone, bold=True, indent=0.14)
         with self.local_context(fill_color=_COLOURS[report.verdict.tone]):

@@ -122,9 +122,18 @@ class Report:
     verdict : Paragraph
         The one sentence that everything comes to.
     sections : tuple of Section
+    notices : tuple of Paragraph
+        What must be read before the numbers: that this is a draft, that sensors were simulated.
+    watermark : str
+        In pale letters across every page; empty on an issued certificate.
+    number : str
+        Of the certificate and its revision, at the foot of every page; empty on a draft.
     """
 
     title: str
     subtitle: str
     verdict: Paragraph
     sections: tuple[Section, ...]
+    notices: tuple[Paragraph, ...] = ()
+    watermark: str = ""
+    number: str = ""

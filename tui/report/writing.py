@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
+from itertools import chain, count
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from daq.errors import HuddleError
 from daq.results.sources import sources
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from tui.report.parts import Report
 
+Taken: TypeAlias = Literal["refuse", "replace", "beside"]
 PAPER = (".pdf",)
 PAGES = (".html", ".htm")
 
@@ -35,7 +37,8 @@ def write(
     recordings: Sequence[str | Path],
     settings: Settings,
     models: Sequence[Mask] = (),
-) -> Report:
+    taken: Taken = "refuse",
+) -> tuple[Report, Path]:
     """Write the calibration report of a huddle test.
 
     Parameters
@@ -43,8 +46,7 @@ def write(
     snapshot : Snapshot
         The finished estimate: what `daq.estimation.estimate` or `Estimation.finish` returned.
     path : path
-        ``.html`` for a page, ``.pdf`` for paper. A file that was there is replaced when the new
-        one is complete, and not before.
+        ``.html`` for a page, ``.pdf`` for paper. The file is complete when it has its name.
     recordings : sequence of path
         What the estimate was made from. In a process that follows one of them while it grows,
         stop that first: HDF5 shares what it remembers of a file among its readers.
@@ -52,11 +54,16 @@ def write(
         What the estimate was made with.
     models : sequence of Mask
         Noise models to show beside the noise.
+    taken : {"refuse", "replace", "beside"}
+        What to do where a file of this name has other content: a draft by other settings may be
+        the one that somebody keeps.
 
     Returns
     -------
     Report
         What was written.
+    Path
+        Where: another name than `path` only if `taken` is ``beside``.
 
     Raises
     ------
@@ -70,14 +77,14 @@ def write(
     path = Path(path)
     check_suffix(path)
     report = report_of(snapshot, settings, sources(recordings), models)
-    if path.suffix.lower() in PAPER:
-        from tui.report.paper import write_paper  # noqa: PLC0415 - loads fpdf2
-
-        paper = io.BytesIO()
-        write_paper(report, paper)
-        content = paper.getvalue()
-    else:
-        content = page(report).encode("utf-8")
+    content = written(report, path.suffix)
+    if taken == "beside":
+        path = _free(path, content)
+    elif taken == "refuse" and not _may_be(path, content):
+        raise ReportError(
+            f"{path}: exists with other content, perhaps by other settings; --force replaces it, "
+            "--out takes another name"
+        )
     try:
         write_whole(path, content)
     except OSError as error:
@@ -85,7 +92,28 @@ def write(
             f"{path}: the report cannot be written ({error.strerror}); choose another place with "
             "--out, or make room"
         ) from error
-    return report
+    return report, path
+
+
+def _may_be(path: Path, content: bytes) -> bool:
+    return not path.exists() or path.read_bytes() == content
+
+
+def _free(path: Path, content: bytes) -> Path:
+    """Return the first of ``night.html``, ``night-2.html``, … without other content."""
+    names = (path.with_stem(f"{path.stem}-{number}") for number in count(2))
+    return next(each for each in chain([path], names) if _may_be(each, content))
+
+
+def written(report: Report, suffix: str) -> bytes:
+    """Return a report as the content of a file with this suffix."""
+    if suffix.lower() not in PAPER:
+        return page(report).encode("utf-8")
+    from tui.report.paper import write_paper  # noqa: PLC0415 - loads fpdf2
+
+    paper = io.BytesIO()
+    write_paper(report, paper)
+    return paper.getvalue()
 
 
 def check_suffix(path: Path) -> None:

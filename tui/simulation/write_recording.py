@@ -13,7 +13,7 @@ from daq.devices.bench_file import load
 from daq.devices.registry import driver_type
 from daq.protocols.block import EventKind, HostTime
 from daq.recording.array_writer import ArrayWriter
-from daq.recording.file_format import SensorLayout
+from daq.recording.file_format import SIMULATED, SensorLayout
 from sim_devices.errors import ScenarioError
 from sim_devices.world import paper_scenarios
 from sim_devices.world.tables import SensorClock
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 DEFAULT_DURATION = 600.0
 BLOCK_SECONDS = 1.0
 CHUNK_SECONDS = 10.0
-SIMULATED = "simulated"
-"""Driver of a recording without devices."""
 HEADROOM = 30.0
 """Full scale of a named scenario over the rms of a channel."""
 DIRECTIONS = ("X", "Y", "Z")

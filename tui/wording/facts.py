@@ -41,6 +41,7 @@ from daq.results.facts import (
     SamplesUncounted,
     SegmentsExcluded,
     SensorLost,
+    SensorsSimulated,
     SharedNoiseNotSearched,
     StatedTimesDrift,
     StatedTimesUnchecked,
@@ -73,6 +74,7 @@ RANKS: Mapping[Rank, str] = {
 }
 MOST_LINES = 3
 """Below a table."""
+SIMULATED = "Simulated sensors: the noise is that of a model, not of instruments."
 NOTHING_TO_DO = "Nothing to do."
 
 
@@ -179,6 +181,12 @@ def _finding(fact: Finding, names: Names) -> Wording:
         line += f" (and {more} more like this)"
     words = together(fact.findings, names)
     return Wording(line, words.text, words.remedy)
+
+
+@word.register(SensorsSimulated)
+def _simulated(fact: SensorsSimulated, names: Names) -> Wording:
+    del fact, names
+    return Wording(SIMULATED.rstrip("."), SIMULATED)
 
 
 @word.register(MethodRefused)

@@ -71,7 +71,7 @@ def test_paper_says_all_that_the_page_says(reported: Reported, paper: PdfReader)
         assert "".join(word.split()) in page
         for piece in word.split():  # lines are broken between words, cells stand side by side
             assert piece in letters
-    assert f"{len(paper.pages)} / {len(paper.pages)}" in whole
+    assert f"page {len(paper.pages)} of {len(paper.pages)}" in whole
 
 
 @pytest.mark.usefixtures("empty_figures")

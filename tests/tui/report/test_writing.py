@@ -58,8 +58,9 @@ def test_a_report_is_whole_or_not_there(reported: Reported, tmp_path: Path) -> N
     try:
         with pytest.raises(ReportError, match=r"old.html: the report cannot be written \(File too"):
             write(
-                reported.snapshot, out, recordings=[reported.recording], settings=reported.settings
-            )
+                reported.snapshot, out, recordings=[reported.recording],
+                settings=reported.settings, taken="replace",
+            )  # fmt: skip
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert out.read_text(encoding="utf-8") == "the old one"
@@ -76,3 +77,35 @@ def test_a_wrong_name_is_refused_before_anything_is_done(
     result = CliRunner().invoke(app, arguments, terminal_width=300)
     assert result.exit_code == 2
     assert re.search(said, result.stderr)
+
+
+@pytest.mark.usefixtures("empty_figures")
+def test_a_draft_replaces_no_other_one_unless_forced(reported: Reported, tmp_path: Path) -> None:
+    """Settings are not tried until they pass, without a trace."""
+    out = tmp_path / "night.html"
+    arguments = ["report", str(reported.recording), "--out", str(out), "--segment", "1s"]
+    run = CliRunner()
+    assert run.invoke(app, arguments).exit_code == 4
+    first = out.read_bytes()
+    assert run.invoke(app, arguments).exit_code == 4  # the same once more changes nothing
+    refused = run.invoke(app, [*arguments[:-1], "2s"])
+    assert refused.exit_code == 3
+    assert "exists with other content" in refused.stderr
+    assert out.read_bytes() == first
+    assert run.invoke(app, [*arguments[:-1], "2s", "--force"]).exit_code == 4
+    page = Words(out.read_text(encoding="utf-8")).text
+    assert "segment 1.0 → 2.0" in page
+    _, beside = write(
+        reported.snapshot, out, recordings=[reported.recording], settings=reported.settings,
+        taken="beside",
+    )  # fmt: skip
+    assert beside == tmp_path / "night-2.html"
+
+
+def test_a_draft_is_marked_and_says_what_is_missing(reported: Reported) -> None:
+    report = reported.report
+    assert report.watermark == "DRAFT"
+    assert report.number == ""
+    text = Words(reported.page).text
+    assert "DRAFT: not a certificate" in text
+    assert "name and address of the laboratory ([laboratory] name, address)" in text

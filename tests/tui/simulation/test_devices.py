@@ -13,10 +13,14 @@ from typing import TYPE_CHECKING
 import pytest
 from typer.testing import CliRunner
 
+from daq.bench.loading import dump
 from daq.devices.bench_file import parse
 from daq.python_process import python_command
+from daq.recording.reader import Recording
+from daq.transport.ports import is_simulated
 from tests.waiting import limit
 from tui.cli.main import app
+from tui.simulation.devices import simulated
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -52,3 +56,25 @@ def test_help_of_the_demo_says_what_it_does_unless_told() -> None:
     assert "(default 5min)" in said
     assert "real time (default 4)" in said
     assert "bench file" not in said
+
+
+def test_a_recording_of_simulated_ports_is_simulated_whatever_its_bench_file(
+    tmp_path: Path,
+) -> None:
+    """The bytes and the bench file are those of real devices: the server says what they are."""
+    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
+    clean, out = tmp_path / "clean.toml", tmp_path / "clean.h5"
+    with simulated(parse(text), speed=1.0) as bench:
+        ports = list(bench.ports())
+        own = bench.model_copy(update={"simulation": {}})
+        assert not own.runs_simulated
+        clean.write_text(dump(own), encoding="utf-8")
+        command = python_command("tui", "record", str(clean), "--duration", "1s", "-o", str(out))
+        subprocess.run(command, check=True, capture_output=True, timeout=limit())
+        assert all(map(is_simulated, ports))
+        assert is_simulated(os.path.realpath(ports[0]))
+    assert not any(map(is_simulated, ports))
+    with Recording.open(out) as recording:
+        assert recording.simulated
+        assert recording.bench is not None
+        assert not recording.bench.runs_simulated

@@ -13,7 +13,7 @@ from rich.text import Text
 from daq.bench.units import decibels
 from daq.recording.sensor_state import SensorState
 from daq.results.band_summary import band_of, channel_means
-from daq.results.facts import Rank
+from daq.results.facts import Rank, SensorsSimulated
 from daq.results.known_facts import WITHOUT_ESTIMATE
 from daq.results.partners import without_partners
 from daq.results.precision import precision
@@ -308,11 +308,12 @@ def findings(snapshot: Snapshot, *, width: int, besides: type[Fact] | None = Non
 
     Those of the kind `besides` are left out: they are shown elsewhere.
     """
-    styles = {Rank.INVALIDATES: "bold #ff6b6b", Rank.DELAYS: "yellow"}
+    styles = {Rank.INVALIDATES: "bold #ff6b6b", Rank.DELAYS: "yellow", Rank.TO_KNOW: MUTED}
     needed = [
         each
         for each in known(snapshot)
-        if each.needs_action and (besides is None or not isinstance(each.fact, besides))
+        if (each.needs_action or isinstance(each.fact, SensorsSimulated))
+        and (besides is None or not isinstance(each.fact, besides))
     ]
     lines = [Text(each.line, styles[each.fact.rank]) for each in needed]
     for line in lines:

@@ -278,7 +278,8 @@ def _report(
 ) -> None:
     from tui.report.writing import write  # noqa: PLC0415 - matplotlib only where there is a report
 
-    write(snapshot, last.with_suffix(f".{kind}"), recordings=paths, settings=settings)
+    out = last.with_suffix(f".{kind}")
+    write(snapshot, out, recordings=paths, settings=settings, taken="beside")
 
 
 def _noise(

@@ -1,0 +1,69 @@
+"""Tables of the bench file for certificates: who tests, for whom, and how certificates are made."""
+
+from __future__ import annotations
+
+import datetime as dt
+import re
+from pathlib import Path
+from typing import Annotated, Literal, TypeAlias
+
+from pydantic import AfterValidator, Field
+
+from daq.bench.tables.fields import Table
+
+Day: TypeAlias = dt.date
+_PREFIX = re.compile(r"[A-Za-z0-9][A-Za-z0-9.]{0,15}", re.ASCII)
+
+
+def _prefix(value: str) -> str:
+    if not _PREFIX.fullmatch(value):
+        raise ValueError('expected 1 to 16 letters, digits and dots, such as "LAB"')
+    return value
+
+
+class Laboratory(Table):
+    """``[laboratory]``: who issues the certificate."""
+
+    name: str = ""
+    address: str = ""
+    email: str = ""
+    phone: str = ""
+    accreditation: str = ""
+    """Text of the accreditation, such as its body and number; empty without one."""
+
+
+class Customer(Table):
+    """``[customer]``: for whom the test is done."""
+
+    name: str = ""
+    address: str = ""
+    email: str = ""
+    order: str = ""
+    """Number of the order."""
+
+
+class CertificateTable(Table):
+    """``[certificate]``: how certificates are numbered, and what they state."""
+
+    prefix: Annotated[str, AfterValidator(_prefix)] = "HT"
+    """Start of the numbers, as in ``HT-2026-0042``."""
+    folder: Path = Path("certificates")
+    """Folder of the certificates and of their ledger; relative to the recording."""
+    procedure: str = ""
+    """Number and issue of the laboratory's procedure."""
+    place: str = ""
+    """Where the test was done, if not at the address of the laboratory."""
+    received: Day | None = None
+    """When the sensors arrived."""
+    condition: str = ""
+    """Of the sensors as received."""
+    traceability: str = ""
+    """How sensitivities and times are traceable to the SI."""
+    deviations: str = ""
+    """From the procedure."""
+    responsible: str = ""
+    """Who authorises certificates."""
+    decision_rule: Literal["simple-acceptance", "guard-band"] = "guard-band"
+    """Of ILAC-G8:09/2019, clauses 4.2.1 and 4.2.2."""
+    guard_band: Annotated[float, Field(ge=0.0)] = 1.0
+    """r of the guard band w = r·U; 1 is the rule of ILAC-G8."""

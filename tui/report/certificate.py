@@ -1,0 +1,298 @@
+"""What makes a report a certificate: who, for whom, by which procedure, and what is not given.
+
+`CHECKLIST` follows ISO/IEC 17025:2017, 7.8.2 to 7.8.6 and 7.8.8; ``docs/certificate.md`` has it for
+people.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from daq.bench.estimate_settings import EstimateSettings, to_table
+from daq.bench.tables.certificate import CertificateTable, Customer, Laboratory
+from tui.report.parts import Facts, Paragraph, Section
+from tui.report.wording import utc_time
+
+if TYPE_CHECKING:
+    import datetime as dt
+    from collections.abc import Callable, Sequence
+
+    from daq.bench.model import Bench
+    from daq.estimation.settings import Settings
+    from daq.results.sources import Source
+
+_NONE = "not given"
+PROCEDURE = (
+    "Self-noise by the coherence of sensors side by side (huddle test): Sleeman, van Wettum and"
+    " Trampert (2006), Bull. Seismol. Soc. Am. 96, 258–271, and its extension to sensors in any"
+    " orientation."
+)
+SCOPE = (
+    "The results relate only to the items listed, as received, and to the time and place of the"
+    " test. The certificate may be reproduced only in full, unless the laboratory agrees in"
+    " writing."
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Issue:
+    """How a certificate was issued; a report without one is a draft.
+
+    Attributes
+    ----------
+    number : str
+        Such as ``HT-2026-0042``.
+    revision : int
+    at : datetime
+        UTC.
+    by : str
+        Who authorised it.
+    entry : str
+        Hash of its row in the ledger.
+    replaces : int or None
+        The revision it replaces.
+    reason : str
+        Of the revision.
+    changes : tuple of str
+        Settings that differ from the replaced revision.
+    incomplete : bool
+        Whether it was issued without all that the checklist asks.
+    """
+
+    number: str
+    revision: int
+    at: dt.datetime
+    by: str
+    entry: str
+    replaces: int | None = None
+    reason: str = ""
+    changes: tuple[str, ...] = ()
+    incomplete: bool = False
+
+    @property
+    def name(self) -> str:
+        """Number and revision, as on every page."""
+        return f"{self.number}, revision {self.revision}"
+
+
+@dataclass(frozen=True, slots=True)
+class Requirement:
+    """One line of the checklist.
+
+    Attributes
+    ----------
+    clause : str
+        Of ISO/IEC 17025:2017.
+    what : str
+        What is missing, as people read it.
+    key : str
+        Where it is given.
+    is_given : callable
+    """
+
+    clause: str
+    what: str
+    key: str
+    is_given: Callable[[Bench, Source], bool]
+
+
+CHECKLIST = (
+    Requirement(
+        "7.8.2.1 b", "name and address of the laboratory", "[laboratory] name, address",
+        lambda bench, _: bool(bench.laboratory.name and bench.laboratory.address),
+    ),
+    Requirement(
+        "7.8.2.1 c", "place of the test", "[certificate] place, or location",
+        lambda bench, source: bool(bench.certificate.place or source.location),
+    ),
+    Requirement(
+        "7.8.2.1 e", "name and contact of the customer", "[customer] name, and address or email",
+        lambda bench, _: bool(
+            bench.customer.name and (bench.customer.address or bench.customer.email)
+        ),
+    ),
+    Requirement(
+        "7.8.2.1 f", "procedure", "[certificate] procedure",
+        lambda bench, _: bool(bench.certificate.procedure),
+    ),
+    Requirement(
+        "7.8.2.1 g", "model, manufacturer and serial number of every sensor",
+        "[[sensors]] model, manufacturer, serial_number",
+        lambda bench, source: not unidentified(bench, source),
+    ),
+    Requirement(
+        "7.8.2.1 g", "condition of the sensors", "[certificate] condition",
+        lambda bench, _: bool(bench.certificate.condition),
+    ),
+    Requirement(
+        "7.8.2.1 h", "date of receipt", "[certificate] received",
+        lambda bench, _: bench.certificate.received is not None,
+    ),
+    Requirement(
+        "7.8.2.1 o", "person who authorises", "[certificate] responsible, or --by",
+        lambda bench, _: bool(bench.certificate.responsible),
+    ),
+    Requirement(
+        "7.8.3.1 / 7.5.1", "operator", "operator", lambda _, source: bool(source.operator)
+    ),
+    Requirement(
+        "7.8.4.1 c", "metrological traceability", "[certificate] traceability",
+        lambda bench, _: bool(bench.certificate.traceability) or _is_calibrated(bench),
+    ),
+)  # fmt: skip
+"""What a user has to give; the rest of the checklist is made by the program."""
+
+
+def missing(bench: Bench | None, source: Source, *, by: str = "") -> list[Requirement]:
+    """Return what the user has not given."""
+    if bench is None:
+        return list(CHECKLIST)
+    if by and not bench.certificate.responsible:
+        table = bench.certificate.model_copy(update={"responsible": by})
+        bench = bench.model_copy(update={"certificate": table})
+    return [each for each in CHECKLIST if not each.is_given(bench, source)]
+
+
+def unidentified(bench: Bench, source: Source) -> list[str]:
+    """Return the sensors without model, manufacturer or serial number."""
+    makers = manufacturers(bench)
+    return [
+        sensor.name
+        for sensor in source.sensors
+        if not (sensor.model and sensor.serial_number and makers.get(sensor.name))
+    ]
+
+
+def manufacturers(bench: Bench | None) -> dict[str, str]:
+    """Return the manufacturer of every sensor that has one."""
+    sensors = () if bench is None else bench.sensors
+    return {sensor.name: sensor.manufacturer for sensor in sensors if sensor.manufacturer}
+
+
+def _is_calibrated(bench: Bench) -> bool:
+    return any(
+        all(channel.certificate is not None for channel in sensor.channels if not channel.auxiliary)
+        for sensor in bench.sensors
+    )
+
+
+def settings_line(settings: Settings, bench: Bench | None) -> Paragraph:
+    """Return the settings in a line, with those that are not of the bench file."""
+    shown = to_table(settings) | {
+        key: value.isoformat()
+        for key, value in (("start", settings.start), ("end", settings.end))
+        if value is not None
+    }
+    changed = changes(to_table(bench.estimate if bench else EstimateSettings()), shown)
+    text = "Settings: " + (_listed(shown) or "all defaults") + "."
+    if changed:
+        of = "the bench file" if bench else "the defaults"
+        return Paragraph(f"{text} Not those of {of}: {'; '.join(changed)}.", "doubtful")
+    return Paragraph(text, "quiet")
+
+
+def changes(before: dict[str, object], after: dict[str, object]) -> list[str]:
+    """Return what differs between two tables of settings, in words."""
+    return [
+        f"{key} {before.get(key, 'default')} → {after.get(key, 'default')}"
+        for key in dict.fromkeys([*before, *after])
+        if before.get(key) != after.get(key)
+    ]
+
+
+def _listed(table: dict[str, object]) -> str:
+    return ", ".join(f"{key} {value}" for key, value in table.items())
+
+
+def notices(
+    found: Sequence[Source], settings: Settings, bench: Bench | None, issue: Issue | None
+) -> tuple[Paragraph, ...]:
+    """Return what must be read before the numbers."""
+    lines: list[Paragraph] = []
+    if any(source.simulated for source in found):
+        text = "SIMULATED SENSORS: the noise is that of a model. No instrument was measured."
+        lines.append(Paragraph(text, "bad"))
+    if issue is None:
+        lines.append(Paragraph("DRAFT: not a certificate. huddle issue makes one.", "doubtful"))
+        left = missing(bench, found[0])
+        if left:
+            text = "; ".join(f"{each.what} ({each.key})" for each in left)
+            lines.append(Paragraph(f"Not given: {text}.", "doubtful"))
+    else:
+        text = f"Certificate {issue.name}, issued {issue.at:%Y-%m-%d} by {issue.by}."
+        if issue.replaces is not None:
+            text += (
+                f" Replaces revision {issue.replaces} of {issue.number}. Reason: {issue.reason}."
+                f" Changed settings: {'; '.join(issue.changes) or 'none'}."
+            )
+        lines.append(Paragraph(text))
+        if issue.incomplete:
+            left = missing(bench, found[0], by=issue.by)
+            text = "; ".join(each.what for each in left)
+            lines.append(Paragraph(f"Issued incomplete. Not given: {text}.", "doubtful"))
+    lines.append(settings_line(settings, bench))
+    return tuple(lines)
+
+
+def watermark(found: Sequence[Source], issue: Issue | None) -> str:
+    """Return what stands across every page."""
+    simulated = any(source.simulated for source in found)
+    return "SIMULATED" if simulated else "DRAFT" if issue is None else ""
+
+
+def parties_section(found: Sequence[Source], bench: Bench | None, issue: Issue | None) -> Section:
+    """Return laboratory, customer, items, procedure and traceability."""
+    laboratory = Laboratory() if bench is None else bench.laboratory
+    customer = Customer() if bench is None else bench.customer
+    table = CertificateTable() if bench is None else bench.certificate
+    first, last = found[0], found[-1]
+    place = table.place or first.location or laboratory.address
+    rows = [
+        ("Laboratory", _joined(laboratory.name, laboratory.address)),
+        ("Contact", _joined(laboratory.email, laboratory.phone)),
+        ("Accreditation", laboratory.accreditation or "none claimed"),
+        ("Customer", _joined(customer.name, customer.address, customer.email)),
+        ("Order", customer.order or _NONE),
+        ("Place of the test", place or _NONE),
+        ("Received", "not given" if table.received is None else table.received.isoformat()),
+        ("Condition", table.condition or _NONE),
+        ("Tested", f"{utc_time(first.started)} to {utc_time(last.last)}"),
+        ("Procedure", table.procedure or _NONE),
+        ("Method", PROCEDURE),
+        ("Deviations", table.deviations or "none"),
+        ("Traceability", table.traceability or _traceability(bench)),
+        ("Operator", first.operator or _NONE),
+        ("Authorised by", (issue.by if issue else table.responsible) or _NONE),
+        ("Date of issue", f"{issue.at:%Y-%m-%d}" if issue else "not issued"),
+    ]
+    if issue is not None:
+        rows.append(("Entry of the ledger", issue.entry))
+    parts = (
+        Facts(tuple(rows)),
+        Paragraph(
+            "Given by the customer or user, and not verified: data of the sensors and of the"
+            " parties, sensitivities without a certificate.",
+            "quiet",
+        ),
+        Paragraph(SCOPE, "quiet"),
+    )
+    return Section("Laboratory, customer and procedure", parts)
+
+
+def _joined(*parts: str) -> str:
+    return ", ".join(part for part in parts if part) or _NONE
+
+
+def _traceability(bench: Bench | None) -> str:
+    if bench is None or not _is_calibrated(bench):
+        return "not given: sensitivities are nominal values"
+    numbers = sorted(
+        {
+            channel.certificate.number or "without number"
+            for sensor in bench.sensors
+            for channel in sensor.channels
+            if channel.certificate is not None
+        }
+    )
+    return f"sensitivities by certificates {', '.join(numbers)}; times by the host's clock (UTC)"
