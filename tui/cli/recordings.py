@@ -1,4 +1,4 @@
-"""``estimate``, ``calibrate``, ``report``, ``plot``, ``import``, ``simulate``, ``repair``."""
+"""``estimate``, ``calibrate``, ``report``, ``issue``, ``plot``, ``import``, ``simulate``, etc."""
 
 # ruff: noqa: PLC0415 - what a subcommand needs is imported when it runs
 
@@ -160,6 +160,99 @@ def report(
     from tui.commands.report import report_recordings
 
     report_recordings(files, out=out, models=models, force=force, start=start, end=end, **wanted)
+
+
+@examples(
+    "huddle issue night.h5 --by 'A. Lovelace'",
+    "huddle issue night.h5 --by 'A. Lovelace' --bench lab.toml",
+    "huddle issue night.h5 --by 'A. Lovelace' --segment 20s --reason 'resolution of 0.05 Hz'",
+)
+@with_estimate_options
+def issue(
+    files: FilesArgument,
+    *,
+    by: Annotated[
+        str, typer.Option("--by", metavar="NAME", help="Who authorises the certificate.")
+    ],
+    reason: Annotated[
+        str,
+        typer.Option(
+            "--reason", metavar="TEXT", help="Why a certificate of the same recording is revised."
+        ),
+    ] = "",
+    bench: Annotated[
+        Path | None,
+        typer.Option(
+            "--bench",
+            metavar="BENCH",
+            help="Bench file with [laboratory], [customer], [certificate] and the manufacturers "
+            "of the sensors (default: the one inside the recording).",
+        ),
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            "--folder",
+            metavar="DIR",
+            help="Folder of the certificates and their ledger (default: folder of [certificate], "
+            "or certificates beside the recording).",
+        ),
+    ] = None,
+    allow_incomplete: Annotated[
+        bool,
+        typer.Option(
+            "--allow-incomplete", help="Issue without all that ISO/IEC 17025 asks for; say so."
+        ),
+    ] = False,
+    models: ModelsOption = "",
+    start: StartOption = None,
+    end: EndOption = None,
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
+) -> None:
+    """Issue a numbered certificate of a huddle test as PDF.
+
+    The number, such as HT-2026-0042, comes from an append-only ledger in the
+    folder of the certificates. No certificate is overwritten: a further one
+    of the same recording is a revision, and needs a reason. Recordings of
+    simulated sensors are refused.
+
+    Options not given come from the bench file inside the recording.
+    The exit code is 1 if a limit is not met, and 4 if that is not decided.
+    """
+    from tui.commands.issue import issue_certificate
+
+    issue_certificate(
+        files,
+        by=by,
+        reason=reason,
+        bench=bench,
+        folder=folder,
+        models=models,
+        allow_incomplete=allow_incomplete,
+        start=start,
+        end=end,
+        **wanted,
+    )
+
+
+@examples("huddle issues certificates", "huddle issues night.h5 --json -")
+def issues(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SOURCE", help="Folder of certificates, or a recording of the laboratory."
+        ),
+    ] = Path("certificates"),
+    *,
+    json: JsonOption = None,
+) -> None:
+    """List the certificates of a ledger, with revisions and void numbers.
+
+    The exit code is 3 if the ledger was changed, or if a certificate is missing.
+    """
+    from tui.commands.issue import list_issues
+
+    list_issues(source, json=json)
 
 
 @examples(

@@ -151,12 +151,16 @@ def pin(
 
 
 @examples(
-    "huddle verify lab.toml", "huddle verify recordings", "huddle verify a.h5 --key lab.key.pub"
+    "huddle verify lab.toml",
+    "huddle verify recordings",
+    "huddle verify a.h5 --key lab.key.pub",
+    "huddle verify a.h5 b.h5 --json -",
+    "huddle verify certificates/HT-2026-0042-r0.pdf night.h5",
 )
 def verify(
     sources: Annotated[
         list[Path],
-        typer.Argument(metavar="SOURCE", help="Recordings, bench files or folders."),
+        typer.Argument(metavar="SOURCE", help="Recordings, bench files or folders; certificates."),
     ],
     *,
     key: Annotated[
@@ -168,6 +172,9 @@ def verify(
     json: JsonOption = None,
 ) -> None:
     """Verify the checksums and signatures of recordings, or of all recordings of a service.
+
+    A certificate (.pdf) is compared with the ledger in its folder, and with
+    the recordings named with it, or those beside that folder.
 
     The exit code is 3 if a recording is damaged, lost or exchanged, or a signature does not fit.
     """

@@ -56,6 +56,11 @@ PANELS: dict[str, dict[str, tuple[str, str]]] = {
             "Keep the spectra of months of recordings, and show the noise over time.",
         ),
         "report": ("recordings", "Write the calibration report of a huddle test as HTML or PDF."),
+        "issue": ("recordings", "Issue a numbered certificate of a huddle test as PDF."),
+        "issues": (
+            "recordings",
+            "List the certificates of a ledger, with revisions and void numbers.",
+        ),
         "plot": ("recordings", "Draw the self-noise of every channel as a figure for publication."),
         "import": ("recordings", "Convert files of other programs into a recording."),
         "export": ("recordings", "Write samples or noise curves for other programs."),

@@ -9,6 +9,7 @@ from rich.table import Table
 from daq.errors import HuddleError, RecordingError
 from daq.recording.signing import problem, signature_of
 from daq.recording.storage.trial import trials
+from tui.certificate.ledger import Ledger
 from tui.output.console import check_places, for_people, write_json, write_text
 from tui.output.csv_text import csv_text
 from tui.service.records.places import NoServiceError, Place
@@ -136,6 +137,10 @@ def verify_recordings(
     RecordingError
         If one is damaged, lost, another one than the service made, or not signed with the key.
     """
+    certificates = [source for source in sources if source.suffix.lower() == ".pdf"]
+    if certificates:
+        _verify_certificates(certificates, sources)
+        return
     found = []
     paths, known = _recordings(sources)
     # In children: a file that hangs or crashes HDF5 is damaged, and the others are verified.
@@ -171,6 +176,22 @@ def verify_recordings(
     )
     if bad:
         raise RecordingError(f"{len(bad)} of {len(found)} recordings are damaged or lost")
+
+
+def _verify_certificates(certificates: Sequence[Path], sources: Sequence[Path]) -> None:
+    """Check certificates against the ledger in their folder, and the recordings named beside them.
+
+    Raises
+    ------
+    VerificationError
+        If one was changed, or is of another recording.
+    """
+    from tui.certificate.issuing import verify  # noqa: PLC0415 - loads matplotlib
+
+    recordings = [source for source in sources if source not in certificates]
+    for path in certificates:
+        for line in verify(path, recordings, Ledger(path.absolute().parent)):
+            for_people(None).print(f"{path.name}: {line}", soft_wrap=True)
 
 
 def _recordings(

@@ -6,6 +6,7 @@ their header comes again. Lengths are in inches. Plots are vectors, their letter
 
 from __future__ import annotations
 
+import hashlib
 import io
 import logging
 import math
@@ -56,10 +57,25 @@ _START = datetime(2000, 1, 1, tzinfo=UTC)
 """Date of every file: the same recording gives the same file."""
 
 
-def write_paper(report: Report, file: BinaryIO) -> None:
-    """Write a report as PDF."""
+def write_paper(
+    report: Report,
+    file: BinaryIO,
+    *,
+    attached: Sequence[tuple[str, str, bytes]] = (),
+    at: datetime = _START,
+) -> None:
+    """Write a report as PDF; with files attached (name, MIME type, content), as PDF/A-3."""
     logging.getLogger("fpdf").setLevel(logging.ERROR)  # letters that the font does not have
-    paper = _Paper(report)
+    paper = _Paper(report, at, archival=bool(attached))
+    for name, mime_type, content in attached:
+        paper.embed_file(
+            bytes=content,
+            basename=name,
+            mime_type=mime_type,
+            modification_date=at,
+            compress=True,
+            associated_file_relationship="Data",
+        )
     paper.add_page()
     paper.heading(report)
     for number, section in enumerate(report.sections, start=1):
@@ -77,8 +93,10 @@ def write_paper(report: Report, file: BinaryIO) -> None:
 class _Paper(FPDF):
     """Pages being filled from above."""
 
-    def __init__(self, report: Report) -> None:
-        super().__init__(unit="in", format="A4")
+    def __init__(self, report: Report, at: datetime, *, archival: bool) -> None:
+        super().__init__(
+            unit="in", format="A4", enforce_compliance="PDF/A-3B" if archival else None
+        )
         fonts = Path(mpl.get_data_path(), "fonts", "ttf")
         self.add_font(_FAMILY, "", fonts / "DejaVuSans.ttf")
         self.add_font(_FAMILY, "B", fonts / "DejaVuSans-Bold.ttf")
@@ -87,7 +105,9 @@ class _Paper(FPDF):
         self.set_title(f"{report.title}: {report.subtitle}")
         self.set_lang("en")
         self.set_creator("huddle")
-        self.set_creation_date(_START)
+        self.set_creation_date(at)
+        number = report.number.encode()
+        self._identifier = hashlib.sha256(number).hexdigest()[:32].upper() if number else ""
         self.c_margin = 0.0
         self.set_section_title_styles(
             TextStyle(_FAMILY, "B", HEADING, color=drawing.INK, t_margin=0.16, b_margin=0.05)
@@ -96,8 +116,9 @@ class _Paper(FPDF):
         self._watermark = report.watermark
 
     def file_id(self) -> str:
-        """Return no identifier: it would hold the time."""
-        return ""
+        """Return an identifier without the time: none for a draft."""
+        one = self._identifier
+        return f"<{one}><{one}>" if one else ""
 
     def footer(self) -> None:
         """Set the foot of a page."""

@@ -1,0 +1,1 @@
+"""Certificates: the ledger of their numbers, issuing, the machine-readable form, verification."""

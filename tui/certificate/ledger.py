@@ -1,0 +1,366 @@
+"""The ledger of a laboratory's certificates: numbers are given once, and no entry is changed.
+
+Theory of operation
+-------------------
+A folder of certificates has one ledger, an SQLite file. Each row is a record as JSON and the
+SHA-256 of the record before and of itself, so that a changed or removed row breaks the chain;
+triggers refuse changes through SQL. SQLite counts the rows ever added, so that rows removed from
+the end are missed, too; and every certificate prints the hash of its own row.
+
+To issue is: add ``allotted``, make the file under a hidden name, add ``issued`` with the SHA-256 of
+the file, and give the file its name. All of it holds a lock that the system releases when the
+process ends. Whoever takes the lock next finds what a killed process left: a number without a
+certificate becomes ``void``; a certificate that lacks only its name gets it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import sqlite3
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+from daq.errors import HuddleError
+from daq.recording.storage.names import sync_directory
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+    from pathlib import Path
+
+NAME, LOCK = "ledger.sqlite", "ledger.lock"
+PATIENCE = 600.0
+"""Seconds to wait for another process that issues."""
+State: TypeAlias = Literal["issued", "replaced", "void", "being issued", "file missing"]
+_TABLE = """
+CREATE TABLE IF NOT EXISTS entries (
+    row INTEGER PRIMARY KEY AUTOINCREMENT, record TEXT NOT NULL, hash TEXT NOT NULL UNIQUE);
+CREATE TRIGGER IF NOT EXISTS no_change BEFORE UPDATE ON entries
+    BEGIN SELECT RAISE(ABORT, 'the ledger is append-only'); END;
+CREATE TRIGGER IF NOT EXISTS no_removal BEFORE DELETE ON entries
+    BEGIN SELECT RAISE(ABORT, 'the ledger is append-only'); END;
+"""
+
+
+class LedgerError(HuddleError, OSError):
+    """The ledger cannot be used: changed by hand, busy, or not there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One certificate or void number, as the ledger knows it now.
+
+    Attributes
+    ----------
+    number : str
+    revision : int
+    at : datetime
+        UTC.
+    by : str
+    recordings : tuple of (file, run_id, sha256)
+    settings : mapping
+        Those of the estimate that differ from the defaults.
+    reason : str
+        Of a revision.
+    hash : str
+        Of the row that allotted the number.
+    state : State
+    file, sha256 : str
+        Of the certificate; empty for a void number.
+    """
+
+    number: str
+    revision: int
+    at: datetime
+    by: str
+    recordings: tuple[tuple[str, str, str], ...]
+    settings: Mapping[str, Any]
+    reason: str
+    hash: str
+    state: State
+    file: str = ""
+    sha256: str = ""
+
+    @property
+    def name(self) -> str:
+        """Number and revision."""
+        return f"{self.number}, revision {self.revision}"
+
+    @property
+    def runs(self) -> frozenset[str]:
+        """The runs certified."""
+        return frozenset(run_id for _, run_id, _ in self.recordings)
+
+
+class Ledger:
+    """The ledger of one folder; every method opens the file anew.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the certificates.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._path = folder / NAME
+
+    @property
+    def exists(self) -> bool:
+        """Whether there is a ledger."""
+        return self._path.is_file()
+
+    @contextmanager
+    def held(self, *, patience: float = PATIENCE) -> Iterator[None]:
+        """Hold the ledger for one certificate; first clear up what a killed process left.
+
+        Raises
+        ------
+        LedgerError
+            If another process holds it for longer, or the ledger was changed.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with self._locked(patience):
+            with self._open() as rows:
+                rows.executescript(_TABLE)
+            self._clear_up()
+            yield
+
+    def entries(self) -> tuple[Entry, ...]:
+        """Return all certificates and void numbers, in the order in which they were allotted.
+
+        Raises
+        ------
+        LedgerError
+            If a row was changed or removed.
+        """
+        found: dict[tuple[str, int], Entry] = {}
+        busy = self._is_busy()
+        for record, own in self._records():
+            key = record["number"], record["revision"]
+            if record["kind"] == "allotted":
+                state: State = "being issued" if busy else "void"
+                found[key] = _entry(record, own, state)
+            elif record["kind"] == "issued":
+                here = (self.folder / record["file"]).exists()
+                state = "issued" if here or busy else "file missing"
+                about = {"file": record["file"], "sha256": record["sha256"]}
+                found[key] = replace(found[key], state=state, **about)
+            else:
+                found[key] = replace(found[key], state="void")
+        last = {e.number: e.revision for e in found.values() if e.state != "void"}
+        return tuple(
+            replace(e, state="replaced")
+            if e.state == "issued" and e.revision < last[e.number]
+            else e
+            for e in found.values()
+        )
+
+    def allot(
+        self,
+        prefix: str,
+        *,
+        at: datetime,
+        by: str,
+        recordings: Sequence[tuple[str, str, str]],
+        settings: Mapping[str, Any],
+        reason: str,
+    ) -> Entry:
+        """Give the next number; a further certificate of the same runs is a revision of theirs."""
+        entries = self.entries()
+        before = self.last_of(frozenset(run_id for _, run_id, _ in recordings), entries)
+        if before is not None:
+            number = before.number
+            revision = 1 + max(e.revision for e in entries if e.number == number)
+        else:
+            start = f"{prefix}-{at:%Y}-"
+            taken = [e.number.removeprefix(start) for e in entries if e.number.startswith(start)]
+            number, revision = f"{start}{1 + max(map(int, taken), default=0):04d}", 0
+        record = {
+            "kind": "allotted",
+            "number": number,
+            "revision": revision,
+            "at": at.isoformat(),
+            "by": by,
+            "recordings": [list(each) for each in recordings],
+            "settings": dict(settings),
+            "reason": reason,
+        }
+        return _entry(record, self._add(record), "being issued")
+
+    def last_of(self, runs: frozenset[str], entries: Sequence[Entry] | None = None) -> Entry | None:
+        """Return the last certificate of the same runs that is not void."""
+        known = self.entries() if entries is None else entries
+        found = [each for each in known if each.runs == runs and each.state != "void"]
+        return found[-1] if found else None
+
+    def publish(self, entry: Entry, suffix: str, content: bytes) -> Path:
+        """Add a certificate to the ledger and to the folder, in which it replaces nothing.
+
+        Raises
+        ------
+        LedgerError
+            If a file has the name already.
+        """
+        path = self.folder / f"{entry.number}-r{entry.revision}{suffix}"
+        if path.exists():
+            raise LedgerError(f"{path}: exists, and is not in the ledger; move it away")
+        part = _part(path)
+        with part.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        sha256 = hashlib.sha256(content).hexdigest()
+        self._add(
+            {
+                "kind": "issued",
+                "number": entry.number,
+                "revision": entry.revision,
+                "at": datetime.now(UTC).isoformat(),
+                "file": path.name,
+                "sha256": sha256,
+            }
+        )
+        _name(part, path)
+        return path
+
+    def void(self, entry: Entry, why: str) -> None:
+        """Mark a number without a certificate."""
+        self._add(
+            {
+                "kind": "void",
+                "number": entry.number,
+                "revision": entry.revision,
+                "at": datetime.now(UTC).isoformat(),
+                "why": why,
+            }
+        )
+
+    def _clear_up(self) -> None:
+        """Finish what a killed process left; the lock is held."""
+        open_entries: dict[tuple[str, int], Entry] = {}
+        for record, own in self._records():
+            key = record["number"], record["revision"]
+            if record["kind"] == "allotted":
+                open_entries[key] = _entry(record, own, "void")
+                continue
+            open_entries.pop(key, None)
+            if record["kind"] == "issued":
+                path = self.folder / record["file"]
+                part = _part(path)
+                if not path.exists() and part.exists() and _sha256(part) == record["sha256"]:
+                    _name(part, path)
+                part.unlink(missing_ok=True)
+        for entry in open_entries.values():
+            self.void(entry, "the process that issued it was ended")
+            for part in self.folder.glob(f".{entry.number}-r{entry.revision}.*.part"):
+                part.unlink()
+
+    def _add(self, record: dict[str, Any]) -> str:
+        with self._open() as rows:
+            rows.execute("BEGIN IMMEDIATE")
+            last = rows.execute("SELECT hash FROM entries ORDER BY row DESC LIMIT 1").fetchone()
+            text = json.dumps(
+                record | {"previous": last[0] if last else ""}, ensure_ascii=False, sort_keys=True
+            )
+            own = hashlib.sha256(text.encode()).hexdigest()
+            rows.execute("INSERT INTO entries (record, hash) VALUES (?, ?)", (text, own))
+            rows.execute("COMMIT")
+        return own
+
+    def _records(self) -> list[tuple[dict[str, Any], str]]:
+        """Return all records with their hashes, after walking the chain."""
+        if not self.exists:
+            raise LedgerError(f"{self._path}: there is no ledger; huddle issue makes one")
+        with self._open() as rows:
+            found = rows.execute("SELECT row, record, hash FROM entries ORDER BY row").fetchall()
+            counted = rows.execute(
+                "SELECT seq FROM sqlite_sequence WHERE name = 'entries'"
+            ).fetchone()
+        previous, records = "", []
+        for number, (row, text, own) in enumerate(found, start=1):
+            record = json.loads(text) if hashlib.sha256(text.encode()).hexdigest() == own else {}
+            if row != number or record.get("previous") != previous:
+                raise LedgerError(f"{self._path}: changed by hand: row {number} breaks the chain")
+            records.append((record, own))
+            previous = own
+        written = counted[0] if counted else 0
+        if written != len(found):
+            raise LedgerError(
+                f"{self._path}: changed by hand: {written} rows were written,"
+                f" {len(found)} are there"
+            )
+        return records
+
+    @contextmanager
+    def _open(self) -> Iterator[sqlite3.Connection]:
+        try:
+            with contextlib.closing(
+                sqlite3.connect(self._path, timeout=60, isolation_level=None)
+            ) as rows:
+                rows.execute("PRAGMA synchronous = EXTRA")
+                yield rows
+        except sqlite3.Error as error:
+            raise LedgerError(f"{self._path}: {error}") from error
+
+    @contextmanager
+    def _locked(self, patience: float) -> Iterator[None]:
+        """Hold the lock: a transaction of a file of its own, which ends with the process."""
+        path = self.folder / LOCK
+        with contextlib.closing(
+            sqlite3.connect(path, timeout=patience, isolation_level=None)
+        ) as lock:
+            try:
+                lock.execute("BEGIN EXCLUSIVE")
+            except sqlite3.OperationalError as error:
+                raise LedgerError(f"{path}: another process is issuing ({error})") from error
+            yield
+
+    def _is_busy(self) -> bool:
+        if not (self.folder / LOCK).exists():
+            return False
+        try:
+            with self._locked(0.0):
+                return False
+        except LedgerError:
+            return True
+
+
+def _entry(record: Mapping[str, Any], own: str, state: State) -> Entry:
+    return Entry(
+        number=record["number"],
+        revision=record["revision"],
+        at=datetime.fromisoformat(record["at"]),
+        by=record["by"],
+        recordings=tuple((file, run_id, sha256) for file, run_id, sha256 in record["recordings"]),
+        settings=record["settings"],
+        reason=record["reason"],
+        hash=own,
+        state=state,
+    )
+
+
+def _part(path: Path) -> Path:
+    return path.with_name(f".{path.name}.part")
+
+
+def _name(part: Path, path: Path) -> None:
+    """Give a complete file its name, which must be free."""
+    try:
+        os.link(part, path)
+    except FileExistsError:
+        raise LedgerError(f"{path}: exists, and is not in the ledger; move it away") from None
+    except OSError:  # a file system without links
+        part.rename(path)
+    else:
+        part.unlink()
+    sync_directory(path.parent)
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
