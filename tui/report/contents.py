@@ -9,6 +9,7 @@ from daq.bench.durations import format_duration
 from daq.bench.estimate_settings import OPTIONS, table_keys
 from daq.results.band_summary import band_of
 from daq.results.calibration import calibrate
+from daq.results.decision.conformity import conformity, with_rule
 from daq.results.decision.limits import judge
 from estimator.errors import InsufficientDataError
 from tui.output.calibration import (
@@ -154,12 +155,18 @@ def report_of(
         )
         sentence = Paragraph(text, "bad" if sentence.tone == "bad" else "doubtful")
     about = bench if about is None else about
+    by_rule = with_rule(bench, about)
     sections = [
         parties_section(found, about, issue),
         _test_section(found),
         facts_section(known(snapshot, settings)),
         _sensors_section(snapshot, found, about),
-        limits_section(snapshot, judged),
+        limits_section(
+            snapshot,
+            judged,
+            conformity(by_rule, snapshot, settings),
+            None if by_rule is None else by_rule.certificate,
+        ),
         noise_section(snapshot, settings, bench, models),
         parameters_section(snapshot, settings, bench),
         calibration_section(snapshot, settings, bench),

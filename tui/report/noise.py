@@ -6,15 +6,17 @@ import math
 from typing import TYPE_CHECKING
 
 from daq.bench.masks.mask import SOURCES
+from daq.bench.tables.certificate import Rule
 from daq.bench.units import decibels
 from daq.results.band_summary import band_of, channel_means, data_means
+from daq.results.decision.conformity import Statement
 from daq.results.partners import without_partners
 from daq.results.precision import channel_covs
 from estimator.decision.verdict import Verdict
 from estimator.self_noise.result import Flag
 from tui.report.figures.curves import noise_plots
 from tui.report.parts import Paragraph, Part, Section, Table
-from tui.report.wording import decibel, plain_number, scientific
+from tui.report.wording import NOTHING, decibel, plain_number, scientific
 from tui.wording.formatting import NOT_KNOWN, level_with_error, span
 from tui.wording.verdict_text import WORDS, headline, margin, not_judged, what_to_do
 from tui.wording.vocabulary import FLAG_WORDS, PARTNER_WORDS
@@ -24,12 +26,21 @@ if TYPE_CHECKING:
 
     from daq.bench.masks.mask import Mask
     from daq.bench.model import Bench
+    from daq.bench.tables.certificate import CertificateTable
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.results.band_summary import BandMeans
+    from daq.results.decision.conformity import Conformity
     from daq.results.decision.verdict import TestVerdict
     from tui.report.parts import Tone
 
+STATEMENTS: Mapping[Statement, str] = {
+    Statement.PASS: "pass",
+    Statement.CONDITIONAL_PASS: "conditional pass",
+    Statement.CONDITIONAL_FAIL: "conditional fail",
+    Statement.FAIL: "fail",
+    Statement.NOT_STATED: "no statement",
+}
 MAX_BANDS = 7
 """Columns of the table of noise by octaves that a page is wide."""
 _TONES: Mapping[Verdict, Tone] = {
@@ -48,12 +59,18 @@ def verdict(found: TestVerdict | None) -> Paragraph:
     return Paragraph(text, _TONES[found.verdict])
 
 
-def limits_section(snapshot: Snapshot, found: TestVerdict | None) -> Section | None:
+def limits_section(
+    snapshot: Snapshot,
+    found: TestVerdict | None,
+    statements: Sequence[Conformity] = (),
+    table: CertificateTable | None = None,
+) -> Section | None:
     """Return every channel beside its limits, worst first; None where the bench file has none."""
     if found is None:
         return None
     rows: list[tuple[str, ...]] = []
     tones: dict[tuple[int, int], Tone] = {}
+    by_rule = {(each.limit, each.sensor, each.channel): each for each in statements}
     order = list(dict.fromkeys(each.limit for each in found.limits))
     ranks = list(_TONES)
     for number, each in enumerate(
@@ -71,10 +88,15 @@ def limits_section(snapshot: Snapshot, found: TestVerdict | None) -> Section | N
                 WORDS[each.verdict] if each.known else "no estimate",
             )
         )
+        if by_rule:
+            stated = by_rule[each.limit, each.sensor, each.channel]
+            rows[-1] += (STATEMENTS[stated.statement], _risk(stated.risk))
     method = next((each.method for each in found.limits), "")
-    header = (
+    header: tuple[str, ...] = (
         "channel", "limit", "at (Hz)", "noise (dB)", "limit (dB)", "margin (dB)", "verdict",
     )  # fmt: skip
+    if by_rule:
+        header += ("conformity", "risk")
     note = (
         f"By the {method} estimate, in bands a third of an octave wide, divided at notches and "
         "steps of the limit; shown is the band where the channel does worst. "
@@ -83,8 +105,39 @@ def limits_section(snapshot: Snapshot, found: TestVerdict | None) -> Section | N
         "one. The intervals hold for all channels and bands together with a probability of 95 %, "
         "and include all that widens them."
     )
-    table = Table(header, tuple(rows), left=frozenset({0, 1, 6}), tones=tones)
-    return Section("Verdict against the limits", (table, Paragraph(note, "quiet")))
+    shown = Table(header, tuple(rows), left=frozenset({0, 1, 6, 7}), tones=tones)
+    parts: list[Part] = [shown, Paragraph(note, "quiet")]
+    if by_rule and table is not None:
+        parts.insert(1, Paragraph(decision_rule(table)))
+    return Section("Verdict against the limits", tuple(parts))
+
+
+def decision_rule(table: CertificateTable) -> str:
+    """Return the decision rule of the statements of conformity, with its source."""
+    r = table.guard_band
+    band = f"the guard band is w = {'' if r == 1 else f'{r:g} '}U below the limit"
+    rules = {
+        Rule.SIMPLE_ACCEPTANCE: "simple acceptance (ILAC-G8:09/2019, 4.2.1): pass at or below the "
+        "limit, fail above",
+        Rule.GUARD_BAND_BINARY: f"guard band with two statements (ILAC-G8:09/2019, 4.2.2): {band}; "
+        "pass where it is kept, else fail",
+        Rule.GUARD_BAND: f"guard band with four statements (ILAC-G8:09/2019, 4.2.3): {band}, and as"
+        " far above it for a fail; between, the statement is conditional",
+    }
+    return (
+        f"Decision rule: {rules[table.decision_rule]}. U is the distance in dB from the noise to "
+        "the end of its interval. Risk: probability that the noise is above the limit, by the "
+        "distribution of the level in the band where it is largest (specific risk, JCGM 106:2012, "
+        "9.3.2)."
+    )
+
+
+def _risk(risk: float) -> str:
+    if not math.isfinite(risk):
+        return NOTHING
+    if risk < 1e-4:
+        return "< 0.01 %"
+    return "> 99.99 %" if risk > 0.9999 else f"{100 * risk:.2g} %"
 
 
 def noise_section(

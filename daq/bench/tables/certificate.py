@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import datetime as dt
+import enum
 import re
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, TypeAlias
 
 from pydantic import AfterValidator, Field
 
@@ -13,6 +14,17 @@ from daq.bench.tables.fields import Table
 
 Day: TypeAlias = dt.date
 _PREFIX = re.compile(r"[A-Za-z0-9][A-Za-z0-9.]{0,15}", re.ASCII)
+
+
+class Rule(enum.StrEnum):
+    """Decision rules of ILAC-G8:09/2019."""
+
+    SIMPLE_ACCEPTANCE = "simple-acceptance"
+    """4.2.1: pass at or below the limit, whatever the uncertainty."""
+    GUARD_BAND_BINARY = "guard-band-binary"
+    """4.2.2: pass where the guard band below the limit is kept, else fail."""
+    GUARD_BAND = "guard-band"
+    """4.2.3: pass, conditional pass, conditional fail, fail."""
 
 
 def _prefix(value: str) -> str:
@@ -63,7 +75,8 @@ class CertificateTable(Table):
     """From the procedure."""
     responsible: str = ""
     """Who authorises certificates."""
-    decision_rule: Literal["simple-acceptance", "guard-band"] = "guard-band"
-    """Of ILAC-G8:09/2019, clauses 4.2.1 and 4.2.2."""
+    decision_rule: Rule = Rule.GUARD_BAND
+    """Of ILAC-G8:09/2019: simple acceptance (4.2.1), guard band with two statements (4.2.2) or
+    with four (4.2.3)."""
     guard_band: Annotated[float, Field(ge=0.0)] = 1.0
     """r of the guard band w = r·U; 1 is the rule of ILAC-G8."""

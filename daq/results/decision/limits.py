@@ -47,10 +47,10 @@ def judge(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> TestVe
         return None
     method = judged_method(snapshot, settings)
     noise = snapshot.results.get(method)
-    bands = [_Bands.of(bench, limit, snapshot) for limit in bench.limits]
+    bands = [Bands.of(bench, limit, snapshot) for limit in bench.limits]
     quantile = joint_quantile(sum(each.n_bands * len(each.columns) for each in bands))
     spectrum = None if noise is None else Spectrum(noise, snapshot, settings)
-    known: dict[bytes, _Columns] = {}  # limits often share their bands
+    known: dict[bytes, Columns] = {}  # limits often share their bands
     found: list[Comparison] = []
     judged: list[Judged] = []
     doubted = _doubted(bench, snapshot)
@@ -58,7 +58,7 @@ def judge(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> TestVe
     for each in bands:
         columns = known.get(each.edges.tobytes())
         if columns is None and spectrum is not None and each.n_bands:
-            columns = _Columns.of(spectrum.levels(each.edges), quantile)
+            columns = Columns.of(spectrum.levels(each.edges), quantile)
             known[each.edges.tobytes()] = columns
         for column in each.columns:
             found.append(
@@ -146,7 +146,7 @@ def _unit_in_file(bench: Bench, label: ChannelLabel) -> str | None:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Columns:
+class Columns:
     """Levels of all channels in the bands of a limit, as a verdict needs them.
 
     Each pair has lower and upper ends, shape (n_bands, n_channels): by the scatter alone, with all
@@ -160,7 +160,7 @@ class _Columns:
     withdrawn: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, found: Levels, quantile: float) -> _Columns:
+    def of(cls, found: Levels, quantile: float) -> Columns:
         """Return the columns at a quantile."""
         return cls(
             found,
@@ -172,7 +172,7 @@ class _Columns:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Bands:
+class Bands:
     """The bands of one limit, and the channels that it is for."""
 
     limit: Limit
@@ -182,7 +182,7 @@ class _Bands:
     alone: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, bench: Bench, limit: Limit, snapshot: Snapshot) -> _Bands:
+    def of(cls, bench: Bench, limit: Limit, snapshot: Snapshot) -> Bands:
         """Return the bands of a limit in a spectrum; the last ends where nothing is known."""
         frequency, points = snapshot.frequency, np.asarray(limit.mask.frequency)
         columns = tuple(n for n, each in enumerate(snapshot.channels) if concerns(limit, each))
@@ -202,7 +202,7 @@ class _Bands:
         return max(len(self.edges) - 1, 0)
 
     def comparison(
-        self, bench: Bench, snapshot: Snapshot, columns: _Columns | None, column: int
+        self, bench: Bench, snapshot: Snapshot, columns: Columns | None, column: int
     ) -> Comparison:
         """Return the noise of a channel beside the mask."""
         frequency, label = snapshot.frequency, snapshot.channels[column]

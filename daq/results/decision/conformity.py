@@ -1,0 +1,199 @@
+"""Statements of conformity by a named decision rule, and the risk that they are wrong.
+
+The rules are those of ILAC-G8:09/2019. The guard band is ``w = r U`` (JCGM 106:2012, 8.3.2), where
+U is the distance in dB from the level to the ends of its 95 % interval, which holds for all
+channels, limits and bands together. The specific risk (JCGM 106:2012, 9.3.2) is the probability
+that the noise is above the limit, by the distribution of the level itself: the quantile whose
+interval ends at the limit.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.bench.tables.certificate import Rule
+from daq.results.band_summary import Spectrum, judged_method
+from daq.results.decision.limits import Bands, Columns
+from estimator.decision.comparison import joint_quantile
+from estimator.decision.verdict import Obstacle
+
+if TYPE_CHECKING:
+    from daq.bench.model import Bench
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from daq.results.band_summary import Levels
+    from estimator.types import FloatArray
+
+QUANTILES = np.arange(0.0, 6.5, 0.25)
+"""Standard deviations at which the distribution of a level is tabulated."""
+
+
+class Statement(enum.StrEnum):
+    """What a decision rule states of a channel beside a limit, best first."""
+
+    PASS = "pass"  # noqa: S105 - no password
+    CONDITIONAL_PASS = "conditional-pass"  # noqa: S105 - no password
+    CONDITIONAL_FAIL = "conditional-fail"
+    FAIL = "fail"
+    NOT_STATED = "not-stated"
+    """The estimate does not allow a statement by any rule."""
+
+
+@dataclass(frozen=True, slots=True)
+class Conformity:
+    """One channel beside one limit.
+
+    Attributes
+    ----------
+    limit, sensor, channel : str
+    statement : Statement
+        By the rule.
+    risk : float
+        Probability that the noise is above the limit in the band where it is largest; NaN where
+        nothing is known.
+    frequency : float
+        Centre of that band in Hz.
+    """
+
+    limit: str
+    sensor: str
+    channel: str
+    statement: Statement
+    risk: float
+    frequency: float
+
+    @property
+    def is_within(self) -> bool:
+        """Whether the statement is that the limit is kept."""
+        return self.statement in {Statement.PASS, Statement.CONDITIONAL_PASS}
+
+
+def conformity(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> list[Conformity]:
+    """Return the statement on every channel beside every limit, by the rule of the bench file.
+
+    The bands and the channels are those of `daq.results.decision.limits.judge`.
+    """
+    if bench is None or not bench.limits:
+        return []
+    rule, r = bench.certificate.decision_rule, bench.certificate.guard_band
+    noise = snapshot.results.get(judged_method(snapshot, settings))
+    bands = [Bands.of(bench, limit, snapshot) for limit in bench.limits]
+    quantile = joint_quantile(sum(each.n_bands * len(each.columns) for each in bands))
+    spectrum = None if noise is None else Spectrum(noise, snapshot, settings)
+    found = []
+    for each in bands:
+        columns, low, high = None, np.empty(0), np.empty(0)
+        if spectrum is not None and each.n_bands:
+            levels = spectrum.levels(each.edges)
+            columns, (low, high) = Columns.of(levels, quantile), distribution(levels)
+        for column in each.columns:
+            compared = each.comparison(bench, snapshot, columns, column)
+            judged, label = compared.judged(), snapshot.channels[column]
+            statement, risk, frequency = Statement.NOT_STATED, math.nan, math.nan
+            if columns is not None and judged.band is not None:
+                risks = risk_above(compared.mask, low[..., column], high[..., column])
+                worst = int(np.nan_to_num(risks, nan=-1.0).argmax())
+                risk, frequency = float(risks[worst]), float(compared.centre[worst])
+                if judged.obstacle in {None, Obstacle.SPANS_LIMIT}:
+                    statement = stated(
+                        rule,
+                        r,
+                        compared.mean,
+                        low=compared.outer_low,
+                        high=compared.outer_high,
+                        limit=compared.mask,
+                    )
+            found.append(
+                Conformity(each.limit.name, label.sensor, label.channel, statement, risk, frequency)
+            )
+    return found
+
+
+def with_rule(bench: Bench | None, about: Bench | None) -> Bench | None:
+    """Return a bench, whose limits are judged, with the decision rule that another one agrees."""
+    if bench is None or about is None:
+        return bench
+    return bench.model_copy(update={"certificate": about.certificate})
+
+
+def stated(
+    rule: Rule,
+    r: float,
+    level: FloatArray,
+    *,
+    low: FloatArray,
+    high: FloatArray,
+    limit: FloatArray,
+) -> Statement:
+    """Return the statement on a channel: the worst of its bands.
+
+    Parameters
+    ----------
+    rule : Rule
+    r : float
+        Guard band over the expanded uncertainty.
+    level, low, high, limit : float64, shape (n_bands,)
+        In unit**2/Hz; bands without a level are not judged.
+    """
+    known = np.isfinite(level)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        value, below, above, most = (
+            10 * np.log10(np.maximum(each[known], 0.0)) for each in (level, low, high, limit)
+        )
+        upper = r * (above - value) if r else np.zeros(value.shape)
+        lower = r * (value - below) if r else np.zeros(value.shape)
+        passes = most - value >= upper
+        fails = value - most > lower
+    # an estimate at or below zero has no decibels: the end of its interval decides
+    passes = np.where(level[known] > 0, passes, (above <= most) & (r <= 1))
+    within = value <= most
+    if rule is Rule.SIMPLE_ACCEPTANCE:
+        return Statement.PASS if within.all() else Statement.FAIL
+    if rule is Rule.GUARD_BAND_BINARY or passes.all():
+        return Statement.PASS if passes.all() else Statement.FAIL
+    if fails.any():
+        return Statement.FAIL
+    return Statement.CONDITIONAL_PASS if within.all() else Statement.CONDITIONAL_FAIL
+
+
+def distribution(levels: Levels) -> tuple[FloatArray, FloatArray]:
+    """Return lower and upper ends at `QUANTILES`, shape (n_quantiles, n_bands, n_channels)."""
+    ends = [levels.ends(float(quantile)) for quantile in QUANTILES]
+    return np.stack([low for low, _ in ends]), np.stack([high for _, high in ends])
+
+
+def risk_above(limit: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Return the probability that a level is above its limit, shape (n_bands,).
+
+    Parameters
+    ----------
+    limit : float64, shape (n_bands,)
+    low, high : float64, shape (n_quantiles, n_bands)
+        Ends at `QUANTILES`. A limit between the ends at quantile 0, where only contributions
+        without a distribution decide, has the probability 1/2.
+    """
+    normal, risks = NormalDist(), []
+    for place, most in enumerate(limit.tolist()):
+        upper, lower = high[:, place], low[:, place]
+        if not np.isfinite(upper[0]) or math.isnan(most):
+            risks.append(math.nan)
+        elif most >= upper[0]:
+            risks.append(1 - normal.cdf(_quantile(upper, most)))
+        elif most <= lower[0]:
+            risks.append(normal.cdf(_quantile(-lower, -most)))
+        else:
+            risks.append(0.5)
+    return np.array(risks)
+
+
+def _quantile(ends: FloatArray, at: float) -> float:
+    """Return the quantile at which rising ends reach a value; the last one if they do not."""
+    finite = np.isfinite(ends)
+    known = ends[finite]
+    return float(np.interp(at, np.maximum.accumulate(known), QUANTILES[: finite.sum()]))
