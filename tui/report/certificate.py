@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from daq.bench.durations import format_duration
 from daq.bench.estimate_settings import EstimateSettings, to_table
 from daq.bench.tables.certificate import CertificateTable, Customer, Laboratory
 from tui.report.parts import Facts, Paragraph, Section
@@ -20,9 +21,12 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
     from daq.results.sources import Source
 
 _NONE = "not given"
+LEAST_LOST = 0.01
+"""Share of a recording without samples of a sensor that page 1 states."""
 PROCEDURE = (
     "Self-noise by the coherence of sensors side by side (huddle test): Sleeman, van Wettum and"
     " Trampert (2006), Bull. Seismol. Soc. Am. 96, 258–271, and its extension to sensors in any"
@@ -206,7 +210,11 @@ def _listed(table: dict[str, object]) -> str:
 
 
 def notices(
-    found: Sequence[Source], settings: Settings, bench: Bench | None, issue: Issue | None
+    found: Sequence[Source],
+    snapshot: Snapshot,
+    settings: Settings,
+    bench: Bench | None,
+    issue: Issue | None,
 ) -> tuple[Paragraph, ...]:
     """Return what must be read before the numbers."""
     lines: list[Paragraph] = []
@@ -231,8 +239,23 @@ def notices(
             left = missing(bench, found[0], by=issue.by)
             text = "; ".join(each.what for each in left)
             lines.append(Paragraph(f"Issued incomplete. Not given: {text}.", "doubtful"))
+    lines += [Paragraph(text, "bad") for text in without_samples(found[-1], snapshot)]
     lines.append(settings_line(settings, bench))
     return tuple(lines)
+
+
+def without_samples(source: Source, snapshot: Snapshot) -> list[str]:
+    """Return the sensors that recorded nothing for more than `LEAST_LOST` of a recording."""
+    whole = (source.last - source.started).total_seconds()
+    lines = []
+    for sensor in snapshot.sensors:
+        lost = whole - sensor.n_samples / sensor.sampling_rate
+        if whole > 0 and lost > max(LEAST_LOST * whole, 1.0):
+            lines.append(
+                f"Sensor {sensor.name} recorded nothing for {format_duration(round(lost))} of "
+                f"{format_duration(round(whole))}."
+            )
+    return lines
 
 
 def watermark(found: Sequence[Source], issue: Issue | None) -> str:

@@ -39,6 +39,7 @@ from tui.report.evidence import (
 from tui.report.noise import limits_section, noise_section, verdict
 from tui.report.parameters import parameters_section
 from tui.report.parts import Facts, Paragraph, Part, Report, Section, Signatures, Table
+from tui.report.uncertainty import uncertainty_section
 from tui.report.wording import is_known, local_time, utc_time
 from tui.wording.facts import known
 from tui.wording.formatting import span
@@ -168,6 +169,7 @@ def report_of(
             None if by_rule is None else by_rule.certificate,
         ),
         noise_section(snapshot, settings, bench, models),
+        uncertainty_section(snapshot, settings, about),
         parameters_section(snapshot, settings, bench),
         calibration_section(snapshot, settings, bench),
         model_test_section(snapshot, settings),
@@ -187,7 +189,7 @@ def report_of(
         subtitle=f"Huddle test {name}" + (f", {utc_time(start)}" if is_known(start) else ""),
         verdict=sentence,
         sections=tuple(section for section in sections if section is not None),
-        notices=notices(found, settings, about, issue),
+        notices=notices(found, snapshot, settings, about, issue),
         watermark=watermark(found, issue),
         number="" if issue is None else issue.name,
     )

@@ -1,0 +1,63 @@
+"""The uncertainty of every level: no total is narrower than its statistical part."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from tests.tui.example_snapshot import SETTINGS, made_snapshot
+from tests.tui.report.written_report import tables
+from tui.report.uncertainty import half_octaves, uncertainties
+
+if TYPE_CHECKING:
+    from tests.tui.report.written_report import Reported
+
+
+def number(text: str) -> float:
+    mantissa, _, power = text.partition("×10")
+    digits = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹−", "-0123456789-")
+    return float(f"{mantissa}e{power or 0}".translate(digits))
+
+
+@pytest.mark.parametrize("n_effective", [4.0, 30.0, 1000.0])
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.9])
+def test_no_total_is_narrower_than_its_statistical_part(n_effective: float, share: float) -> None:
+    snapshot = made_snapshot(n_effective=n_effective, clock_share=share)
+    for method in SETTINGS.methods:
+        found = uncertainties(snapshot, replace(SETTINGS, methods=(method,)))
+        assert found
+        for each in found:
+            assert each.total[0] <= each.statistical[0]
+            assert each.total[1] >= each.statistical[1]
+            if share and n_effective > 100:
+                assert each.k > 0
+                assert each.total[1] > each.statistical[1] or each.total[0] < each.statistical[0]
+
+
+def test_noise_is_stated_in_the_units_of_the_trade(reported: Reported) -> None:
+    """100 counts rms of white noise at 100 Hz, 1e6 counts per m/s²: 2e-10 (m/s²)²/Hz."""
+    summary, budget, rms, *_ = tables(reported.report, "Uncertainty")
+    row = next(row for row in summary.rows if row[0] == "A.X")
+    assert number(row[5]) == pytest.approx(math.sqrt(2e-10), rel=0.05)
+    assert number(row[6]) == pytest.approx(math.sqrt(2e-10) / 9.80665e-6, rel=0.05)
+    assert next(r[1] for r in budget.rows if r[0] == "A.X") == "finite averages"
+    column = rms.header.index("A.X")
+    for each in rms.rows:
+        centre = float(each[0])
+        expected = math.sqrt(2e-10 * centre * (2**0.25 - 2**-0.25))
+        assert number(each[column]) == pytest.approx(expected, rel=0.25)
+
+
+def test_half_octaves_lie_within_the_spectrum_and_share_no_bin() -> None:
+    frequency = np.arange(501) * np.float64(0.1)
+    centres, bins = half_octaves(frequency)
+    assert centres[0] / 2**0.25 >= frequency[1]
+    assert centres[-1] * 2**0.25 <= 45.0
+    assert np.allclose(centres[1:] / centres[:-1], math.sqrt(2))
+    for one, other in itertools.pairwise(bins):
+        assert one[1] <= other[0]

@@ -1,0 +1,295 @@
+"""The uncertainty in the report: level, contributions, total; noise in the units of the trade."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.bench.units import in_acceleration
+from daq.results.band_summary import Spectrum, band_of, judged_method
+from estimator.levels.bands import band_edges
+from estimator.levels.interval import NORMAL_95
+from tui.report.parts import Paragraph, Section, Table
+from tui.report.wording import NOTHING, decibel, plain_number, scientific
+from tui.wording.formatting import span
+from tui.wording.vocabulary import SOURCE_WORDS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from daq.bench.model import Bench
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from daq.results.band_summary import Levels
+    from estimator.types import FloatArray
+    from tui.report.parts import Part
+
+COLUMNS = 8
+"""Channels that one table is wide."""
+LEAST_SHARE = 1e-3
+"""Of the level, from which a contribution has a row."""
+LEAST_BINS = 3
+"""Frequencies from which a half octave has a row."""
+HALF = 2**0.25
+"""From the centre of a half octave to its end."""
+
+
+@dataclass(frozen=True, slots=True)
+class Contribution:
+    """One row of the uncertainty budget of a level.
+
+    Attributes
+    ----------
+    name, distribution : str
+    below, above : float
+        Ends less the level, over the level: how far the interval reaches by this alone, at 95 %.
+    degrees : float
+        Of freedom.
+    """
+
+    name: str
+    distribution: str
+    below: float
+    above: float
+    degrees: float
+
+
+@dataclass(frozen=True, slots=True)
+class Uncertainty:
+    """Level of one channel over the band, with its intervals, in unit²/Hz.
+
+    Attributes
+    ----------
+    level : float
+    statistical, total : (float, float)
+        By the scatter alone, and with all contributions.
+    contributions : tuple of Contribution
+    k : float
+        Coverage factor of the total: half its width over the combined standard uncertainty.
+    """
+
+    level: float
+    statistical: tuple[float, float]
+    total: tuple[float, float]
+    contributions: tuple[Contribution, ...]
+    k: float
+
+
+def uncertainties(snapshot: Snapshot, settings: Settings) -> list[Uncertainty]:
+    """Return the uncertainty of every channel over the band of the tables.
+
+    Raises
+    ------
+    ArithmeticError
+        If a total interval does not hold the statistical one: it never may.
+    """
+    noise = snapshot.results.get(judged_method(snapshot, settings))
+    if noise is None:
+        return []
+    edges = band_edges(snapshot.frequency, band_of(settings, snapshot))
+    found = Spectrum(noise, snapshot, settings).levels(edges)
+    return [_uncertainty(found, column) for column in range(len(snapshot.channels))]
+
+
+def _uncertainty(found: Levels, column: int) -> Uncertainty:
+    level = float(found.mean[0, column])
+    outer = tuple(float(end[0, column]) for end in found.ends())
+    scatter = tuple(float(end[0, column]) for end in found.of_scatter.interval(NORMAL_95))
+    inner = tuple(min(end, outer[1]) for end in scatter)  # the bound cuts both
+    if outer[0] > inner[0] or outer[1] < inner[1]:
+        raise ArithmeticError(
+            f"channel {column}: the total interval {outer} does not hold the statistical {inner}"
+        )
+    scale = abs(level) if level else math.nan
+    variance = float(found.of_scatter.cumulants[0, 0, column])
+    deviation = math.sqrt(variance) if variance > 0 else 0.0
+    degrees = 2 * (level / deviation) ** 2 if deviation else math.inf
+    rows = [
+        Contribution(
+            "finite averages", "chi-squared (skewed)",
+            (inner[0] - level) / scale, (inner[1] - level) / scale, degrees,
+        )
+    ]  # fmt: skip
+    combined = deviation**2
+    for part in found.contributions:
+        below, above = (float(each[0]) for each in part.adds(column, found.mean[:, column]))
+        combined += max(below, above) ** 2 / 3
+        if max(below, above) > LEAST_SHARE * scale:
+            name = SOURCE_WORDS[part.source]
+            rows.append(Contribution(name, "rectangular", -below / scale, above / scale, math.inf))
+    width = (outer[1] - outer[0]) / 2
+    k = width / math.sqrt(combined) if combined > 0 and math.isfinite(combined) else math.nan
+    return Uncertainty(level, (inner[0], inner[1]), (outer[0], outer[1]), tuple(rows), k)
+
+
+def uncertainty_section(
+    snapshot: Snapshot, settings: Settings, about: Bench | None
+) -> Section | None:
+    """Return level, contributions, total, and the noise in half octaves; None without a result."""
+    found = uncertainties(snapshot, settings)
+    if not found:
+        return None
+    names = [f"{label.sensor}.{label.channel}" for label in snapshot.channels]
+    method = judged_method(snapshot, settings)
+    band = span(*band_of(settings, snapshot))
+    unit = snapshot.unit
+    micro = _micro_g(unit)
+    rows = tuple(
+        (
+            name,
+            decibel(each.level, 2),
+            _ends(each.statistical),
+            _ends(each.total),
+            plain_number(each.k, ".2f"),
+            _root(each.level),
+            *((_root(each.level, micro),) if micro else ()),
+        )
+        for name, each in zip(names, found, strict=True)
+    )
+    header: tuple[str, ...] = (
+        "channel", "noise (dB)", "statistical (dB)", "total (dB)", "k", f"({unit})/√Hz",
+    )  # fmt: skip
+    if micro:
+        header += ("µg/√Hz",)
+    budget = tuple(
+        (
+            name, row.name, row.distribution, _percent(row.below), _percent(row.above),
+            "∞" if math.isinf(row.degrees) else plain_number(row.degrees, ".0f"),
+        )
+        for name, each in zip(names, found, strict=True)
+        for row in each.contributions
+    )  # fmt: skip
+    parts: list[Part] = [
+        Table(
+            header,
+            rows,
+            title=f"Mean over {band} by the {method} method, PSD in dB re 1 ({unit})²/Hz",
+        ),
+        Paragraph(
+            "Intervals at 95 %. The statistical interval is that of the scatter of the averages. "
+            "The total holds it, and adds the bounds below. k: half the width of the total over "
+            "the combined standard uncertainty. The uncertainty of the sensitivities is not part "
+            "of it: see Calibration.",
+            "quiet",
+        ),
+        Table(
+            ("channel", "contribution", "distribution", "−", "+", "degrees of freedom"),
+            budget,
+            left=frozenset({0, 1, 2}),
+            title="Uncertainty budget (GUM): what each contribution moves the ends, of the level",
+        ),
+    ]
+    parts += _half_octaves(snapshot, settings, about, names)
+    return Section("Uncertainty", tuple(parts))
+
+
+def half_octaves(frequency: FloatArray) -> tuple[FloatArray, list[NDArray[np.int64]]]:
+    """Return centres of whole half octaves within a spectrum, and the bins of each."""
+    first, last = float(frequency[1]), 0.9 * float(frequency[-1])
+    low = math.ceil(2 * math.log2(first * HALF) - 1e-9)
+    high = math.floor(2 * math.log2(last / HALF) + 1e-9)
+    centres, bins = [], []
+    for half in range(low, high + 1):
+        centre = 2.0 ** (half / 2)
+        edges = np.searchsorted(frequency, [centre / HALF, centre * HALF])
+        if edges[1] - edges[0] >= LEAST_BINS:
+            centres.append(centre)
+            bins.append(edges.astype(np.int64))
+    return np.array(centres), bins
+
+
+def _half_octaves(
+    snapshot: Snapshot, settings: Settings, about: Bench | None, names: Sequence[str]
+) -> list[Part]:
+    """Return tables of the rms in half octaves, and of the range up to clipping where known."""
+    noise = snapshot.results[judged_method(snapshot, settings)]
+    spectrum = Spectrum(noise, snapshot, settings)
+    centres, bins = half_octaves(snapshot.frequency)
+    if not len(centres):
+        return []
+    means = np.stack([spectrum.levels(edges).mean[0] for edges in bins])
+    width = centres * (HALF - 1 / HALF)
+    with np.errstate(invalid="ignore"):
+        rms = np.sqrt(np.where(means > 0, means, np.nan) * width[:, None])
+    full = np.array([_full_scale(snapshot, column, about) for column in range(len(names))])
+    parts: list[Part] = []
+    for first in range(0, len(names), COLUMNS):
+        some = slice(first, first + COLUMNS)
+        parts.append(
+            Table(
+                ("centre (Hz)", *names[some]),
+                tuple(
+                    (f"{centre:.3g}", *(scientific(value, 3) for value in row[some]))
+                    for centre, row in zip(centres, rms, strict=True)
+                ),
+                title=f"Self-noise in half octaves, rms in {snapshot.unit}",
+            )
+        )
+        if np.isfinite(full[some]).any():
+            with np.errstate(invalid="ignore", divide="ignore"):
+                reach = 20 * np.log10(full / math.sqrt(2) / rms)
+            parts.append(
+                Table(
+                    ("centre (Hz)", *names[some]),
+                    tuple(
+                        (f"{centre:.3g}", *(plain_number(value, ".1f") for value in row[some]))
+                        for centre, row in zip(centres, reach, strict=True)
+                    ),
+                    title="Operating range in half octaves: from the noise to a sine of full "
+                    "scale, rms over rms, in dB",
+                )
+            )
+    parts.append(
+        Paragraph(
+            "Half octaves about powers of √2, as strong-motion users state noise and range (Evans "
+            "and others, USGS Open-File Report 2009–1055). Full scale as of the data sheet in the "
+            "bench file; without it no range is given.",
+            "quiet",
+        )
+    )
+    return parts
+
+
+def _full_scale(snapshot: Snapshot, column: int, about: Bench | None) -> float:
+    """Return the full scale of a channel in the unit of the spectrum; NaN where not known."""
+    label = snapshot.channels[column]
+    for sensor in () if about is None else about.sensors:
+        sheet = sensor.data_sheet
+        if sensor.name != label.sensor or sheet is None or sheet.full_scale is None:
+            continue
+        if sheet.channels and label.channel not in sheet.channels:
+            continue
+        own = next((c.unit for c in sensor.channels if c.name == label.channel), "")
+        unit = sheet.unit or own
+        if unit == snapshot.unit:
+            return sheet.full_scale
+        wanted, given = in_acceleration(snapshot.unit), in_acceleration(unit)
+        if wanted and given:
+            return sheet.full_scale * given / wanted
+    return math.nan
+
+
+def _micro_g(unit: str) -> float | None:
+    """Return how many µg one of a unit of acceleration is; None of others."""
+    size, one = in_acceleration(unit), in_acceleration("µg")
+    return size / one if size and one else None
+
+
+def _root(psd: float, factor: float = 1.0) -> str:
+    return scientific(factor * math.sqrt(psd)) if psd > 0 else NOTHING
+
+
+def _ends(ends: tuple[float, float]) -> str:
+    low, high = ends
+    if not math.isfinite(high):
+        return "not known"
+    return f"{decibel(low, 2)} … {decibel(high, 2)}" if low > 0 else f"below {decibel(high, 2)}"
+
+
+def _percent(value: float) -> str:
+    return f"{plain_number(100 * value, '+.2f')} %" if math.isfinite(value) else NOTHING
