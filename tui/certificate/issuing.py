@@ -13,6 +13,8 @@ from daq.errors import HuddleError
 from daq.recording.reader import Recording
 from daq.results.decision.limits import judge
 from daq.results.sources import sources
+from tui.certificate.dcc import NAME as DCC_NAME
+from tui.certificate.dcc import dcc
 from tui.certificate.ledger import Entry, Ledger
 from tui.output.console import finite
 from tui.output.json_document import document
@@ -165,12 +167,14 @@ def issue(
                 by=by,
                 entry=entry.hash,
                 replaces=None if before is None else before.revision,
+                replaces_sha256="" if before is None else before.sha256,
                 reason=reason,
                 changes=() if before is None else tuple(changes(dict(before.settings), table)),
                 incomplete=bool(missing(about, found[0], by=by)),
             )
             report = report_of(snapshot, settings, found, models, issue=made, about=about)
-            content = _pdf(report, _result(snapshot, settings, found, made), at)
+            xml = dcc(snapshot, settings, found, issue=made, about=about)
+            content = _pdf(report, _result(snapshot, settings, found, made), xml, at)
             if sign is not None:
                 content = sign(content)
             path = ledger.publish(entry, ".pdf", content)
@@ -194,10 +198,11 @@ def _result(snapshot: Snapshot, settings: Settings, found: Sequence[Source], mad
     return json.dumps(finite(result), ensure_ascii=False, allow_nan=False).encode()
 
 
-def _pdf(report: Report, result: bytes, at: datetime) -> bytes:
+def _pdf(report: Report, result: bytes, xml: bytes, at: datetime) -> bytes:
     """Return the certificate with its machine-readable forms inside."""
     paper = io.BytesIO()
-    write_paper(report, paper, attached=[(JSON_NAME, "application/json", result)], at=at)
+    attached = [(JSON_NAME, "application/json", result), (DCC_NAME, "application/xml", xml)]
+    write_paper(report, paper, attached=attached, at=at)
     return paper.getvalue()
 
 

@@ -136,7 +136,8 @@ def report(
             "--out",
             "-o",
             metavar="FILE",
-            help="Report to write, .html or .pdf (default: beside the recording).",
+            help="Report to write: .html, .pdf, or .xml for a Digital Calibration Certificate "
+            "(DCC 3.1.2) (default: .html beside the recording).",
         ),
     ] = None,
     models: ModelsOption = "",

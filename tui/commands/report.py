@@ -8,6 +8,7 @@ import typer
 
 from daq.bench.masks.mask_file import masks_named
 from daq.results.decision.limits import judge
+from daq.results.sources import sources
 from tui.commands.estimate import estimated, exit_with
 from tui.output.console import check_places, console, notices
 from tui.output.extras import require
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from tui.report.writing import Taken
 
-SUFFIXES = (".html", ".htm", ".pdf")
+SUFFIXES = (".html", ".htm", ".pdf", ".xml")
 _COLOURS = {"good": "green", "bad": "red", "doubtful": "yellow"}
 
 
@@ -71,7 +72,7 @@ def checked(out: Path) -> Path:
     """
     require("matplotlib", "jinja2", *(["fpdf"] if out.suffix.lower() == ".pdf" else []))
     if out.suffix.lower() not in SUFFIXES:
-        raise typer.BadParameter(f"{out}: expected a file name that ends in .html or .pdf")
+        raise typer.BadParameter(f"{out}: expected a file name that ends in .html, .pdf or .xml")
     check_places(str(out))
     return out
 
@@ -95,6 +96,13 @@ def write_report(
     """
     from tui.report.writing import write  # noqa: PLC0415 - matplotlib only where there is a report
 
+    if out.suffix.lower() == ".xml":
+        from tui.certificate.dcc import dcc  # noqa: PLC0415 - seldom needed
+        from tui.report.writing import write_content  # noqa: PLC0415
+
+        out = write_content(out, dcc(snapshot, settings, sources(recordings)), taken)
+        screen.print(f"{out} written", soft_wrap=True)
+        return
     with notices().status("writing the report"):
         report, out = write(
             snapshot,

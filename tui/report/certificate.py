@@ -60,6 +60,8 @@ class Issue:
         Of the revision.
     changes : tuple of str
         Settings that differ from the replaced revision.
+    replaces_sha256 : str
+        Of the file of the replaced revision.
     incomplete : bool
         Whether it was issued without all that the checklist asks.
     """
@@ -72,6 +74,7 @@ class Issue:
     replaces: int | None = None
     reason: str = ""
     changes: tuple[str, ...] = ()
+    replaces_sha256: str = ""
     incomplete: bool = False
 
     @property

@@ -78,6 +78,17 @@ def write(
     check_suffix(path)
     report = report_of(snapshot, settings, sources(recordings), models)
     content = written(report, path.suffix)
+    return report, write_content(path, content, taken)
+
+
+def write_content(path: Path, content: bytes, taken: Taken) -> Path:
+    """Write a draft, and return its place: another name than `path` only where taken, beside it.
+
+    Raises
+    ------
+    ReportError
+        If the file cannot be written, or has other content.
+    """
     if taken == "beside":
         path = _free(path, content)
     elif taken == "refuse" and not _may_be(path, content):
@@ -92,7 +103,7 @@ def write(
             f"{path}: the report cannot be written ({error.strerror}); choose another place with "
             "--out, or make room"
         ) from error
-    return report, path
+    return path
 
 
 def _may_be(path: Path, content: bytes) -> bool:

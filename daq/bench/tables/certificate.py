@@ -15,6 +15,8 @@ from daq.bench.tables.fields import Table
 Day: TypeAlias = dt.date
 _PREFIX = re.compile(r"[A-Za-z0-9][A-Za-z0-9.]{0,15}", re.ASCII)
 
+_COUNTRY = re.compile(r"[A-Z]{2}", re.ASCII)
+
 
 class Rule(enum.StrEnum):
     """Decision rules of ILAC-G8:09/2019."""
@@ -33,11 +35,19 @@ def _prefix(value: str) -> str:
     return value
 
 
+def _country(value: str) -> str:
+    if value and not _COUNTRY.fullmatch(value):
+        raise ValueError('expected the two capital letters of ISO 3166, such as "DE"')
+    return value
+
+
 class Laboratory(Table):
     """``[laboratory]``: who issues the certificate."""
 
     name: str = ""
     address: str = ""
+    country: Annotated[str, AfterValidator(_country)] = ""
+    """ISO 3166 code, such as ``DE``."""
     email: str = ""
     phone: str = ""
     accreditation: str = ""

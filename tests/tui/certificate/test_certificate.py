@@ -1,0 +1,324 @@
+"""Issued certificates: the checklist of ISO/IEC 17025, revisions, and what verification finds."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from lxml import etree
+from pypdf import PdfReader
+from typer.testing import CliRunner
+
+from tests.tui.night_recording import BENCH, HOSTILE, SENSOR, record
+from tests.tui.report.written_report import ROOT
+from tui.certificate.dcc import NAME
+from tui.certificate.issuing import JSON_NAME
+from tui.certificate.ledger import Ledger
+from tui.cli.main import app
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+ABOUT = """
+[laboratory]
+name = "Pier Metrology"
+address = "1 Quiet Lane, 12345 Cellarton"
+country = "DE"
+email = "lab@pier.example"
+accreditation = "Accredited by the Example Body, D-K-99999"
+[customer]
+name = "Slow Waves & Sons"
+address = "2 Loud Road"
+email = "buyer@waves.example"
+order = "PO-4711"
+[certificate]
+prefix = "PIER"
+procedure = "QP-17, issue 3"
+received = 2016-07-01
+condition = "unopened, no damage"
+traceability = "sensitivities by certificate 123 of the Example Institute"
+deviations = "shortened to one minute"
+responsible = "Grace Hopper"
+decision_rule = "guard-band"
+"""
+NAMESPACES = {"dcc": "https://ptb.de/dcc", "si": "https://ptb.de/si"}
+
+CHECKLIST: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "7.8.2.1 a": (("Calibration certificate: self-noise",), ("//dcc:measurementResult/dcc:name",)),
+    "7.8.2.1 b": (
+        ("Pier Metrology, 1 Quiet Lane, 12345 Cellarton",),
+        ("//dcc:calibrationLaboratory[contains(., 'Pier Metrology')]",),
+    ),
+    "7.8.2.1 c": (("Place of the test", "cellar"), ("//dcc:performanceLocation",)),
+    "7.8.2.1 d": (
+        ("PIER-2016-0001", "page 1 of"),
+        ("//dcc:uniqueIdentifier[contains(., 'PIER-')]",),
+    ),
+    "7.8.2.1 e": (
+        ("Slow Waves & Sons, 2 Loud Road, buyer@waves.example",),
+        ("//dcc:customer/dcc:eMail[.='buyer@waves.example']",),
+    ),
+    "7.8.2.1 f": (
+        ("QP-17, issue 3", "Sleeman"),
+        ("//dcc:usedMethod/dcc:reference[.='QP-17, issue 3']",),
+    ),
+    "7.8.2.1 g": (
+        ("Acme Sensors", "M-1", "SN-2", "unopened, no damage"),
+        ("//dcc:item[.//dcc:value='SN-2' and contains(., 'Acme Sensors')]",),
+    ),
+    "7.8.2.1 h": (("2016-07-01",), ("//dcc:receiptDate[.='2016-07-01']",)),
+    "7.8.2.1 i": (
+        ("2016-07-14 01:00:00 UTC to",),
+        ("//dcc:beginPerformanceDate[.='2016-07-14']", "//dcc:endPerformanceDate"),
+    ),
+    "7.8.2.1 j": (("Date of issue",), ()),
+    "7.8.2.1 l": (
+        ("relate only to the items listed",),
+        ("//dcc:statement[contains(., 'relate only to the items')]",),
+    ),
+    "7.8.2.1 m": (
+        ("Self-noise", "dB re 1 (m/s²)²/Hz"),
+        ("//si:unitXMLList[contains(., 'metre')]",),
+    ),
+    "7.8.2.1 n": (("shortened to one minute",), ()),
+    "7.8.2.1 o": (
+        ("Authorised by", "Grace Hopper"),
+        ("//dcc:respPerson[dcc:mainSigner='true' and contains(., 'Grace Hopper')]",),
+    ),
+    "7.8.2.2": (("Given by the customer or user, and not verified",), ()),
+    "7.8.4.1 a": (
+        ("Uncertainty budget (GUM)", "finite averages"),
+        ("//si:coverageIntervalXMLList/si:intervalMinXMLList",),
+    ),
+    "7.8.4.1 b": (("Place of the test",), ("//dcc:influenceCondition",)),
+    "7.8.4.1 c": (
+        ("certificate 123 of the Example Institute",),
+        ("//dcc:statement[contains(., 'certificate 123')]",),
+    ),
+    "7.8.6": (
+        ("ILAC-G8:09/2019", "conditional"),
+        ("//dcc:norm[.='ILAC-G8:09/2019']", "//dcc:conformity[.='pass']"),
+    ),
+}
+"""By clause: texts of the PDF, and paths in the DCC."""
+
+
+@dataclass(frozen=True)
+class Laboratory:
+    """A folder with a recording, and the bench file that describes the parties."""
+
+    folder: Path
+    recording: Path
+    bench: Path
+
+    def issue(self, *more: str, by: str = "Grace Hopper") -> str:
+        """Issue a certificate; a channel is dead, so that the limits are not decided."""
+        arguments = ["issue", str(self.recording), "--by", by, "--bench", str(self.bench), *more]
+        found = CliRunner().invoke(app, arguments)
+        assert found.exit_code == 4, found.output
+        return found.output
+
+    def verify(self, *files: Path) -> tuple[int, str]:
+        """Verify files; return exit code and all that was said."""
+        found = CliRunner().invoke(app, ["verify", *map(str, files)])
+        return found.exit_code, " ".join((found.output + found.stderr).split())
+
+    @property
+    def certificates(self) -> Path:
+        """Their folder."""
+        return self.folder / "certificates"
+
+    def certificate(self, revision: int = 0) -> Path:
+        """Return the file of a revision of the only certificate."""
+        (path,) = self.certificates.glob(f"PIER-*-0001-r{revision}.pdf")
+        return path
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _empty_figures() -> Iterator[None]:
+    """Leave figures empty: curves take most of a certificate's time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tui.report.figures.drawing.draw", lambda *_, **__: None)
+        yield
+
+
+@pytest.fixture(scope="module")
+def issued(tmp_path_factory: pytest.TempPathFactory) -> Laboratory:
+    """Make a laboratory with one certificate; tests that change it take a copy."""
+    folder = tmp_path_factory.mktemp("laboratory")
+    made = laboratory(folder)
+    made.issue()
+    return made
+
+
+def laboratory(folder: Path) -> Laboratory:
+    recording = record(folder / "night.h5")
+    sensors = "".join(
+        SENSOR.format(name=name, number=number).replace(
+            "serial_number", 'manufacturer = "Acme Sensors"\nserial_number'
+        )
+        for number, name in enumerate(("A", "B", "C", HOSTILE))
+    )
+    bench = folder / "bench.toml"
+    bench.write_text(BENCH.format(sensors=sensors, psd=2e-9) + ABOUT, encoding="utf-8")
+    return Laboratory(folder, recording, bench)
+
+
+@pytest.fixture
+def copied(issued: Laboratory, tmp_path: Path) -> Laboratory:
+    folder = tmp_path / "laboratory"
+    shutil.copytree(issued.folder, folder)
+    return Laboratory(folder, folder / "night.h5", folder / "bench.toml")
+
+
+def text_of(path: Path) -> str:
+    """Return the text of a PDF without white space, where lines may break."""
+    return "".join("".join(page.extract_text() for page in PdfReader(path).pages).split())
+
+
+def test_the_certificate_has_all_of_the_checklist(issued: Laboratory) -> None:
+    """Each line of docs/certificate.md, in the text of the PDF and in the DCC."""
+    path = issued.certificate()
+    text, reader = text_of(path), PdfReader(path)
+    year = re.search(r"PIER-(\d{4})-", path.name)
+    assert year is not None
+    tree = etree.parse(io.BytesIO(reader.attachments[NAME][0]))
+    for clause, (words, paths) in CHECKLIST.items():
+        for word in words:
+            expected = word.replace("2016-0001", f"{year[1]}-0001")
+            assert "".join(expected.split()) in text, clause
+        for each in paths:
+            assert tree.xpath(each, namespaces=NAMESPACES), (clause, each)
+    document = (ROOT / "docs" / "certificate.md").read_text(encoding="utf-8")
+    assert {line[2:].split(" |")[0] for line in document.splitlines() if line[:4] == "| 7."} >= (
+        set(CHECKLIST)
+    )
+
+
+def test_the_dcc_is_valid_by_the_schema_of_the_ptb(issued: Laboratory, tmp_path: Path) -> None:
+    """Of a certificate, and of a draft of a recording without a bench file's tables."""
+    root = Path(os.environ.get("HUDDLE_DATA", ROOT.parent / "shared" / "data"))
+    file = root / "dcc" / "dcc.xsd"
+    if not file.is_file():
+        pytest.skip(f"no schema at {file} (set HUDDLE_DATA to the folder of data)")
+    schema = etree.XMLSchema(etree.parse(file))
+    content = PdfReader(issued.certificate()).attachments[NAME][0]
+    schema.assertValid(etree.parse(io.BytesIO(content)))
+    draft = tmp_path / "draft.xml"
+    found = CliRunner().invoke(app, ["report", str(issued.recording), "--out", str(draft)])
+    assert found.exit_code == 4, found.output
+    tree = etree.parse(draft)
+    schema.assertValid(tree)
+    assert tree.xpath("//dcc:statement[contains(., 'DRAFT')]", namespaces=NAMESPACES)
+
+
+def test_every_page_has_number_revision_and_count(issued: Laboratory) -> None:
+    pages = PdfReader(issued.certificate()).pages
+    for number, page in enumerate(pages, start=1):
+        text = " ".join(page.extract_text().split())
+        assert re.search(r"PIER-\d{4}-0001, revision 0", text)
+        assert f"page {number} of {len(pages)}" in text
+        assert "DRAFT" not in text
+
+
+def test_the_files_inside_have_the_numbers_of_the_page(issued: Laboratory) -> None:
+    reader = PdfReader(issued.certificate())
+    result = json.loads(reader.attachments[JSON_NAME][0])
+    tree = etree.parse(io.BytesIO(reader.attachments[NAME][0]))
+    assert result["certificate"]["revision"] == 0
+    (entry,) = Ledger(issued.certificates).entries()
+    assert result["certificate"]["entry"] == entry.hash
+    own = next(each for each in result["band_means"] if each["channel"] == "X")
+    (value,) = tree.xpath(
+        "//dcc:result[dcc:name/dcc:content='Self-noise of A.X']//si:real[si:unit!='\\one']"
+        "/si:value/text()",
+        namespaces=NAMESPACES,
+    )
+    numbers = [number for number in own.values() if isinstance(number, float)]
+    assert any(abs(float(value) / number - 1) < 1e-6 for number in numbers if number)
+    metadata = reader.xmp_metadata
+    assert metadata is not None
+    assert b"pdfaid:part>3<" in metadata.stream.get_data()
+
+
+def test_a_revision_says_what_it_replaces_and_what_changed(copied: Laboratory) -> None:
+    again = ["issue", str(copied.recording), "--by", "Ada", "--bench", str(copied.bench)]
+    refused = CliRunner().invoke(app, again)
+    assert refused.exit_code == 2
+    assert "--reason" in refused.stderr
+    before = copied.certificate().read_bytes()
+    copied.issue("--segment", "2s", "--reason", "finer bins")
+    assert copied.certificate().read_bytes() == before
+    text = text_of(copied.certificate(1))
+    for word in ("revision 1", "Replaces revision 0", "finer bins", "segment 1.0 → 2.0"):
+        assert "".join(word.split()) in text
+    listed = CliRunner().invoke(app, ["issues", str(copied.recording), "--json", "-"])
+    states = [each["state"] for each in json.loads(listed.stdout)["certificates"]]
+    assert states == ["replaced", "issued"]
+    code, said = copied.verify(copied.certificate(), copied.recording)
+    assert code == 0
+    assert "replaced by revision 1" in said
+
+
+def test_what_is_not_given_is_refused_unless_allowed(tmp_path: Path) -> None:
+    recording = record(tmp_path / "night.h5")
+    run = CliRunner()
+    refused = run.invoke(app, ["issue", str(recording), "--by", "Ada"])
+    assert refused.exit_code == 2
+    for key in ("[laboratory] name", "[customer] name", "[certificate] procedure"):
+        assert key in " ".join(refused.stderr.split())
+    assert not (tmp_path / "certificates").exists()
+    allowed = run.invoke(app, ["issue", str(recording), "--by", "Ada", "--allow-incomplete"])
+    assert allowed.exit_code == 4, allowed.output
+    (path,) = (tmp_path / "certificates").glob("HT-*.pdf")
+    assert "Issuedincomplete.Notgiven:nameandaddressofthelaboratory" in text_of(path)
+
+
+def test_no_certificate_is_issued_of_simulated_sensors(tmp_path: Path) -> None:
+    recording, run = tmp_path / "s.h5", CliRunner()
+    run.invoke(app, ["simulate", "fig4", "--duration", "20s", "--out", str(recording)])
+    found = run.invoke(app, ["issue", str(recording), "--by", "Ada", "--allow-incomplete"])
+    assert found.exit_code == 2
+    assert "simulated" in found.stderr
+    assert not (tmp_path / "certificates").exists()
+
+
+def changed_certificate(made: Laboratory) -> list[Path]:
+    path = made.certificate()
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"/Title", b"/Tible", 1))
+    return [path]
+
+
+def other_recording(made: Laboratory) -> list[Path]:
+    return [made.certificate(), record(made.folder / "other.h5", psd=1e-9)]
+
+
+def changed_recording(made: Laboratory) -> list[Path]:
+    content = bytearray(made.recording.read_bytes())
+    made.recording.write_bytes(content + b"\0")
+    return [made.certificate(), made.recording]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (changed_certificate, "changed: its SHA-256 is not that of certificate"),
+        (other_recording, "is another recording than the one certified"),
+        (changed_recording, "was changed since the certificate"),
+    ],
+)
+def test_what_is_wrong_is_found(
+    copied: Laboratory, change: Callable[[Laboratory], list[Path]], said: str
+) -> None:
+    assert copied.verify(copied.certificate(), copied.recording)[0] == 0
+    code, text = copied.verify(*change(copied))
+    assert code == 3
+    assert said in text

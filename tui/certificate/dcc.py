@@ -1,0 +1,375 @@
+"""The certificate as a Digital Calibration Certificate (DCC 3.1.2, PTB) with units of the D-SI.
+
+The numbers are those of the report: levels of `daq.results.band_summary`, statements of
+`daq.results.decision.conformity`. Intervals are given as they are, with both ends. A band whose
+interval has no upper end has no place in the schema's lists and is left out.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from importlib.metadata import version
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.bench.tables.certificate import CertificateTable, Customer, Laboratory
+from daq.bench.units import conversion, is_motion
+from daq.results.band_summary import Spectrum, band_of, judged_method
+from daq.results.decision.conformity import Statement, conformity, with_rule
+from estimator.levels.bands import third_octaves
+from estimator.levels.interval import NORMAL_95
+from tui.report.certificate import PROCEDURE, SCOPE, manufacturers
+from tui.report.noise import decision_rule
+from tui.report.uncertainty import uncertainties
+from tui.wording.formatting import span
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from daq.bench.model import Bench
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from daq.results.decision.conformity import Conformity
+    from daq.results.sources import Source
+    from estimator.types import FloatArray
+    from tui.report.certificate import Issue
+    from tui.report.uncertainty import Uncertainty
+
+DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"
+SCHEMA_VERSION = "3.1.2"
+NAME = "certificate.dcc.xml"
+"""Name of the DCC in the PDF."""
+_LANGUAGE, _NO_COUNTRY = "en", "ZZ"
+"""ISO 3166 keeps ZZ free for what is not known."""
+_STATED = {
+    Statement.PASS: "pass",
+    Statement.CONDITIONAL_PASS: "conditionalPass",
+    Statement.CONDITIONAL_FAIL: "conditionalFail",
+    Statement.FAIL: "fail",
+}
+_UNITS = {
+    "m/s²": r"\metre\tothe{2}\second\tothe{-4}\hertz\tothe{-1}",
+    "m/s": r"\metre\tothe{2}\second\tothe{-2}\hertz\tothe{-1}",
+    "m": r"\metre\tothe{2}\hertz\tothe{-1}",
+}
+"""PSD of each unit of motion in the D-SI."""
+
+
+def dcc(
+    snapshot: Snapshot,
+    settings: Settings,
+    found: Sequence[Source],
+    *,
+    issue: Issue | None = None,
+    about: Bench | None = None,
+) -> bytes:
+    """Return the DCC of an estimate; without an `issue` it is a draft and says so.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        A finished estimate.
+    settings : Settings
+        It was made with.
+    found : sequence of Source
+        The recordings it was made from.
+    issue : Issue, optional
+        Number and revision.
+    about : Bench, optional
+        Where laboratory, customer and sensors are described; default: the recorded bench.
+    """
+    for prefix, name in (("dcc", DCC), ("si", SI)):
+        ET.register_namespace(prefix, name)
+    about = found[0].bench if about is None else about
+    root = ET.Element(_dcc("digitalCalibrationCertificate"), schemaVersion=SCHEMA_VERSION)
+    _administrative(root, found, about, issue)
+    _results(root, snapshot, settings, found, about)
+    ET.indent(root)
+    content: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
+    return content + b"\n"
+
+
+def _administrative(
+    root: ET.Element, found: Sequence[Source], about: Bench | None, issue: Issue | None
+) -> None:
+    laboratory = Laboratory() if about is None else about.laboratory
+    customer = Customer() if about is None else about.customer
+    table = CertificateTable() if about is None else about.certificate
+    part = _add(root, "administrativeData")
+    software = _add(_add(part, "dccSoftware"), "software")
+    _text(software, "name", "huddle")
+    _add(software, "release", version("huddle-bench"))
+    country = laboratory.country or _NO_COUNTRY
+    _core(_add(part, "coreData"), found, table, issue, country=country, order=customer.order)
+    _items(_add(part, "items"), found[-1], about)
+    _contact(
+        _add(_add(part, "calibrationLaboratory"), "contact"),
+        (laboratory.name, laboratory.address),
+        email=laboratory.email,
+        phone=laboratory.phone,
+    )
+    responsible = issue.by if issue else table.responsible
+    _persons(_add(part, "respPersons"), responsible, found[0].operator)
+    _contact(_add(part, "customer"), (customer.name, customer.address), email=customer.email)
+    statements = _add(part, "statements")
+    lines = [SCOPE, f"Traceability: {table.traceability or 'not given'}"]
+    if laboratory.accreditation:
+        lines.append(laboratory.accreditation)
+    if any(source.simulated for source in found):
+        lines.insert(0, "SIMULATED SENSORS: no instrument was measured.")
+    if issue is None:
+        lines.insert(0, "DRAFT: not a certificate.")
+    for line in lines:
+        _content(_add(_add(statements, "statement"), "declaration"), line)
+
+
+def _core(
+    core: ET.Element,
+    found: Sequence[Source],
+    table: CertificateTable,
+    issue: Issue | None,
+    *,
+    country: str,
+    order: str,
+) -> None:
+    """Add number, dates, and what the certificate is of and replaces."""
+    first, last = found[0], found[-1]
+    _add(core, "countryCodeISO3166_1", country)
+    _add(core, "usedLangCodeISO639_1", _LANGUAGE)
+    _add(core, "mandatoryLangCodeISO639_1", _LANGUAGE)
+    _add(core, "uniqueIdentifier", issue.name if issue else f"DRAFT {first.run_id}")
+    identifications = [("other", "SHA-256 of the recording", s.sha256 or "none") for s in found]
+    if order:
+        identifications.append(("customer", "order", order))
+    if issue is not None:
+        entry = ("calibrationLaboratory", "entry of the ledger", issue.entry)
+        identifications.append(entry)
+    _identifications(core, identifications)
+    if table.received is not None:
+        _add(core, "receiptDate", table.received.isoformat())
+    _add(core, "beginPerformanceDate", f"{first.started:%Y-%m-%d}")
+    _add(core, "endPerformanceDate", f"{last.last:%Y-%m-%d}")
+    _add(core, "performanceLocation", "other" if table.place or first.location else "laboratory")
+    if issue is not None and issue.replaces is not None:
+        before = _add(core, "previousReport")
+        _text(before, "referral", issue.reason)
+        _add(before, "referralID", f"{issue.number}, revision {issue.replaces}")
+        _add(before, "procedure", "SHA-256")
+        _add(before, "value", issue.replaces_sha256)
+
+
+def _items(items: ET.Element, last: Source, about: Bench | None) -> None:
+    """Add the sensors."""
+    condition = "" if about is None else about.certificate.condition
+    makers = manufacturers(about)
+    for sensor in last.sensors:
+        item = _add(items, "item")
+        _text(item, "name", sensor.name)
+        if condition:
+            _content(_add(item, "description"), f"Condition: {condition}")
+        _text(_add(item, "manufacturer"), "name", makers.get(sensor.name) or "not given")
+        _add(item, "model", sensor.model or "not given")
+        serial = ("manufacturer", "serial number", sensor.serial_number or "not given")
+        _identifications(item, [serial])
+
+
+def _persons(persons: ET.Element, responsible: str, operator: str) -> None:
+    """Add who authorises, and who did the test."""
+    people = [(responsible or "not given", "authorises the certificate", "true")]
+    if operator:
+        people.append((operator, "operator", "false"))
+    for name, role, signs in people:
+        person = _add(persons, "respPerson")
+        _text(_add(person, "person"), "name", name)
+        _add(person, "role", role)
+        _add(person, "mainSigner", signs)
+
+
+def _results(
+    root: ET.Element,
+    snapshot: Snapshot,
+    settings: Settings,
+    found: Sequence[Source],
+    about: Bench | None,
+) -> None:
+    table = CertificateTable() if about is None else about.certificate
+    one = _add(_add(root, "measurementResults"), "measurementResult")
+    _text(one, "name", "Self-noise")
+    methods = _add(one, "usedMethods")
+    method = _add(methods, "usedMethod")
+    _text(method, "name", f"Huddle test, {judged_method(snapshot, settings)} method")
+    _content(_add(method, "description"), PROCEDURE)
+    if table.procedure:
+        _add(method, "reference", table.procedure)
+    stated = conformity(with_rule(found[0].bench, about), snapshot, settings)
+    if stated:
+        method = _add(methods, "usedMethod")
+        _text(method, "name", "Decision rule")
+        _content(_add(method, "description"), decision_rule(table))
+        _add(method, "norm", "ILAC-G8:09/2019")
+        _add(method, "norm", "JCGM 106:2012")
+    condition = _add(_add(one, "influenceConditions"), "influenceCondition")
+    _text(condition, "name", "Ambient conditions")
+    _content(_add(_add(condition, "data"), "text"), "Temperature: not recorded.")
+    results = _add(one, "results")
+    noise = snapshot.results.get(judged_method(snapshot, settings))
+    if noise is None:
+        result = _add(results, "result")
+        _text(result, "name", "Self-noise")
+        _content(_add(_add(result, "data"), "text"), "Nothing can be said of the noise.")
+        return
+    band = band_of(settings, snapshot)
+    edges = third_octaves(snapshot.frequency, *band)
+    levels = Spectrum(noise, snapshot, settings).levels(edges)
+    centre = np.sqrt(snapshot.frequency[edges[:-1]] * snapshot.frequency[edges[1:] - 1])
+    low, high = levels.ends()
+    factor, unit = _in_si(snapshot.unit)
+    whole = uncertainties(snapshot, settings)
+    for column, label in enumerate(snapshot.channels):
+        result = _add(results, "result")
+        _text(result, "name", f"Self-noise of {label.sensor}.{label.channel}")
+        data = _add(result, "data")
+        _mean(data, whole[column], f"Mean PSD over {span(*band)}", factor, unit)
+        psd, ends = levels.mean[:, column], (low[:, column], high[:, column])
+        own = np.isfinite(psd) & np.isfinite(ends[0]) & np.isfinite(ends[1])
+        if own.any():
+            in_si = (ends[0][own] * factor, ends[1][own] * factor)
+            _spectrum(data, centre[own], psd[own] * factor, in_si, unit)
+        else:
+            _content(_add(data, "text"), "No band of a third of an octave has both ends.")
+        concerned = [e for e in stated if (e.sensor, e.channel) == (label.sensor, label.channel)]
+        if concerned:
+            _conformity(_add(data, "list"), concerned)
+
+
+def _mean(data: ET.Element, total: Uncertainty, name: str, factor: float, unit: str) -> None:
+    """Add the level over the band, where its interval has both ends."""
+    low, high = total.total
+    if not np.isfinite([total.level, low, high]).all():
+        return
+    quantity = _add(data, "quantity")
+    _text(quantity, "name", name)
+    real = _si(quantity, "real")
+    _si(real, "value", _number(total.level * factor))
+    _si(real, "unit", unit)
+    interval = _si(real, "coverageInterval")
+    _si(interval, "standardUnc", _number(factor * (high - low) / (2 * NORMAL_95)))
+    _si(interval, "intervalMin", _number(factor * low))
+    _si(interval, "intervalMax", _number(factor * high))
+    _si(interval, "coverageProbability", "0.95")
+
+
+def _spectrum(
+    data: ET.Element,
+    centre: FloatArray,
+    psd: FloatArray,
+    ends: tuple[FloatArray, FloatArray],
+    unit: str,
+) -> None:
+    """Add levels in thirds of an octave as lists with their intervals."""
+    listed = _add(data, "list")
+    _text(listed, "name", "PSD in bands of a third of an octave")
+    quantity = _add(listed, "quantity")
+    _text(quantity, "name", "Frequency, centre of the band")
+    frequency = _si(quantity, "realListXMLList")
+    _si(frequency, "valueXMLList", _numbers(centre))
+    _si(frequency, "unitXMLList", r"\hertz")
+    quantity = _add(listed, "quantity")
+    _text(quantity, "name", "Self-noise, one-sided PSD")
+    values = _si(quantity, "realListXMLList")
+    _si(values, "valueXMLList", _numbers(psd))
+    _si(values, "unitXMLList", unit)
+    interval = _si(values, "coverageIntervalXMLList")
+    _si(interval, "standardUncXMLList", _numbers((ends[1] - ends[0]) / (2 * NORMAL_95)))
+    _si(interval, "intervalMinXMLList", _numbers(ends[0]))
+    _si(interval, "intervalMaxXMLList", _numbers(ends[1]))
+    _si(interval, "coverageProbabilityXMLList", "0.95")
+
+
+def _conformity(listed: ET.Element, stated: Iterable[Conformity]) -> None:
+    """Add the statements on the limits in the words of the schema, with their risks."""
+    _text(listed, "name", "Conformity")
+    for each in stated:
+        quantity = _add(listed, "quantity")
+        _text(quantity, "name", f"Probability that the noise is above {each.limit}")
+        if np.isfinite(each.risk):
+            real = _si(quantity, "real")
+            _si(real, "value", _number(each.risk))
+            _si(real, "unit", r"\one")
+        else:
+            _content(_add(quantity, "noQuantity"), "not known")
+        meta = _add(_add(quantity, "measurementMetaData"), "metaData")
+        said = _STATED.get(each.statement, "no statement")
+        _content(_add(meta, "declaration"), f"{each.limit}: {said}")
+        if each.statement in _STATED:
+            _add(meta, "conformity", _STATED[each.statement])
+
+
+def _in_si(unit: str) -> tuple[float, str]:
+    """Return what a PSD is multiplied by to be in an SI unit, and that unit in the D-SI."""
+    if not is_motion(unit):
+        return 1.0, r"\one\hertz\tothe{-1}"
+    at = np.array([1 / (2 * np.pi)])  # where derivatives change nothing
+    for si, name in _UNITS.items():
+        factor = conversion(unit, si, at)[0]
+        if abs(factor.imag) <= 1e-9 * abs(factor) and factor.real > 0:
+            return float(abs(factor) ** 2), name
+    return 1.0, r"\one\hertz\tothe{-1}"
+
+
+def _contact(part: ET.Element, who: tuple[str, str], *, email: str, phone: str = "") -> None:
+    """Add name and address, and how to reach them."""
+    name, address = who
+    _text(part, "name", name or "not given")
+    _add(part, "eMail", email or "not given")
+    if phone:
+        _add(part, "phone", phone)
+    _content(_add(_add(part, "location"), "further"), address or "not given")
+
+
+def _identifications(part: ET.Element, entries: Sequence[tuple[str, str, str]]) -> None:
+    listed = _add(part, "identifications")
+    for issuer, name, value in entries:
+        entry = _add(listed, "identification")
+        _add(entry, "issuer", issuer)
+        _add(entry, "value", value)
+        _text(entry, "name", name)
+
+
+def _text(part: ET.Element, name: str, text: str) -> None:
+    """Add an element of the type of texts in languages."""
+    _content(_add(part, name), text)
+
+
+def _content(part: ET.Element, text: str) -> None:
+    _add(part, "content", text).set("lang", _LANGUAGE)
+
+
+def _add(part: ET.Element, name: str, text: str | None = None) -> ET.Element:
+    element = ET.SubElement(part, _dcc(name))
+    element.text = None if text is None else _printable(text)
+    return element
+
+
+def _si(part: ET.Element, name: str, text: str | None = None) -> ET.Element:
+    element = ET.SubElement(part, f"{{{SI}}}{name}")
+    element.text = text
+    return element
+
+
+def _dcc(name: str) -> str:
+    return f"{{{DCC}}}{name}"
+
+
+def _printable(text: str) -> str:
+    """Return a text without the characters that XML does not have."""
+    return "".join(c for c in text if c in "\t\n" or c.isprintable() or ord(c) >= 0xA0)
+
+
+def _number(value: float) -> str:
+    return f"{value:.8g}"
+
+
+def _numbers(values: FloatArray) -> str:
+    return " ".join(map(_number, values.tolist()))
