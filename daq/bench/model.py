@@ -105,6 +105,12 @@ def _rising(value: tuple[float, ...]) -> tuple[float, ...]:
     return value
 
 
+def _range(value: tuple[float, float]) -> tuple[float, float]:
+    if value[0] >= value[1]:
+        raise ValueError("expected the lowest and the highest temperature in °C")
+    return value
+
+
 class DataSheet(Table):
     """What a sensor's data sheet states of its noise."""
 
@@ -126,6 +132,8 @@ class DataSheet(Table):
     """Peak, in the unit."""
     channels: tuple[str, ...] = ()
     """Names of the channels it holds for; all, if empty."""
+    temperature: Annotated[tuple[Number, Number], AfterValidator(_range)] | None = None
+    """Lowest and highest of operation, in °C."""
 
     @model_validator(mode="after")
     def _has_full_scale(self) -> DataSheet:

@@ -281,6 +281,7 @@ class _Recorder:
                         sampling_rate=found.sampling_rate or layout.sampling_rate,
                         model=found.model or layout.model,
                         serial_number=found.serial_number or layout.serial_number,
+                        temperature=found.temperature,
                     )
                 layouts[sensor.name] = layout
         ordered = [layouts[sensor.name] for sensor in self._bench.sensors]

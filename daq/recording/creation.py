@@ -75,6 +75,8 @@ def make_datasets(file: h5py.File, sensors: Sequence[SensorLayout], chunk_second
         group = groups.create_group(sensor.name)
         for key in ("model", "serial_number", "driver", "port", "clock", "sampling_rate"):
             group.attrs[key] = file_format.fixed(getattr(sensor, key))
+        if sensor.temperature is not None:
+            group.attrs["temperature"] = float(sensor.temperature)
         n_channels = len(sensor.channels)
         # Reading a chunk takes at least 10 µs, so at low rates a chunk has 2 s.
         min_rows = min(_MIN_CHUNK_ROWS, round(2 * sensor.sampling_rate))

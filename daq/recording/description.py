@@ -33,7 +33,7 @@ _FILE = (
     *("software", "bench", "operator", "location", "duration", "until", "estimate", "origin"),
     "simulated",
 )
-_SENSOR = ("model", "serial_number", "driver", "port", "clock", "sampling_rate")
+_SENSOR = ("model", "serial_number", "driver", "port", "clock", "sampling_rate", "temperature")
 _SAMPLES = ("channels", "sensitivity", "unit", "direction", "auxiliary", "response")
 
 

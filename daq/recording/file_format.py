@@ -85,6 +85,8 @@ class SensorLayout:
         Type of the raw counts.
     clock : str
         Name of the sampling clock; sensors with one clock share the name.
+    temperature : float or None
+        In °C, as the device reported at the start; None if it reports none.
     """
 
     name: str
@@ -96,6 +98,7 @@ class SensorLayout:
     serial_number: str = ""
     driver: str = ""
     port: str = ""
+    temperature: float | None = None
 
     @classmethod
     def of(cls, sensor: Sensor, driver: DriverRules) -> SensorLayout:

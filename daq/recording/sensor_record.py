@@ -68,6 +68,10 @@ class SensorRecord:
         """Name of the sampling clock; sensors with one clock share the name."""
         self.sampling_rate = float(number(attributes, "sampling_rate"))
         """In Hz, as reported by the device; otherwise nominal."""
+        self.temperature = (
+            float(number(attributes, "temperature")) if "temperature" in attributes else None
+        )
+        """In °C, as the device reported at the start; None if it reported none."""
         self._samples = dataset(group, "samples")
         self._instants = dataset(group, "instants", np.dtype("<i8"))
         self.channels: tuple[Channel, ...] = file_format.channels_of(self._samples.attrs)

@@ -69,6 +69,8 @@ class RecordedSensor:
     driver: str
     sampling_rate: float
     channels: tuple[Channel, ...]
+    temperature: float | None = None
+    """In °C, as the device reported at the start."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,6 +175,7 @@ def _source(recording: Recording, *, continued: bool) -> Source:
                 sensor.driver,
                 sensor.sampling_rate,
                 sensor.channels,
+                sensor.temperature,
             )
             for sensor in recording.sensors
         ),

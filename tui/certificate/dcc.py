@@ -209,9 +209,7 @@ def _results(
         _content(_add(method, "description"), decision_rule(table))
         _add(method, "norm", "ILAC-G8:09/2019")
         _add(method, "norm", "JCGM 106:2012")
-    condition = _add(_add(one, "influenceConditions"), "influenceCondition")
-    _text(condition, "name", "Ambient conditions")
-    _content(_add(_add(condition, "data"), "text"), "Temperature: not recorded.")
+    _conditions(_add(_add(one, "influenceConditions"), "influenceCondition"), found)
     results = _add(one, "results")
     noise = snapshot.results.get(judged_method(snapshot, settings))
     if noise is None:
@@ -241,6 +239,22 @@ def _results(
         concerned = [e for e in stated if (e.sensor, e.channel) == (label.sensor, label.channel)]
         if concerned:
             _conformity(_add(data, "list"), concerned)
+
+
+def _conditions(condition: ET.Element, found: Sequence[Source]) -> None:
+    """Add the temperatures that the devices stated."""
+    _text(condition, "name", "Temperature of the sensors")
+    data = _add(condition, "data")
+    known = [(e.name, e.temperature) for source in found for e in source.sensors]
+    for name, temperature in known:
+        if temperature is not None:
+            quantity = _add(data, "quantity")
+            _text(quantity, "name", f"Temperature of {name} at the start of the recording")
+            real = _si(quantity, "real")
+            _si(real, "value", _number(temperature))
+            _si(real, "unit", r"\degreecelsius")
+    if all(temperature is None for _, temperature in known):
+        _content(_add(data, "text"), "Temperature: not stated by the devices.")
 
 
 def _mean(data: ET.Element, total: Uncertainty, name: str, factor: float, unit: str) -> None:

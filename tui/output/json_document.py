@@ -162,6 +162,7 @@ def _recording(source: Source) -> dict[str, Any]:
                 "serial_number": sensor.serial_number or None,
                 "driver": sensor.driver or None,
                 "sampling_rate_hz": sensor.sampling_rate,
+                "temperature_c": sensor.temperature,
                 "channels": [
                     {
                         "name": channel.name,

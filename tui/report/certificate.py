@@ -6,14 +6,15 @@ people.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from daq.bench.durations import format_duration
 from daq.bench.estimate_settings import EstimateSettings, to_table
 from daq.bench.tables.certificate import CertificateTable, Customer, Laboratory
-from tui.report.parts import Facts, Paragraph, Section
-from tui.report.wording import utc_time
+from tui.report.parts import Facts, Paragraph, Section, Table
+from tui.report.wording import plain_number, utc_time
 
 if TYPE_CHECKING:
     import datetime as dt
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.results.sources import Source
+    from tui.report.parts import Part
 
 _NONE = "not given"
 LEAST_LOST = 0.01
@@ -304,6 +306,38 @@ def parties_section(found: Sequence[Source], bench: Bench | None, issue: Issue |
         Paragraph(SCOPE, "quiet"),
     )
     return Section("Laboratory, customer and procedure", parts)
+
+
+def conditions_section(found: Sequence[Source], about: Bench | None) -> Section:
+    """Return the temperature of every sensor, and what lies outside the data sheet's range."""
+    ranges = {
+        sensor.name: sensor.data_sheet.temperature
+        for sensor in (() if about is None else about.sensors)
+        if sensor.data_sheet is not None and sensor.data_sheet.temperature is not None
+    }
+    parts: list[Part] = []
+    rows = []
+    for sensor in found[0].sensors:
+        known = [
+            each.temperature
+            for source in found
+            for each in source.sensors
+            if each.name == sensor.name and each.temperature is not None
+        ]
+        least, most = (min(known), max(known)) if known else (math.nan, math.nan)
+        limits = ranges.get(sensor.name)
+        shown = "not given" if limits is None else f"{limits[0]:g} … {limits[1]:g}"
+        low, high = (plain_number(end, ".1f") for end in (least, most))
+        rows.append((sensor.name, low, high, shown))
+        if limits is not None and known and (least < limits[0] or most > limits[1]):
+            parts.append(
+                Paragraph(f"Sensor {sensor.name} was outside of its data sheet's range.", "bad")
+            )
+    table = Table(("sensor", "lowest (°C)", "highest (°C)", "range of the data sheet"), tuple(rows))
+    note = (
+        "Temperature as the devices state it when a recording starts; ? where a device states none."
+    )
+    return Section("Conditions", (table, *parts, Paragraph(note, "quiet")))
 
 
 def _joined(*parts: str) -> str:

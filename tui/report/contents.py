@@ -24,6 +24,7 @@ from tui.output.calibration import (
 )
 from tui.report.certificate import (
     Issue,
+    conditions_section,
     manufacturers,
     notices,
     parties_section,
@@ -162,6 +163,7 @@ def report_of(
         _test_section(found),
         facts_section(known(snapshot, settings)),
         _sensors_section(snapshot, found, about),
+        conditions_section(found, about),
         limits_section(
             snapshot,
             judged,

@@ -171,7 +171,7 @@ class _Paper(FPDF):
         self.lines(report.subtitle, TEXT, "quiet")
         self.ln(0.12)
         for notice in report.notices:
-            self.lines(notice.text, TEXT, notice.tone, bold=notice.tone != "plain")
+            self.lines(notice.text, TEXT, notice.tone, bold=notice.tone in {"bad", "doubtful"})
             self.ln(0.06)
         top = self.y
         self.lines(report.verdict.text, 10.0, report.verdict.tone, bold=True, indent=0.14)

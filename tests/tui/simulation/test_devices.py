@@ -17,6 +17,7 @@ from daq.bench.loading import dump
 from daq.devices.bench_file import parse
 from daq.python_process import python_command
 from daq.recording.reader import Recording
+from daq.results.sources import sources
 from daq.transport.ports import is_simulated
 from tests.waiting import limit
 from tui.cli.main import app
@@ -78,3 +79,7 @@ def test_a_recording_of_simulated_ports_is_simulated_whatever_its_bench_file(
         assert recording.simulated
         assert recording.bench is not None
         assert not recording.bench.runs_simulated
+        temperatures = [sensor.temperature for sensor in recording.sensors]
+    (source,) = sources([out])  # what huddle check shows is kept, for the certificate
+    assert [sensor.temperature for sensor in source.sensors] == temperatures
+    assert all(each is not None and 10 < each < 60 for each in temperatures)
