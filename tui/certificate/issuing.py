@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 from datetime import UTC, datetime
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from daq.bench.estimate_settings import to_table
@@ -239,7 +240,25 @@ def verify(path: Path, recordings: Sequence[Path], ledger: Ledger) -> list[str]:
         last = ledger.last_of(entry.runs, entries)
         lines.append(f"replaced by revision {last.revision}" if last else "replaced")
     lines.append("SHA-256 and ledger: as issued")
+    lines += _signatures(path)
     return [*lines, *_recordings(path, entry, recordings, ledger)]
+
+
+def _signatures(path: Path) -> list[str]:
+    """Return who signed, a line each."""
+    content = path.read_bytes()
+    if b"/ByteRange" not in content:
+        return ["not signed"]
+    if find_spec("pyhanko") is None:
+        return ["signature not checked: pip install 'huddle-bench[sign]'"]
+    from tui.certificate.signing import signatures  # noqa: PLC0415 - an extra
+
+    lines = []
+    for name, intact in signatures(content):
+        if not intact:
+            raise VerificationError(f"{path}: the signature of {name} is not intact")
+        lines.append(f"signed by {name}: intact; whom the signer is vouched for by, a reader shows")
+    return lines
 
 
 def _recordings(path: Path, entry: Entry, recordings: Sequence[Path], ledger: Ledger) -> list[str]:

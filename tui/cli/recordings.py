@@ -205,6 +205,15 @@ def issue(
             "--allow-incomplete", help="Issue without all that ISO/IEC 17025 asks for; say so."
         ),
     ] = False,
+    sign: Annotated[
+        Path | None,
+        typer.Option(
+            "--sign",
+            metavar="FILE",
+            help="Key of the laboratory (.p12) that signs the PDF. Its passphrase is asked for, "
+            "or taken from HUDDLE_PASSPHRASE. Extra: sign.",
+        ),
+    ] = None,
     models: ModelsOption = "",
     start: StartOption = None,
     end: EndOption = None,
@@ -230,6 +239,7 @@ def issue(
         folder=folder,
         models=models,
         allow_incomplete=allow_incomplete,
+        sign=sign,
         start=start,
         end=end,
         **wanted,

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from typing import TYPE_CHECKING, Any
 
+import typer
 from rich.table import Table
 
 from daq.bench.masks.mask_file import masks_named
@@ -30,6 +33,7 @@ def issue_certificate(
     folder: Path | None,
     models: str,
     allow_incomplete: bool,
+    sign: Path | None,
     start: str | None,
     end: str | None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
@@ -44,13 +48,18 @@ def issue_certificate(
         With 1 if a limit is not met, with 4 if that is not decided, after the certificate was
         issued.
     """
-    require("matplotlib", "jinja2", "fpdf")
+    require("matplotlib", "jinja2", "fpdf", *(["pyhanko"] if sign is not None else []))
     from tui.certificate.issuing import (  # noqa: PLC0415 - loads matplotlib
         issue,
         ledger_of,
         refuse_unfit,
     )
 
+    signer = None
+    if sign is not None:
+        from tui.certificate.signing import Signer  # noqa: PLC0415 - an extra
+
+        signer = Signer(sign, _passphrase())
     masks = masks_named(models)
     found = sources(files)
     about = found[0].bench if bench is None else load(bench)
@@ -68,9 +77,18 @@ def issue_certificate(
             about=about,
             models=masks,
             complete=not allow_incomplete,
+            sign=signer,
         )
     console().print(f"certificate {entry.name}: {path}", soft_wrap=True)
     exit_with(judge(recorded, snapshot, settings))
+
+
+def _passphrase() -> str:
+    """Return the passphrase of the key: of the environment, or asked for; empty if neither."""
+    given = os.environ.get("HUDDLE_PASSPHRASE")
+    if given is not None or not sys.stdin.isatty():
+        return given or ""
+    return str(typer.prompt("Passphrase of the key", hide_input=True, default=""))
 
 
 def list_issues(source: Path, *, json: str | None) -> None:

@@ -8,10 +8,16 @@ import os
 import re
 import shutil
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import pkcs12
+from cryptography.x509.oid import NameOID
 from lxml import etree
 from pypdf import PdfReader
 from typer.testing import CliRunner
@@ -21,6 +27,7 @@ from tests.tui.report.written_report import ROOT
 from tui.certificate.dcc import NAME
 from tui.certificate.issuing import JSON_NAME
 from tui.certificate.ledger import Ledger
+from tui.certificate.signing import signatures
 from tui.cli.main import app
 
 if TYPE_CHECKING:
@@ -288,6 +295,56 @@ def test_no_certificate_is_issued_of_simulated_sensors(tmp_path: Path) -> None:
     assert found.exit_code == 2
     assert "simulated" in found.stderr
     assert not (tmp_path / "certificates").exists()
+
+
+def key(file: Path, passphrase: bytes) -> Path:
+    """Write a key with a certificate of its own."""
+    private = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "Pier Metrology")])
+    now = datetime(2026, 1, 1, tzinfo=UTC)
+    usage = dict.fromkeys(
+        ("key_encipherment", "data_encipherment", "key_agreement", "key_cert_sign", "crl_sign"),
+        False,
+    )
+    certificate = (
+        x509.CertificateBuilder(name, name, private.public_key(), 1, now, now + timedelta(36500))
+        .add_extension(
+            x509.KeyUsage(
+                digital_signature=True, content_commitment=True, encipher_only=False,
+                decipher_only=False, **usage,
+            ),
+            critical=True,
+        )
+        .sign(private, hashes.SHA256())
+    )  # fmt: skip
+    locked = serialization.BestAvailableEncryption(passphrase)
+    file.write_bytes(
+        pkcs12.serialize_key_and_certificates(b"p", private, certificate, None, locked)
+    )
+    return file
+
+
+def test_a_signed_certificate_is_verified(
+    copied: Laboratory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    signing = key(tmp_path / "key.p12", b"secret")
+    arguments = ("--sign", str(signing), "--reason", "signed")
+    monkeypatch.setenv("HUDDLE_PASSPHRASE", "wrong")
+    whole = ["issue", str(copied.recording), "--by", "Ada", "--bench", str(copied.bench)]
+    refused = CliRunner().invoke(app, [*whole, *arguments])
+    assert refused.exit_code == 2
+    assert "passphrase is wrong" in refused.stderr
+    monkeypatch.setenv("HUDDLE_PASSPHRASE", "secret")
+    copied.issue(*arguments)
+    path = copied.certificate(1)
+    code, said = copied.verify(path)
+    assert code == 0, said
+    assert "signed by Common Name: Pier Metrology: intact" in said
+    assert signatures(path.read_bytes()) == [("Common Name: Pier Metrology", True)]
+    changed = path.read_bytes().replace(b"/Title", b"/Tible", 1)
+    assert signatures(changed) == [("Common Name: Pier Metrology", False)]
+    assert "not signed" in copied.verify(copied.certificate())[1]
+    assert len(Ledger(copied.certificates).entries()) == 2  # the refused one took no number
 
 
 def changed_certificate(made: Laboratory) -> list[Path]:
