@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from daq.bench.estimate_settings import to_table
 from daq.errors import HuddleError
 from daq.recording.reader import Recording
+from daq.results.decision.conformity import conformity, with_rule
 from daq.results.decision.limits import judge
 from daq.results.sources import sources
 from tui.certificate.dcc import NAME as DCC_NAME
@@ -151,6 +152,10 @@ def issue(
     prefix = "HT" if about is None else about.certificate.prefix
     runs = [(source.path.name, source.run_id, source.sha256) for source in found]
     table = settings_table(settings, snapshot)
+    if about is not None and about.certificate.guard_band != 1.0:
+        table["guard_band"] = about.certificate.guard_band
+    if about is not None:
+        table["decision_rule"] = str(about.certificate.decision_rule)
     with ledger.held():
         before = ledger.last_of(frozenset(run_id for _, run_id, _ in runs))
         if before is not None and not reason:
@@ -175,7 +180,7 @@ def issue(
             )
             report = report_of(snapshot, settings, found, models, issue=made, about=about)
             xml = dcc(snapshot, settings, found, issue=made, about=about)
-            content = _pdf(report, _result(snapshot, settings, found, made), xml, at)
+            content = _pdf(report, _result(snapshot, settings, found, made, about), xml, at)
             if sign is not None:
                 content = sign(content)
             path = ledger.publish(entry, ".pdf", content)
@@ -185,9 +190,16 @@ def issue(
     return entry, path
 
 
-def _result(snapshot: Snapshot, settings: Settings, found: Sequence[Source], made: Issue) -> bytes:
+def _result(
+    snapshot: Snapshot,
+    settings: Settings,
+    found: Sequence[Source],
+    made: Issue,
+    about: Bench | None,
+) -> bytes:
     """Return the result as JSON, with the certificate it is of."""
-    verdict = judge(found[0].bench, snapshot, settings)
+    rule = with_rule(found[0].bench, about)
+    verdict = judge(rule, snapshot, settings)
     result = document(snapshot, settings, sources=found, verdict=verdict)
     result["certificate"] = {
         "number": made.number,
@@ -196,6 +208,23 @@ def _result(snapshot: Snapshot, settings: Settings, found: Sequence[Source], mad
         "by": made.by,
         "entry": made.entry,
     }
+    stated = conformity(rule, snapshot, settings)
+    if rule is not None and stated:
+        result["certificate"] |= {
+            "decision_rule": rule.certificate.decision_rule,
+            "guard_band": rule.certificate.guard_band,
+            "conformity": [
+                {
+                    "limit": each.limit,
+                    "sensor": each.sensor,
+                    "channel": each.channel,
+                    "statement": each.statement,
+                    "risk": each.risk,
+                    "frequency_hz": each.frequency,
+                }
+                for each in stated
+            ],
+        }
     return json.dumps(finite(result), ensure_ascii=False, allow_nan=False).encode()
 
 

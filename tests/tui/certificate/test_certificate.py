@@ -240,6 +240,9 @@ def test_the_files_inside_have_the_numbers_of_the_page(issued: Laboratory) -> No
     result = json.loads(reader.attachments[JSON_NAME][0])
     tree = etree.parse(io.BytesIO(reader.attachments[NAME][0]))
     assert result["certificate"]["revision"] == 0
+    statements = [each["statement"] for each in result["certificate"]["conformity"]]
+    assert statements.count("pass") == 7
+    assert statements.count("not-stated") == 1  # the dead channel
     (entry,) = Ledger(issued.certificates).entries()
     assert result["certificate"]["entry"] == entry.hash
     own = next(each for each in result["band_means"] if each["channel"] == "X")
