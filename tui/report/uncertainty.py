@@ -12,7 +12,9 @@ from daq.bench.units import in_acceleration
 from daq.results.band_summary import Spectrum, band_of, judged_method
 from estimator.levels.bands import band_edges
 from estimator.levels.interval import NORMAL_95
-from tui.report.parts import Paragraph, Section, Table
+from tui.report.figures import drawing
+from tui.report.figures.curves import logarithmic
+from tui.report.parts import Paragraph, Plot, Section, Table
 from tui.report.wording import NOTHING, decibel, plain_number, scientific
 from tui.wording.formatting import span
 from tui.wording.vocabulary import SOURCE_WORDS
@@ -20,6 +22,7 @@ from tui.wording.vocabulary import SOURCE_WORDS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
     from daq.bench.model import Bench
@@ -218,11 +221,13 @@ def _half_octaves(
         rms = np.sqrt(np.where(means > 0, means, np.nan) * width[:, None])
     full = np.array([_full_scale(snapshot, column, about) for column in range(len(names))])
     parts: list[Part] = []
+    if np.isfinite(full).any():
+        parts += _diagrams(snapshot, centres, rms, full)
     for first in range(0, len(names), COLUMNS):
         some = slice(first, first + COLUMNS)
         parts.append(
             Table(
-                ("centre (Hz)", *names[some]),
+                ("Hz", *names[some]),
                 tuple(
                     (f"{centre:.3g}", *(scientific(value, 3) for value in row[some]))
                     for centre, row in zip(centres, rms, strict=True)
@@ -235,7 +240,7 @@ def _half_octaves(
                 reach = 20 * np.log10(full / math.sqrt(2) / rms)
             parts.append(
                 Table(
-                    ("centre (Hz)", *names[some]),
+                    ("Hz", *names[some]),
                     tuple(
                         (f"{centre:.3g}", *(plain_number(value, ".1f") for value in row[some]))
                         for centre, row in zip(centres, reach, strict=True)
@@ -253,6 +258,67 @@ def _half_octaves(
         )
     )
     return parts
+
+
+@dataclass(frozen=True, slots=True)
+class _Range:
+    """Draws the rms in half octaves of one sensor's channels, up to a sine of full scale."""
+
+    sensor: str
+    names: tuple[str, ...]
+    centres: FloatArray
+    rms_db: FloatArray
+    full_db: FloatArray
+    unit: str
+    scale: tuple[float, float]
+
+    def __call__(self, axes: Axes) -> None:
+        axes.set_title(f"Sensor {self.sensor}")
+        logarithmic(axes, (float(self.centres[0]) / HALF, float(self.centres[-1]) * HALF))
+        ends = np.append(self.centres / HALF, self.centres[-1] * HALF)
+        for number, name in enumerate(self.names):
+            dashes = ("-", (0, (4, 1.5)), ":")[number % 3]  # told apart without colours, too
+            colour = drawing.LINES[number % len(drawing.LINES)]
+            values = self.rms_db[:, number]
+            axes.stairs(values, ends, baseline=None, color=colour, ls=dashes, lw=1.0, label=name)
+        clips = self.full_db[np.isfinite(self.full_db)]
+        if clips.size:
+            axes.axhline(
+                float(clips.min()), color=drawing.LIMIT, lw=1.0, ls="--", label="sine of full scale"
+            )
+        axes.set_ylim(self.scale)
+        axes.set_ylabel(f"dB re 1 {self.unit} rms")
+
+
+def _diagrams(
+    snapshot: Snapshot, centres: FloatArray, rms: FloatArray, full: FloatArray
+) -> list[Plot]:
+    """Return the operating range of every sensor, up to three side by side."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rms_db, full_db = 20 * np.log10(rms), 20 * np.log10(full / math.sqrt(2))
+    known = np.concatenate([rms_db[np.isfinite(rms_db)], full_db[np.isfinite(full_db)]])
+    if not known.size:
+        return []
+    scale = 20 * math.floor(known.min() / 20), 20 * math.ceil((known.max() + 1) / 20)
+    panels = []
+    for sensor in snapshot.sensor_names:
+        own = [n for n, label in enumerate(snapshot.channels) if label.sensor == sensor]
+        names = tuple(snapshot.channels[n].channel for n in own)
+        panels.append(
+            _Range(sensor, names, centres, rms_db[:, own], full_db[own], snapshot.unit, scale)
+        )
+    return [
+        Plot(
+            "Operating range in half octaves" if first == 0 else "",
+            tuple(panels[first : first + 3]),
+            n_columns=min(3, max(2, len(panels))),
+            height=1.6,
+            key_rows=1 if first == 0 else 0,
+            titled=True,
+            alt="Noise in half octaves against frequency, below a sine of full scale",
+        )
+        for first in range(0, len(panels), 3)
+    ]
 
 
 def _full_scale(snapshot: Snapshot, column: int, about: Bench | None) -> float:

@@ -10,9 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from daq.bench.model import DataSheet
+from daq.recording.reader import Recording
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
 from tests.tui.report.written_report import tables
-from tui.report.uncertainty import half_octaves, uncertainties
+from tui.report.parts import Plot, Table
+from tui.report.uncertainty import half_octaves, uncertainties, uncertainty_section
 
 if TYPE_CHECKING:
     from tests.tui.report.written_report import Reported
@@ -61,3 +64,28 @@ def test_half_octaves_lie_within_the_spectrum_and_share_no_bin() -> None:
     assert np.allclose(centres[1:] / centres[:-1], math.sqrt(2))
     for one, other in itertools.pairwise(bins):
         assert one[1] <= other[0]
+
+
+def test_the_range_reaches_from_the_noise_to_a_sine_of_full_scale(reported: Reported) -> None:
+    """Of the sensor whose data sheet states a full scale, in any unit of acceleration."""
+    with Recording.open(reported.recording) as recording:
+        bench = recording.bench
+    assert bench is not None
+    sheet = DataSheet(full_scale=2.0, unit="g")
+    first = bench.sensors[0].model_copy(update={"data_sheet": sheet})
+    about = bench.model_copy(update={"sensors": (first, *bench.sensors[1:])})
+    section = uncertainty_section(reported.snapshot, reported.settings, about)
+    assert section is not None
+    assert any(isinstance(part, Plot) for part in section.parts)
+    rms, reach = [part for part in section.parts if isinstance(part, Table)][2:4]
+    column = rms.header.index("A.X")
+    for noise, range_db in zip(rms.rows, reach.rows, strict=True):
+        expected = 20 * math.log10(2 * 9.80665 / math.sqrt(2) / number(noise[column]))
+        assert float(range_db[column]) == pytest.approx(expected, abs=0.1)
+        assert range_db[rms.header.index("B.X")] == "?"
+    assert not any(
+        isinstance(part, Plot)
+        for each in reported.report.sections
+        if each.title == "Uncertainty"
+        for part in each.parts
+    )
