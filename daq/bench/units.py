@@ -94,6 +94,12 @@ def in_acceleration(unit: str) -> float | None:
     return si if derivatives == 2 else None
 
 
+def in_si(unit: str) -> tuple[float, str] | None:
+    """Return how many SI units one of a unit of motion is, and which; None of other units."""
+    derivatives, si = _MOTION.get(canonical(unit), (-1, 1.0))
+    return (si, ("m", "m/s", "m/s²")[derivatives]) if derivatives >= 0 else None
+
+
 def conversion(unit: str, wanted: str, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
     """Return what spectra in `unit` are multiplied by to be in `wanted`.
 

@@ -7,21 +7,19 @@ interval has no upper end has no place in the schema's lists and is left out.
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ET
 from importlib.metadata import version
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from daq.bench.tables.certificate import CertificateTable, Customer, Laboratory
-from daq.bench.units import conversion, is_motion
-from daq.results.band_summary import Spectrum, band_of, judged_method
+from daq.bench.units import in_si
+from daq.results.band_summary import band_of, judged_method
 from daq.results.decision.conformity import Statement, conformity, with_rule
-from estimator.levels.bands import third_octaves
 from estimator.levels.interval import NORMAL_95
 from tui.report.certificate import PROCEDURE, SCOPE, manufacturers
 from tui.report.noise import decision_rule
-from tui.report.uncertainty import uncertainties
+from tui.report.uncertainty import thirds, uncertainties
 from tui.wording.formatting import span
 
 if TYPE_CHECKING:
@@ -32,9 +30,8 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from daq.results.decision.conformity import Conformity
     from daq.results.sources import Source
-    from estimator.types import FloatArray
     from tui.report.certificate import Issue
-    from tui.report.uncertainty import Uncertainty
+    from tui.report.uncertainty import Thirds, Uncertainty
 
 DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"
 SCHEMA_VERSION = "3.1.2"
@@ -211,29 +208,21 @@ def _results(
         _add(method, "norm", "JCGM 106:2012")
     _conditions(_add(_add(one, "influenceConditions"), "influenceCondition"), found)
     results = _add(one, "results")
-    noise = snapshot.results.get(judged_method(snapshot, settings))
-    if noise is None:
+    whole, spectra = uncertainties(snapshot, settings), thirds(snapshot, settings)
+    if not whole:
         result = _add(results, "result")
         _text(result, "name", "Self-noise")
         _content(_add(_add(result, "data"), "text"), "Nothing can be said of the noise.")
         return
-    band = band_of(settings, snapshot)
-    edges = third_octaves(snapshot.frequency, *band)
-    levels = Spectrum(noise, snapshot, settings).levels(edges)
-    centre = np.sqrt(snapshot.frequency[edges[:-1]] * snapshot.frequency[edges[1:] - 1])
-    low, high = levels.ends()
+    name = f"Mean PSD over {span(*band_of(settings, snapshot))}"
     factor, unit = _in_si(snapshot.unit)
-    whole = uncertainties(snapshot, settings)
-    for column, label in enumerate(snapshot.channels):
+    for label, total, spectrum in zip(snapshot.channels, whole, spectra, strict=True):
         result = _add(results, "result")
         _text(result, "name", f"Self-noise of {label.sensor}.{label.channel}")
         data = _add(result, "data")
-        _mean(data, whole[column], f"Mean PSD over {span(*band)}", factor, unit)
-        psd, ends = levels.mean[:, column], (low[:, column], high[:, column])
-        own = np.isfinite(psd) & np.isfinite(ends[0]) & np.isfinite(ends[1])
-        if own.any():
-            in_si = (ends[0][own] * factor, ends[1][own] * factor)
-            _spectrum(data, centre[own], psd[own] * factor, in_si, unit)
+        _mean(data, total, name, factor, unit)
+        if spectrum.centre:
+            _spectrum(data, spectrum, factor, unit)
         else:
             _content(_add(data, "text"), "No band of a third of an octave has both ends.")
         concerned = [e for e in stated if (e.sensor, e.channel) == (label.sensor, label.channel)]
@@ -260,7 +249,7 @@ def _conditions(condition: ET.Element, found: Sequence[Source]) -> None:
 def _mean(data: ET.Element, total: Uncertainty, name: str, factor: float, unit: str) -> None:
     """Add the level over the band, where its interval has both ends."""
     low, high = total.total
-    if not np.isfinite([total.level, low, high]).all():
+    if not all(map(math.isfinite, (total.level, low, high))):
         return
     quantity = _add(data, "quantity")
     _text(quantity, "name", name)
@@ -274,30 +263,25 @@ def _mean(data: ET.Element, total: Uncertainty, name: str, factor: float, unit: 
     _si(interval, "coverageProbability", "0.95")
 
 
-def _spectrum(
-    data: ET.Element,
-    centre: FloatArray,
-    psd: FloatArray,
-    ends: tuple[FloatArray, FloatArray],
-    unit: str,
-) -> None:
+def _spectrum(data: ET.Element, found: Thirds, factor: float, unit: str) -> None:
     """Add levels in thirds of an octave as lists with their intervals."""
     listed = _add(data, "list")
     _text(listed, "name", "PSD in bands of a third of an octave")
     quantity = _add(listed, "quantity")
     _text(quantity, "name", "Frequency, centre of the band")
     frequency = _si(quantity, "realListXMLList")
-    _si(frequency, "valueXMLList", _numbers(centre))
+    _si(frequency, "valueXMLList", _numbers(found.centre))
     _si(frequency, "unitXMLList", r"\hertz")
     quantity = _add(listed, "quantity")
     _text(quantity, "name", "Self-noise, one-sided PSD")
     values = _si(quantity, "realListXMLList")
-    _si(values, "valueXMLList", _numbers(psd))
+    _si(values, "valueXMLList", _numbers(found.level, factor))
     _si(values, "unitXMLList", unit)
     interval = _si(values, "coverageIntervalXMLList")
-    _si(interval, "standardUncXMLList", _numbers((ends[1] - ends[0]) / (2 * NORMAL_95)))
-    _si(interval, "intervalMinXMLList", _numbers(ends[0]))
-    _si(interval, "intervalMaxXMLList", _numbers(ends[1]))
+    widths = [high - low for low, high in zip(found.low, found.high, strict=True)]
+    _si(interval, "standardUncXMLList", _numbers(widths, factor / (2 * NORMAL_95)))
+    _si(interval, "intervalMinXMLList", _numbers(found.low, factor))
+    _si(interval, "intervalMaxXMLList", _numbers(found.high, factor))
     _si(interval, "coverageProbabilityXMLList", "0.95")
 
 
@@ -307,7 +291,7 @@ def _conformity(listed: ET.Element, stated: Iterable[Conformity]) -> None:
     for each in stated:
         quantity = _add(listed, "quantity")
         _text(quantity, "name", f"Probability that the noise is above {each.limit}")
-        if np.isfinite(each.risk):
+        if math.isfinite(each.risk):
             real = _si(quantity, "real")
             _si(real, "value", _number(each.risk))
             _si(real, "unit", r"\one")
@@ -322,14 +306,10 @@ def _conformity(listed: ET.Element, stated: Iterable[Conformity]) -> None:
 
 def _in_si(unit: str) -> tuple[float, str]:
     """Return what a PSD is multiplied by to be in an SI unit, and that unit in the D-SI."""
-    if not is_motion(unit):
+    found = in_si(unit)
+    if found is None:
         return 1.0, r"\one\hertz\tothe{-1}"
-    at = np.array([1 / (2 * np.pi)])  # where derivatives change nothing
-    for si, name in _UNITS.items():
-        factor = conversion(unit, si, at)[0]
-        if abs(factor.imag) <= 1e-9 * abs(factor) and factor.real > 0:
-            return float(abs(factor) ** 2), name
-    return 1.0, r"\one\hertz\tothe{-1}"
+    return found[0] ** 2, _UNITS[found[1]]
 
 
 def _contact(part: ET.Element, who: tuple[str, str], *, email: str, phone: str = "") -> None:
@@ -385,5 +365,5 @@ def _number(value: float) -> str:
     return f"{value:.8g}"
 
 
-def _numbers(values: FloatArray) -> str:
-    return " ".join(map(_number, values.tolist()))
+def _numbers(values: Sequence[float], factor: float = 1.0) -> str:
+    return " ".join(_number(factor * value) for value in values)

@@ -148,12 +148,12 @@ def report(
     end: EndOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
-    """Write the calibration report of a huddle test as HTML or PDF: a draft of the certificate.
+    """Write the calibration report of a huddle test as HTML or PDF.
 
     It contains the noise of every channel with its uncertainty, the
     verdict on the limits of the bench file, alignment, clocks, events, and a
     place to sign. The report of a growing recording is preliminary.
-    huddle issue makes the numbered certificate.
+    It is a draft: huddle issue makes the numbered certificate.
 
     Options not given come from the bench file inside the recording.
     The exit code is 1 if a limit is not met, and 4 if that is not decided.

@@ -10,7 +10,7 @@ import numpy as np
 
 from daq.bench.units import in_acceleration
 from daq.results.band_summary import Spectrum, band_of, judged_method
-from estimator.levels.bands import band_edges
+from estimator.levels.bands import band_edges, third_octaves
 from estimator.levels.interval import NORMAL_95
 from tui.report.figures import drawing
 from tui.report.figures.curves import logarithmic
@@ -128,6 +128,43 @@ def _uncertainty(found: Levels, column: int) -> Uncertainty:
     width = (outer[1] - outer[0]) / 2
     k = width / math.sqrt(combined) if combined > 0 and math.isfinite(combined) else math.nan
     return Uncertainty(level, (inner[0], inner[1]), (outer[0], outer[1]), tuple(rows), k)
+
+
+@dataclass(frozen=True, slots=True)
+class Thirds:
+    """Levels of one channel in thirds of an octave whose intervals have both ends.
+
+    Attributes
+    ----------
+    centre : list of float
+        Hz.
+    level, low, high : list of float
+        In unit²/Hz; the interval is the total one, at 95 %.
+    """
+
+    centre: list[float]
+    level: list[float]
+    low: list[float]
+    high: list[float]
+
+
+def thirds(snapshot: Snapshot, settings: Settings) -> list[Thirds]:
+    """Return the levels of every channel in thirds of an octave of the band of the tables."""
+    noise = snapshot.results.get(judged_method(snapshot, settings))
+    if noise is None:
+        return []
+    edges = third_octaves(snapshot.frequency, *band_of(settings, snapshot))
+    levels = Spectrum(noise, snapshot, settings).levels(edges)
+    centre = np.sqrt(snapshot.frequency[edges[:-1]] * snapshot.frequency[edges[1:] - 1])
+    low, high = levels.ends()
+    own = np.isfinite(levels.mean) & np.isfinite(low) & np.isfinite(high)
+    return [
+        Thirds(
+            centre[own[:, column]].tolist(),
+            *(ends[own[:, column], column].tolist() for ends in (levels.mean, low, high)),
+        )
+        for column in range(len(snapshot.channels))
+    ]
 
 
 def uncertainty_section(

@@ -68,7 +68,7 @@ def test_a_report_is_whole_or_not_there(reported: Reported, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("out", "said"), [("report.doc", r"\.html or \.pdf"), ("none/report.pdf", "no folder")]
+    ("out", "said"), [("report.doc", r"\.html, \.pdf or \.xml"), ("none/report.pdf", "no folder")]
 )
 def test_a_wrong_name_is_refused_before_anything_is_done(
     reported: Reported, out: str, said: str, tmp_path: Path
