@@ -139,7 +139,7 @@ def verify_recordings(
     """
     certificates = [source for source in sources if source.suffix.lower() == ".pdf"]
     if certificates:
-        _verify_certificates(certificates, sources)
+        _verify_certificates(certificates, sources, json=json)
         return
     found = []
     paths, known = _recordings(sources)
@@ -178,7 +178,9 @@ def verify_recordings(
         raise RecordingError(f"{len(bad)} of {len(found)} recordings are damaged or lost")
 
 
-def _verify_certificates(certificates: Sequence[Path], sources: Sequence[Path]) -> None:
+def _verify_certificates(
+    certificates: Sequence[Path], sources: Sequence[Path], *, json: str | None
+) -> None:
     """Check certificates against the ledger in their folder, and the recordings named beside them.
 
     Raises
@@ -189,9 +191,13 @@ def _verify_certificates(certificates: Sequence[Path], sources: Sequence[Path]) 
     from tui.certificate.issuing import verify  # noqa: PLC0415 - loads matplotlib
 
     recordings = [source for source in sources if source not in certificates]
+    found = []
     for path in certificates:
-        for line in verify(path, recordings, Ledger(path.absolute().parent)):
-            for_people(None).print(f"{path.name}: {line}", soft_wrap=True)
+        lines = verify(path, recordings, Ledger(path.absolute().parent))
+        found.append({"path": str(path), "findings": lines})
+        for line in lines:
+            for_people(json).print(f"{path.name}: {line}", soft_wrap=True)
+    write_json(json, {"certificates": found})
 
 
 def _recordings(
