@@ -13,6 +13,7 @@ import pytest
 from daq.bench.driver_rules import Checking
 from daq.bench.model import Channel, Sensor
 from daq.devices.registry import driver_type
+from daq.devices.text.driver import TextDriver
 from daq.errors import BenchFileError, NoAnswerError
 from daq.protocols.block import Block, BlockFlag, Event, EventKind
 from daq.transport.address import host_and_port
@@ -173,7 +174,7 @@ def test_a_wrong_host_is_a_fault_of_the_file() -> None:
     one = own_port(**{"from": "127.0.0.3"}).model_copy(update={"port": "/dev/ttyUSB0"})
     assert isinstance(DRIVER, Checking)
     with pytest.raises(BenchFileError, match="is for ports udp://"):
-        DRIVER.check([one])
+        TextDriver().check([one])
 
 
 def own_port(**settings: object) -> Sensor:
