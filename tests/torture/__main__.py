@@ -26,6 +26,7 @@ from tests.torture.damaged_files import (
     make_recording,
     tally,
 )
+from tests.torture.long_history import N_RUNS, command_faults, loop_faults, make_history
 from tests.torture.power_cuts import MODELS, faults, recorded, shim
 
 if TYPE_CHECKING:
@@ -103,6 +104,12 @@ def torture(share: float, folder: Path) -> list[Row]:
     add(_changes("flipped bits", flips, round(FLIPS * share), folder))
     add(_changes("flipped bits in block tables", changed_blocks, round(FLIPS * share), folder))
     add(_changes("changed sectors", changed_sectors, round(SECTORS * share), folder))
+    n = max(1000, round(N_RUNS * share))
+    bench = make_history(folder / "history", n, seed=4)
+    found, remark = command_faults(folder / "history")
+    add(Row(f"commands with {n} runs of a service", 3, found, f" ({remark})"))
+    found, remark = loop_faults(bench)
+    add(Row(f"start of a service with {n} runs", 1, found, f" ({remark})"))
     return rows
 
 
