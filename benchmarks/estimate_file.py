@@ -22,7 +22,7 @@ import scipy.fft
 from isal import isal_zlib
 
 from benchmarks.row import Row, least_work
-from daq.bench.model import Channel
+from daq.bench.channel import Channel
 from daq.clocks.resampling import resample
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.settings import Settings

@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.application import WIDE, Terminal
 from benchmarks.row import Row
-from daq.bench.model import Channel
+from daq.bench.channel import Channel
 from daq.protocols.block import Block, BlockFlag, HostTime
 from daq.python_process import python_command
 from daq.recording.file_format import SensorLayout

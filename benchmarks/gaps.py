@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.row import Row, least_work
-from daq.bench.model import Channel
+from daq.bench.channel import Channel
 from daq.estimation.estimation import estimate
 from daq.protocols.block import Block, BlockFlag, HostTime
 from daq.recording.file_format import SensorLayout

@@ -24,8 +24,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from benchmarks.row import Row, peak_memory
+from daq.bench.channel import Channel
 from daq.bench.loading import parse
-from daq.bench.model import Bench, Channel, Sensor
+from daq.bench.model import Bench, Sensor
 from daq.devices.epson import commands
 from daq.estimation.estimation import Estimation
 from daq.estimation.follow import COMMIT_INTERVAL, SHORTEST_INTERVAL

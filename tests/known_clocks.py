@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
-from daq.bench.model import Channel
+from daq.bench.channel import Channel
 from daq.protocols.block import Block, BlockFlag, HostTime
 from daq.recording.file_format import SensorLayout
 from daq.recording.writer import RecordingWriter

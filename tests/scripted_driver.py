@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from pydantic import BaseModel
 
-from daq.bench.model import Bench, Channel, Sensor
+from daq.bench.channel import Channel
+from daq.bench.model import Bench, Sensor
 from daq.devices.interface import DEFAULT_PATIENCE, DeviceInformation
 from daq.protocols.block import Block, Event, HostTime
 

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     from daq.archive.plan import Plan
     from daq.archive.spectra_file import Described
-    from daq.bench.model import Channel
+    from daq.bench.channel import Channel
     from daq.estimation.settings import Settings
 
     ComplexArray = NDArray[np.complex128]

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daq.bench.model import Channel
+    from daq.bench.channel import Channel
 
     ComplexArray = NDArray[np.complex128]
 

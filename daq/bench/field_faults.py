@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, get_args
 from pydantic import BaseModel
 
 from daq.bench.driver_settings import meaning_of
-from daq.bench.estimate_settings import EstimateSettings
-from daq.bench.model import EstimateTable
+from daq.bench.model import TABLES
 from daq.errors import ABSENT, FileFault
 
 if TYPE_CHECKING:
@@ -120,8 +119,8 @@ def _model_at(model: type[BaseModel], location: Sequence[int | str]) -> type[Bas
 
 
 def _model_in(annotation: object) -> type[BaseModel] | None:
-    if annotation is EstimateSettings:
-        return EstimateTable
+    if isinstance(annotation, type) and annotation in TABLES:
+        return TABLES[annotation]
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return next((m for m in map(_model_in, get_args(annotation)) if m is not None), None)

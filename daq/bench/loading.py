@@ -7,8 +7,6 @@ The tables are in :mod:`daq.bench.model`; checks of several keys together are in
 
 from __future__ import annotations
 
-import re
-import tomllib
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +16,7 @@ from pydantic import ValidationError
 from daq.bench.field_faults import field_faults
 from daq.bench.masks.mask_file import embed_masks
 from daq.bench.model import Bench
+from daq.bench.tables.toml_text import checked_table
 from daq.bench.validation import cross_faults
 from daq.errors import BenchFileError, FileFault
 
@@ -26,13 +25,8 @@ if TYPE_CHECKING:
 
     from daq.bench.driver_rules import DriverRules
 
-_MAX_LENGTH = 1 << 20
-_MAX_KEYS = 10_000
-"""Counted by equals signs and brackets, before the slow parser: hundreds of sensors have fewer."""
 _MAX_FAULTS = 100
 """Errors that are reported: a file with more is another kind of file."""
-_DOTTED = re.compile(r"""(?<![\w"'-])(?:[\w"'-]++[ \t]*+\.[ \t]*+){16}""")
-"""A key of so many parts: the time that tomllib takes for one grows with their square."""
 
 
 def load(path: str | Path, drivers: Mapping[str, DriverRules] | None = None) -> Bench:
@@ -118,21 +112,10 @@ def _check(
 
 
 def _table(text: str, source: str | Path) -> dict[str, Any]:
-    """Return the table of a TOML text, in bounded time."""
-    if len(text) > _MAX_LENGTH:
-        problem = f"{len(text)} characters; expected at most {_MAX_LENGTH}"
-    elif (keys := text.count("=") + text.count("\n[")) > _MAX_KEYS:
-        problem = f"{keys} keys and tables; expected at most {_MAX_KEYS}"
-    elif _DOTTED.search(text):
-        problem = "a key of more than 16 parts; expected a bench file"
-    else:
-        try:
-            return tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
-            problem = f"not TOML: {error}"
-        except RecursionError:
-            problem = "tables or arrays nested too deeply; expected a bench file"
-    raise BenchFileError(FileFault("", problem), source=source)
+    try:
+        return checked_table(text)
+    except ValueError as error:
+        raise BenchFileError(FileFault("", str(error)), source=source) from None
 
 
 def dump(bench: Bench) -> str:

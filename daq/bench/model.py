@@ -5,8 +5,8 @@ from __future__ import annotations
 import datetime as dt
 import hashlib
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -14,15 +14,14 @@ from pydantic import (
     AfterValidator,
     BeforeValidator,
     Field,
-    GetCoreSchemaHandler,
     InstanceOf,
     PlainSerializer,
     PrivateAttr,
     create_model,
     model_validator,
 )
-from pydantic_core import core_schema
 
+from daq.bench.channel import Certificate, Channel
 from daq.bench.estimate_settings import OPTIONS, EstimateSettings, table_keys, to_table
 from daq.bench.masks.mask import NOISE_MODELS, Mask, check_points
 from daq.bench.response import PolesZeros, Response
@@ -35,8 +34,8 @@ from daq.bench.units import DensityUnit
 Day: TypeAlias = dt.date
 
 
-class Certificate(Table):
-    """Calibration of a channel by a laboratory."""
+class ChannelCertificateTable(Table):
+    """The table of a channel's certificate, from which a `Certificate` is made."""
 
     value: Number = Field(description="sensitivity in counts per unit, not zero")
     expanded_uncertainty: PositiveNumber = Field(description="its expanded uncertainty")
@@ -55,41 +54,77 @@ class Certificate(Table):
         return table
 
 
-class _PolesZerosInText:
-    """A whole response is taken as it is, and left out of text: it is kept with the samples.
+def _certificate(table: object) -> object:
+    if table is None or isinstance(table, Certificate):
+        return table
+    return Certificate(**dict(ChannelCertificateTable.model_validate(table)))
+
+
+def _table_of_certificate(certificate: Certificate | None) -> object:
+    if certificate is None:
+        return None
+    return ChannelCertificateTable.model_construct(**asdict(certificate)).model_dump(
+        exclude_defaults=True
+    )
+
+
+def _pair_to_complex(value: object) -> object:
+    if isinstance(value, (list, tuple)) and len(value) == 2:
+        real, imaginary = value
+        if all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in value):
+            return complex(real, imaginary)
+    if isinstance(value, (int, float, complex)) and not isinstance(value, bool):
+        return complex(value)
+    raise ValueError("expected a number or [real, imaginary], in rad/s")
+
+
+ComplexNumber = Annotated[complex, BeforeValidator(_pair_to_complex)]
+
+
+class PolesZerosTable(Table):
+    """The table of a channel's poles and zeros, from which `PolesZeros` are made."""
+
+    zeros: tuple[ComplexNumber, ...] = Field((), description="zeros in rad/s")
+    poles: tuple[ComplexNumber, ...] = Field((), description="poles in rad/s")
+    normalization: Number | None = None
+    frequency: PositiveNumber = 1.0
+    """Frequency in Hz at which the sensitivity holds."""
+
+
+def _poles_zeros(table: object) -> object:
+    if table is None or isinstance(table, (PolesZeros, Response)):
+        return table
+    return PolesZeros(**dict(PolesZerosTable.model_validate(table)))
+
+
+def _table_of_response(response: PolesZeros | Response | None) -> object:
+    """Return the table; none of a whole response, which is kept with the samples.
 
     Its hundreds of coefficients are nothing for people to read.
     """
-
-    def __get_pydantic_core_schema__(
-        self, source: object, handler: GetCoreSchemaHandler
-    ) -> core_schema.CoreSchema:
-        def checked(value: Any, check: Callable[[Any], Any]) -> Any:  # noqa: ANN401 - pydantic's
-            return value if isinstance(value, Response) else check(value)
-
-        def shown(value: Any, show: Callable[[Any], Any]) -> Any:  # noqa: ANN401 - pydantic's
-            return None if isinstance(value, Response) else show(value)
-
-        return core_schema.no_info_wrap_validator_function(
-            checked,
-            handler.generate_schema(PolesZeros | None),
-            serialization=core_schema.wrap_serializer_function_ser_schema(shown),
-        )
+    if not isinstance(response, PolesZeros):
+        return None
+    return PolesZerosTable.model_construct(**asdict(response)).model_dump(exclude_defaults=True)
 
 
-class Channel(Table):
-    """One digitised input."""
+class ChannelTable(Table):
+    """The table of a channel, from which a `Channel` is made."""
 
     name: Name = Field(description="the channel's name")
     sensitivity: Number = Field(description="counts per unit, not zero")
     unit: str = "m/s²"
     direction: str | None = None
-    response: Annotated[PolesZeros | Response | None, _PolesZerosInText()] = None
-    """Poles and zeros, as the bench file has them, or the whole response of an imported file."""
-    certificate: Certificate | None = None
-    """A sensor with one for each channel is the reference of ``huddle calibrate``."""
+    response: Annotated[
+        InstanceOf[PolesZeros] | InstanceOf[Response] | None,
+        BeforeValidator(_poles_zeros),
+        PlainSerializer(_table_of_response),
+    ] = None
+    certificate: Annotated[
+        InstanceOf[Certificate] | None,
+        BeforeValidator(_certificate),
+        PlainSerializer(_table_of_certificate),
+    ] = None
     auxiliary: bool = False
-    """Recorded but not part of the huddle test (temperature, …)."""
 
     @model_validator(mode="before")
     @classmethod
@@ -97,6 +132,28 @@ class Channel(Table):
         if isinstance(table, Mapping) and table.get("sensitivity") == 0:
             raise ValueError("sensitivity: expected counts per unit, not zero")
         return table
+
+
+def _channel(table: object) -> Channel:
+    if isinstance(table, Channel):
+        return table
+    return Channel(**dict(ChannelTable.model_validate(table)))
+
+
+def _table_of_channel(channel: Channel) -> dict[str, Any]:
+    values = {each.name: getattr(channel, each.name) for each in fields(channel)}
+    return ChannelTable.model_construct(**values).model_dump(exclude_defaults=True)
+
+
+CheckedChannel = Annotated[
+    InstanceOf[Channel], BeforeValidator(_channel), PlainSerializer(_table_of_channel)
+]
+TABLES: dict[type, type[Table]] = {
+    Channel: ChannelTable,
+    PolesZeros: PolesZerosTable,
+    Certificate: ChannelCertificateTable,
+}
+"""The table of each plain class that is made of one."""
 
 
 def _rising(value: tuple[float, ...]) -> tuple[float, ...]:
@@ -155,7 +212,9 @@ class Sensor(Table):
     """In Hz; default: that of the bench."""
     settings: dict[str, Any] = Field(default_factory=dict)
     """Options of the driver, validated by its own model."""
-    channels: tuple[Channel, ...] = Field(min_length=1, description="[[sensors.channels]] tables")
+    channels: tuple[CheckedChannel, ...] = Field(
+        min_length=1, description="[[sensors.channels]] tables"
+    )
     clock: Name | None = None
     """Sensors of one clock name are sampled by one clock."""
     position: tuple[Number, Number, Number] | None = None
@@ -178,6 +237,7 @@ _ESTIMATE_FIELDS: dict[str, Any] = {
 }
 EstimateTable = create_model("EstimateTable", __base__=Table, **_ESTIMATE_FIELDS)
 """The ``[estimate]`` table, each key with the check of its option."""
+TABLES[EstimateSettings] = EstimateTable
 
 
 def estimate_settings(table: object) -> EstimateSettings:

@@ -19,12 +19,9 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
-from pydantic import BeforeValidator, Field
-
-from daq.bench.tables.fields import Number, PositiveNumber, Table
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -33,31 +30,19 @@ if TYPE_CHECKING:
     ComplexArray: TypeAlias = NDArray[np.complex128]
 
 
-def _pair_to_complex(value: object) -> object:
-    if isinstance(value, (list, tuple)) and len(value) == 2:
-        real, imaginary = value
-        if all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in value):
-            return complex(real, imaginary)
-    if isinstance(value, (int, float, complex)) and not isinstance(value, bool):
-        return complex(value)
-    raise ValueError("expected a number or [real, imaginary], in rad/s")
-
-
-ComplexNumber = Annotated[complex, BeforeValidator(_pair_to_complex)]
-
-
-class PolesZeros(Table):
-    """Frequency response as poles and zeros of the Laplace transform.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PolesZeros:
+    """Frequency response as poles and zeros of the Laplace transform, in rad/s.
 
     ``H(s) = normalization * prod(s - zeros) / prod(s - poles)``, to be multiplied by the channel's
-    sensitivity. Without ``normalization``, ``|H| = 1`` at ``frequency``.
+    sensitivity. Without ``normalization``, ``|H| = 1`` at ``frequency`` in Hz, at which the
+    sensitivity holds.
     """
 
-    zeros: tuple[ComplexNumber, ...] = Field((), description="zeros in rad/s")
-    poles: tuple[ComplexNumber, ...] = Field((), description="poles in rad/s")
-    normalization: Number | None = None
-    frequency: PositiveNumber = 1.0
-    """Frequency in Hz at which the sensitivity holds."""
+    zeros: tuple[complex, ...] = ()
+    poles: tuple[complex, ...] = ()
+    normalization: float | None = None
+    frequency: float = 1.0
 
     @property
     def described(self) -> str:
@@ -308,12 +293,26 @@ def response_from_json(text: str) -> PolesZeros | Response:
     """
     table = json.loads(text)
     if not isinstance(table, Mapping) or "stages" not in table:
-        return PolesZeros.model_validate(table)
+        return _poles_zeros(table)
     try:
         stages = tuple(_stage(dict(each)) for each in table["stages"])
         return Response(stages, float(table["frequency"]))
     except (KeyError, TypeError) as error:
         raise ValueError(f"not a response: {error!r}") from error
+
+
+def _poles_zeros(table: Any) -> PolesZeros:  # noqa: ANN401 - whatever JSON holds
+    try:
+        zeros, poles = (tuple(complex(*pair) for pair in table[key]) for key in _COMPLEX)
+        given = table["normalization"]
+        normalization = None if given is None else float(given)
+        frequency = float(table["frequency"])
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"not a response: {error!r}") from error
+    values = (*zeros, *poles, normalization or 0.0, frequency)
+    if not np.isfinite(values).all() or frequency <= 0:
+        raise ValueError("not a response: expected finite numbers, and a frequency above 0")
+    return PolesZeros(zeros=zeros, poles=poles, normalization=normalization, frequency=frequency)
 
 
 def _stage(table: dict[str, Any]) -> Stage:

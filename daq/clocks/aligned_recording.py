@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daq.bench.model import Channel
+    from daq.bench.channel import Channel
     from daq.recording.interface import ReadableRecording
 
     FloatArray = NDArray[np.float64]

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daq.bench.model import Channel
+    from daq.bench.channel import Channel
     from daq.clocks.clock_model import ClockState
     from daq.estimation.noise_estimates import Dimensions
     from daq.estimation.segments.segment_pass import Pass

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daq.bench.model import Channel
+    from daq.bench.channel import Channel
     from daq.estimation.segments.segment_pass import Pass
     from estimator.self_noise.result import SelfNoise
     from estimator.spectra.welch import WelchSettings

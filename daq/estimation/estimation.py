@@ -166,8 +166,8 @@ class Estimation:
             for path in paths:
                 self._recordings.append(open_another(path, self._recordings))
             self._open_continuations()
-            self.settings = Settings.of(self._recordings[0].bench) if settings is None else settings
             first = self._recordings[0]
+            self.settings = Settings.of(first.outline) if settings is None else settings
             self._sensors = live_sensors(first, self.settings) if live else None
             self._passes = [self._pass(recording) for recording in self._recordings]
             check_same(self._passes)

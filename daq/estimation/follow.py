@@ -257,7 +257,7 @@ def _with_target(settings: Settings | None, recording: Recording) -> Settings | 
     """Return settings with the target c.o.v. at which the recording ends, if it does."""
     if recording.until.cov is None:
         return settings
-    settings = Settings.of(recording.bench) if settings is None else settings
+    settings = Settings.of(recording.outline) if settings is None else settings
     return replace(settings, target_cov=recording.until.cov)
 
 
@@ -271,7 +271,7 @@ def _check_left(path: Path, *, is_open: bool) -> None:
 
 def _until_segment(estimation: Estimation) -> float:
     """Return the seconds until there may be a new segment: before, there is nothing to see."""
-    bench = estimation.recordings[0].bench
+    bench = estimation.recordings[0].outline
     speed = 1.0 if bench is None else bench.speed
     return max(SHORTEST_INTERVAL, (estimation.lacking - COMMIT_INTERVAL) / speed)
 

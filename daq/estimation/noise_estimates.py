@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daq.bench.model import Channel
+    from daq.bench.channel import Channel
     from daq.estimation.segments.segment_pass import Pass
     from daq.estimation.settings import Settings
     from daq.recording.interface import ReadableRecording
@@ -176,11 +176,10 @@ def known_gains(settings: Settings, channels: Channels) -> FloatArray:
 
 def known_positions(recording: ReadableRecording, channels: Channels) -> FloatArray | None:
     """Return the positions of sensors in metres, (n_sensors, 3); None unless all are known."""
-    bench = recording.bench
     names = dict.fromkeys(sensor for sensor, _ in channels)
-    if bench is None or not set(names) <= {sensor.name for sensor in bench.sensors}:
+    if recording.outline is None:
         return None
-    positions = [bench.sensor(name).position for name in names]
+    positions = [recording.outline.positions.get(name) for name in names]
     known = [each for each in positions if each is not None]
     return np.array(known) if len(known) == len(positions) else None
 

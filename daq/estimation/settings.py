@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from daq.bench.model import Bench, Sensor
+    from daq.bench.outline import BenchOutline
     from daq.recording.interface import ReadableSensor
 
 _LONG_WINDOW = 4096  # samples, in which every window with a parameter that has one is possible
@@ -81,7 +82,7 @@ class Settings(EstimateSettings):
         return tuple(found)
 
     @classmethod
-    def of(cls, bench: Bench | None) -> Settings:
+    def of(cls, bench: Bench | BenchOutline | None) -> Settings:
         """Return the settings of a bench file, or the defaults if there is none."""
         if bench is None:
             return cls()

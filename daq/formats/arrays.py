@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from daq.bench.model import Channel
+from daq.bench.channel import Channel
 from daq.bench.units import canonical
 from daq.errors import ArrayError
 from daq.formats.foreign_sensor import NS_PER_S, ForeignSensor, Stretch, finite_stretches

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from daq.bench.tables.fields import check_name
+from daq.bench.channel import check_name
 from daq.errors import ImportFormatError
 
 if TYPE_CHECKING:

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from daq.bench.channel import Channel, check_name
 from daq.bench.loading import dump, parse
-from daq.bench.model import Bench, Channel, Sensor
+from daq.bench.model import Bench, Sensor
 from daq.bench.option_fit import misfits
-from daq.bench.tables.fields import check_name
 from daq.bench.units import canonical
 from daq.errors import ImportFormatError, WrongSettingError
 from daq.formats.assembly import Columns
@@ -343,11 +343,15 @@ def _described(
         known = responses and responses.of(foreign.name, name, foreign.dated_spans_ns())
         if not known:
             continue
-        changes = {"sensitivity": known.sensitivity, "unit": known.unit, "response": known.shape}
+        changes: dict[str, Any] = {
+            "sensitivity": known.sensitivity,
+            "unit": known.unit,
+            "response": known.shape,
+        }
         if known.azimuth is not None and known.dip is not None and not channels[number].direction:
             direction = f"azimuth {known.azimuth:g}°, dip {known.dip:g}°"
             changes["direction"] = direction
-        channels[number] = channels[number].model_copy(update=changes)
+        channels[number] = replace(channels[number], **changes)
         found[number] = Taken(
             channels[number].name,
             "response",

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daq.bench.model import Channel
+    from daq.bench.channel import Channel
     from daq.formats.foreign_sensor import ForeignSensor, Stretch
     from daq.protocols.block import Event
 
@@ -115,7 +115,7 @@ class RecordingInMemory:
     """
 
     closed = True
-    bench = None
+    outline = None
     events: tuple[Event, ...] = ()
 
     def __init__(self, sensors: Sequence[SensorInMemory], name: str) -> None:

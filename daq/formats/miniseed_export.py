@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import re
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daq.bench.model import Channel
+    from daq.bench.channel import Channel
     from daq.bench.response import Stage
     from daq.recording.reader import Recording
     from daq.recording.sensor_record import SensorRecord
@@ -363,7 +363,7 @@ def _response(parts: Any, channel: Channel, rate: float) -> Any:  # noqa: ANN401
     gain, factor = channel.sensitivity, 1.0
     if shape is not None:
         at = float(np.abs(shape.at(np.array([frequency])))[0])
-        bare = shape.model_copy(update={"normalization": 1.0})
+        bare = replace(shape, normalization=1.0)
         plain = float(np.abs(bare.at(np.array([frequency])))[0])
         if not (np.isfinite(at) and at > 0 and np.isfinite(plain) and plain > 0):
             raise RecordingError(

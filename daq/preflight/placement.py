@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daq.bench.model import Channel
+    from daq.bench.channel import Channel
     from daq.preflight.common_motion import CommonMotion
     from daq.preflight.preview import SensorPreview
 

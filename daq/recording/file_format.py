@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import h5py
 import numpy as np
 
-from daq.bench.model import Channel, Sensor
-from daq.bench.response import response_from_json, response_to_json
+from daq.bench.channel import Channel
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,6 +17,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.driver_rules import DriverRules
+    from daq.bench.model import Sensor
+    from daq.bench.response import PolesZeros, Response
 
 FORMAT = "huddle-recording"
 FORMAT_VERSION = 2
@@ -150,7 +151,7 @@ def channel_attributes(channels: Sequence[Channel]) -> dict[str, Any]:
         "auxiliary": np.array([channel.auxiliary for channel in channels], dtype=np.int8),
         "response": fixed(
             [
-                "" if channel.response is None else response_to_json(channel.response)
+                "" if channel.response is None else _response_text(channel.response)
                 for channel in channels
             ]
         ),
@@ -171,10 +172,22 @@ def channels_of(attributes: Any) -> tuple[Channel, ...]:  # noqa: ANN401  (h5py 
             unit=unit,
             direction=direction or None,
             auxiliary=bool(auxiliary),
-            response=response_from_json(response) if response else None,
+            response=_response(response) if response else None,
         )
         for name, sensitivity, unit, direction, auxiliary, response in columns
     )
+
+
+def _response_text(response: PolesZeros | Response) -> str:
+    from daq.bench.response import response_to_json  # noqa: PLC0415 - few channels have one
+
+    return response_to_json(response)
+
+
+def _response(text: str) -> PolesZeros | Response:
+    from daq.bench.response import response_from_json  # noqa: PLC0415 - few channels have one
+
+    return response_from_json(text)
 
 
 def block_crc32(row: NDArray[np.void], counts_crc32: int) -> int:

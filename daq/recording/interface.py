@@ -10,7 +10,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from daq.bench.model import Bench, Channel
+    from daq.bench.channel import Channel
+    from daq.bench.outline import BenchOutline
     from daq.protocols.block import Event, HostTime
 
 
@@ -93,8 +94,8 @@ class ReadableRecording(Protocol):
         """Start of the recording."""
 
     @property
-    def bench(self) -> Bench | None:
-        """The bench that was recorded, if there is one."""
+    def outline(self) -> BenchOutline | None:
+        """The bench that was recorded in outline, if there is one."""
 
     @property
     def simulated(self) -> bool:

@@ -17,9 +17,7 @@ import h5py
 import numpy as np
 
 from daq.bench.end_condition import EndCondition
-from daq.bench.loading import parse
-from daq.bench.model import estimate_settings
-from daq.bench.tables.unattended import Hooks
+from daq.bench.outline import BenchOutline
 from daq.errors import BenchFileError, NotARecordingError
 from daq.protocols.block import Event, EventKind, HostTime
 from daq.recording import file_format
@@ -137,14 +135,23 @@ class Recording:
             self._marked_simulated
             or self._origin == SIMULATED
             or any(sensor.driver == SIMULATED for sensor in self.sensors)
-            or (self.bench is not None and self.bench.runs_simulated)
+            or (self.outline is not None and self.outline.is_simulated)
         )
+
+    @cached_property
+    def outline(self) -> BenchOutline | None:
+        """The recorded bench in outline; None for recordings without a bench."""
+        return BenchOutline.of_text(self.bench_text, self._estimate)
 
     @cached_property
     def bench(self) -> Bench | None:
         """The recorded bench; None for imported recordings."""
         if not self.bench_text:
             return None
+        from daq.bench.loading import parse  # noqa: PLC0415 - pydantic, as long as all of HDF5
+        from daq.bench.model import estimate_settings  # noqa: PLC0415
+        from daq.bench.tables.unattended import Hooks  # noqa: PLC0415
+
         with contextlib.suppress(BenchFileError):
             bench = parse(self.bench_text, str(self.path))
             if bench.hooks != Hooks():  # of a version that recorded them

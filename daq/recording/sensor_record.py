@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import h5py
     from numpy.typing import NDArray
 
-    from daq.bench.model import Channel
+    from daq.bench.channel import Channel
 
 
 class CommittedRows:

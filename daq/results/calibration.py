@@ -24,7 +24,8 @@ from estimator.spectra.windows import get_window
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from daq.bench.model import Bench, Certificate, Channel
+    from daq.bench.channel import Certificate, Channel
+    from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import ChannelLabel, Snapshot
     from estimator.responses.calibration import ResponseCurve, SensorCalibration

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
-    from daq.bench.model import Bench, Channel
+    from daq.bench.channel import Channel
+    from daq.bench.model import Bench
     from daq.clocks.clock_model import ClockState
     from daq.recording.reader import SensorRecord
 
@@ -91,7 +92,8 @@ class Source:
     state : {"closed", "growing", "continued", "left open"}
         Continued in the file that follows, because the disk refused this one. Left open by a
         recorder that was killed, and not repaired since.
-    bench : Bench or None
+    recording : Recording
+        Its description; its file is closed.
     sensors : tuple of RecordedSensor
     simulated : bool
         Whether a sensor was simulated.
@@ -112,11 +114,16 @@ class Source:
     started: datetime
     last: datetime
     state: State
-    bench: Bench | None
+    recording: Recording
     sensors: tuple[RecordedSensor, ...]
     simulated: bool
     logged_events: tuple[LoggedEvent, ...]
     signed_by: str = ""
+
+    @property
+    def bench(self) -> Bench | None:
+        """The whole bench, if one was recorded."""
+        return self.recording.bench
 
 
 def sources(paths: Sequence[str | Path]) -> tuple[Source, ...]:
@@ -166,7 +173,7 @@ def _source(recording: Recording, *, continued: bool) -> Source:
         started=recording.created.astimezone(UTC),
         last=datetime.fromtimestamp(last / _SECOND_NS, tz=UTC),
         state=state,
-        bench=recording.bench,
+        recording=recording,
         sensors=tuple(
             RecordedSensor(
                 sensor.name,

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from daq.bench.model import Channel, Sensor
+from daq.bench.channel import Channel
+from daq.bench.model import Sensor
 from daq.devices.registry import driver_type
 from daq.protocols.block import BlockFlag
 from tests.daq.devices.reading import record

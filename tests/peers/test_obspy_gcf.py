@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from daq.bench.model import Channel, Sensor
+from daq.bench.channel import Channel
+from daq.bench.model import Sensor
 from daq.devices.guralp import brp, gcf, scream
 from daq.devices.guralp.decoders import ScreamDecoder, SerialDecoder
 from daq.devices.guralp.gcf import SampleBlock

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from daq.bench.model import Bench, Channel, Sensor
+from daq.bench.channel import Channel
+from daq.bench.model import Bench, Sensor
 from daq.devices.epson import commands
 from sim_devices.world.scenario import Scenario
 from tests.devices import paced_clock

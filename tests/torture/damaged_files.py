@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import h5py
 import numpy as np
 
-from daq.bench.model import Channel
+from daq.bench.channel import Channel
 from daq.errors import RecordingError
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
 from daq.recording.file_format import SensorLayout

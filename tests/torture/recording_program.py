@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from daq.bench.model import Channel
+from daq.bench.channel import Channel
 from daq.errors import RecordingError
 from daq.protocols.block import Block, Event, HostTime
 from daq.recording.file_format import SensorLayout

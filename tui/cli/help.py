@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
 
 import typer
 from typer.core import TyperArgument, TyperCommand, TyperGroup
@@ -34,7 +35,7 @@ class HelpfulCommand(TyperCommand):
         super().__init__(*args, **declared)
         parameters: list[Any] = list(self.params)
         for parameter in parameters:
-            converter = _Converter(parameter.get_runtime_param)
+            converter = _Converter(parameter.type_descriptor, parameter.get_runtime_param)
             parameter.get_runtime_param = converter.itself
 
     def get_help(self, ctx: Any) -> str:
@@ -67,10 +68,12 @@ class _Converter:
     """Converts the value of a parameter as typer does, if one is given.
 
     Typer makes a converter with Pydantic for every parameter: those of thirty options take longer
-    than all the rest of reading a command line.
+    than all the rest of reading a command line, and Pydantic as long as HDF5. Texts, and paths of
+    which nothing is asked, need none.
     """
 
-    def __init__(self, of_typer: Callable[[], Any]) -> None:
+    def __init__(self, declared: Any, of_typer: Callable[[], Any]) -> None:
+        self._plain = _plain_type(declared)
         self._of_typer = of_typer
 
     def itself(self) -> _Converter:
@@ -79,9 +82,26 @@ class _Converter:
 
     def coerce(self, value: Any, param: Any, ctx: Any) -> Any:
         """Return what typer makes of a value; without one None, or () if several may be given."""
+        several = param.multiple or param.nargs == -1
         if value is None:
-            return () if param.multiple or param.nargs == -1 else None
+            return () if several else None
+        if self._plain is not None and isinstance(value, str):
+            return self._plain(value)
+        if self._plain is not None and several and isinstance(value, (list, tuple)):
+            return [self._plain(each) for each in value]
         return self._of_typer().coerce(value, param=param, ctx=ctx)
+
+
+def _plain_type(declared: Any) -> type[str] | type[Path] | None:
+    """Return `str` or `Path` where that is all there is to the conversion of a parameter."""
+    about = declared.parameter_info
+    kind = get_args(declared.annotation)[0] if declared.is_list else declared.annotation
+    if about.parser is not None or declared.is_file:
+        return None
+    if kind is Path:
+        asked = about.exists or about.writable or about.resolve_path or about.path_type
+        return None if asked or not (about.file_okay and about.dir_okay) else Path
+    return str if kind is str else None
 
 
 class LazyGroup(TyperGroup):

@@ -46,8 +46,8 @@ def calibrate_recordings(
 ) -> None:
     """Estimate, calibrate, and show the result."""
     check_places(json)
-    snapshot, settings, bench = estimated(files, start=start, end=end, **wanted)
-    found = calibrate(snapshot, settings, bench, reference=reference, confidence=confidence)
+    snapshot, settings, first = estimated(files, start=start, end=end, **wanted)
+    found = calibrate(snapshot, settings, first.bench, reference=reference, confidence=confidence)
     screen = for_people(json)
     screen.print(Text(title(found, snapshot), "bold"))
     _show(screen, "", sensitivity_table(found, snapshot))

@@ -1,5 +1,7 @@
 """``huddle estimate``."""
 
+# ruff: noqa: PLC0415 - limits, noise parameters and JSON are loaded where they are asked for
+
 from __future__ import annotations
 
 from contextlib import contextmanager
@@ -11,11 +13,7 @@ from rich.text import Text
 
 from daq.estimation.estimation import estimate
 from daq.recording.reader import Recording
-from daq.results.decision.limits import judge
-from daq.results.noise_parameters import noise_parameters as parameters_of
 from daq.results.noise_parameters import quantisation_shares
-from daq.results.sources import sources
-from estimator.decision.verdict import Verdict
 from tui.output.console import (
     check_places,
     for_people,
@@ -27,7 +25,6 @@ from tui.output.console import (
 )
 from tui.output.diagnosis import details
 from tui.output.exit_codes import ExitCode
-from tui.output.json_document import document
 from tui.output.noise_parameters import (
     allan_table,
     notes,
@@ -38,10 +35,9 @@ from tui.output.noise_parameters import (
 from tui.output.results import averages_line, curves_csv, result_table, result_title
 from tui.runs.estimate_settings import settings_of
 from tui.wording.facts import brief, known
-from tui.wording.verdict_text import STYLES, headline, limit_line, not_judged, what_to_do
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from rich.console import Console
@@ -52,12 +48,6 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from daq.results.decision.verdict import TestVerdict
     from daq.results.noise_parameters import ChannelNoise
-
-EXIT_CODES: Mapping[Verdict, ExitCode] = {
-    Verdict.PASS: ExitCode.DONE,
-    Verdict.FAIL: ExitCode.LIMIT_NOT_MET,
-    Verdict.NOT_DECIDED: ExitCode.NOT_DECIDED,
-}
 
 
 def estimate_recordings(
@@ -78,7 +68,15 @@ def estimate_recordings(
     `noise_parameters` fits terms to the noise of every channel.
     """
     check_places(json, csv)
-    snapshot, settings, bench = estimated(files, start=start, end=end, **wanted)
+    snapshot, settings, first = estimated(files, start=start, end=end, **wanted)
+    outline = first.outline
+    judged = noise_parameters or (outline is not None and outline.has_limits)
+    bench = first.bench if judged else None  # all of it takes as long to read as to estimate
+    parameters = None
+    if noise_parameters:
+        from daq.results.noise_parameters import noise_parameters as parameters_of
+
+        parameters = parameters_of(snapshot, settings, bench)
     found = show_result(
         snapshot,
         settings,
@@ -87,7 +85,7 @@ def estimate_recordings(
         csv=csv,
         bench=bench,
         diagnostics=diagnostics,
-        parameters=parameters_of(snapshot, settings, bench) if noise_parameters else None,
+        parameters=parameters,
     )
     hint(f"For a report: huddle report {files[0]}")
     exit_with(found)
@@ -101,8 +99,14 @@ def exit_with(found: TestVerdict | None) -> None:
     typer.Exit
         With 1 if a limit is not met, with 4 if that is not decided.
     """
-    if found is not None and EXIT_CODES[found.verdict]:
-        raise typer.Exit(EXIT_CODES[found.verdict])
+    if found is None:
+        return
+    from estimator.decision.verdict import Verdict
+
+    if found.verdict is Verdict.FAIL:
+        raise typer.Exit(ExitCode.LIMIT_NOT_MET)
+    if found.verdict is Verdict.NOT_DECIDED:
+        raise typer.Exit(ExitCode.NOT_DECIDED)
 
 
 def estimated(
@@ -111,15 +115,15 @@ def estimated(
     start: str | None,
     end: str | None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
-) -> tuple[Snapshot, Settings, Bench | None]:
-    """Estimate recordings, showing the progress; return also the settings and the first bench."""
+) -> tuple[Snapshot, Settings, Recording]:
+    """Estimate recordings, showing the progress; return also settings and the first, closed."""
     with (
         Recording.open(files[0]) as first,  # once, for its settings and for the estimate
         _counted_segments() as count,
     ):
-        settings, bench = settings_of(first, start=start, end=end, **wanted)
+        settings = settings_of(first, start=start, end=end, **wanted)
         snapshot = estimate([first, *files[1:]], settings, progress=count)
-    return snapshot, settings, bench
+    return snapshot, settings, first
 
 
 @contextmanager
@@ -128,7 +132,7 @@ def _counted_segments() -> Iterator[Progress | None]:
     if not shows_progress():
         yield None
         return
-    from rich.progress import (  # noqa: PLC0415 - files and pipes show none
+    from rich.progress import (
         BarColumn,
         TextColumn,
         TimeRemainingColumn,
@@ -174,8 +178,15 @@ def show_result(
     facts = known(snapshot, settings)
     for part in details(snapshot, facts) if diagnostics else brief(facts):
         screen.print(part)
-    found = judge(bench, snapshot, settings)
+    found = None
+    if bench is not None and bench.limits:
+        from daq.results.decision.limits import judge
+
+        found = judge(bench, snapshot, settings)
     if json is not None:
+        from daq.results.sources import sources
+        from tui.output.json_document import document
+
         result = document(
             snapshot,
             settings,
@@ -187,13 +198,20 @@ def show_result(
     if csv is not None:
         write_text(csv, curves_csv(snapshot))
     if found is not None:
-        for each in found.limits:
-            if each.verdict is not Verdict.PASS:
-                screen.print(limit_line(each), style=STYLES[each.verdict].removeprefix("bold "))
-        screen.print(headline(found), style=STYLES[found.verdict])
-        for line in (*what_to_do(found), *not_judged(found)):
-            screen.print(line)
+        _show_verdict(screen, found)
     return found
+
+
+def _show_verdict(screen: Console, found: TestVerdict) -> None:
+    from estimator.decision.verdict import Verdict
+    from tui.wording.verdict_text import STYLES, headline, limit_line, not_judged, what_to_do
+
+    for each in found.limits:
+        if each.verdict is not Verdict.PASS:
+            screen.print(limit_line(each), style=STYLES[each.verdict].removeprefix("bold "))
+    screen.print(headline(found), style=STYLES[found.verdict])
+    for line in (*what_to_do(found), *not_judged(found)):
+        screen.print(line)
 
 
 def _show_parameters(screen: Console, found: Sequence[ChannelNoise], unit: str) -> None:

@@ -80,7 +80,7 @@ def issue_certificate(
             sign=signer,
         )
     console().print(f"certificate {entry.name}: {path}", soft_wrap=True)
-    exit_with(judge(recorded, snapshot, settings))
+    exit_with(judge(recorded.bench, snapshot, settings))
 
 
 def _passphrase() -> str:

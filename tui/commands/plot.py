@@ -43,9 +43,9 @@ def plot_recordings(
         raise typer.BadParameter(f"{out}: expected a file name that ends in .svg, .png or .pdf")
     check_places(str(out))
     masks = masks_named(models)
-    snapshot, settings, bench = estimated(files, start=start, end=end, **wanted)
+    snapshot, settings, first = estimated(files, start=start, end=end, **wanted)
     from tui.report.figures.sheet import write_figure  # noqa: PLC0415 - matplotlib only here
 
     with notices().status("drawing"):
-        write_figure(snapshot, settings, bench, out, models=masks, width=width / 25.4)
+        write_figure(snapshot, settings, first.bench, out, models=masks, width=width / 25.4)
     console().print(f"{out} written", soft_wrap=True)

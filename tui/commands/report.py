@@ -47,7 +47,7 @@ def report_recordings(
     """
     masks = masks_named(models)
     out = checked(files[0].with_suffix(".html") if out is None else out)
-    snapshot, settings, bench = estimated(files, start=start, end=end, **wanted)
+    snapshot, settings, first = estimated(files, start=start, end=end, **wanted)
     write_report(
         snapshot,
         out,
@@ -57,7 +57,7 @@ def report_recordings(
         taken="replace" if force else "refuse",
         screen=console(),
     )
-    exit_with(judge(bench, snapshot, settings))
+    exit_with(judge(first.bench, snapshot, settings))
 
 
 def checked(out: Path) -> Path:

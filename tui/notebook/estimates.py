@@ -21,7 +21,7 @@ from tui.notebook.result import Result
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from daq.bench.model import Channel
+    from daq.bench.channel import Channel
     from daq.formats.response import Responses
     from daq.recording.interface import ReadableRecording, ReadableSensor
 

@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
-    from daq.bench.model import Bench, Channel
+    from daq.bench.channel import Channel
+    from daq.bench.model import Bench
     from daq.formats.channel_runs import Overlap
     from daq.formats.importer import ImportResult
     from daq.formats.memory import RecordingInMemory

@@ -28,8 +28,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from daq.bench.channel import Channel
     from daq.bench.masks.mask import Mask
-    from daq.bench.model import Bench, Channel
+    from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import ChannelLabel, Snapshot
     from daq.estimation.snapshot_diagnostics import (

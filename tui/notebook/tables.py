@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-    from daq.bench.model import Channel
+    from daq.bench.channel import Channel
     from daq.estimation.snapshot import Snapshot
 
 _CURVES = {"noise_psd": "noise_psd", "noise_low": "low", "noise_high": "high", "cov": "cov"}

@@ -141,6 +141,7 @@ def _instant(utc_ns: int) -> str:
 
 
 def _recording(source: Source) -> dict[str, Any]:
+    bench = source.recording.outline
     return {
         "file": source.path.name,
         "run_id": source.run_id,
@@ -151,8 +152,8 @@ def _recording(source: Source) -> dict[str, Any]:
         "software": source.software,
         "operator": source.operator or None,
         "location": source.location or None,
-        "bench": None if source.bench is None else source.bench.name,
         "simulated": source.simulated,
+        "bench": None if bench is None else bench.name,
         "started": source.started.isoformat(),
         "last_block": source.last.isoformat(),
         "sensors": [

@@ -48,9 +48,10 @@ from tui.wording.formatting import span
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from daq.bench.channel import Channel
     from daq.bench.estimate_settings import Option
     from daq.bench.masks.mask import Mask
-    from daq.bench.model import Bench, Channel
+    from daq.bench.model import Bench
     from daq.clocks.clock_model import ClockState
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot

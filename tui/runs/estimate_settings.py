@@ -38,7 +38,8 @@ def settings_for(
         If an option does not fit the others or the sensors.
     """
     with Recording.open(file) as recording:
-        return settings_of(recording, start=start, end=end, **wanted)
+        settings = settings_of(recording, start=start, end=end, **wanted)
+        return settings, recording.bench
 
 
 def settings_of(
@@ -47,18 +48,18 @@ def settings_of(
     start: str | None = None,
     end: str | None = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
-) -> tuple[Settings, Bench | None]:
-    """Return the settings for an open recording, and its bench.
+) -> Settings:
+    """Return the settings for an open recording.
 
     Raises
     ------
     typer.BadParameter
         If an option does not fit the others or the sensors.
     """
-    bench, created = recording.bench, recording.created
-    settings = chosen(Settings.of(bench), **wanted)
+    created = recording.created
+    settings = chosen(Settings.of(recording.outline), **wanted)
     check_fit(settings, recording.sensors)
-    return replace(settings, start=_instant(start, created), end=_instant(end, created)), bench
+    return replace(settings, start=_instant(start, created), end=_instant(end, created))
 
 
 def chosen(settings: Settings, **wanted: Any) -> Settings:  # noqa: ANN401 - fields of EstimateSettings

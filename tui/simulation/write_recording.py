@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.bench.model import Bench, Channel, Sensor
+from daq.bench.channel import Channel
+from daq.bench.model import Bench, Sensor
 from daq.devices.bench_file import load
 from daq.devices.registry import driver_type
 from daq.protocols.block import EventKind, HostTime

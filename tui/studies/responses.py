@@ -6,6 +6,7 @@ three sensors another response: what leaks into its noise is predicted, and is g
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -202,7 +203,7 @@ def _run(
         for sensor, response in zip(recording.sensors, (usual, other, usual), strict=True):
             if mode == "known" and response is not None:
                 sensor.channels = tuple(
-                    each.model_copy(update={"response": response}) for each in sensor.channels
+                    replace(each, response=response) for each in sensor.channels
                 )
         snapshot = estimate([recording], Settings(segment=10.0, equalise=mode))
         to_counts = other.at(snapshot.frequency) if mode == "known" else None

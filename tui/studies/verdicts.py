@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.bench.model import Bench, Channel, Limit, Sensor
+from daq.bench.channel import Channel
+from daq.bench.model import Bench, Limit, Sensor
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import ChannelLabel, Snapshot
 from daq.results.decision.limits import judge

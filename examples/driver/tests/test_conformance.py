@@ -9,7 +9,8 @@ from huddle_ax3.driver import DRIVER
 from huddle_ax3.sdk_driver import DRIVER as SDK_DRIVER
 from huddle_ax3.simulator import COUNTS_PER_UNIT, serve_tcp
 
-from daq.bench.model import Channel, Sensor
+from daq.bench.channel import Channel
+from daq.bench.model import Sensor
 from daq.conformance.suite import DriverConformance, Sent, Served
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from daq.archive.plan import Plan
 from daq.archive.sources import sort
 from daq.archive.store import PLAN_FILE, Store
 from daq.archive.task import Task, software_version
-from daq.bench.model import Channel
+from daq.bench.channel import Channel
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
 from daq.protocols.block import HostTime

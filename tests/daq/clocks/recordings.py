@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daq.bench.model import Channel
+from daq.bench.channel import Channel
 from daq.protocols.block import Block, BlockFlag, HostTime
 from daq.recording.file_format import SensorLayout
 from daq.recording.writer import RecordingWriter

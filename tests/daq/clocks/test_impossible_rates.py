@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from daq.bench.model import Channel
+from daq.bench.channel import Channel
 from daq.clocks.aligned_recording import AlignedRecording
 from daq.errors import CannotAlignError
 from daq.protocols.block import HostTime

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import pytest
 
-from daq.bench.model import Channel, Sensor
+from daq.bench.channel import Channel
+from daq.bench.model import Sensor
 from daq.devices.blocking import BlockingSource, Samples
 from daq.errors import NoAnswerError, NotConnectedError
 from daq.host_clock import SystemClock

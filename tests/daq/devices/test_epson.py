@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import pytest
 
-from daq.bench.model import Channel, Sensor
+from daq.bench.channel import Channel
+from daq.bench.model import Sensor
 from daq.devices.epson import commands
 from daq.devices.epson.commands import CommandDecoder, Read, Write
 from daq.devices.epson.device import Configuration, Device

@@ -13,7 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daq.bench.model import Channel, Sensor
+from daq.bench.channel import Channel
+from daq.bench.model import Sensor
 from daq.conformance.suite import Sent, check_blocks, check_counters, check_truth
 from daq.devices.epson import canopen as protocol
 from daq.devices.registry import driver_type

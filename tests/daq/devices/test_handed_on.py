@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from daq.bench.model import Channel, Sensor
+from daq.bench.channel import Channel
+from daq.bench.model import Sensor
 from daq.devices.guralp.brp import encode_frame
 from daq.devices.labjack.registers import Adu, AduFinder, encode_adu
 from daq.devices.modbus.rtu import RequestFinder, encode_registers

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import pytest
 
-from daq.bench.model import Channel, Sensor
+from daq.bench.channel import Channel
+from daq.bench.model import Sensor
 from daq.devices.iio.driver import IioSession
 from daq.devices.iio.protocol import Device, ScanElement, ScanLayout
 from daq.devices.interface import DeviceInformation

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from daq.bench.model import Channel, Sensor
+from daq.bench.channel import Channel
+from daq.bench.model import Sensor
 from daq.devices.labjack.driver import LabJackDriver
 from daq.devices.labjack.registers import actual_scan_rate
 from daq.devices.registry import driver_type

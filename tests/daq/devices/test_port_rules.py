@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from daq.bench.channel import Channel
 from daq.bench.driver_rules import Checking
-from daq.bench.model import Channel, Sensor
+from daq.bench.model import Sensor
 from daq.bench.tables.toml_text import to_toml
 from daq.devices.bench_file import parse
 from daq.devices.registry import driver_type

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from daq.bench.model import Channel, Sensor
+from daq.bench.channel import Channel
+from daq.bench.model import Sensor
 from daq.devices.modbus import rtu
 from daq.devices.modbus.bus import open_bus
 from daq.devices.registry import driver_type

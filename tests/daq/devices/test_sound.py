@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daq.bench.model import Channel, Sensor
+from daq.bench.channel import Channel
+from daq.bench.model import Sensor
 from daq.devices.registry import driver_type
 from daq.devices.sound import FULL_SCALE, Capture
 from daq.errors import BenchFileError
@@ -43,7 +44,8 @@ READ = """
 import asyncio, contextlib, json, sys
 import numpy as np
 from daq.devices.registry import driver_type
-from daq.bench.model import Channel, Sensor
+from daq.bench.channel import Channel
+from daq.bench.model import Sensor
 from daq.errors import HuddleError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
+from daq.bench.channel import Channel
 from daq.bench.driver_rules import Checking
-from daq.bench.model import Channel, Sensor
+from daq.bench.model import Sensor
 from daq.devices.registry import driver_type
 from daq.devices.text.driver import TextDriver
 from daq.errors import BenchFileError, NoAnswerError

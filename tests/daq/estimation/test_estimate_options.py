@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from daq.bench.model import Channel
+from daq.bench.channel import Channel
 from daq.errors import CannotAlignError
 from daq.estimation.diagnosis import vertical_channel
 from daq.estimation.estimation import Estimation, estimate

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from daq.bench.model import Channel
+from daq.bench.channel import Channel
 from daq.errors import RecordingError
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.settings import Settings

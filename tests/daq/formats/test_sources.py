@@ -8,7 +8,7 @@ import numpy as np
 import pymseed
 import pytest
 
-from daq.bench.model import Channel
+from daq.bench.channel import Channel
 from daq.clocks.aligned_recording import AlignedRecording
 from daq.errors import ImportFormatError
 from daq.formats.importer import import_files

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from daq.bench.model import Channel
+from daq.bench.channel import Channel
 from daq.errors import RecordingError
 from daq.protocols.block import BlockFlag, EventKind, HostTime
 from daq.recording.array_writer import ArrayWriter

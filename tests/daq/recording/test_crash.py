@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 import pytest
 
-from daq.bench.model import Channel
+from daq.bench.channel import Channel
 from daq.errors import RecordingError
 from daq.protocols.block import Block, HostTime
 from daq.recording.file_format import SensorLayout
@@ -32,7 +32,7 @@ NOW = HostTime(1_000_000_000, 1_790_000_000_000_000_000)
 WRITER = """
 import json, resource, sys
 import numpy as np
-from daq.bench.model import Channel
+from daq.bench.channel import Channel
 from daq.errors import RecordingError
 from daq.protocols.block import Block, HostTime
 from daq.recording.file_format import SensorLayout

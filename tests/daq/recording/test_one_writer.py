@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from daq.bench.model import Channel
+from daq.bench.channel import Channel
 from daq.errors import RecordingError
 from daq.protocols.block import Block, HostTime
 from daq.recording.creation import make_datasets

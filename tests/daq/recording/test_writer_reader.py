@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daq.bench.model import Channel
+from daq.bench.channel import Channel
 from daq.bench.response import PolesZeros
 from daq.errors import NotARecordingError, RecordingError
 from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from daq.bench.model import Bench, Certificate, Channel
+from daq.bench.channel import Certificate, Channel
+from daq.bench.model import Bench
 from daq.bench.model import Sensor as BenchSensor
 from daq.clocks.clock_model import RelativeTime
 from daq.errors import WrongSettingError

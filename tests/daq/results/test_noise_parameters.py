@@ -136,7 +136,8 @@ def test_impossible_data_sheets_are_refused_with_what_is_expected() -> None:
 def coarse(path: Path, step: float) -> Path:
     """Write three sensors with white noise of 1 m/s² rms, counted in steps of so much."""
     rng = np.random.default_rng(3)
-    channel = bench().sensors[0].channels[0].model_copy(update={"sensitivity": 1 / step})
+    channel = bench().sensors[0].channels[0]
+    channel = replace(channel, sensitivity=1 / step)
     layouts = [
         SensorLayout(name, (channel,), 100.0, dtype=np.dtype("<i4"), clock="one") for name in "ABC"
     ]

@@ -85,7 +85,7 @@ async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]
 
 def test_channels_of_several_units_have_each_its_own() -> None:
     first, second, _ = SOUND
-    channels = tuple(each.model_copy(update={"unit": "V"}) for each in second.sensor.channels)
+    channels = tuple(replace(each, unit="V") for each in second.sensor.channels)
     other = replace(second, sensor=second.sensor.model_copy(update={"channels": channels}))
     header, *rows = channel_traces((first, other), width=100).plain.splitlines()
     assert header.split() == ["channel", "mean", "RMS", "peak", "last", "10", "s"]

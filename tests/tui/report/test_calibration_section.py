@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.bench.model import Bench, Certificate, Channel, Sensor
+from daq.bench.channel import Certificate, Channel
+from daq.bench.model import Bench, Sensor
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
