@@ -86,14 +86,22 @@ class RecordingWriter:
     """Writes one recording; not thread-safe, but may be used from any single thread."""
 
     def __init__(
-        self, path: Path, file: h5py.File, sensors: Sequence[SensorLayout], lock: WriterLock
+        self,
+        path: Path,
+        file: h5py.File,
+        sensors: Sequence[SensorLayout],
+        lock: WriterLock,
+        *,
+        packs: bool = False,
     ) -> None:
         self.path = path
         self._hidden: Path | None = None
         self._journal: Journal | None = None
         self._file = file
         self._lock = lock
-        self._sensors = {s.name: SensorRows(file["sensors"][s.name], s) for s in sensors}
+        self._sensors = {
+            s.name: SensorRows(file["sensors"][s.name], s, packs=packs) for s in sensors
+        }
         self._events = TableBuffer(file["events"])
         self._committed = file["committed"]
         self._run_id = text(file.attrs, "run_id")
@@ -132,7 +140,7 @@ class RecordingWriter:
             Length of a chunk. Longer chunks are read faster, but samples are buffered longer.
         hidden : bool
             Keep the temporary name until `close`, to hide an incomplete recording; `abandon` then
-            removes the file.
+            removes the file. Chunks are packed as in `daq.recording.chunks.packing`.
 
         Raises
         ------
@@ -161,7 +169,7 @@ class RecordingWriter:
                 write_attributes(file, bench, created, control, attributes or {})
                 make_datasets(file, sensors, chunk_seconds)
                 file.swmr_mode = True
-                writer = cls(path, file, sensors, lock)
+                writer = cls(path, file, sensors, lock, packs=hidden)
                 writer._sync()
                 if hidden:
                     writer._hidden = temporary

@@ -14,12 +14,12 @@ Single blocks are checked only if the two values differ.
 
 from __future__ import annotations
 
-import zlib
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daq.recording.chunks.packing import deflate
 from daq.recording.file_format import BLOCK_DTYPE
 
 if TYPE_CHECKING:
@@ -59,10 +59,10 @@ def intact_blocks(blocks: NDArray[np.void], counts: NDArray[Any]) -> NDArray[np.
         content[:, :n_bytes] = taken.view(np.uint8).reshape(len(which), n_bytes)
         content[:, n_bytes:] = rows if alike else rows[which]
         expected = blocks["crc32"][which]
-        if zlib.crc32(content.data) == _joined(expected, content.shape[1]):
+        if deflate.crc32(content.data) == _joined(expected, content.shape[1]):
             intact[which] = True
         else:
-            found = np.array([zlib.crc32(each) for each in content], np.uint32)
+            found = np.array([deflate.crc32(each) for each in content], np.uint32)
             intact[which] = found == expected
     return intact
 

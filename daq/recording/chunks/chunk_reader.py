@@ -1,31 +1,19 @@
-"""Reads many small chunks of a dataset together, also from several threads.
-
-HDF5 holds one lock for the whole process while it reads and decompresses. So HDF5 only reads the
-stored chunks. ISA-L decompresses them without a lock, in little more than half of zlib's time; zlib
-is the fallback. Then numpy unshuffles the bytes of all chunks together.
-
-The Adler-32 in the zlib stream, over the decompressed bytes, shows whether a chunk is intact. The
-Fletcher-32 that HDF5 appends, over the compressed bytes, adds nothing and is not checked.
-"""
+"""Reads many small chunks of a dataset together, also from several threads."""
 
 from __future__ import annotations
 
 import threading
 from typing import TYPE_CHECKING, Any
 
-import h5py
 import numpy as np
 
-try:
-    from isal import isal_zlib as inflater
-except ModuleNotFoundError:  # the extra "fast" is not installed
-    import zlib as inflater  # type: ignore[no-redef]  # the same interface
+from daq.recording.chunks.packing import PIPELINE, unpacked
 
 if TYPE_CHECKING:
+    import h5py
     from numpy.typing import NDArray
 
 _KEPT_BYTES = 1 << 20  # of the last read: short recordings are read several times
-_PIPELINE = (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32)
 
 
 class ChunkedRows:
@@ -42,12 +30,11 @@ class ChunkedRows:
         self._length, *columns = dataset.chunks
         self._dtype: np.dtype[Any] = dataset.dtype
         self._corner = (0,) * len(columns)
-        self._n_bytes = int(np.prod(dataset.chunks)) * self._dtype.itemsize
         created = dataset.id.get_create_plist()
         filters = tuple(created.get_filter(n)[0] for n in range(created.get_nfilters()))
         self._kept: tuple[int, NDArray[Any]] = (0, np.empty((0, *columns), self._dtype))
         self._lock = threading.Lock()
-        self._direct = filters == _PIPELINE and tuple(columns) == dataset.shape[1:]
+        self._direct = filters == PIPELINE and tuple(columns) == dataset.shape[1:]
 
     def read(self, first_row: int, last_row: int, n_rows: int) -> NDArray[Any]:
         """Return rows, ``last_row`` not included.
@@ -90,24 +77,15 @@ class ChunkedRows:
         The rows after the known ones begin a chunk.
         """
         start = low + len(known)
-        fetch, corner, n_bytes = self._dataset.id.read_direct_chunk, self._corner, self._n_bytes
+        fetch, corner = self._dataset.id.read_direct_chunk, self._corner
         try:
             stored = [fetch((row, *corner)) for row in range(start, last_row, self._length)]
-            if any(skipped for skipped, _ in stored):  # stored without compression
-                return None
-            inflate, bits = inflater.decompress, inflater.MAX_WBITS
-            chunks = [inflate(content, bits, n_bytes) for _, content in stored]
-        except (OSError, RuntimeError, inflater.error):  # type: ignore[misc]  # a class: its stub says instance
+        except (OSError, RuntimeError):
             return None
-        if any(len(chunk) != n_bytes for chunk in chunks):
-            return None
-        size = self._dtype.itemsize
-        shuffled = np.frombuffer(b"".join(chunks), np.uint8).reshape(len(chunks), size, -1)
-        rows = np.empty((len(known) + len(chunks) * self._length, *known.shape[1:]), self._dtype)
+        rows = np.empty((len(known) + len(stored) * self._length, *known.shape[1:]), self._dtype)
         rows[: len(known)] = known
-        whole = rows[len(known) :].view(np.uint8).reshape(len(chunks), -1, size)
-        for place in range(size):
-            whole[:, :, place] = shuffled[:, place]
+        if not unpacked(stored, rows[len(known) :]):
+            return None
         rows = rows[: n_rows - low]
         rows.flags.writeable = False
         # The next read begins in a chunk that is not in these rows, or in the rows that are kept.

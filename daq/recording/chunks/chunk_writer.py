@@ -12,6 +12,7 @@ from h5py import h5s, h5t
 
 from daq.errors import RecordingError
 from daq.recording import file_format
+from daq.recording.chunks.packing import RAW, packed
 from daq.recording.storage.retries import repeated, report
 
 if TYPE_CHECKING:
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from daq.protocols.block import Block, HostTime
     from daq.recording.file_format import SensorLayout
 
-_NO_FILTER = 0b111  # as a mask: shuffle, gzip and fletcher32 are skipped
 _MERGED_SECONDS = 0.1
 """Length of merged blocks in seconds."""
 
@@ -84,10 +84,20 @@ class TableBuffer:
 
 
 class ChunkBuffer:
-    """Appends rows to a dataset in complete chunks; buffers the rows of an incomplete chunk."""
+    """Appends rows to a dataset in complete chunks; buffers the rows of an incomplete chunk.
 
-    def __init__(self, dataset: h5py.Dataset) -> None:
+    Parameters
+    ----------
+    dataset : h5py.Dataset
+    packs : bool
+        Pack chunks as in `daq.recording.chunks.packing`. Not in a file that may be left open: when
+        HDF5 2.0 shrinks a dataset to what was acknowledged, it filters the last chunk without
+        regard to the chunk's mask, and destroys it.
+    """
+
+    def __init__(self, dataset: h5py.Dataset, *, packs: bool = False) -> None:
         self.dataset = dataset
+        self._packs = packs
         self._rows = AppendedRows(dataset)
         self._buffer = np.empty(dataset.chunks, dataset.dtype)
         self._filled = 0
@@ -115,7 +125,7 @@ class ChunkBuffer:
                 part = rows[first : first + length]
                 chunk[: len(part)] = part
                 place = (begin + first, *corner)
-                self.dataset.id.write_direct_chunk(place, chunk.tobytes(), _NO_FILTER)
+                self.dataset.id.write_direct_chunk(place, chunk.tobytes(), RAW)
                 if bytes(self.dataset.id.read_direct_chunk(place)[1]) != chunk.tobytes():
                     raise OSError(f"{self.dataset.name}: a chunk was not stored as written")
 
@@ -151,12 +161,29 @@ class ChunkBuffer:
         repeated(lambda: self._rows.extend(self.n_written + len(rows)))
         self._unsafe.append((self.n_written, rows.copy()))
         try:
-            self._rows.write(self.n_written, rows)
+            if self._packs:
+                self._store(rows)
+            else:
+                self._rows.write(self.n_written, rows)
         except (OSError, RuntimeError) as error:
             report(error)
             repeated(self.write_again)
         self.n_written += len(rows)
         self.sha256.update(np.ascontiguousarray(rows, self.dataset.dtype).data)
+
+    def _store(self, rows: NDArray[Any]) -> None:
+        """Write rows as chunks, which HDF5 takes as they are; the last is filled up with zeros."""
+        length, *columns = self.dataset.chunks
+        rows = np.ascontiguousarray(rows, self.dataset.dtype)
+        for first in range(0, len(rows), length):
+            chunk = rows[first : first + length]
+            if len(chunk) < length:
+                chunk = np.concatenate(
+                    [chunk, np.zeros((length - len(chunk), *columns), chunk.dtype)]
+                )
+            content, mask = packed(chunk)
+            place = (self.n_written + first, *(0 for _ in columns))
+            self.dataset.id.write_direct_chunk(place, content, mask)
 
 
 @dataclass(slots=True)
@@ -186,9 +213,9 @@ class SensorRows:
     port delivers three or four samples per read, which take less space than a row.
     """
 
-    def __init__(self, group: h5py.Group, sensor: SensorLayout) -> None:
-        self.samples = ChunkBuffer(group["samples"])
-        self.instants = ChunkBuffer(group["instants"])
+    def __init__(self, group: h5py.Group, sensor: SensorLayout, *, packs: bool = False) -> None:
+        self.samples = ChunkBuffer(group["samples"], packs=packs)
+        self.instants = ChunkBuffer(group["instants"], packs=packs)
         self._polled: bool | None = None
         self.blocks = TableBuffer(group["blocks"])
         self.gaps = TableBuffer(group["gaps"])

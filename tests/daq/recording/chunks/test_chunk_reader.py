@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
-from daq.recording.chunks import chunk_reader
+from daq.recording.chunks import chunk_reader, packing
 from daq.recording.chunks.chunk_reader import ChunkedRows
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ LENGTH, N_ROWS = 10, 257
 def inflater(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Decompress by either library: the extra "fast" may be missing."""
     if request.param == "zlib":
-        monkeypatch.setattr("daq.recording.chunks.chunk_reader.inflater", zlib)
+        monkeypatch.setattr("daq.recording.chunks.packing.deflate", zlib)
     else:
         pytest.importorskip("isal")
 
@@ -113,7 +113,7 @@ def test_repeated_reads_use_a_bounded_cache(tmp_path: Path) -> None:
 def count_of_inflated(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
     """Return a list to which every chunk is added when it is inflated."""
     found: list[bytes] = []
-    library: Any = chunk_reader.__dict__["inflater"]
+    library: Any = packing.__dict__["deflate"]
 
     def decompress(content: bytes, bits: int, n_bytes: int) -> bytes:
         found.append(content)
@@ -123,7 +123,7 @@ def count_of_inflated(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
     counted = SimpleNamespace(
         decompress=decompress, MAX_WBITS=library.MAX_WBITS, error=library.error
     )
-    monkeypatch.setattr(chunk_reader, "inflater", counted)
+    monkeypatch.setattr(packing, "deflate", counted)
     return found
 
 
