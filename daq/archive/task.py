@@ -26,9 +26,12 @@ from estimator.errors import EstimatorError
 from estimator.spectra.segment_rejection import Reason
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     FloatArray = NDArray[np.float64]
+    ComplexArray = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,11 +168,20 @@ class StretchPass(Pass):
             self.n_written += spectra.n_segments
 
     def _take(self, samples: FloatArray, starts: NDArray[np.int64], first: int) -> None:
-        middle = (first + starts + self.welch.segment_length / 2) / self.welch.sampling_rate
+        for some in self._by_stretch(first + starts):
+            super()._take(samples, starts[some], first)
+
+    def _take_whole(self, spectra: ComplexArray, begins: NDArray[np.int64]) -> None:
+        for some in self._by_stretch(begins):
+            super()._take_whole(spectra[some], begins[some])
+
+    def _by_stretch(self, begins: NDArray[np.int64]) -> Iterator[NDArray[np.bool_]]:
+        """Yield which segments belong to each stretch, and end the one before."""
+        middle = (begins + self.welch.segment_length / 2) / self.welch.sampling_rate
         ns = self.aligned.start_utc_ns + np.rint(middle * 1e9).astype(np.int64)
         numbers = ns // self._stretch_ns
         for number in np.unique(numbers):
             if self._number is not None and number != self._number:
                 self.end_stretch()
             self._number = int(number)
-            super()._take(samples, starts[numbers == number], first)
+            yield numbers == number

@@ -21,6 +21,7 @@ import numpy as np
 
 from daq.clocks.clock_model import ClockSource, ClockState, nominal
 from daq.clocks.grid import SNAP, Grid, grid_rate
+from daq.clocks.own_samples import OwnSamples
 from daq.clocks.resampling import USABLE
 from daq.clocks.sensor_reader import SensorSource, main_columns
 from daq.clocks.slip_search import find_by_arrivals, find_by_motion
@@ -440,6 +441,27 @@ class AlignedRecording:
         for source, low, high in zip(self._sources, edges[:-1], edges[1:], strict=True):
             valid &= grid.read(source, start, samples[:, low:high])
         return samples, valid
+
+    def own_samples(self, begins: NDArray[np.int64], length: int) -> list[OwnSamples] | None:
+        """Return segments in the samples of each sensor, not interpolated.
+
+        None where any sensor has a gap in them, or a clock that is not straight.
+
+        Parameters
+        ----------
+        begins : int64, shape (n_segments,)
+            Grid samples, increasing.
+        length : int
+        """
+        if self._grid is None:
+            return None
+        found = []
+        for source in self._sources:
+            own = OwnSamples.of(source, self._grid, begins, length)
+            if own is None:
+                return None
+            found.append(own)
+        return found
 
     @property
     def _reference(self) -> int:

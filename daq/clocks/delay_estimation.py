@@ -144,11 +144,34 @@ class DelayEstimator:
             if the coherent motion is too weak. Where `is_wide`, the deviation is NaN where the
             motion is strong, and the sensor does not follow it.
         """
-        shape = (len(starts), len(self.columns))
-        delays, std = np.full(shape, np.nan), np.full(shape, np.inf)
-        if len(starts) == 0 or (not self.has_frame and len(starts) < self.min_segments):
-            return delays, std
-        sensors = self._spectra(samples, starts)
+        if not self._is_enough(len(starts)):
+            return self._unknown(len(starts))
+        return self._measured(self._spectra(samples, starts))
+
+    def measure_spectra(self, spectra: ComplexArray) -> tuple[FloatArray, FloatArray]:
+        """Return what `measure` does, from spectra of the segments under the window.
+
+        Parameters
+        ----------
+        spectra : complex128, shape (n_segments, n_freqs, n_channels)
+            From 0 Hz on, of samples without trend.
+        """
+        if not self._is_enough(len(spectra)):
+            return self._unknown(len(spectra))
+        used = spectra[:, 1 : len(self.omega) + 1].swapaxes(0, 1)
+        return self._measured([np.ascontiguousarray(used[:, :, one]) for one in self.columns])
+
+    def _is_enough(self, n_segments: int) -> bool:
+        return n_segments >= (1 if self.has_frame else self.min_segments)
+
+    def _unknown(self, n_segments: int) -> tuple[FloatArray, FloatArray]:
+        shape = (n_segments, len(self.columns))
+        return np.full(shape, np.nan), np.full(shape, np.inf)
+
+    def _measured(self, sensors: list[ComplexArray]) -> tuple[FloatArray, FloatArray]:
+        """Measure delays from the spectra of each sensor, (n_freqs, n_segments, n_channels)."""
+        n_segments = sensors[0].shape[1]
+        delays, std = self._unknown(n_segments)
         if self.has_frame:
             x0 = sensors[self._reference]
             found = {
@@ -163,7 +186,7 @@ class DelayEstimator:
             frame, xj = self._frames.get(number), sensors[number]
             known = np.isfinite(spread)
             if frame is None or known.any():
-                used = known if known.any() else np.ones(len(starts), dtype=bool)
+                used = known if known.any() else np.ones(n_segments, dtype=bool)
                 advanced = self._advanced(xj[:, used], np.where(known, tau, 0.0)[used])
                 new = _Frame.of(x0[:, used], advanced)
                 if frame is None:

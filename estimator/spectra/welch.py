@@ -127,9 +127,9 @@ class CrossSpectra:
         self._tapers = bool(np.any(self._window != 1))
         # Trends are fitted to the samples and subtracted from their spectra, where they fill few
         # bins.
-        trends = _trends(settings.detrend, length)
-        self._fit = trends / np.sum(trends**2, axis=1, keepdims=True)
-        spectra = np.fft.rfft(trends * self._window, axis=1).T
+        lines = trends(settings.detrend, length)
+        self._fit = lines / np.sum(lines**2, axis=1, keepdims=True)
+        spectra = np.fft.rfft(lines * self._window, axis=1).T
         self._trend_bins = slice(0, _last_bin(spectra))
         self._trend_spectra = spectra[self._trend_bins]
 
@@ -164,6 +164,39 @@ class CrossSpectra:
                     self._sum += total
                     self._keep(single)
         self.n_segments += len(starts)
+
+    def add_spectra(self, spectra: ComplexArray) -> None:
+        """Add segments by their spectra.
+
+        Parameters
+        ----------
+        spectra : complex128, shape (n_segments, n_freqs, n_channels), contiguous
+            Transforms of windowed samples without trend, in physical units.
+
+        Raises
+        ------
+        EstimatorError
+            If their shape is another.
+        """
+        if spectra.ndim != 3 or spectra.shape[1:] != self._sum.shape[:2]:
+            n_freqs, n_channels, _ = self._sum.shape
+            raise EstimatorError(
+                f"spectra of shape {spectra.shape}, expected (n_segments, {n_freqs}, {n_channels})"
+            )
+        if len(spectra) == 0:
+            return
+        parts = spectra.view(np.float64)
+        for some in self._pieces():
+            _add_gram(self._sum[some], _gram(parts[:, some]))
+        if self._single is not None:
+            self._single.add(spectra[:, self._single.bins])
+        self.n_segments += len(spectra)
+
+    def _pieces(self) -> list[slice]:
+        """Return the frequencies whose products of channels are made at a time."""
+        n_freqs, n_channels, _ = self._sum.shape
+        step = max(1, min(FREQUENCIES_PER_BLOCK, PRODUCT_VALUES // (2 * n_channels) ** 2))
+        return [slice(low, low + step) for low in range(0, n_freqs, step)]
 
     def _keep(self, single: list[ComplexArray]) -> None:
         if self._single is not None:
@@ -208,8 +241,7 @@ class CrossSpectra:
         # where many groups of segments add up.
         many = len(starts) > FEW_GROUPS * block
         gram = np.zeros((n_freqs if many else 0, 2 * n_channels, 2 * n_channels))
-        step = max(1, min(FREQUENCIES_PER_BLOCK, PRODUCT_VALUES // (2 * n_channels) ** 2))
-        pieces = [slice(low, low + step) for low in range(0, n_freqs, step)]
+        pieces = self._pieces()
         single: list[ComplexArray] = []
         for first in range(0, len(starts), block):
             rows = starts[first : first + block]
@@ -227,9 +259,7 @@ class CrossSpectra:
                 if len(starts) == 1:  # cheaper than the sum over real and imaginary parts
                     total[some] += spectra[0, some, :, None] * spectra[0, some, None, :].conj()
                     continue
-                products = np.matmul(
-                    parts[:, some].transpose(1, 2, 0), parts[:, some].swapaxes(0, 1)
-                )
+                products = _gram(parts[:, some])
                 if many:
                     gram[some] += products
                 else:
@@ -321,6 +351,11 @@ class CrossSpectra:
         return spectra
 
 
+def _gram(parts: FloatArray) -> FloatArray:
+    """Return the sum over segments of products of (n_segments, n_freqs, n) real numbers."""
+    return np.asarray(np.matmul(parts.transpose(1, 2, 0), parts.swapaxes(0, 1)))
+
+
 def _add_gram(total: ComplexArray, gram: FloatArray) -> None:
     """Add products of complex numbers, given those of their real and imaginary parts."""
     total.real += gram[:, ::2, ::2] + gram[:, 1::2, 1::2]
@@ -336,7 +371,7 @@ def _segments(samples: FloatArray, rows: IntArray, length: int) -> FloatArray:
     return windows[rows]
 
 
-def _trends(detrend: str, length: int) -> FloatArray:
+def trends(detrend: str, length: int) -> FloatArray:
     """Return the orthogonal trends that `detrend` removes, shape (n_trends, length)."""
     line = np.arange(length) - (length - 1) / 2
     return np.stack([np.ones(length), line])[: {"none": 0, "constant": 1, "linear": 2}[detrend]]

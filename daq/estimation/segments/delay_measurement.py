@@ -77,8 +77,26 @@ class DelayMeasurement:
         together : bool
             Whether the segments may wait for others, until the clocks are set.
         """
-        if not (self._is_wanted and self._aligned.measurable):
+        meter = self._wanted_meter()
+        if meter is None:
             return
+        if not (together and meter.has_frame):
+            self._learn(samples, starts, begin)
+            return
+        self._held.append((samples, starts, begin))
+        n_values = sum(each.size for each, _, _ in self._held)
+        if sum(len(rows) for _, rows, _ in self._held) >= _HELD or n_values >= _HELD_VALUES:
+            self._learn_held()
+
+    def measure_spectra(self, spectra: NDArray[np.complex128], begin: IntArray) -> None:
+        """Measure what delays are left in segments, by their spectra from 0 Hz on."""
+        meter = self._wanted_meter()
+        if meter is not None:
+            self._tell(begin, *meter.measure_spectra(spectra))
+
+    def _wanted_meter(self) -> DelayEstimator | None:
+        if not (self._is_wanted and self._aligned.measurable):
+            return None
         if self._meter is None:
             edges = np.cumsum([0, *self._aligned.dims])
             sensors = self._aligned.measurable
@@ -86,13 +104,7 @@ class DelayMeasurement:
             window = get_window(self._welch.window, self._welch.segment_length)
             rate, fixed = self._welch.sampling_rate, self._aligned.stated_reference is not None
             self._meter = DelayEstimator(rate, window, columns, 1 if fixed else REFERENCES)
-        if not (together and self._meter.has_frame):
-            self._learn(samples, starts, begin)
-            return
-        self._held.append((samples, starts, begin))
-        n_values = sum(each.size for each, _, _ in self._held)
-        if sum(len(rows) for _, rows, _ in self._held) >= _HELD or n_values >= _HELD_VALUES:
-            self._learn_held()
+        return self._meter
 
     def measure_with_gaps(
         self,
@@ -134,9 +146,10 @@ class DelayMeasurement:
         )
 
     def _learn(self, samples: FloatArray, starts: IntArray, begin: IntArray) -> None:
-        if self._meter is None:
-            return
-        delays, std = self._meter.measure(samples, starts)
+        if self._meter is not None:
+            self._tell(begin, *self._meter.measure(samples, starts))
+
+    def _tell(self, begin: IntArray, delays: FloatArray, std: FloatArray) -> None:
         at = begin + self._welch.segment_length / 2
         self._aligned.learn(
             np.asarray(at, dtype=np.float64), delays, std=std, frame_delays=self._frame_delays

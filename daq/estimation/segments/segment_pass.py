@@ -15,6 +15,7 @@ from daq.clocks.aligned_recording import AlignedRecording
 from daq.clocks.growing_rows import GrowingRows
 from daq.estimation.segments.clipping import in_clipped_blocks
 from daq.estimation.segments.delay_measurement import DelayMeasurement
+from daq.estimation.segments.own_spectra import OwnSpectra, need_samples_of_grid
 from daq.estimation.segments.stated_times import agree, compare
 from estimator.spectra.gap_window import Leakage, gap_window, without_trend
 from estimator.spectra.multiresolution import MultiResolution
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from estimator.spectra.equaliser import Equaliser
 
     FloatArray = NDArray[np.float64]
+    ComplexArray = NDArray[np.complex128]
     BoolArray = NDArray[np.bool_]
     from collections.abc import Iterator
 
@@ -363,35 +365,25 @@ class Pass:
 
         source = self._newest if live and len(pieces) == 1 else self.aligned
 
-        def read(piece: tuple[int, int]) -> _Samples:
-            return self._read(source, self.filters, piece[0] * hop, piece[1])
+        exact = self.aligned.is_exact
+        on_grid = need_samples_of_grid(
+            self._settings, filtered=self.filters is not None, exact=exact
+        )
+
+        def read(piece: tuple[int, int]) -> _Samples | OwnSpectra:
+            first, count = piece
+            if source is self.aligned and not on_grid:
+                own = self.aligned.own_samples((first + np.arange(count)) * hop, length)
+                found = None if own is None else OwnSpectra.of(own, self.welch)
+                if found is not None:
+                    return found
+            return self._read(source, self.filters, first * hop, count)
 
         for (first, count), part in zip(pieces, read_ahead(read, pieces), strict=True):
-            samples, usable, clipped = part.samples, part.usable, part.clipped
-            self.stillness.add(part.raw, part.raw_usable)
-            starts = np.arange(count) * hop
-            whole = whole_segments(usable, starts, length)
-            clean = whole if clipped is None else whole_segments(usable & ~clipped, starts, length)
-            self.left_out[Reason.GAP] += count - int(whole.sum())
-            self.left_out[Reason.CLIPPED] += int((whole & ~clean).sum())
-            starts = starts[clean]
-            if self.octaves is not None:
-                complete = usable if clipped is None else usable & ~clipped
-                new = self._fed - first * hop
-                self.octaves.add(samples[new:], complete[new:])
-                self._fed = first * hop + len(samples)
+            if isinstance(part, OwnSpectra):
+                self._take_spectra(part, first)
             else:
-                self._take(samples, starts, first * hop + reach)
-            self._n_taken += len(starts)
-            self._taken_at.add(self._positions(np.arange(first, first + count)))
-            self._delays.measure(samples, starts, first * hop + reach + starts, together=live)
-            if self._bridge is not None and not whole.all():
-                touched = np.flatnonzero(~whole) * hop
-                taken = self._bridge.take(samples, usable, clipped, touched)
-                begins = first * hop + reach + taken
-                self._delays.measure_with_gaps(
-                    samples, usable, taken, begins, most=self._settings.bridge, together=live
-                )
+                self._take_samples(part, first, count, together=live)
             self.n_seen += count
             if progress is not None:
                 progress(count)
@@ -461,6 +453,58 @@ class Pass:
         else:
             self._undisturbed.add(samples, starts)
             self._selected = None
+
+    def _take_whole(self, spectra: ComplexArray, begins: NDArray[np.int64]) -> None:
+        """Add segments by their spectra; they begin at grid samples `begins`."""
+        self._all.add_spectra(spectra)
+        self._kept_at.add(begins)
+
+    def _take_samples(self, part: _Samples, first: int, count: int, *, together: bool) -> None:
+        """Add segments from samples on the grid; `first` is the number of the first of them."""
+        samples, usable, clipped = part.samples, part.usable, part.clipped
+        hop, length, reach = self.welch.hop, self.welch.segment_length, self.reach
+        begin = first * hop
+        self.stillness.add(part.raw, part.raw_usable)
+        starts = np.arange(count) * hop
+        whole = whole_segments(usable, starts, length)
+        clean = whole if clipped is None else whole_segments(usable & ~clipped, starts, length)
+        self.left_out[Reason.GAP] += count - int(whole.sum())
+        self.left_out[Reason.CLIPPED] += int((whole & ~clean).sum())
+        starts = starts[clean]
+        if self.octaves is not None:
+            complete = usable if clipped is None else usable & ~clipped
+            new = self._fed - begin
+            self.octaves.add(samples[new:], complete[new:])
+            self._fed = begin + len(samples)
+        else:
+            self._take(samples, starts, begin + reach)
+        self._n_taken += len(starts)
+        self._taken_at.add(self._positions(np.arange(first, first + count)))
+        self._delays.measure(samples, starts, begin + reach + starts, together=together)
+        if self._bridge is not None and not whole.all():
+            touched = np.flatnonzero(~whole) * hop
+            taken = self._bridge.take(samples, usable, clipped, touched)
+            begins = begin + reach + taken
+            self._delays.measure_with_gaps(
+                samples, usable, taken, begins, most=self._settings.bridge, together=together
+            )
+
+    def _take_spectra(self, part: OwnSpectra, first: int) -> None:
+        """Add whole segments by their spectra; `first` is the number of the first of them."""
+        count, length, hop = len(part.spectra), self.welch.segment_length, self.welch.hop
+        self.stillness.add(part.raw, np.ones(len(part.raw), dtype=np.bool_))
+        starts = np.arange(count) * hop
+        clipped = self._clipped(first * hop, int(starts[-1]) + length)
+        spectra = part.spectra
+        if clipped is not None:
+            clean = whole_segments(~clipped, starts, length)
+            self.left_out[Reason.CLIPPED] += count - int(clean.sum())
+            spectra, starts = spectra[clean], starts[clean]
+        begins = first * hop + starts
+        self._take_whole(spectra, begins)
+        self._n_taken += len(spectra)
+        self._taken_at.add(self._positions(np.arange(first, first + count)))
+        self._delays.measure_spectra(spectra, begins)
 
     def _silence(self, samples: FloatArray) -> None:
         """Make channels that stand still exactly zero: the rounding of their mean is no signal."""

@@ -1,0 +1,79 @@
+"""Spectra of segments on the grid from each sensor's own samples, where that is precise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.estimation.segments.segment_pass import stands_still
+from estimator.spectra.shifted_windows import order_of, shifted_spectra
+from estimator.spectra.welch import trends
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from daq.clocks.own_samples import OwnSamples
+    from daq.estimation.settings import Settings
+    from estimator.spectra.welch import WelchSettings
+
+    FloatArray = NDArray[np.float64]
+
+
+def need_samples_of_grid(settings: Settings, *, filtered: bool, exact: bool) -> str:
+    """Return why segments need samples on the grid; empty if each sensor's own ones will do."""
+    if exact:
+        return "the samples are on the grid"
+    if settings.window != "hann":
+        return "only a Hann window can be shifted by a fraction of a sample"
+    if filtered:
+        return "filters work on samples"
+    if settings.octaves:
+        return "octaves are decimated on the grid"
+    if settings.reject:
+        return "transients are looked for in the samples of the grid"
+    return ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OwnSpectra:
+    """Spectra of whole segments.
+
+    Attributes
+    ----------
+    spectra : complex128, shape (n_segments, n_freqs, n_channels)
+    raw : float64, shape (n_samples, n_channels)
+        Samples of the hops, each sensor's from the first segment on.
+    """
+
+    spectra: NDArray[np.complex128]
+    raw: FloatArray
+
+    @classmethod
+    def of(cls, sensors: list[OwnSamples], welch: WelchSettings) -> OwnSpectra | None:
+        """Return the spectra; None where a clock drifts by more than the series takes."""
+        length, n_segments = welch.segment_length, len(sensors[0].rows)
+        orders = [order_of(float(np.abs(own.drift).max()), length) for own in sensors]
+        n_channels = sum(own.samples.shape[1] for own in sensors)
+        spectra = np.empty((n_segments, length // 2 + 1, n_channels), np.complex128)
+        raw = np.empty((n_segments * welch.hop, n_channels))
+        basis = trends(welch.detrend, length)
+        fit = basis / np.sum(basis**2, axis=1, keepdims=True)
+        column = 0
+        for own, order in zip(sensors, orders, strict=True):
+            if order is None:
+                return None
+            columns = slice(column, column + own.samples.shape[1])
+            column = columns.stop
+            first = own.rows[0]
+            raw[:, columns] = own.samples[first : first + len(raw)]
+            by_channel = np.ascontiguousarray(own.samples.T)
+            segments = np.lib.stride_tricks.sliding_window_view(by_channel, length, axis=1)
+            segments = segments[:, own.rows].swapaxes(0, 1)
+            segments = segments - (segments @ fit.T) @ basis
+            if welch.detrend != "none":  # the rounding of a mean is no signal
+                segments[:, stands_still(own.samples)] = 0.0
+            found = shifted_spectra(segments, own.shift, own.drift, order=order)
+            spectra[:, :, columns] = found.swapaxes(1, 2)
+        return cls(spectra, raw)

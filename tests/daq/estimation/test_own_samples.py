@@ -1,0 +1,130 @@
+"""Free clocks: segments in each sensor's own samples, against the interpolated grid."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.clocks.aligned_recording import AlignedRecording
+from daq.estimation.estimation import estimate
+from daq.estimation.segments.own_spectra import OwnSpectra, need_samples_of_grid
+from daq.estimation.settings import Settings
+from daq.recording.reader import Recording
+from estimator.spectra.welch import WelchSettings
+from tests.daq.clocks.recordings import Sensor, write
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+RATE, SEGMENT = 100.0, 5.0
+SETTINGS = Settings(segment=SEGMENT, methods=("three-sensor",), equalise="off")
+WELCH = WelchSettings(RATE, round(SEGMENT * RATE))
+
+
+def free(
+    ppm: tuple[float, ...] = (0.0, 15.0, -20.0),
+    *,
+    n_samples: int = 30_000,
+    gaps: tuple[tuple[int, int], ...] = (),
+) -> dict[str, Sensor]:
+    """Three sensors, each with a clock of its own, on motion of 200 sinusoids an axis."""
+    rng = np.random.default_rng(2)
+    frequency, phase = rng.uniform(0.2, 44.0, (2, 200, 3))
+    sensors = {}
+    for number, (name, off) in enumerate(zip("abc", ppm, strict=True)):
+        at = np.arange(n_samples) / (RATE * (1 + off * 1e-6))
+        motion = np.stack(
+            [
+                sum(
+                    np.cos(2 * np.pi * f * at + p)
+                    for f, p in zip(frequency[:, axis], phase[:, axis], strict=True)
+                )
+                for axis in range(3)
+            ],
+            axis=1,
+        )
+        turn = np.linalg.qr(np.random.default_rng(number).standard_normal((3, 3)))[0]
+        felt = 1e4 * motion @ turn + 100 * rng.standard_normal((n_samples, 3))
+        counts = np.rint(felt).astype(np.int32)
+        sensors[name] = Sensor(
+            counts,
+            rate=RATE * (1 + off * 1e-6),
+            nominal=RATE,
+            clock=name,
+            gaps=gaps if number else (),
+        )
+    return sensors
+
+
+def _spectra_of_grid(aligned: AlignedRecording, begins: np.ndarray) -> np.ndarray:
+    length = WELCH.segment_length
+    hann = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length)
+    found = []
+    for begin in begins.tolist():
+        samples, valid = aligned.read(begin, begin + length)
+        assert valid.all()
+        found.append(np.fft.rfft((samples - samples.mean(axis=0)) * hann[:, None], axis=0))
+    return np.stack(found)
+
+
+def test_spectra_of_own_samples_are_those_of_the_interpolated_grid(tmp_path: Path) -> None:
+    with Recording.open(write(tmp_path / "free.h5", free())) as recording:
+        aligned = AlignedRecording(recording)
+        begins = np.arange(0, 20_000, 250)
+        own = aligned.own_samples(begins, WELCH.segment_length)
+        assert own is not None
+        assert max(np.abs(each.drift).max() for each in own) > 5e-6
+        found = OwnSpectra.of(own, WELCH)
+        assert found is not None
+        grid = _spectra_of_grid(aligned, begins)
+    band = slice(2, int(0.44 * WELCH.segment_length))
+    error = np.mean(np.abs(found.spectra - grid)[:, band] ** 2, axis=(0, 1))
+    assert (error < 1e-8 * np.mean(np.abs(grid[:, band]) ** 2, axis=(0, 1))).all()
+
+
+def test_no_segment_is_taken_across_a_gap_or_from_a_clock_too_fast(tmp_path: Path) -> None:
+    gap = write(tmp_path / "gap.h5", free(gaps=((10_000, 10_050),)))
+    with Recording.open(gap) as recording:
+        aligned = AlignedRecording(recording)
+        length = WELCH.segment_length
+        assert aligned.own_samples(np.array([9000, 9250, 9500]), length) is None
+        assert aligned.own_samples(np.array([2000, 2250]), length) is not None
+    fast = write(tmp_path / "fast.h5", free((0.0, 400.0, -20.0)))
+    with Recording.open(fast) as recording:
+        own = AlignedRecording(recording).own_samples(np.array([2000]), WELCH.segment_length)
+        assert own is not None
+        assert OwnSpectra.of(own, WELCH) is None
+
+
+@pytest.mark.parametrize("gaps", [(), ((10_000, 10_050),)])
+def test_the_noise_is_that_from_the_interpolated_grid(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gaps: tuple[tuple[int, int], ...]
+) -> None:
+    path = write(tmp_path / "free.h5", free(gaps=gaps))
+    own = estimate([path], SETTINGS)
+    monkeypatch.setattr(
+        "daq.estimation.segments.segment_pass.need_samples_of_grid", lambda *_, **__: "a test"
+    )
+    grid = estimate([path], SETTINGS)
+    assert own.n_segments == grid.n_segments
+    band = (own.frequency > 1) & (own.frequency < 44)
+    mine, others = (each.results["three-sensor"].noise_psd[band] for each in (own, grid))
+    assert np.abs(10 * np.log10(mine.mean(axis=0) / others.mean(axis=0))).max() < 0.02
+    assert [clock.ppm for clock in own.clocks] == pytest.approx(
+        [clock.ppm for clock in grid.clocks], abs=1e-3
+    )
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{"window": "blackman"}, {"reject": True}, {"octaves": True}, {"window": "rectangular"}],
+)
+def test_what_needs_samples_of_the_grid_says_why(changed: dict[str, object]) -> None:
+    assert not need_samples_of_grid(SETTINGS, filtered=False, exact=False)
+    assert need_samples_of_grid(SETTINGS, filtered=True, exact=False)
+    assert need_samples_of_grid(SETTINGS, filtered=False, exact=True)
+    wanted = replace(SETTINGS, **changed)  # type: ignore[arg-type]  # of several types
+    assert need_samples_of_grid(wanted, filtered=False, exact=False)
