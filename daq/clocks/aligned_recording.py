@@ -200,6 +200,11 @@ class AlignedRecording:
         return self._untouched and not any(s.offset_in_doubt or s.doubted for s in self._sources)
 
     @property
+    def is_unbroken(self) -> bool:
+        """Whether no clock restarts."""
+        return all(len(source.known_clock.epochs) == 1 for source in self._sources)
+
+    @property
     def usable(self) -> float:
         """Frequency in Hz up to which interpolation preserves the samples."""
         return (0.5 if self._untouched else USABLE) * self.sampling_rate

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     BoolArray = NDArray[np.bool_]
 
 _HELD = 6  # segments that are measured together while a recording is followed
+_TOGETHER = 24  # segments whose spectra are measured together
 _HELD_VALUES = 1 << 19  # samples times channels that may wait for that: 4 MB
 
 
@@ -45,6 +46,8 @@ class DelayMeasurement:
         self._aligned, self._welch, self._is_wanted = aligned, welch, is_wanted
         self._meter: DelayEstimator | None = None
         self._held: list[tuple[FloatArray, IntArray, IntArray]] = []
+        self._held_spectra: list[tuple[NDArray[np.complex128], IntArray]] = []
+        self._spreads: list[float] = []
 
     @property
     def has_begun(self) -> bool:
@@ -89,10 +92,20 @@ class DelayMeasurement:
             self._learn_held()
 
     def measure_spectra(self, spectra: NDArray[np.complex128], begin: IntArray) -> None:
-        """Measure what delays are left in segments, by their spectra from 0 Hz on."""
-        meter = self._wanted_meter()
-        if meter is not None:
-            self._tell(begin, *meter.measure_spectra(spectra))
+        """Measure what delays are left in segments, by their spectra from 0 Hz on.
+
+        Few segments wait for others.
+        """
+        if self._wanted_meter() is None:
+            return
+        self._held_spectra.append((spectra, begin))
+        if sum(len(each) for each, _ in self._held_spectra) >= max(_TOGETHER, self.fewest):
+            self._learn_held_spectra()
+
+    @property
+    def precision(self) -> float | None:
+        """Standard deviation of a delay, usually, in s; None if none is known."""
+        return float(np.median(self._spreads)) if self._spreads else None
 
     def _wanted_meter(self) -> DelayEstimator | None:
         if not (self._is_wanted and self._aligned.measurable):
@@ -134,7 +147,15 @@ class DelayMeasurement:
         rows = np.arange(len(taken)) * length
         self.measure(np.concatenate(segments), rows, np.array(taken, np.int64), together=together)
 
+    def _learn_held_spectra(self) -> None:
+        if self._meter is None or not self._held_spectra:
+            return
+        held, self._held_spectra = self._held_spectra, []
+        begin = np.concatenate([begin for _, begin in held])
+        self._tell(begin, *self._meter.measure_spectra(np.concatenate([one for one, _ in held])))
+
     def _learn_held(self) -> None:
+        self._learn_held_spectra()
         if not self._held:
             return
         held, self._held = self._held, []
@@ -150,6 +171,9 @@ class DelayMeasurement:
             self._tell(begin, *self._meter.measure(samples, starts))
 
     def _tell(self, begin: IntArray, delays: FloatArray, std: FloatArray) -> None:
+        known = np.isfinite(std) & (std > 0)
+        if known.any():
+            self._spreads.append(float(np.median(std[known])))
         at = begin + self._welch.segment_length / 2
         self._aligned.learn(
             np.asarray(at, dtype=np.float64), delays, std=std, frame_delays=self._frame_delays

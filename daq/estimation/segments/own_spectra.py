@@ -66,14 +66,15 @@ class OwnSpectra:
                 return None
             columns = slice(column, column + own.samples.shape[1])
             column = columns.stop
-            first = own.rows[0]
-            raw[:, columns] = own.samples[first : first + len(raw)]
+            few = own.samples[: len(raw)]  # a slow clock may have one sample less
+            raw[: len(few), columns], raw[len(few) :, columns] = few, few[-1]
             by_channel = np.ascontiguousarray(own.samples.T)
             segments = np.lib.stride_tricks.sliding_window_view(by_channel, length, axis=1)
-            segments = segments[:, own.rows].swapaxes(0, 1)
-            segments = segments - (segments @ fit.T) @ basis
+            segments = np.ascontiguousarray(segments[:, own.rows].swapaxes(0, 1))
+            for line, slope in zip(basis, fit, strict=True):
+                segments -= (segments @ slope)[..., None] * line
             if welch.detrend != "none":  # the rounding of a mean is no signal
-                segments[:, stands_still(own.samples)] = 0.0
+                segments[:, stands_still(by_channel.T)] = 0.0
             found = shifted_spectra(segments, own.shift, own.drift, order=order)
             spectra[:, :, columns] = found.swapaxes(1, 2)
         return cls(spectra, raw)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -28,14 +28,19 @@ def free(
     ppm: tuple[float, ...] = (0.0, 15.0, -20.0),
     *,
     n_samples: int = 30_000,
+    wander: float = 0.0,
     gaps: tuple[tuple[int, int], ...] = (),
 ) -> dict[str, Sensor]:
-    """Three sensors, each with a clock of its own, on motion of 200 sinusoids an axis."""
+    """Three sensors, each with a clock of its own, on motion of 200 sinusoids an axis.
+
+    The second one's wanders by this many seconds, once in 120.
+    """
     rng = np.random.default_rng(2)
     frequency, phase = rng.uniform(0.2, 44.0, (2, 200, 3))
     sensors = {}
     for number, (name, off) in enumerate(zip("abc", ppm, strict=True)):
         at = np.arange(n_samples) / (RATE * (1 + off * 1e-6))
+        at += wander * (number == 1) * np.sin(2 * np.pi * at / 120)
         motion = np.stack(
             [
                 sum(
@@ -99,16 +104,20 @@ def test_no_segment_is_taken_across_a_gap_or_from_a_clock_too_fast(tmp_path: Pat
         assert OwnSpectra.of(own, WELCH) is None
 
 
-@pytest.mark.parametrize("gaps", [(), ((10_000, 10_050),)])
+@pytest.mark.parametrize(("gaps", "overlap"), [((), 0.5), (((10_000, 10_050),), 0.5), ((), 0.0)])
 def test_the_noise_is_that_from_the_interpolated_grid(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gaps: tuple[tuple[int, int], ...]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    gaps: tuple[tuple[int, int], ...],
+    overlap: float,
 ) -> None:
     path = write(tmp_path / "free.h5", free(gaps=gaps))
-    own = estimate([path], SETTINGS)
+    settings = replace(SETTINGS, overlap=overlap)
+    own = estimate([path], settings)
     monkeypatch.setattr(
         "daq.estimation.segments.segment_pass.need_samples_of_grid", lambda *_, **__: "a test"
     )
-    grid = estimate([path], SETTINGS)
+    grid = estimate([path], settings)
     assert own.n_segments == grid.n_segments
     band = (own.frequency > 1) & (own.frequency < 44)
     mine, others = (each.results["three-sensor"].noise_psd[band] for each in (own, grid))
@@ -116,6 +125,30 @@ def test_the_noise_is_that_from_the_interpolated_grid(
     assert [clock.ppm for clock in own.clocks] == pytest.approx(
         [clock.ppm for clock in grid.clocks], abs=1e-3
     )
+
+
+@pytest.mark.parametrize(("wander", "few"), [(0.0, True), (1e-4, False)])
+def test_delays_are_measured_in_few_segments_only_of_clocks_that_are_straight(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, wander: float, few: bool
+) -> None:
+    path = write(tmp_path / "free.h5", free(n_samples=44_000, wander=wander))
+    settings = replace(SETTINGS, segment=2.56)
+    measured: list[int] = []
+    learn = AlignedRecording.learn
+
+    def counted(self: AlignedRecording, at: np.ndarray, *args: Any, **options: Any) -> None:  # noqa: ANN401
+        measured.append(len(at))
+        learn(self, at, *args, **options)
+
+    monkeypatch.setattr(AlignedRecording, "learn", counted)
+    surveyed = estimate([path], settings)
+    n_segments = surveyed.n_segments
+    assert (sum(measured) < 0.6 * n_segments) == few
+    monkeypatch.setattr("daq.estimation.segments.segment_pass._SURVEYED", n_segments)
+    every = estimate([path], settings)
+    band = (every.frequency > 1) & (every.frequency < 44)
+    mine, others = (each.results["three-sensor"].noise_psd[band] for each in (surveyed, every))
+    assert np.abs(10 * np.log10(mine.mean(axis=0) / others.mean(axis=0))).max() < 0.02
 
 
 @pytest.mark.parametrize(
