@@ -16,13 +16,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.errors import InvalidMatrixError
-from estimator.self_noise.coherency import blocks, check_averages
+from estimator.self_noise.coherency import check_averages
 
 if TYPE_CHECKING:
     from estimator.likelihood.factor_analysis import Maximum
     from estimator.types import ComplexArray, FloatArray
 
 _LEAST_INFORMATION = 1e-12
+_PRODUCT_BYTES = 1 << 21
+"""Of the products of channels that are made at a time."""
 
 
 def information(residual_vectors: ComplexArray) -> FloatArray:
@@ -154,20 +156,32 @@ def cumulants(maximum: Maximum, *, n_effective: float) -> FloatArray:
     Notes
     -----
     psi_i is, to first order, ``tr(K_i W)`` of the residual matrix W, a Wishart matrix of unit
-    covariance with n - q averages: ``K_i = sum_j inv(J)_ij b_j b_j*``, where b_j is channel j in
-    the basis of the space without motion. Without a penalty ``tr(K_i**2) = inv(J)_ii``.
+    covariance with n - q averages: ``K_i = sum_j a_ij b_j b_j*`` with ``a = inv(J)``, where b_j is
+    channel j in the basis of the space without motion. With ``Q_i = P diag(a_i) P``,
+
+        tr(K_i**2) = sum_j a_ij Q_ijj,   tr(K_i**3) = sum_jl a_ij a_il Re(Q_ijl conj(P_jl)),
+        tr(K_i**4) = sum_jl a_ij a_il |Q_ijl|**2.
+
+    All Q_i are one product of real matrices, Q_ijl and Q_ilj conjugates of each other. Without a
+    penalty ``tr(K_i**2) = inv(J)_ii``.
     """
-    found = np.empty((3, *maximum.psi.shape))
-    for some in blocks(*maximum.psi.shape):
+    n_freqs, p = maximum.psi.shape
+    found = np.empty((3, n_freqs, p))
+    j, k = np.triu_indices(p)
+    twice = np.where(j == k, 1.0, 2.0)
+    step = max(1, _PRODUCT_BYTES // (16 * p * len(j)))
+    for low in range(0, n_freqs, step):
+        some = slice(low, low + step)
         free = maximum.eigenvectors[some, :, maximum.n_factors :]
-        inverse = covariance(information(free) + maximum.penalty)
-        n, p, m = free.shape
-        outer = free.conj()[:, :, :, None] * free[:, :, None, :]
-        K = (inverse @ outer.reshape(n, p, m * m)).reshape(n, p, m, m)
-        K2 = K @ K
-        found[0, some] = np.einsum("nimm->ni", K2).real
-        found[1, some] = np.einsum("niml,nilm->ni", K, K2).real
-        found[2, some] = np.einsum("niml,nilm->ni", K2, K2).real
+        P = free @ free.conj().swapaxes(1, 2)
+        a = covariance(np.abs(P) ** 2 + maximum.penalty)
+        products = np.take(P, j, axis=2).conj() * np.take(P, k, axis=2)
+        Q = (a @ products.view(np.float64)).view(np.complex128)
+        found[0, some] = (a * Q[:, :, j == k].real).sum(axis=2)
+        weight = np.take(a, j, axis=2) * np.take(a, k, axis=2) * twice
+        along = Q.real * P[:, None, j, k].real + Q.imag * P[:, None, j, k].imag
+        found[1, some] = (weight * along).sum(axis=2)
+        found[2, some] = (weight * (Q.real**2 + Q.imag**2)).sum(axis=2)
     averages = n_effective - maximum.n_factors
     powers = [maximum.psi ** (m + 2) / averages ** (m + 1) for m in range(3)]
     return np.asarray(found * np.stack(powers))

@@ -85,6 +85,25 @@ def test_the_first_cumulant_is_the_cramer_rao_bound() -> None:
     assert np.all(found[2] * found[0] >= found[1] ** 2)  # Cauchy and Schwarz
 
 
+@pytest.mark.parametrize("with_penalty", [False, True])
+def test_cumulants_are_traces_of_powers(*, with_penalty: bool) -> None:
+    rng = np.random.default_rng(8)
+    true = random_bench(rng, dims=(2, 2, 2, 2), snr=30.0, noise_psd=np.linspace(1, 2, 8))
+    csm = wishart(true, 150, rng)
+    penalty = 0.3 * np.eye(8) + 0.1 if with_penalty else None
+    found = maximise(np.repeat(csm.reshape(1, 8, 8), 3, axis=0), 2, penalty=penalty)
+    cumulants = fisher.cumulants(found, n_effective=150.0)
+    free = found.eigenvectors[1][:, 2:]
+    information = np.abs(free @ free.conj().T) ** 2 + found.penalty
+    inverse = np.linalg.inv(information)
+    for i in range(8):
+        K = sum(inverse[i, j] * np.outer(free[j].conj(), free[j]) for j in range(8))
+        for m in range(3):
+            trace = np.trace(np.linalg.matrix_power(K, m + 2)).real
+            expected = trace * found.psi[1, i] ** (m + 2) / 148.0 ** (m + 1)
+            assert cumulants[m, 1, i] == pytest.approx(expected, rel=1e-9)
+
+
 def test_eigenvalues_are_corrected_for_scatter() -> None:
     """One factor in noise: the largest eigenvalue of the averages is above the true one."""
     rng = np.random.default_rng(2)
