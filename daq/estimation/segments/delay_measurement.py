@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.clocks.delay_estimation import MIN_SEGMENTS, REFERENCES, DelayEstimator
+from estimator.median import median
 from estimator.spectra.gap_window import gap_window, without_trend
 from estimator.spectra.windows import get_window
 
@@ -105,7 +106,7 @@ class DelayMeasurement:
     @property
     def precision(self) -> float | None:
         """Standard deviation of a delay, usually, in s; None if none is known."""
-        return float(np.median(self._spreads)) if self._spreads else None
+        return float(median(np.array(self._spreads))) if self._spreads else None
 
     def _wanted_meter(self) -> DelayEstimator | None:
         if not (self._is_wanted and self._aligned.measurable):
@@ -173,7 +174,7 @@ class DelayMeasurement:
     def _tell(self, begin: IntArray, delays: FloatArray, std: FloatArray) -> None:
         known = np.isfinite(std) & (std > 0)
         if known.any():
-            self._spreads.append(float(np.median(std[known])))
+            self._spreads.append(float(median(std[known])))
         at = begin + self._welch.segment_length / 2
         self._aligned.learn(
             np.asarray(at, dtype=np.float64), delays, std=std, frame_delays=self._frame_delays
