@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
+from daq.bench.response import PolesZeros
 from daq.bench.units import canonical
 from daq.errors import CannotAlignError, WrongSettingError
 from daq.estimation.estimation import Estimation, estimate
@@ -251,7 +252,7 @@ def test_velocity_becomes_acceleration_by_omega_and_responses_are_taken_out(
     tmp_path: Path,
 ) -> None:
     path = write(tmp_path / "v.h5", huddle(unit="m/s", channel={"sensitivity": 4.0}))
-    pole = {"poles": [[-30.0, 0.0]], "normalization": 30.0}
+    pole = PolesZeros(poles=(-30 + 0j,), normalization=30.0)
     with_response = write(
         tmp_path / "w.h5", huddle(unit="m/s", channel={"sensitivity": 4.0, "response": pole})
     )
