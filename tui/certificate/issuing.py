@@ -279,7 +279,7 @@ def _signatures(path: Path) -> list[str]:
     if b"/ByteRange" not in content:
         return ["not signed"]
     if find_spec("pyhanko") is None:
-        return ["signature not checked: pip install 'huddle-bench[signing]'"]
+        return ["signature not checked: pip install 'huddle-bench[sign]'"]
     from tui.certificate.signing import signatures  # noqa: PLC0415 - an extra
 
     lines = []

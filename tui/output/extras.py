@@ -22,7 +22,7 @@ _EXTRA = {
     "fpdf": "report",
     "prometheus_client": "metrics",
     "distributed": "cluster",
-    "pyhanko": "signing",
+    "pyhanko": "sign",
 }
 
 

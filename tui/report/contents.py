@@ -337,5 +337,7 @@ def _option(option: Option, value: object) -> str:
         return "not given"
     if option.is_switch:
         return "yes" if value else "no"
+    if option.metavar == "TIME" and isinstance(value, float):
+        return format_duration(value)
     text = option.text(value)
     return text if isinstance(text, str) else ", ".join(text)

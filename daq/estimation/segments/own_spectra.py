@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.estimation.segments.segment_pass import stands_still
+from daq.estimation.segments.flatline import stands_still
 from estimator.spectra.shifted_windows import order_of, shifted_spectra
 from estimator.spectra.welch import trends
 

@@ -70,7 +70,7 @@ def test_kinds_of_events_are_the_documented_strings_and_unknown_ones_are_read(
         assert file["events"]["kind"].tolist() == [
             *(b"started", b"stopped", b"mark", b"connected", b"disconnected", b"late", b"stalled"),
             *(b"refused", b"resynchronised", b"checksum", b"reset", b"overflow"),
-            *(b"uncounted", b"status"),
+            *(b"uncounted", b"clock", b"status"),
             b"warmed up",
         ]
     with Recording.open(tmp_path / "r.h5") as recording:

@@ -45,7 +45,8 @@ def test_the_settings_of_every_driver_are_listed_with_what_they_mean(name: str) 
     assert result.exit_code == 0, result.stderr
     told = json.loads(result.stdout)
     assert told["summary"] == driver_type(name).summary
-    fields = driver_type(name).settings.model_fields
+    settings = driver_type(name).settings.model_fields
+    fields = [field.alias or key for key, field in settings.items()]
     assert [one["name"] for one in told["settings"]] == list(fields)
     for one in told["settings"]:
         assert one["values"], one

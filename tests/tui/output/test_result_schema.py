@@ -151,8 +151,10 @@ def test_band_means_are_those_of_the_table(written: Written) -> None:
     result = huddle.estimate(written.recording, segment="1s")
     band = result.band()
     means = written.document["band_means"]
-    assert [each["noise_psd"] for each in means[:7]] == band.noise_psd[:7].tolist()
-    assert [each["noise_psd_high"] for each in means[:7]] == band.noise_high[:7].tolist()
+    assert [each["noise_psd"] for each in means[:7]] == pytest.approx(band.noise_psd[:7], rel=1e-12)
+    assert [each["noise_psd_high"] for each in means[:7]] == pytest.approx(
+        band.noise_high[:7], rel=1e-12
+    )
     assert means[7]["noise_psd"] is None  # a dead channel
     assert {(each["low_hz"], each["high_hz"]) for each in means} == {(2.0, 20.0)}
 

@@ -33,7 +33,7 @@ def test_it_says_what_was_tested_on_what_by_whom_and_when(reported: Reported) ->
     for word in (
         "pier & <floor>", "Ada <ada@lab>", "cellar", "night.h5", digest, "SN-0", "SN-2", "M-1",
         "X (east), Y", "1000000", "2016-07-14 01:00:00 UTC", "2016-07-14 03:00:00 UTC+0200",
-        "Duration1m", "three-sensor", "1 s (100 samples)", "hann", "50 %", "Signature",
+        "Duration1m", "three-sensor", "[estimate] segment1s", "hann", "0.5", "Signature",
         "Small-sample biasremoved",
     ):  # fmt: skip
         assert word in text
@@ -165,7 +165,7 @@ def test_the_report_and_json_say_that_shared_noise_was_not_searched_for(
         facts_section(known(snapshot)),
         result_document(snapshot, next(iter(snapshot.results))),
     )
-    for module in ("daq.results.known_facts", "tui.output.json_document"):
+    for module in ("daq.results.known_facts", "tui.output.json_diagnostics"):
         monkeypatch.setattr(f"{module}.MAX_CHANNELS", 2)
     words = "Noise that two channels share is not searched for among more than 2 channels"
     assert words in str(facts_section(known(snapshot)))

@@ -25,7 +25,7 @@ def test_a_simulated_recording_says_so_wherever_it_is_shown(tmp_path: Path) -> N
     assert run.invoke(app, simulate).exit_code == 0
     shown = run.invoke(app, ["estimate", str(recording), "--segment", "2s", "--json", str(out)])
     assert shown.exit_code == 0, shown.output
-    assert "Simulated sensors" in shown.output
+    assert "simulated sensors" in shown.output
     assert json.loads(out.read_text(encoding="utf-8"))["recordings"][0]["simulated"] is True
     written = run.invoke(app, ["report", str(recording), "--segment", "2s", "--out", str(page)])
     assert written.exit_code == 0, written.output
