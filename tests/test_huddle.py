@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 import huddle
 from daq.bench.units import canonical, cf_unit
 from daq.errors import ArrayError, ImportFormatError, WrongSettingError
+from daq.results.band_summary import judged_method
 from estimator.errors import BandError
 from tui.cli.main import app
 from tui.output import extras
@@ -521,3 +522,17 @@ def test_a_package_that_is_missing_is_named_with_its_extra(
             extras.MissingPackageError, match=r"is not installed; run: pip install 'huddle-bench\["
         ):
             call()
+
+
+def test_with_fewer_averages_than_channels_auto_is_three_sensor_and_not_judged() -> None:
+    """Maximum likelihood of 15 channels needs more than ten averages."""
+    rng = np.random.default_rng(27)
+    motion = rng.normal(size=(1000, 3))
+    sensors = {name: motion + 0.1 * rng.normal(size=(1000, 3)) for name in "ABCDE"}
+    few = huddle.self_noise(sensors, fs=100.0, segment="1s", overlap=0, window="boxcar")
+    assert few.method == "three-sensor"
+    assert any(line.startswith("maximum-likelihood: ") for line in few.advice)
+    assert judged_method(few.snapshot, few.settings) == "maximum-likelihood"
+    enough = huddle.self_noise(sensors, fs=100.0, segment="0.25s", overlap=0, window="boxcar")
+    assert enough.method == "maximum-likelihood"
+    assert list(enough.snapshot.results) == ["maximum-likelihood"]

@@ -223,10 +223,11 @@ def noise_estimates(
     known : mapping of str to sequence of SelfNoise, optional
         What some methods give for each band, where that is estimated already.
     """
-    known, settings = known or {}, settings.for_sensors(dims)
+    chosen, known = "auto" in settings.methods, known or {}
+    settings = settings.for_sensors(dims)
     results: dict[str, SelfNoise] = {}
     refused: dict[str, str] = {}
-    wanted = ALL_METHODS if "all" in settings.methods else settings.methods
+    wanted = list(ALL_METHODS if "all" in settings.methods else settings.methods)
     with np.errstate(invalid="ignore", divide="ignore"):  # responses vanish at 0 Hz
         for method in wanted:
             try:
@@ -254,6 +255,8 @@ def noise_estimates(
                     parts = _by_gradients(parts, bands, dimensions, dims)
             except InsufficientDataError as error:
                 refused[method] = str(error)
+                if chosen and method == "maximum-likelihood" and "three-sensor" not in wanted:
+                    wanted.append("three-sensor")  # it needs fewer averages; it is not judged by
             else:
                 results[method] = _joined(parts)
     return Estimates(results, refused, dimensions)

@@ -214,10 +214,10 @@ def fitting(choice: Choice, state: State) -> Choice:
         return choice
     channel = min(choice.channel, len(snapshot.channels) - 1)
     methods = choice.methods
-    if not methods:
+    if not set(methods) & set(snapshot.results or methods):  # none yet, or averages are too few
         wanted = settings.for_sensors(snapshot.dims).methods
-        names = tuple(name for name in wanted if name != "all")
-        names = names or tuple(snapshot.results)
+        names = tuple(name for name in wanted if name in snapshot.results)
+        names = names or tuple(snapshot.results) or wanted
         methods = names if len(names) < 3 else names[:1]
     picked = frozenset(each for each in choice.picked if each < len(snapshot.channels))
     return replace(choice, channel=channel, methods=methods, picked=picked)
