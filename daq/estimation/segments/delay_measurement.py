@@ -90,7 +90,7 @@ class DelayMeasurement:
         self._held.append((samples, starts, begin))
         n_values = sum(each.size for each, _, _ in self._held)
         if sum(len(rows) for _, rows, _ in self._held) >= _HELD or n_values >= _HELD_VALUES:
-            self._learn_held()
+            self.learn_held()
 
     def measure_spectra(self, spectra: NDArray[np.complex128], begin: IntArray) -> None:
         """Measure what delays are left in segments, by their spectra from 0 Hz on.
@@ -155,7 +155,8 @@ class DelayMeasurement:
         begin = np.concatenate([begin for _, begin in held])
         self._tell(begin, *self._meter.measure_spectra(np.concatenate([one for one, _ in held])))
 
-    def _learn_held(self) -> None:
+    def learn_held(self) -> None:
+        """Measure delays in the segments that wait for others: the clocks are about to be set."""
         self._learn_held_spectra()
         if not self._held:
             return
@@ -182,7 +183,7 @@ class DelayMeasurement:
 
     def _frame_delays(self) -> FloatArray:
         """Return delays of frames; the clocks, about to be set, know all segments before."""
-        self._learn_held()
+        self.learn_held()
         return np.empty(0) if self._meter is None else self._meter.frame_delays()
 
 

@@ -555,6 +555,7 @@ class Pass:
     def set_clocks(self) -> None:
         """Set the clocks by the delays measured in the segments taken."""
         if self._delays.has_begun:
+            self._delays.learn_held()
             self.aligned.set_clocks()
 
     @property
