@@ -165,6 +165,7 @@ class BenchControls(_Controls):
     models: tuple[Mask, ...] = ()
     """Noise models in reports."""
     started: list[RecorderProcess] = field(default_factory=list)
+    _own: set[Path] = field(default_factory=set)
     ports: threading.Lock = field(default_factory=threading.Lock)
     """Held by who reads the sensors."""
 
@@ -211,7 +212,10 @@ class BenchControls(_Controls):
         HuddleError
             If it has other drivers, ports or serial numbers, or cannot be read.
         """
-        if any(each.out == path for each in self.started) or is_of(path, self.bench):
+        # A file that is followed here is not opened again: HDF5 would show it as it was before.
+        if path in self._own or any(each.out == path for each in self.started):
+            return
+        if is_of(path, self.bench):
             return
         raise HuddleError(
             f"{path.name} is recorded by another bench, and is only shown here: stop it from the"
@@ -220,7 +224,10 @@ class BenchControls(_Controls):
 
     def find_running(self) -> Path | None:
         """Return the file of a running recorder of this bench, if there is one."""
-        return running_recording(self.bench)
+        found = running_recording(self.bench)
+        if found is not None:
+            self._own.add(found)
+        return found
 
     @property
     def preview(self) -> Preview | None:

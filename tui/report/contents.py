@@ -35,6 +35,7 @@ from tui.report.evidence import (
     clocks_section,
     events_section,
     facts_section,
+    invalidating,
     model_test_section,
 )
 from tui.report.noise import limits_section, noise_section, verdict
@@ -159,10 +160,11 @@ def report_of(
         sentence = Paragraph(text, "bad" if sentence.tone == "bad" else "doubtful")
     about = bench if about is None else about
     by_rule = with_rule(bench, about)
+    facts = known(snapshot, settings)
     sections = [
         parties_section(found, about, issue),
         _test_section(found),
-        facts_section(known(snapshot, settings)),
+        facts_section(facts),
         _sensors_section(snapshot, found, about),
         conditions_section(found, about),
         limits_section(
@@ -192,7 +194,7 @@ def report_of(
         subtitle=f"Huddle test {name}" + (f", {utc_time(start)}" if is_known(start) else ""),
         verdict=sentence,
         sections=tuple(section for section in sections if section is not None),
-        notices=notices(found, snapshot, settings, about, issue),
+        notices=(*notices(found, snapshot, settings, about, issue), *invalidating(facts)),
         watermark=watermark(found, issue),
         number="" if issue is None else issue.name,
     )

@@ -272,13 +272,28 @@ def events_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
 def facts_section(facts: Sequence[Known]) -> Section:
     """Return what is known of the test beyond its numbers, the worst first."""
     items = tuple(
-        Paragraph(f"{MARKS[each.fact.rank]} {each}", TONES[each.fact.rank]) for each in facts
+        Paragraph(
+            f"{MARKS[each.fact.rank]} {each}" if each.needs_action else str(each),
+            TONES[each.fact.rank],
+        )
+        for each in facts
     )
     parts: list[Part] = [Items(items)] if items else []
     if not any(each.needs_action for each in facts):
         parts.insert(0, Paragraph(NOTHING_TO_DO, "good"))
-    legend = ", ".join(f"{MARKS[rank]} {words}" for rank, words in RANKS.items())
+    legend = ", ".join(
+        f"{MARKS[rank]} {words}" for rank, words in RANKS.items() if rank is not Rank.TO_KNOW
+    )
     return Section("Facts", (*parts, Paragraph(f"{legend}.", "quiet")))
+
+
+def invalidating(facts: Sequence[Known]) -> tuple[Paragraph, ...]:
+    """Return the lines of facts that invalidate the result, for the first page."""
+    return tuple(
+        Paragraph(each.line, TONES[each.fact.rank])
+        for each in facts
+        if each.fact.rank is Rank.INVALIDATES
+    )
 
 
 def _ratio(band: BandDiagnosis) -> float:

@@ -40,6 +40,7 @@ GAP = 0.05
 TOGETHER = 2.6
 """Tables that are lower are not broken."""
 BOX = 0.75
+_SLACK = 0.2  # inches by which heights of parts are estimated too low, together
 """Height of a box to be filled in."""
 HEAD = 0.45
 """Height of the title of a section."""
@@ -83,7 +84,7 @@ def write_paper(
         if number == len(report.sections) - 1:  # no page with nothing but signatures
             last_two = report.sections[number - 1 :]
             together = sum(HEAD + sum(map(paper.height, each.parts)) for each in last_two)
-            needed = together if together < paper.eph else needed
+            needed = together + _SLACK if together < paper.eph else needed
         if paper.will_page_break(needed):
             paper.add_page()
         paper.section(f"{number}   {section.title}", section.parts)

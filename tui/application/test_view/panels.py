@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 MUTED = "#9aa5b8"
 MIN_BAR = 6  # cells
+NOT_KNOWN_FROM = 10.0
+"""C.o.v. from which no number is given."""
 
 
 def noise_in_band(snapshot: Snapshot, settings: Settings, choice: Choice) -> tuple[BandMeans, ...]:
@@ -229,7 +231,7 @@ def progress_line(
         parts.append(f"{snapshot.n_dropped} excluded")
     if not math.isnan(cov):
         parts.append(known_to(reached))
-    left = reached.seconds_left
+    left = reached.seconds_left if reached.cov <= NOT_KNOWN_FROM else None
     if left is not None:
         left = max(0.0, left - _gone_on(now, snapshot))
     if snapshot.closed:
@@ -260,7 +262,8 @@ def progress_line(
 def known_to(reached: Precision) -> str:
     """Return how well the noise at one frequency is known, and how well that is wanted."""
     wanted = "" if reached.target is None else f", wanted {percent(reached.target)}"
-    return f"known to {percent(reached.cov)}{wanted}"
+    known = "not known yet" if reached.cov > NOT_KNOWN_FROM else f"known to {percent(reached.cov)}"
+    return f"{known}{wanted}"
 
 
 def _gone_on(now: RecordingStatus, snapshot: Snapshot) -> float:
