@@ -40,7 +40,6 @@ GAP = 0.05
 TOGETHER = 2.6
 """Tables that are lower are not broken."""
 BOX = 0.75
-_SLACK = 0.2  # inches by which heights of parts are estimated too low, together
 """Height of a box to be filled in."""
 HEAD = 0.45
 """Height of the title of a section."""
@@ -84,7 +83,7 @@ def write_paper(
         if number == len(report.sections) - 1:  # no page with nothing but signatures
             last_two = report.sections[number - 1 :]
             together = sum(HEAD + sum(map(paper.height, each.parts)) for each in last_two)
-            needed = together + _SLACK if together < paper.eph else needed
+            needed = together if together < paper.eph else needed
         if paper.will_page_break(needed):
             paper.add_page()
         paper.section(f"{number}   {section.title}", section.parts)
@@ -298,7 +297,11 @@ class _Paper(FPDF):
             case Items():
                 return sum(0.03 + line * self._n_lines(e.text, INNER) for e in part.entries)
             case Facts():
-                return 0.1 + sum(line * self._n_lines(v, INNER - NAMES) for _, v in part.rows)
+                return 0.1 + sum(
+                    line
+                    * max(self._n_lines(name, NAMES - GAP), self._n_lines(value, INNER - NAMES))
+                    for name, value in part.rows
+                )
             case Plot():
                 return drawing.height_of(part) + (line + 0.05 if part.title else 0.0)
             case Signatures():
