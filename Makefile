@@ -17,11 +17,7 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	touch $@
 
-$(VENV)/.installed-studies: $(VENV)/.installed-dev  ## coverage of intervals and verdicts; hours
-	$(BIN)/python -m benchmarks.studies.levels
-	$(BIN)/python -m benchmarks.studies.leaning
-
-docs: $(VENV)/.installed
+$(VENV)/.installed-docs: $(VENV)/.installed
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
 	touch $@
 
@@ -46,6 +42,10 @@ check: $(VENV)/.installed-dev  ## formatting, rules, types, who may import whom
 
 bench: $(VENV)/.installed-dev  ## speed and memory, as ratios within one run
 	$(BIN)/python -m benchmarks
+
+studies: $(VENV)/.installed-dev  ## coverage of intervals and verdicts; hours
+	$(BIN)/python -m benchmarks.studies.levels
+	$(BIN)/python -m benchmarks.studies.leaning
 
 docs: $(VENV)/.installed-docs  ## the documentation as a site in build/site; its examples run
 	$(BIN)/python -m sphinx -q -W --keep-going -b html -d build/doctrees docs build/site
