@@ -7,7 +7,7 @@ from pathlib import Path
 
 import atheris  # type: ignore[import-untyped]  # no dependency: runs where it is installed
 
-with atheris.instrument_imports(include=["daq.protocols"]):
+with atheris.instrument_imports(include=["daq.protocols", "daq.devices"]):
     from tests.fuzz.targets import TARGETS
 
 

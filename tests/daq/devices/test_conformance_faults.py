@@ -175,8 +175,8 @@ def test_each_sample_has_its_index(
     tmp_path: Path, subtests: pytest.Subtests, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One test, for all modes are recorded once."""
-    for module in ("sample_counter", "labjack.stream"):
-        monkeypatch.setattr(f"daq.protocols.{module}.SLACK", 2 * HELD_UP * SPEED)
+    for module in ("protocols.sample_counter", "devices.labjack.stream"):
+        monkeypatch.setattr(f"daq.{module}.SLACK", 2 * HELD_UP * SPEED)
     monkeypatch.setattr("daq.devices.labjack.device.SLACK", 2 * HELD_UP * SPEED)
     monkeypatch.setattr("daq.recorder.connection.MAX_RETRY_DELAY", MAX_RETRY_DELAY / SPEED)
     path = tmp_path / "all.h5"

@@ -141,8 +141,8 @@ async def _recorded(served: Served, path: Path, proxies: Sequence[HostileProxy])
 def test_each_sample_is_in_its_place(
     tmp_path: Path, subtests: pytest.Subtests, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("sample_counter", "labjack.stream"):
-        monkeypatch.setattr(f"daq.protocols.{module}.SLACK", 2 * HELD_UP * SPEED)
+    for module in ("protocols.sample_counter", "devices.labjack.stream"):
+        monkeypatch.setattr(f"daq.{module}.SLACK", 2 * HELD_UP * SPEED)
     monkeypatch.setattr("daq.recorder.connection.MAX_RETRY_DELAY", MAX_RETRY_DELAY / SPEED)
     script = [
         {"kind": kind, "sensors": [f"{mode} 1"], "at": 14.0 + 1.7 * n, "every": 5.3, **keys}
