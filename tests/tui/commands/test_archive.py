@@ -105,7 +105,9 @@ def test_the_archive_beside_the_recordings_answers_what_the_estimate_says(
     Draft202012Validator(strict(SCHEMA), registry=registry).validate(found)
     assert found["days"]["date"] == ["2026-08-31", "2026-09-01"]
     assert np.shape(found["days"]["noise_psd"]) == (2, len(found["bands_hz"]), 6)
-    assert found["archive"] == {"stretch_s": 3600, "recordings": 3, "problems": []}
+    assert found["archive"] == {
+        "stretch_s": 3600, "recordings": 3, "problems": [], "doubted": [],
+    }  # fmt: skip
     rows = list(csv.reader(days.read_text(encoding="utf-8").splitlines()))
     assert rows[0][6] == "noise PSD ((m/s²)²/Hz)"
     assert len(rows) == 1 + 2 * len(found["bands_hz"]) * 6
