@@ -272,7 +272,8 @@ def _inflating(path: Path) -> float:
         for sensor in file["sensors"].values():
             rows = sensor["samples"]
             chunks = range(0, len(rows), rows.chunks[0])
-            streams += [rows.id.read_direct_chunk((first, 0))[1] for first in chunks]
+            read = (rows.id.read_direct_chunk((first, 0)) for first in chunks)
+            streams += [stream for skipped, stream in read if not skipped]  # others are raw
 
     def inflate() -> None:
         for stream in streams:
