@@ -32,7 +32,8 @@ def main() -> None:
     bench = Path(sys.argv[1])
     wanted = {"segment": 1.0}
     clock = TrustedByFile(Path(sys.argv[2]))
-    asyncio.run(serve(bench, accepted(bench, wanted), wanted, clock=clock))
+    # The devices run in real time, and lag on a busy computer: no check list of their rates.
+    asyncio.run(serve(bench, accepted(bench, wanted), wanted, clock=clock, anyway=True))
 
 
 if __name__ == "__main__":
