@@ -479,7 +479,7 @@ class IntervalsWidened(Fact):
     Attributes
     ----------
     shares : mapping of Source to float
-        Largest share of the noise; NaN without limit.
+        Largest share of the noise; infinite without limit.
     """
 
     name: ClassVar[str] = "intervals-widened"
