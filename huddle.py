@@ -133,6 +133,6 @@ if __name__ == "__main__":
         del sys.path[0]
     sys.argv[0] = "huddle"  # as help and messages call the command
     _check_packages()
-    from tui.cli.main import main
+    from tui.commands.main import main
 
     main()

@@ -14,7 +14,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks.estimate_file import recorded_file, sensor_samples
+from benchmarks.estimate_file import ESTIMATE, recorded_file, sensor_samples
 from benchmarks.row import Row
 from daq.python_process import python_command
 
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 REPEATS = 7
 CLOCKS = {"one clock": ((0.0, 0.0, 0.0), 0.5), "three clocks": ((0.0, 15.0, -20.0), 0.7)}
 """How far the clocks of three sensors are off, in ppm, and the processor time to reach, in s."""
+RECORD = "rich.live, daq.recorder.recorder, daq.devices.bench_file, tui.simulation.host_time"
+"""Modules that ``huddle record`` imports when it runs."""
 LIBRARIES = "import typer.main, rich.console, rich.table, pydantic.fields, numpy, h5py"
 
 
@@ -52,9 +54,7 @@ def run(*, smallest: bool = False) -> list[Row]:
         )
         for arguments, limit in limits.items()
     ]
-    recorder = usual_time(
-        [sys.executable, "-c", "import tui.cli.main, tui.commands.record"], repeats
-    )
+    recorder = usual_time([sys.executable, "-c", f"import tui.commands.main, {RECORD}"], repeats)
     rows.append(Row("imports of the recorder's process", recorder, "s", note="processor time"))
     return rows + short_recordings(repeats)
 
@@ -62,7 +62,7 @@ def run(*, smallest: bool = False) -> list[Row]:
 def short_recordings(repeats: int = REPEATS) -> list[Row]:
     """Return the rows of the estimate of four minutes."""
     libraries = usual_time([sys.executable, "-c", LIBRARIES], repeats)
-    ours = usual_time([sys.executable, "-c", "import tui.cli.main, tui.commands.estimate"], repeats)
+    ours = usual_time([sys.executable, "-c", f"import tui.commands.main, {ESTIMATE}"], repeats)
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
         for clocks, (ppm, most) in CLOCKS.items():

@@ -34,6 +34,11 @@ from daq.results.store import store_results
 RATE, LENGTH, HOURS = 200, 2000, 3
 SLOW_RATE, SLOW_LENGTH, SLOW_HOURS = 40, 400, 24
 REPEATS = 3
+ESTIMATE = (
+    "rich.table, daq.estimation.estimation, tui.output.results, tui.output.diagnosis,"
+    " tui.runs.estimate_settings, tui.wording.facts"
+)
+"""Modules that ``huddle estimate`` imports when it runs."""
 SHORT = 0.05
 """Hours of the smallest form."""
 MEMORY = """
@@ -80,7 +85,7 @@ def _three_hours(folder: Path, hours: float, repeats: int) -> list[Row]:
         lambda: estimate([free], settings),
         repeats=repeats,
     )
-    (start,) = least_work(lambda: _run("-c", "import tui.commands.estimate"), repeats=repeats)
+    (start,) = least_work(lambda: _run("-c", f"import {ESTIMATE}"), repeats=repeats)
     rows = [
         Row(
             f"{what} {kind}, one clock: matrix and noise against the bare FFTs",

@@ -36,17 +36,19 @@ def test_estimator_loads_no_input_or_output() -> None:
     assert not loaded & {"h5py", "serial", "pymodbus", "textual", "matplotlib", "daq", "tui"}
 
 
-@pytest.mark.parametrize("command", ["record", "estimate"])
+@pytest.mark.parametrize("command", ["record", "run", "estimate", "report"])
 def test_headless_commands_never_load_textual_nor_what_only_terminals_need(command: str) -> None:
     run = (
         "import os; os._exit = sys.exit  # so that it lives to say what it loaded\n"
-        f"from tui.cli.main import main; sys.argv[1:] = ['{command}', 'absent.toml']"
+        f"from tui.commands.main import main; sys.argv[1:] = ['{command}', 'absent.toml']"
     )
     loaded = modules_after(
         f"{run}\ntry:\n    main()\nexcept SystemExit as end:\n    assert end.code\nprint()"
     )
     assert f"tui.commands.{command}" in loaded
-    assert not loaded & {"textual", "rich.progress", "scipy", "matplotlib", "jinja2"}
+    assert "h5py" in loaded
+    assert not loaded & {"textual", "scipy", "matplotlib", "jinja2", "fpdf"}
+    assert command == "run" or "rich.progress" not in loaded
 
 
 ARRAYS_IN = {"notebook", "report", "simulation", "studies"}

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tui.cli.help import subcommand
-from tui.cli.subcommands import MODULES
+from tui.commands.help import COMMANDS, subcommand
 
 ROOT = Path(__file__).parents[1]
 DECISIONS = sorted((ROOT / "docs" / "decisions").glob("[0-9]*.md"))
@@ -76,7 +75,7 @@ def test_commands_and_their_options_exist() -> None:
     for where, line in lines:
         word = line.split()[0]
         options = re.findall(r"(?<!\S)--[a-z][a-z-]*", line)
-        if word not in MODULES:
+        if word not in COMMANDS:
             if options or re.search(rf"`huddle {word}`", texts[where]):
                 wrong.append(f"{where}: huddle {line}")
             continue

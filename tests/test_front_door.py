@@ -65,7 +65,7 @@ def imports_of(path: Path) -> dict[str, str]:
 
 def test_names_types_and_modules_of_the_front_door_agree() -> None:
     imported = imports_of(ROOT / "huddle.py")
-    assert imported.pop("main") == "tui.cli.main"
+    assert imported.pop("main") == "tui.commands.main"
     assert sorted(imported) == sorted(huddle.__all__) == sorted(set(dir(huddle)) & set(imported))
     assert imports_of(ROOT / "tui" / "resources" / "huddle.pyi") == imported
     for name, module in imported.items():

@@ -21,7 +21,7 @@ from daq.bench.units import canonical, cf_unit
 from daq.errors import ArrayError, ImportFormatError, WrongSettingError
 from daq.results.band_summary import judged_method
 from estimator.errors import BandError
-from tui.cli.main import app
+from tui.commands.main import app
 from tui.output import extras
 
 FloatArray = NDArray[np.float64]

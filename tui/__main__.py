@@ -1,6 +1,6 @@
 """``python -m tui`` is the ``huddle`` command."""
 
-from tui.cli.main import main
+from tui.commands.main import main
 
 if __name__ == "__main__":
     main()

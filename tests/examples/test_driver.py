@@ -85,7 +85,7 @@ async def test_huddle_checks_and_runs_the_example(
     (tmp_path / "bench.toml").write_text(bench, encoding="utf-8")
 
     async def huddle(*arguments: str) -> str:
-        program = "import sys; from tui.cli.main import main; main(sys.argv[1:])"
+        program = "import sys; from tui.commands.main import main; main(sys.argv[1:])"
         done = await asyncio.to_thread(
             command, installed, "-c", program, *arguments, folder=tmp_path
         )
@@ -121,7 +121,7 @@ def test_the_bench_file_is_checked_by_the_driver(installed: Path, tmp_path: Path
     bench = (EXAMPLE / "bench.toml").read_text(encoding="utf-8")
     bench = bench.replace("sampling_rate = 100.0", "sampling_rate = 123.0")
     (tmp_path / "bench.toml").write_text(bench, encoding="utf-8")
-    program = "import sys; from tui.cli.main import main; main(sys.argv[1:])"
+    program = "import sys; from tui.commands.main import main; main(sys.argv[1:])"
     done = command(installed, "-c", program, "check", "--no-devices", "bench.toml", folder=tmp_path)
     assert done.returncode == 2
     assert 'sensors["A"].sampling_rate = 123.0: expected one of 50, 100, 200 Hz' in done.stderr

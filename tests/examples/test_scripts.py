@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from tui.cli.main import app
+from tui.commands.main import app
 
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "examples"

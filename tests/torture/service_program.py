@@ -14,7 +14,7 @@ import time
 from datetime import UTC, datetime
 from pathlib import Path
 
-from tui.commands.serve import accepted, serve
+from tui.commands.serve import accepted, serve_runs
 from tui.output.logs.lines import configure
 from tui.output.logs.options import LogLevel
 from tui.service.clock import SystemTime
@@ -66,7 +66,7 @@ def main() -> None:
     """Serve until SIGTERM."""
     configure(LogLevel.INFO)
     bench = Path(sys.argv[1])
-    asyncio.run(serve(bench, accepted(bench, {}), {}, clock=FastClock(Path(sys.argv[2]))))
+    asyncio.run(serve_runs(bench, accepted(bench, {}), {}, clock=FastClock(Path(sys.argv[2]))))
 
 
 if __name__ == "__main__":

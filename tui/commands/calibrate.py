@@ -1,32 +1,25 @@
 """``huddle calibrate``: sensors calibrated against one of them."""
 
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
+
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from rich.cells import cell_len
-from rich.table import Table
-from rich.text import Text
+import typer
 
-from daq.results.calibration import calibrate
 from tui.commands.estimate import estimated
-from tui.output.calibration import (
-    LEGEND,
-    angle_table,
-    budget_table,
-    matrix_table,
-    noise_rows,
-    remarks,
-    sensitivity_table,
-    title,
+from tui.commands.options import (
+    EndOption,
+    FilesArgument,
+    JsonOption,
+    StartOption,
+    examples,
+    with_estimate_options,
 )
-from tui.output.console import check_places, for_people, hint, write_json
-from tui.output.json_document import calibration_document
-from tui.wording.facts import known
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     from rich.console import Console, JustifyMethod
 
@@ -34,17 +27,62 @@ _GAP = 2
 """Characters between columns."""
 
 
-def calibrate_recordings(
-    files: Sequence[Path],
+@examples(
+    "huddle calibrate night.h5",
+    "huddle calibrate night.h5 --reference A --band 0.5:20 --confidence 0.99 --json -",
+)
+@with_estimate_options
+def calibrate(
+    files: FilesArgument,
     *,
-    reference: str | None,
-    confidence: float,
-    start: str | None,
-    end: str | None,
-    json: str | None,
+    reference: Annotated[
+        str | None,
+        typer.Option(
+            "--reference",
+            metavar="SENSOR",
+            help="Sensor to compare with (default: the one with certificates in the bench file, "
+            "otherwise the first).",
+        ),
+    ] = None,
+    confidence: Annotated[
+        float,
+        typer.Option(
+            "--confidence",
+            metavar="P",
+            help="Level of confidence of expanded uncertainties.",
+        ),
+    ] = 0.95,
+    start: StartOption = None,
+    end: EndOption = None,
+    json: JsonOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
-    """Estimate, calibrate, and show the result."""
+    """Calibrate sensors against one of them by their common motion.
+
+    The command prints sensitivity, cross-axis response, angles, delay and
+    skew of every channel, each with its uncertainty, and an uncertainty
+    budget according to the GUM. Results are absolute if the bench file has a
+    certificate for each channel of the reference.
+
+    Options not given come from the bench file inside the recording.
+    """
+    from rich.text import Text
+
+    from daq.results.calibration import calibrate
+    from tui.output.calibration import (
+        LEGEND,
+        angle_table,
+        budget_table,
+        matrix_table,
+        noise_rows,
+        remarks,
+        sensitivity_table,
+        title,
+    )
+    from tui.output.console import check_places, for_people, hint, write_json
+    from tui.output.json_document import calibration_document
+    from tui.wording.facts import known
+
     check_places(json)
     snapshot, settings, first = estimated(files, start=start, end=end, **wanted)
     found = calibrate(snapshot, settings, first.bench, reference=reference, confidence=confidence)
@@ -71,6 +109,10 @@ def _show(
     screen: Console, heading: str, content: tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]
 ) -> None:
     """Print a table; columns that do not fit beside the others follow below it."""
+    from rich.cells import cell_len
+    from rich.table import Table
+    from rich.text import Text
+
     header, rows = content
     if not rows:
         return

@@ -1,207 +1,81 @@
-"""``huddle init`` and ``huddle check``."""
+"""``huddle check``: a bench file and its devices, and the check list before a test."""
+
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
 
 from __future__ import annotations
 
-import asyncio
-import string
-import sys
 from collections import Counter
-from importlib import resources
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
 
 from daq.bench.durations import format_duration
 from daq.bench.editing import set_sensor_values
 from daq.bench.tables.toml_text import to_toml
-from daq.devices.bench_file import load, parse
-from daq.devices.epson.commands import COUNTS_PER_UNIT
-from daq.errors import BenchFileError, DeviceError, HuddleError, NoAnswerError
-from daq.host_clock import SystemClock
-from daq.preflight.device_check import (
-    Examination,
-    discover,
-    examine,
-    search_description,
-)
-from daq.transport.serial_ports import serial_ports, stable_path
-from tui.commands.drivers import print_others, summaries
+from daq.errors import DeviceError, NoAnswerError
+from tui.commands.devices import summaries
+from tui.commands.options import JsonOption, examples
 from tui.output import check_list
-from tui.output.console import (
-    check_places,
-    console,
-    for_people,
-    notices,
-    write_json,
-    write_text,
-)
 from tui.output.exit_codes import ExitCode
-from tui.output.json_values import plain
-from tui.simulation.host_time import host_time
-from tui.wording.formatting import listed, several, signed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from pathlib import Path
+
+    from rich.table import Table
 
     from daq.bench.model import Bench
-    from daq.preflight.device_check import DiscoveredDevice, SensorCheck
+    from daq.preflight.device_check import DiscoveredDevice, Examination, SensorCheck
 
 
-def write_template(out: Path, *, force: bool) -> None:
-    """Write the commented bench file.
-
-    Raises
-    ------
-    typer.BadParameter
-        The file exists, or its folder does not.
-    """
-    if out.exists() and not force:
-        raise typer.BadParameter(f"{out}: exists already; --force replaces it")
-    check_places(str(out))
-    text = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
-    write_text(str(out), text)
-    console().print(f"{out} written. Fill in ports and sensitivities, then: huddle check {out}")
-    print_others(text)
-
-
-def write_discovered(out: Path, ports: Sequence[str], *, force: bool) -> None:
-    """Look for devices on ports, and write a commented bench file that reads them.
-
-    On a terminal, names, operator and a noise limit are asked for. Without `ports`, all serial
-    ports are searched.
-
-    Raises
-    ------
-    typer.BadParameter
-        The file exists, or its folder does not.
-    NoAnswerError
-        No port has a device that huddle can read.
-    """
-    if out.exists() and not force:
-        raise typer.BadParameter(f"{out}: exists already; --force replaces it")
-    check_places(str(out))
-    searched = list(ports) or [port.path for port in serial_ports()]
-    screen = console()
-    is_asked = sys.stdin.isatty() and sys.stdout.isatty()
-    if is_asked and not ports:
-        screen.print(f"Serial ports: {', '.join(searched) or 'none'}")
-        others = typer.prompt(
-            "Other ports to search, such as socket://host:port (empty: none)",
-            default="",
-            show_default=False,
-        )
-        searched += others.split()
-    found: list[DiscoveredDevice] = []
-    for port, answer in zip(searched, asyncio.run(_discover_all(searched)), strict=True):
-        if isinstance(answer, HuddleError):
-            screen.print(f"{port}: {answer}")
-            continue
-        if isinstance(answer, BaseException):
-            raise answer
-        for device in answer:
-            about = device.information
-            what = device.remark if about is None else f"{about.model} {about.serial_number}"
-            screen.print(f"{port}: {device.driver}, {what}")
-        if not answer:
-            screen.print(f"{port}: no reply")
-        found += answer
-    known = [device for device in found if _channels_of(device)]
-    if not known:
-        where = listed(searched) if searched else "this computer has no serial ports: --port"
-        raise NoAnswerError(f"no device that huddle can read by itself ({where})")
-    operator = typer.prompt("Operator", default="", show_default=False) if is_asked else ""
-    names = [
-        string.ascii_uppercase[n % 26] + (str(n // 26) if n > 25 else "") for n in range(len(known))
-    ]
-    if is_asked:
-        names = [
-            typer.prompt(f"Name of the sensor on {device.port}", default=name)
-            for device, name in zip(known, names, strict=True)
-        ]
-    limit = ""
-    if is_asked:
-        limit = typer.prompt(
-            "Limit of the noise from 1 to 50 Hz in µg/√Hz (empty: none)",
-            default="",
-            show_default=False,
-        )
-    text = _bench_text(out.stem, known, names, operator=operator, limit=limit)
-    write_text(str(out), text)
-    screen.print(f"{out} written with {several(len(known), 'sensor')}. Next: huddle check {out}")
-    try:
-        parse(text, out)
-    except BenchFileError as error:  # a bench of two sensors waits for its third
-        screen.print(f"To be completed: {error}")
-
-
-async def _discover_all(ports: Sequence[str]) -> list[list[DiscoveredDevice] | BaseException]:
-    return await asyncio.gather(
-        *(discover(port, SystemClock()) for port in ports), return_exceptions=True
-    )
-
-
-def _channels_of(device: DiscoveredDevice) -> list[dict[str, object]]:
-    """Return the channels of a device as tables; none where its registers are not known."""
-    if device.driver == "epson":
-        return [
-            {"name": axis, "sensitivity": round(COUNTS_PER_UNIT, 1), "unit": "m/s²"}
-            for axis in "XYZ"
-        ]
-    places = device.settings.get("columns") or device.settings.get("channel_names") or ()
-    return [
-        {"name": place if isinstance(place, str) else f"column {place}", "sensitivity": 1.0}
-        for place in places
-    ]
-
-
-def _bench_text(
-    name: str,
-    devices: Sequence[DiscoveredDevice],
-    names: Sequence[str],
+@examples(
+    "huddle check lab.toml",
+    "huddle check lab.toml --no-devices --json -",
+    "huddle check lab.toml --write   (write serial numbers and port names into the file)",
+    "huddle check --port /dev/ttyUSB0   (identify a device without a bench file)",
+)
+def check(
+    bench: Annotated[
+        Path | None, typer.Argument(metavar="BENCH", help="Bench file (TOML).")
+    ] = None,
     *,
-    operator: str,
-    limit: str,
-) -> str:
-    """Return a bench file with the comments of the template, and these sensors."""
-    template = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
-    head, _, rest = template.partition(
-        "# ----------------------------------------------------------------------------- sensors\n"
-    )
-    rest = rest[rest.index("# ----", 1) :]
-    rest = rest[: rest.index("# ---", rest.index("# [[limits]]"))].rstrip() + "\n"
-    head = head.replace(
-        'name = "bench"', f"name = {to_toml({'n': name}).partition('= ')[2].strip()}"
-    )
-    head = head.replace('operator = ""', to_toml({"operator": operator}).strip())
-    head = "".join(line for line in head.splitlines(True) if "simulates these" not in line)
-    sensors = []
-    for device, sensor in zip(devices, names, strict=True):
-        about = device.information
-        table = {
-            "name": sensor,
-            "model": "" if about is None else about.model,
-            "serial_number": "" if about is None else about.serial_number,
-            "driver": device.driver,
-            "port": stable_path(device.port),
-            "channels": _channels_of(device),
-            "settings": device.settings,
-        }
-        comment = f"# {device.port}: {device.remark or 'answered as ' + device.driver}\n"
-        if device.driver == "text":
-            comment += "# Fill in sampling_rate and the sensitivities, in counts per unit.\n"
-        sensors.append(comment + to_toml({"sensors": [table]}))
-    text = head + "\n".join(sensors) + "\n" + rest
-    if limit.strip():
-        mask = {
-            "name": "limit",
-            "unit": "µg/√Hz",
-            "frequency": [1.0, 50.0],
-            "psd": [float(limit)] * 2,
-        }
-        text += "\n" + to_toml({"limits": [mask]})
-    return text
+    port: Annotated[
+        str | None,
+        typer.Option(
+            "--port",
+            metavar="PORT",
+            help="Search this port for Epson accelerometers, for Modbus devices 1 to 5 and 80 at "
+            "9600 to 115200 baud, and for lines of text.",
+        ),
+    ] = None,
+    devices: Annotated[
+        bool, typer.Option("--devices/--no-devices", help="Also connect to the devices.")
+    ] = True,
+    write: Annotated[
+        bool,
+        typer.Option(
+            "--write",
+            help="Write missing serial numbers and persistent port names (/dev/serial/by-id) into "
+            "the bench file.",
+        ),
+    ] = False,
+    json: JsonOption = None,
+) -> None:
+    """Validate a bench file, then identify every device and make the check list.
+
+    The command reports all errors in the file together, and all devices that
+    do not answer. It reads 10 s of samples and checks ports, serial numbers,
+    rates, channels, levels, hum, common motion, sensitivities, polarity,
+    clocks and disk. The exit code is 1 if a check fails.
+    """
+    if (bench is None) == (port is None):
+        raise typer.BadParameter("expected either a bench file or --port PORT")
+    if bench is not None:
+        if write and not devices:
+            raise typer.BadParameter("--write needs the devices: leave out --no-devices")
+        check_bench(bench, devices=devices, write=write, json=json)
+    elif port is not None:
+        check_port(port, json=json)
 
 
 def check_bench(path: Path, *, devices: bool, write: bool = False, json: str | None) -> None:
@@ -216,6 +90,11 @@ def check_bench(path: Path, *, devices: bool, write: bool = False, json: str | N
     ExceptionGroup
         With a DeviceError for every port that failed, after the others have been shown.
     """
+    from daq.devices.bench_file import load
+    from daq.preflight.device_check import Examination
+    from tui.output.console import for_people, write_json
+    from tui.output.json_values import plain
+
     bench = load(path)
     screen = for_people(json)
     screen.print(_summary(bench))
@@ -253,6 +132,11 @@ def check_bench(path: Path, *, devices: bool, write: bool = False, json: str | N
 
 def examined_bench(bench: Bench, *, duration: float | None = None) -> Examination:
     """Return the check list of a bench, whose ports are free again afterwards."""
+    import asyncio
+
+    from daq.preflight.device_check import examine
+    from tui.simulation.host_time import host_time
+
     clock, loop_factory = host_time(bench)
     with asyncio.Runner(loop_factory=loop_factory) as runner:
         return runner.run(examine(bench, clock, duration=duration))
@@ -268,6 +152,8 @@ def check_before_test(bench: Bench, *, duration: float | None = None, anyway: bo
     ExceptionGroup
         Likewise, with the errors of devices that cannot be read.
     """
+    from tui.output.console import notices
+
     examined = examined_bench(bench, duration=duration)
     lines = check_list.lines(examined.rows, failures_only=True)
     if not anyway:
@@ -282,6 +168,8 @@ def check_before_test(bench: Bench, *, duration: float | None = None, anyway: bo
 
 def new_identities(bench: Bench, found: Sequence[SensorCheck]) -> dict[str, dict[str, str]]:
     """Return identities of sensors that the bench file lacks."""
+    from daq.transport.serial_ports import stable_path
+
     identified = {entry.information.sensor: entry.information for entry in found}
     identities: dict[str, dict[str, str]] = {}
     for sensor in bench.sensors:
@@ -308,6 +196,13 @@ def check_port(port: str, *, json: str | None) -> None:
     NoAnswerError
         No device answers.
     """
+    import asyncio
+
+    from daq.host_clock import SystemClock
+    from daq.preflight.device_check import discover, search_description
+    from tui.output.console import for_people, write_json
+    from tui.output.json_values import plain
+
     found = asyncio.run(discover(port, SystemClock()))
     write_json(json, {"port": port, "devices": plain(found)})
     if not found:
@@ -371,6 +266,8 @@ def _drivers(bench: Bench) -> str:
 
 
 def _table(columns: Sequence[str]) -> Table:
+    from rich.table import Table
+
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for column in columns:
         table.add_column(column)
@@ -397,6 +294,8 @@ def _device_table(found: Sequence[SensorCheck]) -> Table:
 
 def remarks(entry: SensorCheck, serial_number: str) -> Iterator[str]:
     """Yield remarks on a sensor, for which the bench file expects a serial number or none."""
+    from tui.wording.formatting import signed
+
     about = entry.information
     if serial_number and not about.serial_number and not about.trouble:
         yield f"states no serial number: {serial_number!r} of the bench file cannot be checked"
@@ -418,6 +317,8 @@ def remarks(entry: SensorCheck, serial_number: str) -> Iterator[str]:
 
 
 def _channel_table(found: Sequence[SensorCheck]) -> Table:
+    from tui.wording.formatting import signed
+
     table = _table(("channel", "mean", "rms", "range", "unit", ""))
     for entry in found:
         for channel in entry.channels:

@@ -1,5 +1,7 @@
 """``huddle demo``: a complete huddle test on simulated sensors, compared with the truth."""
 
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
+
 from __future__ import annotations
 
 import logging
@@ -9,30 +11,23 @@ import tempfile
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
-from rich.text import Text
 
 from daq.bench.durations import format_duration
 from daq.bench.end_condition import EndCondition
-from daq.bench.loading import dump
-from daq.devices.bench_file import parse
-from daq.estimation.estimation import estimate
-from daq.estimation.settings import Settings
-from daq.results.band_summary import band_of, data_means, levels
-from estimator.levels.bands import band_edges
-from estimator.levels.contributions import Source
+from tui.commands.options import JsonOption, examples, with_logging
+from tui.commands.options import duration as read_duration
 from tui.commands.run import result_of
-from tui.output.console import check_places, for_people, notices, write_json
 from tui.output.exit_codes import ExitCode
-from tui.runs.interrupt import defer_interrupt
-from tui.runs.recorder_process import RecorderProcess
-from tui.simulation.devices import scenario_of, simulated
-from tui.wording.formatting import level, level_with_error
 
 if TYPE_CHECKING:
+    from typing import Any
+
+    from rich.table import Table
+
+    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from sim_devices.world.scenario import Scenario
 
@@ -44,40 +39,55 @@ SHOWN_SHARE = 0.01
 """Share of the noise above which the table states the effect of the clocks."""
 
 
-@dataclass(frozen=True, slots=True)
-class NoiseComparison:
-    """Noise of one channel in the band by one method, and the truth; PSD in unit²/Hz."""
-
-    sensor: str
-    channel: str
-    method: str
-    true_psd: float
-    noise_psd: float
-    low: float
-    high: float
-    clocks: float = 0.0
-    """Largest effect of the clocks; the lower limit allows for it."""
-
-    @property
-    def withdrawn(self) -> bool:
-        """Whether the estimate is above what the other sensors leave unpredicted."""
-        return self.noise_psd > self.high
-
-    @property
-    def covers(self) -> bool:
-        """Whether the truth lies in the interval of an estimate that is not withdrawn."""
-        return not self.withdrawn and self.low <= self.true_psd <= self.high
-
-
-def run_demo(
+@examples("huddle demo", "huddle demo --duration 10min --speed 10 --keep demo.h5")
+@with_logging
+def demo(
     *,
-    duration: float | None,
-    speed: float | None,
-    keep: Path | None,
-    table: bool,
-    json: str | None,
+    duration: Annotated[
+        float | None,
+        typer.Option(
+            "--duration",
+            "-d",
+            metavar="TIME",
+            parser=read_duration,
+            help="Length of the recording, such as 90s, 20min or 3h (default 5min).",
+        ),
+    ] = None,
+    speed: Annotated[
+        float | None,
+        typer.Option(
+            "--speed",
+            metavar="FACTOR",
+            min=0.01,
+            help="Speed of the simulation relative to real time (default 4).",
+        ),
+    ] = None,
+    keep: Annotated[
+        Path | None, typer.Option("--keep", metavar="FILE", help="Copy the recording to this file.")
+    ] = None,
+    table: Annotated[
+        bool, typer.Option("--table", help="Print the table instead of opening the application.")
+    ] = False,
+    json: JsonOption = None,
 ) -> None:
-    """Serve the demo bench; then record, estimate and compare, or open the application."""
+    """Run a complete huddle test on simulated sensors.
+
+    The recorder reads three simulated triaxial accelerometers over their
+    real protocol. They point in different directions. Their noise is known,
+    so the table shows which estimate is right.
+
+    On a terminal the command opens the application.
+    """
+    from rich.text import Text
+
+    from daq.bench.loading import dump
+    from daq.devices.bench_file import parse
+    from daq.estimation.estimation import estimate
+    from daq.estimation.settings import Settings
+    from daq.results.band_summary import band_of
+    from tui.output.console import check_places, for_people, write_json
+    from tui.simulation.devices import scenario_of, simulated
+
     check_places(None if keep is None else str(keep))
     text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
     bench = parse(text, "demo")
@@ -128,14 +138,43 @@ def run_demo(
         raise typer.Exit(ExitCode.INTERRUPTED)
 
 
+@dataclass(frozen=True, slots=True)
+class NoiseComparison:
+    """Noise of one channel in the band by one method, and the truth; PSD in unit²/Hz."""
+
+    sensor: str
+    channel: str
+    method: str
+    true_psd: float
+    noise_psd: float
+    low: float
+    high: float
+    clocks: float = 0.0
+    """Largest effect of the clocks; the lower limit allows for it."""
+
+    @property
+    def withdrawn(self) -> bool:
+        """Whether the estimate is above what the other sensors leave unpredicted."""
+        return self.noise_psd > self.high
+
+    @property
+    def covers(self) -> bool:
+        """Whether the truth lies in the interval of an estimate that is not withdrawn."""
+        return not self.withdrawn and self.low <= self.true_psd <= self.high
+
+
 def _show(path: Path, settings: Settings) -> Path | None:
-    from tui.commands.tui import show_demo  # noqa: PLC0415 - Textual only where it is shown
+    from tui.commands.tui import show_demo
 
     return show_demo(path, settings)
 
 
 def _record(path: Path, out: Path, settings: Settings, duration: float, speed: float) -> bool:
     """Record; return whether Ctrl-C ended it."""
+    from tui.output.console import notices
+    from tui.runs.interrupt import defer_interrupt
+    from tui.runs.recorder_process import RecorderProcess
+
     notices().print(
         f"Recording three simulated accelerometers for {format_duration(duration)} at {speed:g} "
         f"times real time, which takes {format_duration(duration / speed)}."
@@ -156,6 +195,10 @@ def _record(path: Path, out: Path, settings: Settings, duration: float, speed: f
 
 def compare(snapshot: Snapshot, settings: Settings, scenario: Scenario) -> list[NoiseComparison]:
     """Return the noise of every channel in the band by each method, with the truth."""
+    from daq.results.band_summary import band_of, levels
+    from estimator.levels.bands import band_edges
+    from estimator.levels.contributions import Source
+
     band = band_of(settings, snapshot)
     edges = band_edges(snapshot.frequency, band)
     inside = snapshot.frequency[slice(*edges)]
@@ -195,6 +238,12 @@ def comparison_table(
     compared: list[NoiseComparison], snapshot: Snapshot, settings: Settings
 ) -> Table:
     """Return a row per channel: truth, each method's estimate, and whether that covers it."""
+    from rich.table import Table
+    from rich.text import Text
+
+    from daq.results.band_summary import band_of, data_means
+    from tui.wording.formatting import level, level_with_error
+
     band = band_of(settings, snapshot)
     data = data_means(snapshot, band)
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))

@@ -1,40 +1,25 @@
 """``huddle estimate``."""
 
-# ruff: noqa: PLC0415 - limits, noise parameters and JSON are loaded where they are asked for
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
 
 from __future__ import annotations
 
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
-from rich.text import Text
 
-from daq.estimation.estimation import estimate
-from daq.recording.reader import Recording
-from daq.results.noise_parameters import quantisation_shares
-from tui.output.console import (
-    check_places,
-    for_people,
-    hint,
-    progress,
-    shows_progress,
-    write_json,
-    write_text,
+from tui.commands.options import (
+    CsvOption,
+    DiagnosticsOption,
+    EndOption,
+    FilesArgument,
+    JsonOption,
+    StartOption,
+    examples,
+    with_estimate_options,
 )
-from tui.output.diagnosis import details
 from tui.output.exit_codes import ExitCode
-from tui.output.noise_parameters import (
-    allan_table,
-    notes,
-    quantisation_notes,
-    sheet_table,
-    term_table,
-)
-from tui.output.results import averages_line, curves_csv, result_table, result_title
-from tui.runs.estimate_settings import settings_of
-from tui.wording.facts import brief, known
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -46,27 +31,43 @@ if TYPE_CHECKING:
     from daq.estimation.estimation import Progress
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from daq.recording.reader import Recording
     from daq.results.decision.verdict import TestVerdict
     from daq.results.noise_parameters import ChannelNoise
 
 
-def estimate_recordings(
-    files: Sequence[Path],
+@examples(
+    "huddle estimate night.h5",
+    "huddle estimate night.h5 --method all --band 1:20",
+    "huddle estimate night.h5 --segment 60s --overlap 0.75 --json - --csv noise.csv",
+    "huddle estimate night.h5 --octaves --dimension auto --details",
+    "huddle estimate night.h5 --noise-parameters",
+)
+@with_estimate_options
+def estimate(
+    files: FilesArgument,
     *,
-    start: str | None,
-    end: str | None,
-    diagnostics: bool = False,
-    noise_parameters: bool = False,
-    json: str | None,
-    csv: str | None,
+    start: StartOption = None,
+    end: EndOption = None,
+    diagnostics: DiagnosticsOption = False,
+    noise_parameters: Annotated[
+        bool,
+        typer.Option(
+            "--noise-parameters",
+            help="Fit white, flicker, random-walk and f² noise to every channel; show the Allan "
+            "deviation, and compare with the data sheet in the bench file.",
+        ),
+    ] = False,
+    json: JsonOption = None,
+    csv: CsvOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
-    """Estimate recordings and show the result.
+    """Estimate the self-noise of every channel from recordings.
 
-    Settings come from `wanted`; those that are None come from the first recording. With
-    `diagnostics` the complete diagnosis is shown, otherwise its findings;
-    `noise_parameters` fits terms to the noise of every channel.
+    Options not given come from the bench file inside the recording.
     """
+    from tui.output.console import check_places, hint
+
     check_places(json, csv)
     snapshot, settings, first = estimated(files, start=start, end=end, **wanted)
     outline = first.outline
@@ -117,6 +118,10 @@ def estimated(
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> tuple[Snapshot, Settings, Recording]:
     """Estimate recordings, showing the progress; return also settings and the first, closed."""
+    from daq.estimation.estimation import estimate
+    from daq.recording.reader import Recording
+    from tui.runs.estimate_settings import settings_of
+
     with (
         Recording.open(files[0]) as first,  # once, for its settings and for the estimate
         _counted_segments() as count,
@@ -129,6 +134,8 @@ def estimated(
 @contextmanager
 def _counted_segments() -> Iterator[Progress | None]:
     """Show how many segments of all are taken; None where that is not shown."""
+    from tui.output.console import progress, shows_progress
+
     if not shows_progress():
         yield None
         return
@@ -166,6 +173,13 @@ def show_result(
     TestVerdict or None
         None where the bench file has no limits.
     """
+    from daq.results.noise_parameters import quantisation_shares
+    from tui.output.console import for_people, write_json, write_text
+    from tui.output.diagnosis import details
+    from tui.output.noise_parameters import quantisation_notes
+    from tui.output.results import averages_line, curves_csv, result_table, result_title
+    from tui.wording.facts import brief, known
+
     screen = for_people(json, csv)
     table = result_table(snapshot, settings)  # refuses a band without frequencies
     screen.print(result_title(snapshot, settings))
@@ -216,6 +230,11 @@ def _show_verdict(screen: Console, found: TestVerdict) -> None:
 
 def _show_parameters(screen: Console, found: Sequence[ChannelNoise], unit: str) -> None:
     """Print the noise parameters as tables."""
+    from rich.table import Table
+    from rich.text import Text
+
+    from tui.output.noise_parameters import allan_table, notes, sheet_table, term_table
+
     for title, (header, rows) in (
         (f"Noise terms at 1 Hz, dB re 1 ({unit})²/Hz, with standard errors", term_table(found)),
         (f"Allan deviation of the self-noise in {unit}, with 95 % intervals", allan_table(found)),

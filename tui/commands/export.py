@@ -1,41 +1,72 @@
 """``huddle export``."""
 
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
+
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
-from daq.results.sources import sources
 from tui.commands.estimate import estimated
-from tui.notebook.curve_files import MINISEED, WRITERS, write_curves, write_samples
-from tui.output.console import for_people, write_json
-from tui.output.json_document import provenance
-from tui.wording.formatting import several
+from tui.commands.options import (
+    EndOption,
+    FilesArgument,
+    JsonOption,
+    StartOption,
+    examples,
+    with_estimate_options,
+    with_logging,
+)
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
-
-def export_recordings(
-    files: Sequence[Path],
+@examples(
+    "huddle export night.h5 --format mseed",
+    "huddle export night.h5 --format netcdf --method all --out noise.nc",
+    "huddle export monday.h5 tuesday.h5 --format uff58",
+)
+@with_logging
+@with_estimate_options
+def export(
+    files: FilesArgument,
     *,
-    kind: str,
-    out: Path | None,
-    start: str | None,
-    end: str | None,
-    json: str | None,
+    kind: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            metavar="FORMAT",
+            help="Samples: mseed. Curves: csv, parquet, netcdf, mat, npz, uff58.",
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="FILE", help="File (default: beside the recording)."),
+    ] = None,
+    start: StartOption = None,
+    end: EndOption = None,
+    json: JsonOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
-    """Write samples or curves of recordings to a file of another program.
+    """Write samples or noise curves for other programs.
 
-    Raises
-    ------
-    typer.BadParameter
-        An unknown format, or options that it does not take.
+    mseed: all samples (times within 0.5 % of the sampling interval), and StationXML.
+
+    csv, parquet: a row for each method, channel and frequency.
+
+    netcdf: labelled arrays, for xarray.
+
+    mat, npz: an array (n_frequencies, n_channels) of each curve.
+
+    uff58: a function of type 9 (PSD) for each curve.
     """
+    from daq.results.sources import sources
+    from tui.notebook.curve_files import MINISEED, WRITERS, write_curves
+    from tui.output.console import for_people, write_json
+    from tui.output.json_document import provenance
+    from tui.wording.formatting import several
+
     if kind == MINISEED:
         given = [start, end, *wanted.values()]
         if len(files) > 1 or any(value is not None for value in given):
@@ -57,6 +88,10 @@ def export_recordings(
 
 
 def _export_samples(file: Path, out: Path, json: str | None) -> None:
+    from tui.notebook.curve_files import MINISEED, write_samples
+    from tui.output.console import for_people, write_json
+    from tui.wording.formatting import several
+
     written, station = write_samples(file, out)
     screen = for_people(json)
     for name, codes in written.codes.items():

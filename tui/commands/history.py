@@ -1,31 +1,152 @@
 """``huddle history``: the noise of each channel over months."""
 
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
+
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
 
-from daq.bench.units import decibels
-from daq.results.change_test import DECIBEL, NORMAL_95
-from tui.output.console import check_places, for_people, write_json, write_text
+from tui.commands.options import CsvOption, JsonOption, examples
 from tui.output.csv_text import csv_text
 from tui.output.extras import require
-from tui.report.figures.drawing import look
-from tui.service.history.series import Series, bands_of, history
-from tui.service.records.places import Place
 from tui.service.records.run_state import utc_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from datetime import datetime
-    from pathlib import Path
+
+    from rich.table import Table
 
     from tui.service.history.series import Series
 
 _WIDTH, _HEIGHT = 8.0, 2.4
 """Inches, of one sensor."""
+PICTURES = (".png", ".svg", ".pdf")
+_COLUMNS = (
+    *("serial_number", "sensor", "channel", "model", "bench", "due", "method", "unit"),
+    *("low_hz", "high_hz", "psd", "low", "high"),
+)
+
+
+def _band(text: str) -> tuple[float, float]:
+    try:
+        low, high = map(float, text.split(":"))
+    except ValueError:
+        raise typer.BadParameter(f"{text!r}: expected LOW:HIGH in Hz, as in 1:10") from None
+    return low, high
+
+
+@examples(
+    "huddle history lab.toml",
+    "huddle history lab.toml --band 1:10 --since 2026-01-01 --out noise.png",
+    "huddle history lab/recordings office/recordings --csv -   (sensors by serial number)",
+)
+def history(
+    sources: Annotated[
+        list[Path],
+        typer.Argument(metavar="BENCH", help="Bench files, or folders of recordings."),
+    ],
+    *,
+    band: Annotated[
+        str | None,
+        typer.Option(
+            "--band",
+            metavar="LOW:HIGH",
+            help="Band in Hz that the runs have stored (default: all).",
+        ),
+    ] = None,
+    since: Annotated[
+        datetime | None,
+        typer.Option(
+            "--since",
+            formats=["%Y-%m-%d", "%Y-%m-%dT%H:%M"],
+            metavar="DATE",
+            help="Leave out earlier runs (UTC, such as 2026-11-21).",
+        ),
+    ] = None,
+    scatter: Annotated[
+        float,
+        typer.Option(
+            "--scatter",
+            min=0.0,
+            metavar="DB",
+            help="Standard deviation between runs that does not count as change, in dB.",
+        ),
+    ] = 0.1,
+    false_alarms: Annotated[
+        float,
+        typer.Option(
+            "--false-alarms",
+            min=1e-9,
+            max=0.5,
+            metavar="SHARE",
+            help="Probability of any false alarm in the whole history.",
+        ),
+    ] = 0.01,
+    json: JsonOption = None,
+    csv: CsvOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="FILE", help="Picture: .png, .svg or .pdf."),
+    ] = None,
+) -> None:
+    """Show the noise of every channel from run to run, and whether it has changed.
+
+    Serial numbers identify a sensor across benches and ports. The test
+    allows for the uncertainty of each run; its false-alarm rate holds for the whole history.
+    """
+    from tui.output.console import check_places, for_people, write_json, write_text
+    from tui.service.history.series import bands_of, history
+    from tui.service.records.places import Place
+
+    wanted = None if band is None else _band(band)
+    since = None if since is None else since.replace(tzinfo=UTC)
+    check_places(json, csv, None if out is None else str(out))
+    if out is not None:
+        require("matplotlib")
+        if out.suffix.lower() not in PICTURES:
+            raise typer.BadParameter(f"{out}: expected a name that ends in {', '.join(PICTURES)}")
+    places = [Place.of(source) for source in sources]
+    noise = [found for place in places for found in place.store.noise(place.bench_name, since)]
+    found = history(noise, band=wanted, scatter=scatter, false_alarms=false_alarms)
+    if wanted is not None and not found:
+        kept = ", ".join(f"{low:g}:{high:g}" for low, high in bands_of(noise)) or "none"
+        raise typer.BadParameter(
+            f"band {wanted[0]:g}:{wanted[1]:g}: no run has its noise; kept are {kept} (Hz)."
+            " [history] bands in the bench file adds bands"
+        )
+    screen = for_people(json, csv)
+    screen.print(_table(found))
+    n_changed = 0
+    for series in found:
+        for line in change_lines(series):
+            n_changed += 1
+            screen.print(line, style="yellow")
+        left_out = len(series.noise) - len(series.usable)
+        if left_out:
+            screen.print(f"{series.name}: {left_out} runs not tested: their interval reaches zero")
+    if found:
+        screen.print(
+            f"{'No change' if not n_changed else 'Changes'} beyond uncertainty and"
+            f" {scatter:g} dB of scatter from run to run. The test gives a false alarm in"
+            f" {false_alarms:.2g} of all histories without a change, however long they become.",
+            soft_wrap=True,
+        )
+    write_json(
+        json,
+        {
+            "false_alarms": false_alarms,
+            "scatter_db": scatter,
+            "series": [series.document() for series in found],
+        },
+    )
+    if csv is not None:
+        write_text(csv, csv_text(_COLUMNS, _rows(found)))
+    if out is not None:
+        write_figure(found, out)
 
 
 def write_figure(found: Sequence[Series], out: Path) -> None:
@@ -36,7 +157,10 @@ def write_figure(found: Sequence[Series], out: Path) -> None:
     OSError
         If the file cannot be written.
     """
-    from matplotlib.figure import Figure  # noqa: PLC0415 - takes a second
+    from matplotlib.figure import Figure
+
+    from daq.bench.units import decibels
+    from tui.report.figures.drawing import look
 
     panels: dict[tuple[str, float, float, str], list[Series]] = {}
     for series in found:
@@ -74,81 +198,9 @@ def write_figure(found: Sequence[Series], out: Path) -> None:
         figure.savefig(out, dpi=150)
 
 
-PICTURES = (".png", ".svg", ".pdf")
-_COLUMNS = (
-    *("serial_number", "sensor", "channel", "model", "bench", "due", "method", "unit"),
-    *("low_hz", "high_hz", "psd", "low", "high"),
-)
-
-
-def show_history(
-    sources: Sequence[Path],
-    *,
-    band: tuple[float, float] | None,
-    since: datetime | None,
-    scatter: float,
-    false_alarms: float,
-    json: str | None,
-    csv: str | None,
-    out: Path | None,
-) -> None:
-    """Show the noise of each channel over all runs, and where it has changed.
-
-    Raises
-    ------
-    NoServiceError, StoreError
-        If there is no database of runs, or it cannot be read.
-    typer.BadParameter
-        If there is no noise of the band.
-    """
-    check_places(json, csv, None if out is None else str(out))
-    if out is not None:
-        require("matplotlib")
-        if out.suffix.lower() not in PICTURES:
-            raise typer.BadParameter(f"{out}: expected a name that ends in {', '.join(PICTURES)}")
-    places = [Place.of(source) for source in sources]
-    noise = [found for place in places for found in place.store.noise(place.bench_name, since)]
-    found = history(noise, band=band, scatter=scatter, false_alarms=false_alarms)
-    if band is not None and not found:
-        kept = ", ".join(f"{low:g}:{high:g}" for low, high in bands_of(noise)) or "none"
-        raise typer.BadParameter(
-            f"band {band[0]:g}:{band[1]:g}: no run has its noise; kept are {kept} (Hz). [history]"
-            " bands in the bench file adds bands"
-        )
-    screen = for_people(json, csv)
-    screen.print(_table(found))
-    n_changed = 0
-    for series in found:
-        for line in change_lines(series):
-            n_changed += 1
-            screen.print(line, style="yellow")
-        left_out = len(series.noise) - len(series.usable)
-        if left_out:
-            screen.print(f"{series.name}: {left_out} runs not tested: their interval reaches zero")
-    if found:
-        screen.print(
-            f"{'No change' if not n_changed else 'Changes'} beyond uncertainty and"
-            f" {scatter:g} dB of scatter from run to run. The test gives a false alarm in"
-            f" {false_alarms:.2g} of all histories without a change, however long they become.",
-            soft_wrap=True,
-        )
-    write_json(
-        json,
-        {
-            "false_alarms": false_alarms,
-            "scatter_db": scatter,
-            "series": [series.document() for series in found],
-        },
-    )
-    if csv is not None:
-        write_text(csv, csv_text(_COLUMNS, _rows(found)))
-    if out is not None:
-        from tui.commands.history import write_figure  # noqa: PLC0415 - matplotlib
-
-        write_figure(found, out)
-
-
 def _table(found: Sequence[Series]) -> Table:
+    from rich.table import Table
+
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for name in ("serial number", "sensor", "channel", "band (Hz)", "unit²/Hz of"):
         table.add_column(name)
@@ -173,6 +225,8 @@ def _ends(series: Series, position: int) -> tuple[float, float]:
 
 def level(psd: float, low: float, high: float) -> str:
     """Return a PSD in dB with half the width of its interval."""
+    from daq.bench.units import decibels
+
     if not psd > 0:
         return "below 0"
     if not 0 < low <= high:
@@ -182,6 +236,8 @@ def level(psd: float, low: float, high: float) -> str:
 
 def change_lines(series: Series) -> Iterator[str]:
     """Yield a sentence for each change of a channel."""
+    from daq.results.change_test import DECIBEL, NORMAL_95
+
     for change in series.changes:
         first, found = series.due_of(change.first), series.due_of(change.found)
         shift, width = change.shift / DECIBEL, NORMAL_95 * change.deviation / DECIBEL

@@ -1,28 +1,166 @@
 """``huddle import``."""
 
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
+
 from __future__ import annotations
 
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
-from rich.table import Table
 
-from daq.bench.loading import parse
-from daq.estimation.settings import Settings
-from daq.formats.importer import import_files
-from daq.formats.sources import Selection
-from tui.output.console import for_people, notices, write_json
+from tui.commands.options import (
+    JsonOption,
+    examples,
+    read_option,
+    with_estimate_options,
+    with_logging,
+)
 from tui.output.exit_codes import ExitCode
-from tui.runs.estimate_settings import chosen
-from tui.wording.formatting import several, utc
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from daq.formats.importer import ImportResult
+    from daq.formats.sources import Selection
+
+_ORIGINS = {
+    "response": "response",
+    "bench": "bench file",
+    "file": "the file's own",
+    "none": "no calibration: counts",
+}
+
+
+@examples(
+    "huddle import *.mseed --response RESP.XX.ABC.00.HNZ --out lab.h5",
+    "huddle import day*.mseed --channels 'HH?' --overlap first --out month.h5",
+    "huddle import sds://archive --net XX --start 2026-11-01 --end 2026-11-08 --out week.h5",
+    "huddle import 'fdsn://EARTHSCOPE/IU.ANMO.{00,10}.BH?' --start 2026-11-01 --end 2026-11-02"
+    " --out anmo.h5",
+    "huddle import samples.csv --bench lab.toml --out lab.h5",
+)
+@with_logging
+@with_estimate_options
+def import_(
+    sources: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SRC",
+            help="Files, sds://ROOT for an archive of day files, or"
+            " fdsn://CENTRE/NET.STA.LOC.CHA for a data centre.",
+        ),
+    ],
+    *,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="FILE", help="Recording to write (.h5).")
+    ],
+    bench: Annotated[
+        Path | None,
+        typer.Option(
+            "--bench", metavar="BENCH", help="Bench file with sensitivities, names and settings."
+        ),
+    ] = None,
+    response: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--response",
+            metavar="FILE",
+            help="Instrument responses: RESP or StationXML files, or folders of them; repeatable. "
+            "Each channel takes the response of its code and date.",
+        ),
+    ] = None,
+    response_for: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--response-for",
+            metavar="PATTERN=FILE",
+            help="Response for channels of another code, as in 'XX.ABC.*=FILE'; repeatable. "
+            "A sensor and its digitizer may be in two files.",
+        ),
+    ] = None,
+    sampling_rate: Annotated[
+        float | None,
+        typer.Option(
+            "--sampling-rate",
+            metavar="HZ",
+            min=1e-6,
+            help="Sampling rate, if the files do not give it.",
+        ),
+    ] = None,
+    channels: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--channels",
+            metavar="PATTERN",
+            help="Channels to import, such as 'HH?' or 'XX.ABC.*.HHZ,XX.DEF.*.HHZ'."
+            " Default: all but those of the instrument's state of health.",
+        ),
+    ] = None,
+    start: Annotated[
+        str | None,
+        typer.Option("--start", metavar="UTC", help="First time to import: 2026-11-21T03:00:00."),
+    ] = None,
+    end: Annotated[
+        str | None, typer.Option("--end", metavar="UTC", help="End of the time to import.")
+    ] = None,
+    overlap: Annotated[
+        str | None,
+        typer.Option(
+            "--overlap",
+            metavar="refuse|first|last",
+            help="Where files overlap with different samples: refuse the channel (default), or keep"
+            " the samples of the file that starts first or last. A number, such as 0.75, is the"
+            " overlap of segments.",
+        ),
+    ] = None,
+    net: Annotated[
+        str, typer.Option("--net", metavar="CODE", help="Network in an SDS archive, or a pattern.")
+    ] = "*",
+    sta: Annotated[str, typer.Option("--sta", metavar="CODE", help="Station, or a pattern.")] = "*",
+    loc: Annotated[
+        str, typer.Option("--loc", metavar="CODE", help="Location, or a pattern; -- if empty.")
+    ] = "*",
+    json: JsonOption = None,
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
+) -> None:
+    """Convert files of other programs into a recording.
+
+    A sensor may be in several files. Memory does not depend on their length. A file or channel that
+    cannot be used is listed at the end; the others are imported, and the exit code is 3.
+
+    miniSEED: a sensor is network.station.location, a channel is its code.
+
+    .npz, .mat: sampling_rate (Hz), start_time (UTC, optional), and for each sensor an array of
+    counts (n_samples, n_channels) under its name.
+
+    .csv: a header such as: time (s), A.X (m/s²), A.Y (m/s²), B.X (m/s²).
+
+    .wav: a file is a sensor, its channels are numbered.
+
+    Also SAC, GSE2, GCF, SEG-2, SEG-Y (extra: formats), UFF 58 and TDMS (extra: vibration).
+    """
+    segments = None if overlap in {None, "refuse", "first", "last"} else overlap
+    import_recording(
+        sources,
+        out=out,
+        bench=bench,
+        response=response or [],
+        response_for=response_for or [],
+        sampling_rate=sampling_rate,
+        selection=selected(
+            channels=channels or [],
+            start=start,
+            end=end,
+            overlap=overlap if segments is None else None,
+            codes=(net, sta, loc),
+        ),
+        json=json,
+        overlap=read_option("overlap", segments),
+        **wanted,
+    )
 
 
 def selected(
@@ -40,6 +178,8 @@ def selected(
     typer.BadParameter
         A time is not understood, or the end is not after the start.
     """
+    from daq.formats.sources import Selection
+
     start_ns, end_ns = _instant_ns("--start", start), _instant_ns("--end", end)
     if start_ns is not None and end_ns is not None and end_ns <= start_ns:
         raise typer.BadParameter(f"--end {end}: expected a time after --start {start}")
@@ -90,6 +230,12 @@ def import_recording(
     typer.Exit
         With the code of trouble, if a file or channel could not be used.
     """
+    from daq.bench.loading import parse
+    from daq.estimation.settings import Settings
+    from daq.formats.importer import import_files
+    from tui.output.console import write_json
+    from tui.runs.estimate_settings import chosen
+
     described = None if bench is None else parse(bench.read_text(encoding="utf-8"), bench)
     given = any(value is not None for value in wanted.values())
     settings = chosen(Settings.of(described), **wanted) if given else None
@@ -119,14 +265,6 @@ def _assigned(text: str) -> tuple[str, Path]:
     return pattern, Path(path)
 
 
-_ORIGINS = {
-    "response": "response",
-    "bench": "bench file",
-    "file": "the file's own",
-    "none": "no calibration: counts",
-}
-
-
 def _calibrations(result: ImportResult) -> list[str]:
     """Return a line for each kind of calibration that was taken, with the channels it is of."""
     alike: dict[str, list[str]] = {}
@@ -150,6 +288,11 @@ def _by_sensor(names: Sequence[str]) -> str:
 
 
 def _show(result: ImportResult, out: Path, json: str | None) -> None:
+    from rich.table import Table
+
+    from tui.output.console import for_people, notices
+    from tui.wording.formatting import several, utc
+
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for column in ("sensor", "channels", "rate", "start (UTC)", "samples", "gaps"):
         table.add_column(column, justify="right" if column in {"samples", "gaps"} else "left")

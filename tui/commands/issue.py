@@ -1,55 +1,104 @@
 """``huddle issue`` and ``huddle issues``."""
 
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
+
 from __future__ import annotations
 
 import os
 import sys
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
-from daq.bench.masks.mask_file import masks_named
-from daq.devices.bench_file import load
-from daq.recording.reader import Recording
-from daq.results.decision.limits import judge
-from daq.results.sources import sources
 from tui.certificate.ledger import Ledger, LedgerError
 from tui.commands.estimate import estimated, exit_with
-from tui.output.console import console, for_people, notices, write_json
+from tui.commands.options import (
+    EndOption,
+    FilesArgument,
+    JsonOption,
+    ModelsOption,
+    StartOption,
+    examples,
+    with_estimate_options,
+)
 from tui.output.extras import require
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
-
-def issue_certificate(
-    files: Sequence[Path],
+@examples(
+    "huddle issue night.h5 --by 'A. Lovelace'",
+    "huddle issue night.h5 --by 'A. Lovelace' --bench lab.toml",
+    "huddle issue night.h5 --by 'A. Lovelace' --segment 20s --reason 'resolution of 0.05 Hz'",
+)
+@with_estimate_options
+def issue(
+    files: FilesArgument,
     *,
-    by: str,
-    reason: str,
-    bench: Path | None,
-    folder: Path | None,
-    models: str,
-    allow_incomplete: bool,
-    sign: Path | None,
-    start: str | None,
-    end: str | None,
+    by: Annotated[
+        str, typer.Option("--by", metavar="NAME", help="Who authorises the certificate.")
+    ],
+    reason: Annotated[
+        str,
+        typer.Option(
+            "--reason", metavar="TEXT", help="Why a certificate of the same recording is revised."
+        ),
+    ] = "",
+    bench: Annotated[
+        Path | None,
+        typer.Option(
+            "--bench",
+            metavar="BENCH",
+            help="Bench file with [laboratory], [customer], [certificate] and the manufacturers "
+            "of the sensors (default: the one inside the recording).",
+        ),
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            "--folder",
+            metavar="DIR",
+            help="Folder of the certificates and their ledger (default: folder of [certificate], "
+            "or certificates beside the recording).",
+        ),
+    ] = None,
+    allow_incomplete: Annotated[
+        bool,
+        typer.Option(
+            "--allow-incomplete", help="Issue without all that ISO/IEC 17025 asks for; say so."
+        ),
+    ] = False,
+    sign: Annotated[
+        Path | None,
+        typer.Option(
+            "--sign",
+            metavar="FILE",
+            help="Key of the laboratory (.p12) that signs the PDF. Its passphrase is asked for, "
+            "or taken from HUDDLE_PASSPHRASE. Extra: sign.",
+        ),
+    ] = None,
+    models: ModelsOption = "",
+    start: StartOption = None,
+    end: EndOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
-    """Estimate recordings, and issue their certificate.
+    """Issue a numbered certificate of a huddle test as PDF.
 
-    Raises
-    ------
-    NotIssuedError
-        If the recordings may not have a certificate; nothing is estimated then.
-    typer.Exit
-        With 1 if a limit is not met, with 4 if that is not decided, after the certificate was
-        issued.
+    The number, such as HT-2026-0042, comes from an append-only ledger in the
+    folder of the certificates. No certificate is overwritten: a further one
+    of the same recording is a revision, and needs a reason. Recordings of
+    simulated sensors are refused.
+
+    Options not given come from the bench file inside the recording.
+    The exit code is 1 if a limit is not met, and 4 if that is not decided.
     """
+    from daq.bench.masks.mask_file import masks_named
+    from daq.devices.bench_file import load
+    from daq.results.decision.limits import judge
+    from daq.results.sources import sources
+    from tui.output.console import console, notices
+
     require("matplotlib", "jinja2", "fpdf", *(["pyhanko"] if sign is not None else []))
-    from tui.certificate.issuing import (  # noqa: PLC0415 - loads matplotlib
+    from tui.certificate.issuing import (
         issue,
         ledger_of,
         refuse_unfit,
@@ -57,7 +106,7 @@ def issue_certificate(
 
     signer = None
     if sign is not None:
-        from tui.certificate.signing import Signer  # noqa: PLC0415 - an extra
+        from tui.certificate.signing import Signer
 
         signer = Signer(sign, _passphrase())
     masks = masks_named(models)
@@ -83,23 +132,26 @@ def issue_certificate(
     exit_with(judge(recorded.bench, snapshot, settings))
 
 
-def _passphrase() -> str:
-    """Return the passphrase of the key: of the environment, or asked for; empty if neither."""
-    given = os.environ.get("HUDDLE_PASSPHRASE")
-    if given is not None or not sys.stdin.isatty():
-        return given or ""
-    return str(typer.prompt("Passphrase of the key", hide_input=True, default=""))
+@examples("huddle issues certificates", "huddle issues night.h5 --json -")
+def issues(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SOURCE", help="Folder of certificates, or a recording of the laboratory."
+        ),
+    ] = Path("certificates"),
+    *,
+    json: JsonOption = None,
+) -> None:
+    """List the certificates of a ledger, with revisions and void numbers.
 
-
-def list_issues(source: Path, *, json: str | None) -> None:
-    """List the certificates of a folder, or of the folder that belongs to a recording.
-
-    Raises
-    ------
-    LedgerError
-        If there is no ledger, or if it was changed by hand.
+    The exit code is 3 if the ledger was changed, or if a certificate is missing.
     """
-    from tui.certificate.issuing import ledger_of  # noqa: PLC0415 - loads matplotlib
+    from rich.table import Table
+
+    from daq.recording.reader import Recording
+    from tui.certificate.issuing import ledger_of
+    from tui.output.console import for_people, write_json
 
     if source.is_dir():
         ledger = Ledger(source)
@@ -147,3 +199,11 @@ def list_issues(source: Path, *, json: str | None) -> None:
     lost = [each.name for each in entries if each.state == "file missing"]
     if lost:
         raise LedgerError(f"{ledger.folder}: the files of these are missing: {'; '.join(lost)}")
+
+
+def _passphrase() -> str:
+    """Return the passphrase of the key: of the environment, or asked for; empty if neither."""
+    given = os.environ.get("HUDDLE_PASSPHRASE")
+    if given is not None or not sys.stdin.isatty():
+        return given or ""
+    return str(typer.prompt("Passphrase of the key", hide_input=True, default=""))

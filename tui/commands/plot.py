@@ -1,42 +1,64 @@
 """``huddle plot``."""
 
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
+
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
-from daq.bench.masks.mask_file import masks_named
 from tui.commands.estimate import estimated
-from tui.output.console import check_places, console, notices
+from tui.commands.options import (
+    EndOption,
+    FilesArgument,
+    ModelsOption,
+    StartOption,
+    examples,
+    with_estimate_options,
+)
 from tui.output.extras import require
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
 SUFFIXES = (".svg", ".png", ".pdf")
 
 
-def plot_recordings(
-    files: Sequence[Path],
+@examples(
+    "huddle plot night.h5 -o noise.svg",
+    "huddle plot night.h5 -o noise.pdf --models nlnm,nhnm --width 85",
+    "huddle plot night.h5 -o noise.png --method all --models brochure.csv",
+)
+@with_estimate_options
+def plot(
+    files: FilesArgument,
     *,
-    out: Path | None,
-    width: float,
-    models: str,
-    start: str | None,
-    end: str | None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="FILE",
+            help="Figure to write, .svg, .png or .pdf (default: beside the recording).",
+        ),
+    ] = None,
+    models: ModelsOption = "",
+    width: Annotated[
+        float,
+        typer.Option("--width", metavar="MM", min=80, max=500, help="Width of the figure in mm."),
+    ] = 180.0,
+    start: StartOption = None,
+    end: EndOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
-    """Estimate, and write the noise of every channel as a figure, `width` in mm.
+    """Draw the self-noise of every channel as a figure for publication.
 
-    Raises
-    ------
-    typer.BadParameter
-        The suffix is unknown, or the folder does not exist.
-    MissingPackageError
-        matplotlib is missing.
+    The curves are those of the report: recorded spectrum, self-noise with its
+    95 % interval, every other method with --method all, limits of the bench
+    file, and noise models.
     """
+    from daq.bench.masks.mask_file import masks_named
+    from tui.output.console import check_places, console, notices
+
     require("matplotlib")
     out = files[0].with_suffix(".svg") if out is None else out
     if out.suffix.lower() not in SUFFIXES:
@@ -44,7 +66,7 @@ def plot_recordings(
     check_places(str(out))
     masks = masks_named(models)
     snapshot, settings, first = estimated(files, start=start, end=end, **wanted)
-    from tui.report.figures.sheet import write_figure  # noqa: PLC0415 - matplotlib only here
+    from tui.report.figures.sheet import write_figure
 
     with notices().status("drawing"):
         write_figure(snapshot, settings, first.bench, out, models=masks, width=width / 25.4)

@@ -1,5 +1,7 @@
 """``huddle record``: the recorder without an estimate."""
 
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
+
 from __future__ import annotations
 
 import logging
@@ -9,21 +11,22 @@ import time
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from rich.live import Live
+import typer
 
-from daq.bench.end_condition import NEVER, EndCondition
-from daq.devices.bench_file import load
+from daq.bench.end_condition import EndCondition
 from daq.errors import HuddleError, WrongSettingError
-from daq.host_clock import SystemClock
 from daq.python_process import python_command
-from daq.recorder.recorder import run
 from daq.recording.storage.names import recording_path
-from daq.transport.wire_log import logging_to
-from tui.output.console import notices, write_json
-from tui.simulation.host_time import host_time
-from tui.wording.formatting import clock_time, roughly, several
+from tui.commands.options import (
+    BenchArgument,
+    DurationOption,
+    JsonOption,
+    OutOption,
+    examples,
+    with_logging,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -36,67 +39,80 @@ GAP_INTERVAL = 60.0
 """Minimum seconds between two log lines about gaps; a polled sensor can have many."""
 
 
-def record_bench(
-    path: Path,
+@examples("huddle record lab.toml --duration 3h --out night.h5")
+@with_logging
+def record(
+    path: BenchArgument,
     *,
-    duration: float | None,
-    until: EndCondition = NEVER,
-    until_stopped: bool = False,
-    operator: str | None = None,
-    estimate: str | None = None,
-    out: Path | None,
-    json: str | None,
-    check: bool = False,
-    wire_log: Path | None = None,
+    duration: DurationOption = None,
+    operator: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Operator (default: from the bench file)."),
+    ] = None,
+    until: Annotated[
+        str,
+        typer.Option(
+            "--until",
+            metavar="CONDITION",
+            help="Stop by the live estimate: 'decided' once all limits are decided, '5 %' once the"
+            " noise in the worst third of an octave of the band is known to 5 %, or both,"
+            " separated by a comma: the first of them.",
+        ),
+    ] = "",
+    estimate: Annotated[str | None, typer.Option("--estimate", hidden=True)] = None,
+    until_stopped: Annotated[
+        bool,
+        typer.Option("--until-stopped", help="Ignore the duration of the bench file."),
+    ] = False,
+    check: Annotated[
+        bool,
+        typer.Option("--check", help="Make the check list first; record nothing if a check fails."),
+    ] = False,
+    wire_log: Annotated[
+        Path | None,
+        typer.Option(
+            "--wire-log",
+            metavar="FILE",
+            help="Also log every byte received and sent, for tests of drivers.",
+        ),
+    ] = None,
+    out: OutOption = None,
+    json: JsonOption = None,
 ) -> None:
-    """Record a bench until the duration has passed, or until SIGINT or SIGTERM.
+    """Record without estimating, until the duration has passed or Ctrl-C."""
+    from rich.live import Live
 
-    The duration is that of the bench file, if none is given and `until_stopped` is false. With a
-    condition `until` on the live estimate, a process beside the recorder makes that estimate.
+    from daq.devices.bench_file import load
+    from daq.host_clock import SystemClock
+    from daq.recorder.recorder import run
+    from daq.transport.wire_log import logging_to
+    from tui.output.console import notices, write_json
+    from tui.simulation.host_time import host_time
 
-    Parameters
-    ----------
-    path : Path
-        Bench file.
-    duration : float, optional
-        In seconds.
-    until : EndCondition
-        Its duration is not used.
-    until_stopped : bool
-    operator : str, optional
-        In place of that of the bench file.
-    estimate : str, optional
-        Settings of the estimate in place of those of the bench file, as its table in JSON.
-    out : Path, optional
-    json : str, optional
-    check : bool
-        Whether the check list is made first, and nothing is recorded if it fails.
-    wire_log : Path, optional
-        New file for every byte that ports receive and send.
-
-    Raises
-    ------
-    WrongSettingError
-        If the test is to be decided and the bench file has no limits.
-    ExceptionGroup
-        With a DeviceError for every sensor that cannot be used at the start.
-    """
+    if until_stopped and duration is not None:
+        raise typer.BadParameter("--duration and --until-stopped exclude each other; expected one")
+    try:
+        condition = EndCondition.of_text(until)
+    except ValueError as error:
+        raise typer.BadParameter(f"--until {error}") from None
+    if condition.duration is not None:
+        raise typer.BadParameter(f"--until {until!r}: expected a time as --duration")
     bench = load(path)
     if operator is not None:
         bench = bench.model_copy(update={"operator": operator})
-    if until.decided and not bench.limits:
+    if condition.decided and not bench.limits:
         raise WrongSettingError(f"until decided: {path} has no limits; expected [[limits]]")
-    if duration is None and not until_stopped and not until.is_estimated:
+    if duration is None and not until_stopped and not condition.is_estimated:
         duration = bench.recording.duration
     if out is None:
         out = recording_path(bench, SystemClock().now())
     if check:
-        from tui.commands.check import check_before_test  # noqa: PLC0415 - loads the estimator
+        from tui.commands.check import check_before_test
 
         check_before_test(bench, duration=duration, anyway=False)
     clock, loop_factory = host_time(bench)
-    attributes = {"until": until.estimated.text, "estimate": estimate or ""}
-    record = partial(
+    attributes = {"until": condition.estimated.text, "estimate": estimate or ""}
+    made = partial(
         run,
         bench,
         out,
@@ -108,7 +124,7 @@ def record_bench(
     screen = notices()
     gaps = GapLog()
     wires = nullcontext() if wire_log is None else logging_to(wire_log)
-    with _watched(out, until), wires:
+    with _watched(out, condition), wires:
         if screen.is_terminal:
             with Live(console=screen, refresh_per_second=2, transient=True) as live:
 
@@ -116,9 +132,9 @@ def record_bench(
                     gaps.look(now)
                     live.update(progress_line(now, duration))
 
-                status = record(acknowledged=show)
+                status = made(acknowledged=show)
         else:
-            status = record(acknowledged=gaps.look)
+            status = made(acknowledged=gaps.look)
     if status.closed:
         _sign(bench, Path(status.path))
         closed = {"recording": status.path}
@@ -130,7 +146,7 @@ def _sign(bench: Bench, path: Path) -> None:
     """Sign a recording if the bench file has a key; without, it is a recording nevertheless."""
     if bench.signing is None:
         return
-    from daq.recording.signing import key_of, sign  # noqa: PLC0415 - seldom needed
+    from daq.recording.signing import key_of, sign
 
     try:
         key = key_of(bench)
@@ -167,6 +183,8 @@ class GapLog:
 
     def look(self, status: RecorderStatus) -> None:
         """Log new gaps of a recorder's status."""
+        from tui.wording.formatting import several
+
         if time.monotonic() < self._next and not status.closed:
             return
         for name, sensor in status.sensors.items():
@@ -182,6 +200,8 @@ class GapLog:
 
 def progress_line(status: RecorderStatus, duration: float | None = None) -> str:
     """Return the safe samples of every sensor, and the time until a run of this duration ends."""
+    from tui.wording.formatting import clock_time, roughly, several
+
     sensors = "  ".join(
         f"{name} {sensor.samples}"
         + (f" ({several(sensor.gaps, 'gap')}, {sensor.missing} missing)" if sensor.gaps else "")

@@ -1,28 +1,34 @@
 """``huddle repair``: verifies a recording, and closes it after a crash."""
 
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
+
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Annotated
 
-from rich.table import Table
+import typer
 
 from daq.errors import RecordingError
-from daq.recording.repair import repair, verify
-from tui.output.console import for_people, write_json
-from tui.output.json_values import plain
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from tui.commands.options import FileArgument, JsonOption, examples
 
 
-def repair_recording(path: Path, *, check: bool, json: str | None) -> None:
-    """Verify every acknowledged block; close the recording unless `check` is set.
+@examples("huddle repair killed.h5", "huddle repair night.h5 --check --json -")
+def repair(
+    path: FileArgument,
+    *,
+    check: Annotated[bool, typer.Option("--check", help="Check only; change nothing.")] = False,
+    json: JsonOption = None,
+) -> None:
+    """Verify the checksums of a recording, and close it if a crash left it open.
 
-    Raises
-    ------
-    RecordingError
-        A recorder is writing it, or acknowledged blocks are damaged.
+    All acknowledged samples are kept. Samples not acknowledged are removed.
     """
+    from rich.table import Table
+
+    from daq.recording.repair import repair, verify
+    from tui.output.console import for_people, write_json
+    from tui.output.json_values import plain
+
     report = verify(path) if check else repair(path)
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("sensor")

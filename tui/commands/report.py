@@ -1,21 +1,27 @@
 """``huddle report``."""
 
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
+
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from daq.bench.masks.mask_file import masks_named
-from daq.results.decision.limits import judge
-from daq.results.sources import sources
 from tui.commands.estimate import estimated, exit_with
-from tui.output.console import check_places, console, notices
+from tui.commands.options import (
+    EndOption,
+    FilesArgument,
+    ModelsOption,
+    StartOption,
+    examples,
+    with_estimate_options,
+)
 from tui.output.extras import require
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     from rich.console import Console
 
@@ -28,23 +34,48 @@ SUFFIXES = (".html", ".htm", ".pdf", ".xml")
 _COLOURS = {"good": "green", "bad": "red", "doubtful": "yellow"}
 
 
-def report_recordings(
-    files: Sequence[Path],
+@examples(
+    "huddle report night.h5",
+    "huddle report night.h5 --out night.pdf --band 1:20",
+    "huddle report night.h5 --models nlnm,nhnm,brochure.csv",
+    "huddle report monday.h5 tuesday.h5 --method all --out week.html",
+)
+@with_estimate_options
+def report(
+    files: FilesArgument,
     *,
-    out: Path | None,
-    models: str,
-    force: bool,
-    start: str | None,
-    end: str | None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="FILE",
+            help="Report to write: .html, .pdf, or .xml for a Digital Calibration Certificate "
+            "(DCC 3.1.2) (default: .html beside the recording).",
+        ),
+    ] = None,
+    models: ModelsOption = "",
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace a file that has other content.")
+    ] = False,
+    start: StartOption = None,
+    end: EndOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
-    """Estimate, and write the report.
+    """Write the calibration report of a huddle test as HTML or PDF.
 
-    Raises
-    ------
-    typer.Exit
-        With 1 if a limit is not met, with 4 if that is not decided, after the report was written.
+    It contains the noise of every channel with its uncertainty, the
+    verdict on the limits of the bench file, alignment, clocks, events, and a
+    place to sign. The report of a growing recording is preliminary.
+    It is a draft: huddle issue makes the numbered certificate.
+
+    Options not given come from the bench file inside the recording.
+    The exit code is 1 if a limit is not met, and 4 if that is not decided.
     """
+    from daq.bench.masks.mask_file import masks_named
+    from daq.results.decision.limits import judge
+    from tui.output.console import console
+
     masks = masks_named(models)
     out = checked(files[0].with_suffix(".html") if out is None else out)
     snapshot, settings, first = estimated(files, start=start, end=end, **wanted)
@@ -70,6 +101,8 @@ def checked(out: Path) -> Path:
     MissingPackageError
         A package that writes reports is missing.
     """
+    from tui.output.console import check_places
+
     require("matplotlib", "jinja2", *(["fpdf"] if out.suffix.lower() == ".pdf" else []))
     if out.suffix.lower() not in SUFFIXES:
         raise typer.BadParameter(f"{out}: expected a file name that ends in .html, .pdf or .xml")
@@ -94,11 +127,13 @@ def write_report(
     ReportError
         If the file cannot be written.
     """
-    from tui.report.writing import write  # noqa: PLC0415 - matplotlib only where there is a report
+    from daq.results.sources import sources
+    from tui.output.console import notices
+    from tui.report.writing import write
 
     if out.suffix.lower() == ".xml":
-        from tui.certificate.dcc import dcc  # noqa: PLC0415 - seldom needed
-        from tui.report.writing import write_content  # noqa: PLC0415
+        from tui.certificate.dcc import dcc
+        from tui.report.writing import write_content
 
         out = write_content(out, dcc(snapshot, settings, sources(recordings)), taken)
         screen.print(f"{out} written", soft_wrap=True)

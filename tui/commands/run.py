@@ -1,52 +1,51 @@
 """``huddle run``: starts a recorder process and estimates its recording."""
 
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
+
 from __future__ import annotations
 
 import logging
 import math
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.progress import BarColumn, TextColumn
 
 from daq.bench.durations import format_duration
 from daq.bench.end_condition import EndCondition
 from daq.bench.option_fit import shortest_duration
-from daq.devices.bench_file import load
 from daq.errors import HuddleError, RecordingError
-from daq.estimation.estimation import estimate
-from daq.estimation.follow import RecordingLeftOpenError, follow
-from daq.estimation.settings import Settings
-from daq.host_clock import SystemClock
-from daq.recording.reader import Recording
-from daq.recording.repair import repair
 from daq.recording.storage.names import recording_path
-from daq.results.decision.limits import judge
-from daq.results.precision import precision
-from daq.results.store import store_results
 from tui.commands.check import check_before_test
 from tui.commands.estimate import exit_with, show_result
+from tui.commands.options import (
+    AnywayOption,
+    BenchArgument,
+    CsvOption,
+    DiagnosticsOption,
+    DurationOption,
+    JsonOption,
+    OutOption,
+    examples,
+    with_estimate_options,
+    with_logging,
+)
 from tui.commands.report import checked, write_report
-from tui.output.console import check_places, for_people, hint, progress
 from tui.output.exit_codes import ExitCode
-from tui.runs.estimate_settings import check_fit, chosen
-from tui.runs.interrupt import defer_interrupt
-from tui.runs.recorder_process import RecorderProcess
-from tui.wording.facts import why_no_estimate
-from tui.wording.formatting import clock_time, time_left
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
     from rich.progress import Progress
 
     from daq.bench.model import Bench
+    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
     from daq.results.decision.verdict import TestVerdict
+    from tui.runs.recorder_process import RecorderProcess
 
 _LOGGER = logging.getLogger(__name__)
 LINE_SHARE = 0.01
@@ -55,30 +54,65 @@ STATUS_INTERVAL = 1.0
 """Seconds between two looks at a recorder whose estimate has failed."""
 
 
-def run_test(
-    path: Path,
+@examples(
+    "huddle run lab.toml --duration 3h",
+    "huddle run lab.toml --until-decided --duration 3h",
+    "huddle run lab.toml --until-cov 0.05 --band 1:20",
+    "huddle run lab.toml -d 20min --json result.json --report result.pdf",
+)
+@with_logging
+@with_estimate_options
+def run(
+    path: BenchArgument,
     *,
-    end: EndCondition,
-    out: Path | None,
-    json: str | None,
-    csv: str | None,
-    diagnostics: bool = False,
-    report: Path | None = None,
-    anyway: bool = False,
+    duration: DurationOption = None,
+    until_cov: Annotated[
+        float | None,
+        typer.Option(
+            "--until-cov",
+            min=0.001,
+            max=1.0,
+            metavar="COV",
+            help="Stop when the noise in the worst third of an octave of the band has this"
+            " coefficient of variation.",
+        ),
+    ] = None,
+    until_decided: Annotated[
+        bool,
+        typer.Option("--until-decided", help="Stop when all limits of the bench are decided."),
+    ] = False,
+    anyway: AnywayOption = False,
+    out: OutOption = None,
+    diagnostics: DiagnosticsOption = False,
+    report: Annotated[
+        Path | None,
+        typer.Option(
+            "--report", metavar="FILE", help="Write the calibration report: .html or .pdf."
+        ),
+    ] = None,
+    json: JsonOption = None,
+    csv: CsvOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
-    """Run one huddle test and show its result.
+    """Run one huddle test: record, estimate live, print the result.
 
-    The check list comes first. It must not fail, unless the test is to be made `anyway`.
+    First the command reads the sensors for 10 s and makes the check list of
+    huddle check. If a check fails, nothing is recorded.
 
-    Raises
-    ------
-    HuddleError
-        The recorder failed; the result of what was recorded is shown before.
-    typer.Exit
-        With 130 after Ctrl-C, 1 if a limit is not met, 4 if that is not decided, after the result
-        has been shown.
+    The recorder is a separate process; the estimate reads its file.
+    Ctrl-C stops the recorder, and the command prints the result. Ctrl-C
+    during the final estimate finishes it first; a second Ctrl-C aborts.
     """
+    from daq.devices.bench_file import load
+    from daq.estimation.settings import Settings
+    from daq.host_clock import SystemClock
+    from daq.results.decision.limits import judge
+    from tui.output.console import check_places, for_people, hint
+    from tui.runs.estimate_settings import check_fit, chosen
+    from tui.runs.interrupt import defer_interrupt
+    from tui.runs.recorder_process import RecorderProcess
+
+    end = EndCondition(duration, until_cov, until_decided)
     bench = load(path)
     settings = chosen(Settings.of(bench), **wanted)
     check_fit(settings, bench.sensors)
@@ -137,6 +171,8 @@ class _Stored:
     """Writes the results into the recording, and raises later what kept it from that."""
 
     def __init__(self, out: Path, snapshot: Snapshot, found: TestVerdict | None) -> None:
+        from daq.results.store import store_results
+
         self._error: RecordingError | None = None
         try:
             store_results(out, snapshot, found)
@@ -165,6 +201,10 @@ def result_of(
     HuddleError, EstimatorError
         The recorder failed, or the recording gives no result.
     """
+    from daq.estimation.estimation import estimate
+    from daq.estimation.follow import RecordingLeftOpenError, follow
+    from daq.recording.repair import repair
+
     with _progress(end.duration) as bar:
         observer = _Run(bar)
         try:
@@ -202,6 +242,9 @@ def result_of(
 
 def _estimate_at_end(recorder: RecorderProcess, settings: Settings) -> Snapshot | None:
     """Wait for the recorder, and estimate its recording; None if it was left open."""
+    from daq.estimation.estimation import estimate
+    from daq.recording.reader import Recording
+
     while not recorder.ends_within(STATUS_INTERVAL):
         pass
     recorder.check()
@@ -222,6 +265,8 @@ class _Run:
 
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
         """Show the progress of the run."""
+        from tui.wording.facts import why_no_estimate
+
         if snapshot.closed:
             return
         self._bar.estimated(snapshot, settings)
@@ -272,6 +317,8 @@ class _Bar:
 
     def estimated(self, snapshot: Snapshot, settings: Settings) -> None:
         """Show the progress of the recording with the precision of its estimate."""
+        from daq.results.precision import precision
+
         reached = precision(snapshot, settings)
         self._cov = reached.cov
         if settings.target_cov is not None and self._duration is None:
@@ -281,6 +328,8 @@ class _Bar:
 
     def recording(self, n_segments: int, elapsed: float) -> None:
         """Show the progress of the recording."""
+        from tui.wording.formatting import clock_time, time_left
+
         left = None if self._end is None else max(0.0, self._end - elapsed)
         parts = [f"{n_segments} segments"]
         if not math.isnan(self._cov):
@@ -307,6 +356,10 @@ class _Bar:
 
 @contextmanager
 def _progress(duration: float | None) -> Iterator[_Bar]:
+    from rich.progress import BarColumn, TextColumn
+
+    from tui.output.console import progress
+
     with progress(
         TextColumn("{task.description}"),
         BarColumn(bar_width=24),

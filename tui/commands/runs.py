@@ -1,23 +1,23 @@
-"""``huddle runs``, ``huddle pin``, ``huddle verify``: what a service has kept."""
+"""``huddle runs`` and ``huddle pin``: the runs of a service."""
+
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
-from rich.table import Table
+import typer
 
-from daq.errors import HuddleError, RecordingError
-from daq.recording.signing import problem, signature_of
-from daq.recording.storage.trial import trials
-from tui.certificate.ledger import Ledger
-from tui.output.console import check_places, for_people, write_json, write_text
+from daq.errors import HuddleError
+from tui.commands.options import CsvOption, JsonOption, examples
 from tui.output.csv_text import csv_text
-from tui.service.records.places import NoServiceError, Place
-from tui.service.records.run_state import Run, RunState, utc_text
+from tui.service.records.run_state import RunState, utc_text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
+
+    from tui.service.records.run_state import Run
 
 _STYLES = {RunState.FAILED: "red", RunState.MISSED: "yellow", RunState.DONE: "green"}
 PAGE = 100
@@ -28,20 +28,35 @@ _COLUMNS = (
 )
 
 
-class RunNotFoundError(HuddleError):
-    """No run has this recording or due time."""
+PlaceArgument: TypeAlias = Annotated[
+    Path, typer.Argument(metavar="BENCH", help="Bench file, or a folder of recordings.")
+]
 
-    is_usage_error = True
 
+@examples(
+    "huddle runs lab.toml", "huddle runs lab.toml --last 10", "huddle runs recordings --csv -"
+)
+def runs(
+    source: PlaceArgument,
+    *,
+    last: Annotated[
+        int | None,
+        typer.Option(
+            "--last", min=1, metavar="N", help="The last N runs (default on the screen: 100)."
+        ),
+    ] = None,
+    json: JsonOption = None,
+    csv: CsvOption = None,
+) -> None:
+    """List the runs of a service: state, verdict, recordings, reason.
 
-def list_runs(source: Path, *, last: int | None, json: str | None, csv: str | None) -> None:
-    """List the runs of a service: the last ones where `last` is given, or for people.
-
-    Raises
-    ------
-    NoServiceError, StoreError
-        If there is no database of runs, or it cannot be read.
+    A run is due, recording, estimating, done, failed or missed.
     """
+    from rich.table import Table
+
+    from tui.output.console import check_places, for_people, write_json, write_text
+    from tui.service.records.places import Place
+
     check_places(json, csv)
     place = Place.of(source)
     is_page = last is None and json is None and csv is None
@@ -69,33 +84,40 @@ def list_runs(source: Path, *, last: int | None, json: str | None, csv: str | No
         write_text(csv, csv_text(_COLUMNS, map(_cells, runs)))
 
 
-def _cells(run: Run) -> list[object]:
-    document = run.document() | {"recordings": " ".join(run.parts)}
-    return [document[name] for name in _COLUMNS]
+@examples(
+    "huddle pin lab.toml lab-20261121T220000Z.h5",
+    "huddle pin lab.toml '2026-11-21 22:00' --remove",
+)
+def pin(
+    source: PlaceArgument,
+    names: Annotated[
+        list[str], typer.Argument(metavar="RUN", help="Recording or due time, as in huddle runs.")
+    ],
+    *,
+    remove: Annotated[bool, typer.Option("--remove", help="Allow their removal again.")] = False,
+) -> None:
+    """Protect runs from removal by the storage limits of the bench file."""
+    from tui.output.console import for_people
+    from tui.service.records.places import Place
 
-
-def pin_runs(source: Path, names: Sequence[str], *, pinned: bool) -> None:
-    """Keep runs whatever the limits of storage, or no longer.
-
-    Parameters
-    ----------
-    source : Path
-        Bench file or folder.
-    names : sequence of str
-        File names of recordings, or due times.
-    pinned : bool
-
-    Raises
-    ------
-    RunNotFoundError
-        If there is no such run; then none is changed.
-    """
+    pinned = not remove
     place = Place.of(source)
     runs = place.runs()
     found = [run for name in names for run in runs_named(runs, name)]
     place.store.pin([run.key for run in found], pinned=pinned)
     for run in found:
         for_people(None).print(f"run {run.name} {'is kept' if pinned else 'is no longer pinned'}")
+
+
+class RunNotFoundError(HuddleError):
+    """No run has this recording or due time."""
+
+    is_usage_error = True
+
+
+def _cells(run: Run) -> list[object]:
+    document = run.document() | {"recordings": " ".join(run.parts)}
+    return [document[name] for name in _COLUMNS]
 
 
 def runs_named(runs: Sequence[Run], name: str) -> list[Run]:
@@ -117,107 +139,3 @@ def runs_named(runs: Sequence[Run], name: str) -> list[Run]:
             f"{name}: no such run; expected a recording or a due time as huddle runs shows them"
         )
     return found
-
-
-def verify_recordings(
-    sources: Sequence[Path], *, key: Path | None = None, json: str | None
-) -> None:
-    """Walk the checksums of recordings, or of all that services have kept.
-
-    Parameters
-    ----------
-    sources : sequence of path
-        Recordings, bench files or folders.
-    key : Path, optional
-        Public key that must have signed every recording.
-    json : str or None
-
-    Raises
-    ------
-    RecordingError
-        If one is damaged, lost, another one than the service made, or not signed with the key.
-    """
-    certificates = [source for source in sources if source.suffix.lower() == ".pdf"]
-    if certificates:
-        _verify_certificates(certificates, sources, json=json)
-        return
-    found = []
-    paths, known = _recordings(sources)
-    # In children: a file that hangs or crashes HDF5 is damaged, and the others are verified.
-    for path, report in trials(paths, "verify"):
-        damaged = ", ".join(report.get("damaged", ()))
-        state = report.get("error") or (f"damaged: {damaged}" if damaged else "intact")
-        if "fatal" in report:
-            state = f"damaged: {report['fatal']}"
-        own = report.get("run_id", ""), report.get("root_sha256", "")
-        if state == "intact" and known.get(path, own) != own:
-            state = "exchanged: not the recording that the service has made under this name"
-        if state == "intact":
-            state = problem(path, *own, public=key) or state
-        signer = signature_of(path) if state == "intact" else None
-        if signer is not None:
-            state = f"intact, signed with key {signer.key_id}"
-        found.append((path, state, report.get("root_sha256") or None))
-        for_people(json).print(f"{path}: {state.removeprefix(f'{path}: ')}", soft_wrap=True)
-    bad = [path.name for path, state, _ in found if not state.startswith("intact")]
-    write_json(
-        json,
-        {
-            "recordings": [
-                {
-                    "path": str(path),
-                    "intact": state.startswith("intact"),
-                    "state": state,
-                    "root_sha256": root,
-                }
-                for path, state, root in found
-            ]
-        },
-    )
-    if bad:
-        raise RecordingError(f"{len(bad)} of {len(found)} recordings are damaged or lost")
-
-
-def _verify_certificates(
-    certificates: Sequence[Path], sources: Sequence[Path], *, json: str | None
-) -> None:
-    """Check certificates against the ledger in their folder, and the recordings named beside them.
-
-    Raises
-    ------
-    VerificationError
-        If one was changed, or is of another recording.
-    """
-    from tui.certificate.issuing import verify  # noqa: PLC0415 - loads matplotlib
-
-    recordings = [source for source in sources if source not in certificates]
-    found = []
-    for path in certificates:
-        lines = verify(path, recordings, Ledger(path.absolute().parent))
-        found.append({"path": str(path), "findings": lines})
-        for line in lines:
-            for_people(json).print(f"{path.name}: {line}", soft_wrap=True)
-    write_json(json, {"certificates": found})
-
-
-def _recordings(
-    sources: Sequence[Path],
-) -> tuple[list[Path], dict[Path, tuple[str, str]]]:
-    """Return recordings, and run id and root SHA-256 of those that services know."""
-    found: list[Path] = []
-    known: dict[Path, tuple[str, str]] = {}
-    for source in sources:
-        if source.suffix.lower() in {".h5", ".hdf5"}:
-            found.append(source)
-            continue
-        try:
-            place = Place.of(source)
-        except NoServiceError:
-            if not source.is_dir():
-                raise
-            found += sorted(source.glob("*.h5"))
-            continue
-        runs = place.runs(kept=True)
-        found += [place.folder / part for run in runs for part in run.parts]
-        known |= {place.folder / part: own for part, own in place.store.identities().items()}
-    return list(dict.fromkeys(found)), known

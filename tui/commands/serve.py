@@ -1,37 +1,35 @@
 """``huddle serve``: the service, from its bench file."""
 
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
+
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import logging
 import signal
 import time
 from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from daq.bench.durations import format_duration
 from daq.bench.option_fit import shortest_duration
-from daq.devices.bench_file import load
 from daq.errors import BenchFileError, FileFault, HuddleError
-from daq.estimation.settings import Settings
-from daq.recorder.clock_trust import ClockTrust
 from daq.recorder.schedule import all_due, utc_now
-from tui.output.console import for_people, write_json, write_whole
+from tui.commands.options import (
+    AnywayOption,
+    BenchArgument,
+    JsonOption,
+    examples,
+    with_estimate_options,
+    with_logging,
+)
 from tui.output.extras import require
-from tui.runs.estimate_settings import check_fit, chosen
-from tui.service.clock import SystemTime
-from tui.service.hooks import HookRunner
 from tui.service.metrics import ServiceMetrics
 from tui.service.notify import Notifier, watchdog_interval
-from tui.service.processes.finish import options_table
 from tui.service.processes.locks import Lock
-from tui.service.processes.steps import ProcessSteps
-from tui.service.records.places import file_name, service_lock
-from tui.service.records.storage import tidy
 from tui.service.records.store import RunStore, StoreError
-from tui.service.service import Service
-from tui.service.window import STALL
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -40,9 +38,54 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from tui.service.clock import Clock
     from tui.service.records.run_state import Run
+    from tui.service.service import Service
 
 INTERVAL = 10.0
 """Seconds between two signs of life, at most."""
+_LOGGER = logging.getLogger(__name__)
+SHOWN = 5
+
+
+@examples(
+    "huddle serve lab.toml",
+    "huddle serve lab.toml --list",
+    "huddle serve lab.toml --method all --reject",
+)
+@with_logging
+@with_estimate_options
+def serve(
+    path: BenchArgument,
+    *,
+    show: Annotated[
+        bool, typer.Option("--list", help="Show the times of the next runs, and exit.")
+    ] = False,
+    anyway: AnywayOption = False,
+    json: JsonOption = None,
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
+) -> None:
+    """Run huddle tests on the schedule of the bench file, until Ctrl-C.
+
+    Before each run, the check list of huddle check is made. If a check fails,
+    it is tried again for five minutes; then the run fails, and the hook
+    on_failed says why. Options of the estimate apply to every run.
+    """
+    import asyncio
+
+    from tui.output.console import for_people, write_json
+
+    bench = accepted(path, wanted)
+    if show:
+        now = utc_now()
+        times = list(islice(all_due(bench.schedule, now), SHOWN))
+        for due, entry in times:
+            for_people(json).print(f"{due:%Y-%m-%d %H:%M %Z}  {entry.name}")
+        document = {
+            "next": [due.isoformat() for due, _ in times],
+            "entries": [entry.name for _, entry in times],
+        }
+        write_json(json, document)
+        return
+    asyncio.run(serve_runs(path, bench, wanted, anyway=anyway))
 
 
 def is_alive(service: Service, at: float) -> bool:
@@ -54,6 +97,8 @@ def is_alive(service: Service, at: float) -> bool:
     at : float
         Time of the event loop.
     """
+    from tui.service.window import STALL
+
     window = service.window
     if window is None or window.progressed_at is None:
         return True  # a recorder that starts is given up by its window
@@ -70,6 +115,8 @@ def status_line(service: Service) -> str:
 
 async def signs_of_life(service: Service, notifier: Notifier) -> None:
     """Send ``READY`` and then ``WATCHDOG`` until cancelled."""
+    import asyncio
+
     notifier.send("READY=1")
     interval = min(INTERVAL, watchdog_interval() or INTERVAL)
     loop = asyncio.get_running_loop()
@@ -81,49 +128,8 @@ async def signs_of_life(service: Service, notifier: Notifier) -> None:
         await asyncio.sleep(interval)
 
 
-_LOGGER = logging.getLogger(__name__)
-SHOWN = 5
-
-
 class AlreadyServedError(HuddleError):
     """Another service runs the schedule of this bench."""
-
-
-def serve_bench(
-    path: Path,
-    *,
-    show: bool,
-    json: str | None,
-    anyway: bool = False,
-    wanted: Mapping[str, object] | None = None,
-) -> None:
-    """Run huddle tests on the schedule of the bench file, until SIGINT or SIGTERM.
-
-    With `anyway`, runs start whatever the check list says.
-
-    Raises
-    ------
-    BenchFileError
-        The bench file has no schedule, or entries without a duration.
-    AlreadyServedError
-        Another service has this bench and folder.
-    typer.BadParameter
-        If an option of the estimate does not fit the others or the sensors.
-    """
-    wanted = wanted or {}
-    bench = accepted(path, wanted)
-    if show:
-        now = utc_now()
-        times = list(islice(all_due(bench.schedule, now), SHOWN))
-        for due, entry in times:
-            for_people(json).print(f"{due:%Y-%m-%d %H:%M %Z}  {entry.name}")
-        document = {
-            "next": [due.isoformat() for due, _ in times],
-            "entries": [entry.name for _, entry in times],
-        }
-        write_json(json, document)
-        return
-    asyncio.run(serve(path, bench, wanted, anyway=anyway))
 
 
 def accepted(path: Path, wanted: Mapping[str, object]) -> Bench:
@@ -134,6 +140,10 @@ def accepted(path: Path, wanted: Mapping[str, object]) -> Bench:
     BenchFileError
         With every fault of the file, also of its schedule.
     """
+    from daq.devices.bench_file import load
+    from daq.estimation.settings import Settings
+    from tui.runs.estimate_settings import check_fit, chosen
+
     bench = load(path)
     settings = chosen(Settings.of(bench), **wanted)
     check_fit(settings, bench.sensors)
@@ -165,7 +175,7 @@ def accepted(path: Path, wanted: Mapping[str, object]) -> Bench:
     return bench
 
 
-async def serve(
+async def serve_runs(
     path: Path,
     bench: Bench,
     wanted: Mapping[str, object],
@@ -180,6 +190,16 @@ async def serve(
     AlreadyServedError, StoreError
         If there is another service, or the folder of the recordings cannot be used.
     """
+    import asyncio
+
+    from daq.recorder.clock_trust import ClockTrust
+    from tui.service.clock import SystemTime
+    from tui.service.hooks import HookRunner
+    from tui.service.processes.finish import options_table
+    from tui.service.processes.steps import ProcessSteps
+    from tui.service.records.storage import tidy
+    from tui.service.service import Service
+
     clock = SystemTime() if clock is None else clock
     folder = bench.recording_directory
     lock = _locked(bench, folder)
@@ -231,6 +251,8 @@ async def serve(
 
 
 def _locked(bench: Bench, folder: Path) -> Lock:
+    from tui.service.records.places import service_lock
+
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = Lock.take(service_lock(bench))
@@ -246,6 +268,9 @@ def _locked(bench: Bench, folder: Path) -> Lock:
 
 def _snapshot(bench: Bench, path: Path) -> Path:
     """Return a copy of the accepted bench file, which recorders read whatever becomes of it."""
+    from tui.output.console import write_whole
+    from tui.service.records.places import file_name
+
     copy = bench.recording_directory / f".{file_name(bench.name)}.toml"
     try:
         write_whole(copy, bench.text.encode())
@@ -272,6 +297,8 @@ def _again(path: Path, wanted: Mapping[str, object], first: Bench) -> Bench:
 
 
 def _on_signals(stop: Callable[[], None], reload: Callable[[], None]) -> None:
+    import asyncio
+
     loop = asyncio.get_running_loop()
     numbers = {signal.SIGINT: stop, signal.SIGTERM: stop}
     if hasattr(signal, "SIGHUP"):

@@ -1,31 +1,44 @@
 """``huddle sign``: signatures of recordings, and keys."""
 
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
+
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import Annotated
 
 import typer
 
 from daq.errors import RecordingError
-from daq.recording.repair import verify
-from daq.recording.signing import make_key, sign
-from tui.output.console import for_people
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
+from tui.commands.options import examples
 
 
-def sign_recordings(recordings: Sequence[Path], *, key: Path | None, new_key: Path | None) -> None:
-    """Sign closed recordings that are intact, or make a key.
+@examples(
+    "huddle sign --new-key ~/lab.key",
+    "huddle sign lab.h5 --key ~/lab.key",
+)
+def sign(
+    recordings: Annotated[
+        list[Path] | None, typer.Argument(metavar="RECORDING", help="Closed recordings.")
+    ] = None,
+    *,
+    key: Annotated[
+        Path | None, typer.Option("--key", metavar="FILE", help="Private key (ed25519, PEM).")
+    ] = None,
+    new_key: Annotated[
+        Path | None,
+        typer.Option("--new-key", metavar="FILE", help="Make a key, and FILE.pub for others."),
+    ] = None,
+) -> None:
+    """Sign recordings with a private key, or make one.
 
-    Raises
-    ------
-    RecordingError
-        If one is damaged; those before it are signed.
-    SigningError
-        If a key or signature cannot be read or written.
+    A recording is verified before. Its signature is a file beside it (.sig).
     """
+    from daq.recording.repair import verify
+    from daq.recording.signing import make_key, sign
+    from tui.output.console import for_people
+
+    recordings = recordings or []
     screen = for_people(None)
     if new_key is not None:
         public = make_key(new_key)

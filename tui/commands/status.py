@@ -1,34 +1,34 @@
 """``huddle status``: what the service of a bench does."""
 
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
+
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
 from daq.bench.durations import format_duration
-from daq.devices.bench_file import load
 from daq.recorder.schedule import utc_now
-from tui.output.console import for_people, write_json
+from tui.commands.options import BenchArgument, JsonOption, examples
 from tui.output.exit_codes import ExitCode
 from tui.service.records.store import RunStore
-from tui.service.status import service_status
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
+    from typing import Any
 
 
-def show_status(path: Path, *, json: str | None) -> None:
-    """Show what the service of a bench file does.
+@examples("huddle status lab.toml", "huddle status lab.toml --json -")
+def status(path: BenchArgument, *, json: JsonOption = None) -> None:
+    """Show the state of the service of a bench: runs, sensors, disk, clock.
 
-    Raises
-    ------
-    BenchFileError, StoreError
-        If the bench file or the database cannot be read.
-    typer.Exit
-        With 3 if no service runs.
+    The exit code is 3 if no service runs.
     """
+    from daq.devices.bench_file import load
+    from tui.output.console import for_people, write_json
+    from tui.service.status import service_status
+
     bench = load(path)
     runs = RunStore(bench.recording_directory).current(bench.name)
     bench.recording_directory.mkdir(parents=True, exist_ok=True)

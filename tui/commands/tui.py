@@ -1,26 +1,19 @@
 """``huddle tui``: opens the application on a bench file or a recording."""
 
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
+
 from __future__ import annotations
 
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from daq.bench.masks.mask_file import masks_named
-from daq.devices.bench_file import load
 from daq.errors import BenchFileError, FileFault
-from daq.estimation.settings import Settings
-from daq.recording.reader import Recording
-from tui.application.app import HuddleApp
 from tui.application.terminal.ascii_text import is_ascii_only
-from tui.application.themes import THEMES, USUAL
-from tui.commands.tui_controls import BenchControls, RecordingControls, with_comparison
-from tui.output.console import notices
-from tui.output.logs.lines import screen_taken
-from tui.runs.estimate_settings import check_fit, chosen, settings_for
+from tui.commands.options import ModelsOption, examples, with_estimate_options, with_log_file
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,12 +22,68 @@ if TYPE_CHECKING:
 
     from daq.bench.masks.mask import Mask
     from daq.bench.model import Sensor
+    from daq.estimation.settings import Settings
     from daq.recording.interface import ReadableSensor
+    from tui.application.app import HuddleApp
 
 FOREIGN = {".npz", ".npy", ".csv", ".txt", ".mat", ".mseed", ".miniseed", ".seed", ".sac", ".gcf"}
 """Suffixes of files that must be imported first."""
 BROWSER = "TEXTUAL_DRIVER"
 """Set by ``textual serve``: the application is shown in a browser, and needs no terminal."""
+
+
+@examples("huddle tui lab.toml", "huddle tui recordings/lab-20261121T030000Z.h5")
+@with_log_file
+@with_estimate_options
+def tui(
+    source: Annotated[
+        Path | None,
+        typer.Argument(metavar="BENCH", help="Bench file, or a recording to view."),
+    ] = None,
+    on_event: Annotated[
+        str,
+        typer.Option(
+            "--on-event",
+            metavar="COMMAND",
+            help="Command to start when a test ends and when a sensor is lost, with"
+            " the environment variables HUDDLE_EVENT (ended, trouble), HUDDLE_TEXT and"
+            " HUDDLE_RECORDING.",
+        ),
+    ] = "",
+    baud: Annotated[
+        int | None,
+        typer.Option(
+            "--baud",
+            min=1200,
+            help="Baud rate of the line to the terminal, which limits the output (default: that of"
+            " a serial port, otherwise unlimited).",
+        ),
+    ] = None,
+    models: ModelsOption = "",
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
+) -> None:
+    """Open the application: start, watch and stop a huddle test.
+
+    Closing the application does not stop a recording. Opening it again shows
+    the running recording. Without a bench file, or with an empty or missing
+    one, the ports are searched and a bench file is written first.
+    """
+    is_first = source is None and not any(Path().glob("*.toml"))
+    if source is not None and source.suffix == ".toml":
+        is_first = not source.exists() or source.stat().st_size == 0
+    if is_first and sys.stdin.isatty() and sys.stdout.isatty():
+        from tui.commands.init import write_discovered
+
+        source = Path("bench.toml") if source is None else source
+        write_discovered(source, (), force=True)
+    if source is None:
+        there = sorted(path.name for path in Path().glob("*.toml"))
+        here = f"; this folder has {', '.join(there)}" if there else ""
+        raise typer.BadParameter(
+            f"expected a bench file (huddle init writes one) or a recording{here}; huddle demo"
+            " needs neither"
+        )
+    open_application(source, on_event=on_event, models=models, baud=baud, **wanted)
 
 
 def open_application(
@@ -83,6 +132,12 @@ def open_bench(
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Open the application on a bench file."""
+    from daq.devices.bench_file import load
+    from daq.estimation.settings import Settings
+    from tui.application.app import HuddleApp
+    from tui.commands.tui_controls import BenchControls, with_comparison
+    from tui.runs.estimate_settings import check_fit, chosen
+
     bench = load(path)
     settings = chosen(Settings.of(bench), **wanted)
     check_fit(settings, bench.sensors)
@@ -99,7 +154,7 @@ def _driver(baud: int | None = None) -> type[Driver] | None:
     """Return the driver that the terminal needs; None: Textual's own, or the one of a browser."""
     if sys.platform == "win32" or BROWSER in os.environ or not sys.stdin.isatty():
         return None
-    from tui.application.terminal.driver import (  # noqa: PLC0415 - not on Windows
+    from tui.application.terminal.driver import (
         driver_for,
         speed_of_terminal,
     )
@@ -110,6 +165,9 @@ def _driver(baud: int | None = None) -> type[Driver] | None:
 
 def _run(app: HuddleApp, *, again: Path) -> None:
     """Run the application; print the name of its recording, and whether it continues."""
+    from tui.output.console import notices
+    from tui.output.logs.lines import screen_taken
+
     if BROWSER not in os.environ and not all(
         stream.isatty() for stream in (sys.stdin, sys.stdout, sys.stderr)
     ):
@@ -139,6 +197,8 @@ def _theme() -> str:
     typer.BadParameter
         There is none of this name.
     """
+    from tui.application.themes import THEMES, USUAL
+
     name = os.environ.get("HUDDLE_THEME", USUAL)
     if name not in THEMES:
         raise typer.BadParameter(
@@ -155,6 +215,11 @@ def show_demo(path: Path, settings: Settings) -> Path | None:
     Path or None
         The last recording, closed.
     """
+    from daq.devices.bench_file import load
+    from tui.application.app import HuddleApp
+    from tui.commands.tui_controls import BenchControls
+    from tui.output.logs.lines import screen_taken
+
     # The recording of the demo is deleted when the demo ends; reports are kept.
     controls = BenchControls(path, load(path), settings, reports=Path.cwd())
     try:
@@ -180,6 +245,11 @@ def open_recording(
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Open the application on a recording, growing or closed."""
+    from daq.recording.reader import Recording
+    from tui.application.app import HuddleApp
+    from tui.commands.tui_controls import RecordingControls, with_comparison
+    from tui.runs.estimate_settings import settings_for
+
     settings, bench = settings_for(path, start=start, end=end, **wanted)
     settings = with_comparison(settings, wanted)
     with Recording.open(path) as recording:
@@ -198,6 +268,8 @@ def _models(
     WrongSettingError
         If one cannot.
     """
+    from daq.bench.masks.mask_file import masks_named
+
     masks = masks_named(names)
     units = [c.unit for sensor in sensors for c in sensor.channels if not c.auxiliary]
     for mask in masks:

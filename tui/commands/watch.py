@@ -1,5 +1,7 @@
 """``huddle watch``: shows the live estimate of a recording that another process writes."""
 
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
+
 from __future__ import annotations
 
 import json as json_text
@@ -7,46 +9,42 @@ import math
 import sys
 from typing import TYPE_CHECKING, Any
 
-from daq.estimation.follow import follow
-from daq.results.band_summary import band_of, channel_means
-from daq.results.decision.limits import judge
-from daq.results.precision import precision
 from tui.commands.estimate import exit_with, show_result
-from tui.output.console import console, finite, write_text
-from tui.output.json_document import verdict_document
-from tui.output.json_values import plain
-from tui.runs.estimate_settings import settings_for
-from tui.wording.facts import why_no_estimate
-from tui.wording.formatting import clock_time, time_left
+from tui.commands.options import (
+    EndOption,
+    FileArgument,
+    JsonOption,
+    StartOption,
+    examples,
+    with_estimate_options,
+    with_logging,
+)
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
 
 
-def watch_recording(
-    file: Path,
+@examples("huddle watch night.h5", "huddle watch night.h5 --json -   (one line of JSON per update)")
+@with_logging
+@with_estimate_options
+def watch(
+    file: FileArgument,
     *,
-    start: str | None,
-    end: str | None,
-    json: str | None,
+    start: StartOption = None,
+    end: EndOption = None,
+    json: JsonOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
-    """Show a growing recording: in the application, as lines, or as lines of JSON.
+    """Show the live estimate of a recording that another process writes."""
+    from daq.estimation.follow import follow
+    from daq.results.decision.limits import judge
+    from tui.runs.estimate_settings import settings_for
 
-    Raises
-    ------
-    RecordingError
-        The recording cannot be read.
-    typer.Exit
-        With 1 if a limit is not met, with 4 if that is not decided.
-    """
     if json is None and sys.stdout.isatty() and sys.stdin.isatty():
-        from tui.commands.tui import open_recording  # noqa: PLC0415 - Textual where it is shown
+        from tui.commands.tui import open_recording
 
         open_recording(file, start=start, end=end, **wanted)
         return
@@ -72,6 +70,9 @@ class _Lines:
         self._says_why = False
 
     def status(self, status: RecordingStatus) -> None:
+        from tui.output.console import console
+        from tui.wording.formatting import clock_time
+
         before, self._now = self._now, status
         events = status.events[self._n_events :]
         self._n_events = len(status.events)
@@ -92,6 +93,11 @@ class _Lines:
                 self._write({"event": document})
 
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
+        from tui.output.console import console
+        from tui.output.json_values import plain
+        from tui.wording.facts import why_no_estimate
+        from tui.wording.formatting import clock_time
+
         before, self.last = self.last, snapshot
         reason = why_no_estimate(snapshot)
         if reason and not self._says_why:
@@ -114,12 +120,17 @@ class _Lines:
         pass
 
     def _write(self, document: dict[str, Any]) -> None:
+        from tui.output.console import finite, write_text
+
         if self._json is not None:
             line = json_text.dumps(finite(document), ensure_ascii=False) + "\n"
             write_text(self._json, line, append=True)
 
 
 def _line(snapshot: Snapshot, settings: Settings) -> str:
+    from daq.results.precision import precision
+    from tui.wording.formatting import clock_time, time_left
+
     reached = precision(snapshot, settings)
     state = "ended" if snapshot.closed else time_left(reached.seconds_left)
     known = "" if math.isnan(reached.cov) else f"c.o.v. {reached.cov:.3f}  "
@@ -130,6 +141,12 @@ def _update(
     snapshot: Snapshot, settings: Settings, now: RecordingStatus | None, bench: Bench | None
 ) -> dict[str, Any]:
     """Return the update for programs: states, noise in the band, verdict."""
+    from daq.results.band_summary import band_of, channel_means
+    from daq.results.decision.limits import judge
+    from daq.results.precision import precision
+    from tui.output.json_document import verdict_document
+    from tui.output.json_values import plain
+
     reached = precision(snapshot, settings)
     document: dict[str, Any] = {
         "elapsed": snapshot.elapsed,

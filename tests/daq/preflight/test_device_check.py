@@ -24,7 +24,7 @@ from daq.preflight.device_check import (
 from daq.protocols.block import Block, HostTime
 from tests.devices import host_clock, serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
-from tui.cli.main import app
+from tui.commands.main import app
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

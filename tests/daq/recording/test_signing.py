@@ -26,7 +26,7 @@ from daq.recording.signing import (
 )
 from tests.tui.service.bench_files import HOURLY, bench_of
 from tests.tui.service.test_continuations import record
-from tui.cli.main import app
+from tui.commands.main import app
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -25,8 +25,8 @@ from daq.results.calibration import calibrate
 from daq.results.uncertainty_budget import Budget, Component, student_quantile
 from estimator.responses.derived_quantities import Value
 from tests.daq.clocks.recordings import Sensor, write
-from tui.cli.main import app
 from tui.commands.calibrate import side_by_side
+from tui.commands.main import app
 from tui.output.calibration import angle, remarks, sensitivity_table, with_error
 
 if TYPE_CHECKING:

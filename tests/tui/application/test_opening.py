@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from tests.tui.example_snapshot import growing
 from tui.application.app import HuddleApp
-from tui.cli.main import app
+from tui.commands.main import app
 
 if TYPE_CHECKING:
     from pathlib import Path

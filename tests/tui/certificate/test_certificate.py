@@ -28,7 +28,7 @@ from tui.certificate.dcc import NAME
 from tui.certificate.issuing import JSON_NAME
 from tui.certificate.ledger import Ledger
 from tui.certificate.signing import signatures
-from tui.cli.main import app
+from tui.commands.main import app
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -41,7 +41,7 @@ from tests.known_clocks import Oscillator, Scene
 from tests.tui.output.test_result_schema import SCHEMA as RESULT
 from tests.tui.output.test_result_schema import strict
 from tests.waiting import finish, wait_until
-from tui.cli.main import app
+from tui.commands.main import app
 from tui.report.figures import drawing
 from tui.report.figures.archive import days_figure, density_figure
 

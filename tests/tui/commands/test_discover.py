@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from daq.devices.bench_file import load
 from tests.devices import serving
 from tests.sim_devices.simulated_bench import bench_of, device, spec
-from tui.cli.main import app
+from tui.commands.main import app
 
 if TYPE_CHECKING:
     from pathlib import Path

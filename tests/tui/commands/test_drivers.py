@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from daq.devices.bench_file import parse
 from daq.devices.registry import driver_names, driver_type
 from daq.errors import BenchFileError
-from tui.cli.main import app
+from tui.commands.main import app
 
 if TYPE_CHECKING:
     from pathlib import Path

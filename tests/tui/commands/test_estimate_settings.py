@@ -26,9 +26,9 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from estimator.likelihood.factor_analysis import max_factors
 from estimator.spectra.welch import WelchSettings
-from tui.cli.help import subcommand
-from tui.cli.main import app
-from tui.cli.options import with_estimate_options
+from tui.commands.help import subcommand
+from tui.commands.main import app
+from tui.commands.options import with_estimate_options
 from tui.runs.estimate_settings import check_fit, chosen
 from tui.simulation.write_recording import simulate_recording
 

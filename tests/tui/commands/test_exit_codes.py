@@ -20,7 +20,7 @@ from daq.errors import (
 )
 from estimator.errors import BandError, EstimatorError, UnknownMethodError
 from sim_devices.errors import ScenarioError, ServeError, SimulationError
-from tui.cli.main import exit_code, messages
+from tui.commands.main import exit_code, messages
 from tui.output.exit_codes import ExitCode
 from tui.runs.recorder_process import RecorderFailedError
 

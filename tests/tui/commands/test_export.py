@@ -26,7 +26,7 @@ from daq.formats.readers.waveforms import load_obspy
 from daq.recording.reader import Recording
 from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, create
 from tests.daq.formats.test_sources import START, STEP, counts, write_records
-from tui.cli.main import app
+from tui.commands.main import app
 from tui.output.exit_codes import ExitCode
 
 if TYPE_CHECKING:

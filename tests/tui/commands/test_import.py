@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from daq.recording.reader import Recording
 from tests.daq.formats.test_sources import START, STEP, counts, write_records
-from tui.cli.main import app
+from tui.commands.main import app
 from tui.output.exit_codes import ExitCode
 
 if TYPE_CHECKING:

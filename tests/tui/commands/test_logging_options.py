@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from daq.python_process import python_command
-from tui.cli.main import app
+from tui.commands.main import app
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -14,7 +14,7 @@ from daq.estimation.snapshot import NoResultError
 from estimator.spectra.segment_rejection import Reason
 from tests.daq.clocks.recordings import write_polled
 from tui.application.test_view.panels import findings
-from tui.commands.watch import watch_recording
+from tui.commands.watch import watch
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -61,12 +61,12 @@ def test_segments_that_count_need_no_reason(tmp_path: Path) -> None:
 
 def test_watch_says_it(path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(NoResultError):
-        watch_recording(path, start=None, end=None, json=None, segment=4.0)
+        watch(path, json=None, segment="4s")
     said = capsys.readouterr().out
     assert said.count("No segment of 4 s can be used: b has at most 0.8 s without a gap.") == 1
     out = tmp_path / "lines.json"
     with pytest.raises(NoResultError):
-        watch_recording(path, start=None, end=None, json=str(out), segment=4.0)
+        watch(path, json=str(out), segment="4s")
     lines = [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()]
     (told,) = [line for line in lines if "no_segment" in line]
     assert told["no_segment"] == {"reason": "gap", "segment": 4.0, "sensor": "b", "longest": 0.8}

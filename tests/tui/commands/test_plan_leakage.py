@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 from typer.testing import CliRunner
 
-from tui.cli.main import app
+from tui.commands.main import app
 from tui.notebook.planning import plan_bench
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from daq.python_process import python_command
 from daq.recording.reader import Recording
 from daq.recording.repair import verify
 from tests.waiting import finish, wait_until
-from tui.cli.main import app
+from tui.commands.main import app
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -136,7 +136,7 @@ def test_a_fault_of_the_estimate_does_not_end_the_recording(
     def fail(*_: object, **__: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("tui.commands.run.follow", fail)
+    monkeypatch.setattr("daq.estimation.follow.follow", fail)
     out = tmp_path / "r.h5"
     huddle("run", str(bench), "--duration", "14s", "--out", str(out))
     with Recording.open(out) as recording:

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from daq.errors import HuddleError
 from tests.torture.damaged_files import make_recording
 from tests.tui.service.bench_files import START
-from tui.cli.main import app
+from tui.commands.main import app
 from tui.commands.tui_controls import pin
 from tui.output.csv_text import csv_text
 from tui.service.processes.locks import Lock

@@ -21,7 +21,7 @@ from daq.errors import BenchFileError, RecordingError
 from daq.recorder.schedule import utc_now
 from daq.recording.reader import Recording
 from tests.waiting import limit
-from tui.commands.serve import AlreadyServedError, accepted, serve
+from tui.commands.serve import AlreadyServedError, accepted, serve_runs
 from tui.service.clock import SystemTime
 from tui.service.processes.locks import Lock
 from tui.service.processes.steps import ProcessSteps
@@ -69,14 +69,14 @@ async def test_the_first_run_makes_its_folder_and_leaves_recording_result_and_ro
     with simulated(parse(DEMO), speed=8.0) as reachable:
         bench = scheduled(reachable, path, seconds=24.0)
         store = RunStore(bench.recording_directory)
-        task = asyncio.create_task(serve(path, bench, {"overlap": 0.25}, clock=ClockAtDue()))
+        task = asyncio.create_task(serve_runs(path, bench, {"overlap": 0.25}, clock=ClockAtDue()))
         async with asyncio.timeout(limit()):
             while True:
                 if store.path.exists() and all(run.is_over for run in store.runs()):
                     break
                 await asyncio.sleep(0.05)
         with pytest.raises(AlreadyServedError, match="another huddle serve"):
-            await serve(path, bench, {})
+            await serve_runs(path, bench, {})
         os.kill(os.getpid(), signal.SIGTERM)
         await task
     (run,) = map(store.with_noise, store.runs())

@@ -14,7 +14,7 @@ from daq.python_process import python_command
 from daq.recorder.block_writer import SensorProgress
 from daq.recorder.recorder import RecorderStatus
 from daq.recording.sensor_state import SensorState
-from tui.cli.main import app
+from tui.commands.main import app
 from tui.commands.record import progress_line
 from tui.output.console import console, notices, progress, reserve_standard_error, write_text
 

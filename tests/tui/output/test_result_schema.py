@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 import huddle
 from daq.bench.estimate_settings import table_keys
 from tests.tui.night_recording import HOSTILE, record
-from tui.cli.main import app
+from tui.commands.main import app
 from tui.output.json_document import SCHEMA_VERSION
 
 if TYPE_CHECKING:

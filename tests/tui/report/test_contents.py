@@ -16,7 +16,7 @@ from daq.estimation.estimation import estimate
 from daq.results.sources import sources
 from tests.tui.night_recording import HOSTILE, N_SAMPLES, RATE, record
 from tests.tui.report.written_report import Reported, Words, tables, texts_of
-from tui.cli.main import app
+from tui.commands.main import app
 from tui.output.json_document import result_document
 from tui.report.contents import report_of
 from tui.report.evidence import facts_section

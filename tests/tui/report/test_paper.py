@@ -15,7 +15,7 @@ from daq.estimation.estimation import estimate
 from daq.results.sources import sources
 from tests.tui.night_recording import RATE
 from tests.tui.report.written_report import Reported, Words, paper_of, texts_of
-from tui.cli.main import app
+from tui.commands.main import app
 from tui.report.contents import report_of
 from tui.report.parts import Facts, Paragraph, Plot, Section, Table
 from tui.report.writing import write

@@ -18,7 +18,7 @@ from daq.bench.masks.mask_file import masks_named
 from daq.errors import WrongSettingError
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
 from tests.tui.night_recording import record
-from tui.cli.main import app
+from tui.commands.main import app
 from tui.report.figures import drawing
 from tui.report.figures.curves import MODEL_RANGE_DB, noise_plots
 from tui.report.figures.sheet import write_figure

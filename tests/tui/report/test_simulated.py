@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from daq.recording.reader import Recording
 from tests.tui.report.written_report import Words
-from tui.cli.main import app
+from tui.commands.main import app
 
 if TYPE_CHECKING:
     from pathlib import Path

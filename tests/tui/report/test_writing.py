@@ -13,7 +13,7 @@ from daq.bench.masks.mask_file import masks_named
 from daq.devices.bench_file import load
 from tests.tui.night_recording import record
 from tests.tui.report.written_report import ROOT, Reported, Words
-from tui.cli.main import app
+from tui.commands.main import app
 from tui.commands.tui_controls import BenchControls
 from tui.report.writing import ReportError, write
 

@@ -9,7 +9,7 @@ import asyncio
 import sys
 from pathlib import Path
 
-from tui.commands.serve import accepted, serve
+from tui.commands.serve import accepted, serve_runs
 from tui.output.logs.lines import configure
 from tui.output.logs.options import LogLevel
 from tui.service.clock import SystemTime
@@ -33,7 +33,7 @@ def main() -> None:
     wanted = {"segment": 1.0}
     clock = TrustedByFile(Path(sys.argv[2]))
     # The devices run in real time, and lag on a busy computer: no check list of their rates.
-    asyncio.run(serve(bench, accepted(bench, wanted), wanted, clock=clock, anyway=True))
+    asyncio.run(serve_runs(bench, accepted(bench, wanted), wanted, clock=clock, anyway=True))
 
 
 if __name__ == "__main__":

@@ -14,7 +14,8 @@ from daq.protocols.block import Block, HostTime
 from daq.recording.reader import Recording
 from tests.tui.example_snapshot import growing
 from tests.tui.service.bench_files import Place
-from tui.commands.runs import pin_runs, verify_recordings
+from tui.commands.runs import pin
+from tui.commands.verify import verify
 from tui.service.processes.finish import Request, finish
 from tui.service.records.run_state import RunState
 from tui.service.records.storage import remove
@@ -78,9 +79,9 @@ async def test_files_that_continue_a_recording_belong_to_its_run(
     await place.serve(1.5 * 3600.0)
     run = place.store.runs()[0]
     assert (run.state, list(run.parts)) == (RunState.DONE, names)
-    pin_runs(folder, ["r-2.h5"], pinned=True)
+    pin(folder, ["r-2.h5"])
     assert place.store.runs()[0].pinned
-    verify_recordings([folder], json=str(tmp_path / "verified.json"))
+    verify([folder], json=str(tmp_path / "verified.json"))
     verified = json.loads((tmp_path / "verified.json").read_text(encoding="utf-8"))
     assert [each["intact"] for each in verified["recordings"]] == [True] * len(names)
     remove(run, folder)

@@ -21,7 +21,7 @@ from daq.recording.signing import identity, make_key, problem, signed_by
 from daq.recording.writer import RecordingWriter
 from tests.tui.service.bench_files import START, Place
 from tests.tui.service.test_continuations import record
-from tui.cli.main import app
+from tui.commands.main import app
 from tui.service.healing import heal
 from tui.service.planning import next_runs
 from tui.service.processes.finish import Request, finish

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from daq.results.change_test import BLOCK, DECIBEL, WIDTHS, Evidence, changes
 from tests.tui.service.bench_files import START
-from tui.cli.main import app
+from tui.commands.main import app
 from tui.service.history.series import history
 from tui.service.records.run_state import BandNoise, Run, RunState
 from tui.service.records.store import RunStore

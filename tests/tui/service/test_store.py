@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.tui.service.bench_files import HOURLY, START, Place
-from tui.cli.main import app
+from tui.commands.main import app
 from tui.commands.runs import PAGE
 from tui.service.records.run_state import BandNoise, Run, RunState
 from tui.service.records.store import RunStore

@@ -20,7 +20,7 @@ from daq.recording.reader import Recording
 from daq.results.sources import sources
 from daq.transport.ports import is_simulated
 from tests.waiting import limit
-from tui.cli.main import app
+from tui.commands.main import app
 from tui.simulation.devices import simulated
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from daq.estimation.diagnosis import residuals as residuals_between
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from sim_devices.world.scenario import Scenario
-from tui.cli.main import app
+from tui.commands.main import app
 from tui.studies.clocks import free_running, residuals, study
 from tui.studies.synthesis import Latency, synthesise
 from tui.wording.facts import known

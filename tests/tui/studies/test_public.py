@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
-from tui.cli.main import app
+from tui.commands.main import app
 from tui.output.exit_codes import ExitCode
 from tui.studies.public import BOUND, levels, model_free_bound
 

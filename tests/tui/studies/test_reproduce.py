@@ -197,7 +197,7 @@ def test_an_unknown_study_is_refused_before_anything_is_simulated() -> None:
 
 def test_the_command_line_refuses_an_unknown_study_and_loads_no_matplotlib() -> None:
     code = (
-        "import sys, tui.cli.main as command\n"
+        "import sys, tui.commands.main as command\n"
         "try:\n    command.main(['reproduce', 'fig6'])\n"
         "finally:\n    print('tui.studies.reproduce' in sys.modules, 'matplotlib' in sys.modules)"
     )

@@ -1,6 +1,7 @@
 """Commands whose help is plain text: usage, description, and a section for each panel.
 
-The help pages of typer need Rich and its Markdown, which take as long to load as all the rest.
+The help pages of typer need Rich and its Markdown, which take as long to load as all the rest. The
+module of a command is imported when the command is used, or asked for its help.
 """
 
 # ruff: noqa: ANN401, PLC0415 - contexts and formatters are typer's own; logging is for commands
@@ -15,14 +16,59 @@ from typing import TYPE_CHECKING, Any, get_args
 import typer
 from typer.core import TyperArgument, TyperCommand, TyperGroup
 
-from tui.cli.examples import EXAMPLES
-from tui.cli.subcommands import MODULES, PANELS
+from tui.commands.options import EXAMPLES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     Rows = Iterable[tuple[str, tuple[str, str]]]
     """Panel, and a form with its help."""
+
+PANELS: dict[str, dict[str, str]] = {
+    "Bench": {
+        "init": "Write a commented bench file to fill in.",
+        "check": "Validate a bench file, then identify every device and make the check list.",
+        "plan": "Compute the duration of recording for a target precision, by method.",
+        "tui": "Open the application: start, watch and stop a huddle test.",
+        "run": "Run one huddle test: record, estimate live, print the result.",
+        "record": "Record without estimating, until the duration has passed or Ctrl-C.",
+        "watch": "Show the live estimate of a recording that another process writes.",
+    },
+    "Unattended": {
+        "serve": "Run huddle tests on the schedule of the bench file, until Ctrl-C.",
+        "status": "Show the state of the service of a bench: runs, sensors, disk, clock.",
+        "runs": "List the runs of a service: state, verdict, recordings, reason.",
+        "history": "Show the noise of every channel from run to run, and whether it has changed.",
+        "pin": "Protect runs from removal by the storage limits of the bench file.",
+        "verify": (
+            "Verify the checksums and signatures of recordings, or of all recordings of a service."
+        ),
+        "sign": "Sign recordings with a private key, or make one.",
+    },
+    "Recordings": {
+        "estimate": "Estimate the self-noise of every channel from recordings.",
+        "calibrate": "Calibrate sensors against one of them by their common motion.",
+        "archive": "Keep the spectra of months of recordings, and show the noise over time.",
+        "report": "Write the calibration report of a huddle test as HTML or PDF.",
+        "issue": "Issue a numbered certificate of a huddle test as PDF.",
+        "issues": "List the certificates of a ledger, with revisions and void numbers.",
+        "plot": "Draw the self-noise of every channel as a figure for publication.",
+        "import": "Convert files of other programs into a recording.",
+        "export": "Write samples or noise curves for other programs.",
+        "repair": "Verify the checksums of a recording, and close it if a crash left it open.",
+    },
+    "Without hardware": {
+        "demo": "Run a complete huddle test on simulated sensors.",
+        "devices": "Serve simulated devices of a bench file, until Ctrl-C.",
+        "simulate": "Simulate a recording without devices.",
+        "reproduce": "Reproduce the figures of the paper and compare them with theory.",
+    },
+}
+"""By panel of the help: the commands, and the first line of the help of each."""
+
+COMMANDS = [name for panel in PANELS.values() for name in panel]
+_MODULES = {"import": "import_", "issues": "issue", "pin": "runs"}
+"""The module of a command that is not in one of its name."""
 
 _HYPHEN = "\N{NON-BREAKING HYPHEN}"
 """In place of a hyphen while lines are broken: --no-reject stays whole."""
@@ -110,7 +156,7 @@ class LazyGroup(TyperGroup):
     def __init__(self, **declared: Any) -> None:
         super().__init__(**declared)
         for panel, entries in PANELS.items():
-            for name, (_, summary) in entries.items():
+            for name, summary in entries.items():
                 self.add_command(TyperCommand(name, help=summary, rich_help_panel=panel))
 
     def get_help_option(self, ctx: Any) -> Any:
@@ -120,20 +166,19 @@ class LazyGroup(TyperGroup):
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return a subcommand with its options; None if there is none of this name."""
         del ctx
-        return subcommand(cmd_name) if cmd_name in MODULES else None
+        return subcommand(cmd_name) if cmd_name in COMMANDS else None
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write a section for the options, and one for each panel of commands."""
         _write_sections(formatter, _options(self.get_params(ctx), ctx))
         for panel, entries in PANELS.items():
-            rows = ((panel, (name, summary)) for name, (_, summary) in entries.items())
-            _write_sections(formatter, rows)
+            _write_sections(formatter, ((panel, entry) for entry in entries.items()))
 
 
 @cache
 def subcommand(name: str) -> Any:
     """Return a subcommand with its options, as a command of typer."""
-    module = import_module(f"tui.cli.{MODULES[name]}")
+    module = import_module(f"tui.commands.{_MODULES.get(name, name)}")
     function = getattr(module, name if hasattr(module, name) else f"{name}_")  # import_
     alone = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
     epilog = "\n".join(EXAMPLES[function.__name__])

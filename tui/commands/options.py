@@ -1,17 +1,34 @@
-"""Options that several commands share, each defined once."""
+"""Options that several commands share, each defined once; examples in the help of commands."""
+
+# ruff: noqa: PLC0415 - what sets up logging is imported when a command runs
 
 import inspect
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, TypeAlias, TypeVar
 
 import typer
 
 from daq.bench.durations import parse_duration
 from daq.bench.estimate_settings import OPTIONS, default_text, from_text
+from tui.output.logs.options import LogFormat, LogLevel
 
 _ESTIMATE_PANEL = "Estimate (defaults come from the bench file)"
+Command = TypeVar("Command", bound=Callable[..., object])
+
+EXAMPLES: dict[str, tuple[str, ...]] = {}
+"""Example lines by the name of the function of a command."""
+
+
+def examples(*lines: str) -> Callable[[Command], Command]:
+    """Add examples to the help of a command."""
+
+    def keep(command: Command) -> Command:
+        EXAMPLES[command.__name__] = lines
+        return command
+
+    return keep
 
 
 def duration(value: str | float) -> float:
@@ -79,6 +96,10 @@ EndOption: TypeAlias = Annotated[
     str | None,
     typer.Option("--end", metavar="T", help="End of the time span to estimate, as --start."),
 ]
+AnywayOption: TypeAlias = Annotated[
+    bool,
+    typer.Option("--anyway", help="Record even where the check list fails (see huddle check)."),
+]
 DiagnosticsOption: TypeAlias = Annotated[
     bool,
     typer.Option(
@@ -136,15 +157,92 @@ def with_estimate_options(command: Callable[..., None]) -> Callable[..., None]:
     `daq.bench.estimate_settings.EstimateSettings`; None where an option is not given. A parameter
     of the command with the name of a field takes the place of that option.
     """
-    first, *others = inspect.signature(command).parameters.values()
+    first, *others = inspect.signature(command, eval_str=True).parameters.values()
     own = [each for each in others if each.kind is not each.VAR_KEYWORD]
     added = [name for name in OPTIONS if name not in {each.name for each in own}]
 
     @wraps(command)
-    def with_options(**given: Any) -> None:  # noqa: ANN401 - values of options
-        wanted = {name: read_option(name, given.pop(name)) for name in added}
-        command(**given, **wanted)
+    def with_options(*own: Any, **given: Any) -> None:  # noqa: ANN401 - values of options
+        wanted = {name: read_option(name, given.pop(name, None)) for name in added}
+        command(*own, **given, **wanted)
 
     signature = inspect.Signature([first, *own, *map(_parameter, added)])
     vars(with_options)["__signature__"] = signature
     return with_options
+
+
+_LOG_PANEL = "Log lines on standard error"
+
+LogLevelOption: TypeAlias = Annotated[
+    LogLevel,
+    typer.Option(
+        "--log-level",
+        metavar="LEVEL",
+        rich_help_panel=_LOG_PANEL,
+        help="Lowest severity to write: debug, info, warning or error (default info).",
+        show_default=False,
+    ),
+]
+LogFormatOption: TypeAlias = Annotated[
+    LogFormat,
+    typer.Option(
+        "--log-format",
+        metavar="FORMAT",
+        rich_help_panel=_LOG_PANEL,
+        help="text, or json: one JSON object per line, and no other output on standard error;"
+        " or journal: entries of systemd's journal (default text).",
+        show_default=False,
+    ),
+]
+LogFileOption: TypeAlias = Annotated[
+    Path | None,
+    typer.Option(
+        "--log-file",
+        metavar="FILE",
+        rich_help_panel=_LOG_PANEL,
+        help="Append log lines to this file (default: write none).",
+    ),
+]
+
+
+def _to_standard_error(
+    *, log_level: LogLevelOption = LogLevel.INFO, log_format: LogFormatOption = LogFormat.TEXT
+) -> None:
+    from tui.output.logs.lines import configure
+
+    configure(log_level, log_format)
+
+
+def _to_file(
+    *,
+    log_level: LogLevelOption = LogLevel.INFO,
+    log_format: LogFormatOption = LogFormat.TEXT,
+    log_file: LogFileOption = None,
+) -> None:
+    from tui.output.logs.lines import configure
+
+    configure(log_level, log_format, file=log_file, screen=False)
+
+
+def with_logging(command: Callable[..., None]) -> Callable[..., None]:
+    """Add options of log lines on standard error to a command."""
+    return _with(_to_standard_error, command)
+
+
+def with_log_file(command: Callable[..., None]) -> Callable[..., None]:
+    """Add options of log lines in a file to a command that uses the whole screen."""
+    return _with(_to_file, command)
+
+
+def _with(set_up: Callable[..., None], command: Callable[..., None]) -> Callable[..., None]:
+    added = inspect.signature(set_up).parameters
+    own = inspect.signature(command, eval_str=True)
+
+    @wraps(command)
+    def logging_command(*args: Any, **given: Any) -> None:  # noqa: ANN401 - values of options
+        set_up(**{name: given.pop(name) for name in added if name in given})
+        command(*args, **given)
+
+    signature = own.replace(parameters=[*own.parameters.values(), *added.values()])
+    vars(logging_command)["__signature__"] = signature
+    return logging_command

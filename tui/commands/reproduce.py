@@ -1,15 +1,15 @@
-"""``reproduce``."""
+"""``huddle reproduce``."""
 
-# ruff: noqa: PLC0415 - what a subcommand needs is imported when it runs
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
+
+from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from tui.cli.examples import examples
-from tui.cli.logging_options import with_logging
-from tui.cli.options import JsonOption
+from tui.commands.options import JsonOption, examples, with_logging
 from tui.output.exit_codes import ExitCode
 
 

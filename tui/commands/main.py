@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import typer
 
 from tui import __version__
-from tui.cli.help import LazyGroup
+from tui.commands.help import LazyGroup
 from tui.output.exit_codes import ExitCode
 
 if TYPE_CHECKING:

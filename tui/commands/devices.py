@@ -1,0 +1,130 @@
+"""``huddle devices``: simulated devices of a bench, and the settings of installed drivers."""
+
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from daq.bench.driver_settings import settings_of
+from daq.errors import DriverError
+from tui.commands.options import JsonOption, SpeedOption, examples, with_logging
+
+
+@examples(
+    "huddle devices lab.toml",
+    "huddle devices --driver labjack   (list the settings of a driver)",
+    "huddle devices lab.toml --speed 10 -o simulated.toml   (then in another terminal:)",
+    "huddle run simulated.toml --duration 10min",
+)
+@with_logging
+def devices(
+    bench: Annotated[
+        Path | None, typer.Argument(metavar="BENCH", help="Bench file (TOML).")
+    ] = None,
+    *,
+    driver: Annotated[
+        str | None,
+        typer.Option(
+            "--driver",
+            metavar="NAME",
+            help="List the settings of this driver; serve no devices.",
+        ),
+    ] = None,
+    speed: SpeedOption = None,
+    faults: Annotated[
+        Path | None,
+        typer.Option(
+            "--faults",
+            metavar="FILE",
+            help="Faults to simulate (TOML; docs/simulation.md).",
+        ),
+    ] = None,
+    log: Annotated[
+        Path | None,
+        typer.Option(
+            "--log",
+            metavar="FILE",
+            help="Log every fault and everything sent, one JSON object per line.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", metavar="FILE", help="Bench file to write (default: print it)."
+        ),
+    ] = None,
+    json: JsonOption = None,
+) -> None:
+    """Serve simulated devices of a bench file, until Ctrl-C.
+
+    Each device is a separate process that speaks its real protocol on a
+    pseudo-terminal or a TCP port. The command makes a bench file that
+    connects to them.
+
+    The table simulation of the bench file defines motion and noise.
+    """
+    if (bench is None) == (driver is None):
+        raise typer.BadParameter("expected either a bench file or --driver NAME")
+    if driver is not None:
+        list_settings(driver, json=json)
+    elif bench is not None:
+        from tui.simulation.devices import serve_devices
+
+        serve_devices(bench, speed=speed, faults=faults, log=log, out=out, json=json)
+
+
+def list_settings(name: str, *, json: str | None) -> None:
+    """Print the settings of a driver, keys of ``[sensors.settings]``.
+
+    Raises
+    ------
+    typer.BadParameter
+        The driver is not installed.
+    """
+    from rich.table import Table
+    from rich.text import Text
+
+    from daq.devices.registry import driver_names, driver_type
+    from tui.output.console import for_people, write_json
+
+    if name not in driver_names():
+        known = "\n".join(f"  {other}  {summary}" for other, summary in summaries().items())
+        raise typer.BadParameter(f"{name!r} is no driver; expected one of\n{known}")
+    driver = driver_type(name)
+    settings = settings_of(driver.settings)
+    write_json(json, {"driver": name, "summary": driver.summary, "settings": settings})
+    screen = for_people(json)
+    screen.print(f"{name}: {driver.summary}\n", markup=False, highlight=False)
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for column in ("setting", "values", "default", "meaning"):
+        table.add_column(column)
+    for one in settings:
+        cells = (one["name"], one["values"], one["default"], one["meaning"])
+        table.add_row(*(Text(cell) for cell in cells))
+    screen.print(table)
+
+
+def summaries() -> dict[str, str]:
+    """Return the summary of each installed driver, or why it cannot be imported."""
+    from daq.devices.registry import driver_names, driver_type
+
+    found = {}
+    for name in driver_names():
+        try:
+            found[name] = driver_type(name).summary
+        except DriverError as error:
+            found[name] = str(error)
+    return found
+
+
+def print_others(known: str) -> None:
+    """Print the drivers of other packages, which a text does not name."""
+    from tui.output.console import console
+
+    for name, summary in summaries().items():
+        if f"#   {name} " not in known:
+            console().print(f"  driver {name}: {summary}", markup=False, highlight=False)

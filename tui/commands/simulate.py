@@ -1,0 +1,36 @@
+"""``huddle simulate``."""
+
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tui.commands.options import DurationOption, JsonOption, examples, with_logging
+
+
+@examples("huddle simulate lab.toml --duration 3h --out model.h5")
+@with_logging
+def simulate(
+    scenario: Annotated[
+        str,
+        typer.Argument(
+            metavar="SCENARIO",
+            help="Bench file with a [simulation] table, or a scenario of the paper: fig4, fig5, "
+            "fig9, fig12, fig13, setup1, setup2, waves.",
+        ),
+    ],
+    *,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="FILE", help="Recording to write (.h5).")
+    ],
+    duration: DurationOption = None,
+    json: JsonOption = None,
+) -> None:
+    """Simulate a recording without devices."""
+    from tui.simulation.write_recording import simulate_recording
+
+    simulate_recording(scenario, out=out, duration=duration, json=json)
