@@ -9,8 +9,8 @@ Make a bench, record it from simulated devices at life's pace, compare::
 
 ``bench DIMENSIONS LATENCY [SNR] [HOURS]`` has three sensors on an Epson burst over a
 pseudo-terminal and text rows over a pseudo-terminal and TCP, with the scenario of
-`tui.studies.clocks.free_running`. ``compare`` needs nothing but the recording, whose bench holds
-the whole world: every recorded row is found there by its counts, exactly. A copy of the recording
+`benchmarks.studies.clocks.free_running`. ``compare`` needs nothing but the recording, whose bench
+holds the whole world: every recorded row is found there by its counts, exactly. A copy of the recording
 is written that has the true instant of every sample (the oracle), and ``huddle estimate`` is run on
 it, and on the recording with its samples at face value, with clocks from arrival times alone, and
 refined. Exit code 1 where something issue 5 asks for does not hold.
@@ -31,6 +31,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.studies.clocks import BANDS, free_running
+from benchmarks.studies.synthesis import SENSITIVITY
 from daq.bench.loading import dump
 from daq.devices.bench_file import parse
 from daq.python_process import python_command
@@ -38,8 +40,6 @@ from daq.recording.reader import Recording
 from sim_devices.world.world import World
 from tests.acceptance.true_instants import Truth, truth_of, write_oracle
 from tui.simulation.devices import scenario_of
-from tui.studies.clocks import BANDS, free_running
-from tui.studies.synthesis import SENSITIVITY
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

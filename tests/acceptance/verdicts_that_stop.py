@@ -1,7 +1,7 @@
 """How often a test that stops by itself once it is decided has a wrong verdict.
 
 `python -m tests.acceptance.verdicts_that_stop [TESTS] [SEED]`: simulated tests as of
-`tui.studies.verdicts`, their true noise up to 3 dB below or above the limit. Each is looked at
+`benchmarks.studies.verdicts`, their true noise up to 3 dB below or above the limit. Each is seen
 again whenever it has grown by `GROWTH`, from 20 s on, and stops as the application stops it, or
 after 10 min with an ordinary verdict. Prints a line for each test, and the counts. Not run by
 pytest: 200 tests take some five minutes.
@@ -14,9 +14,7 @@ from collections import Counter
 
 import numpy as np
 
-from daq.results.decision.end import is_surely_decided
-from estimator.decision.verdict import Verdict
-from tui.studies.verdicts import (
+from benchmarks.studies.verdicts import (
     FARTHEST_DB,
     LONGEST,
     SEED,
@@ -25,6 +23,8 @@ from tui.studies.verdicts import (
     Outcome,
     SimulatedTest,
 )
+from daq.results.decision.end import is_surely_decided
+from estimator.decision.verdict import Verdict
 
 GROWTH = 0.05
 """From one look to the next. Those of the application are closer, and more alike."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import typer
@@ -15,87 +16,66 @@ from rich.text import Text
 from sim_devices.errors import ScenarioError
 from tui.output.console import check_places, for_people, progress, write_json
 from tui.output.extras import require
-from tui.studies.clocks import clock_coverage, clocks
-from tui.studies.drawn.arrays import RANDOM_TESTS, random_tests
-from tui.studies.drawn.recordings import RANDOM_RECORDINGS, random_recordings
-from tui.studies.estimates import ESTIMATES
-from tui.studies.gradients import gradients
-from tui.studies.paper.laboratory import LABORATORY, Laboratory
-from tui.studies.paper.numerical import NUMERICAL, Ingredients
-from tui.studies.responses import calibration, edges
-from tui.studies.shared_noise import SHARED_NOISE, shared
+from tui.studies.laboratory import LABORATORY, Laboratory
+from tui.studies.numerical import NUMERICAL, Ingredients
 from tui.studies.study import TOLERANCE
-from tui.studies.verdicts import verdicts
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from rich.console import Console
 
     from tui.studies.study import ProgressCallback, Series, Study
 
-CLOCKS, VERDICTS = "clocks", "verdicts"
-RESPONSES = {
-    "calibration": calibration,
-    "edges": edges,
-    "gradients": gradients,
-    "clock-coverage": clock_coverage,
-    RANDOM_TESTS: random_tests,
-    RANDOM_RECORDINGS: random_recordings,
-}
-STUDIES = (*NUMERICAL, *LABORATORY, CLOCKS, VERDICTS, *ESTIMATES, SHARED_NOISE, *RESPONSES)
+Studies: TypeAlias = "Callable[[ProgressCallback, float], Mapping[str, Callable[[], Study]]]"
+"""Takes what reports progress, and the share of the full length to simulate."""
+STUDIES = (*NUMERICAL, *LABORATORY)
 ALL = "all"
 DEFAULT_FOLDER = Path("reproduced")
 
 
+def paper(progress: ProgressCallback, length: float) -> Mapping[str, Callable[[], Study]]:
+    """Return the studies of the paper by name; they share what they simulate."""
+    ingredients = Ingredients(progress, length=length)
+    laboratory = Laboratory(progress, length=length)
+    return {name: partial(study, ingredients) for name, study in NUMERICAL.items()} | {
+        name: partial(study, laboratory) for name, study in LABORATORY.items()
+    }
+
+
 def reproduce(
-    names: Sequence[str], *, progress: ProgressCallback, length: float = 1.0
+    names: Sequence[str],
+    *,
+    progress: ProgressCallback,
+    length: float = 1.0,
+    studies: Studies = paper,
 ) -> Iterator[Study]:
     """Carry out studies, one by one.
 
     Parameters
     ----------
     names
-        Of `STUDIES`; ``all``, or none at all, stands for every one.
+        Of `studies`; ``all``, or none at all, stands for every one.
     progress
         Takes progress.
     length
         Share of the paper's length to simulate.
+    studies
+        Those there are.
 
     Raises
     ------
     ScenarioError
         If there is no study of a name, before anything is simulated.
     """
-    unknown = [name for name in names if name not in {*STUDIES, ALL}]
+    known = studies(progress, length)
+    unknown = [name for name in names if name not in {*known, ALL}]
     if unknown:
         raise ScenarioError(
-            f"no study {', '.join(map(repr, unknown))}; expected {', '.join(STUDIES)} or {ALL}"
+            f"no study {', '.join(map(repr, unknown))}; expected {', '.join(known)} or {ALL}"
         )
-    wanted = STUDIES if ALL in names or not names else tuple(dict.fromkeys(names))
-    return _studies(wanted, progress, length)
-
-
-def _studies(names: tuple[str, ...], progress: ProgressCallback, length: float) -> Iterator[Study]:
-    ingredients, laboratory = (
-        Ingredients(progress, length=length),
-        Laboratory(progress, length=length),
-    )
-    for name in names:
-        if name == CLOCKS:
-            yield clocks(progress, length=length)
-        elif name == VERDICTS:
-            yield verdicts(progress, length=length)
-        elif name == SHARED_NOISE:
-            yield shared(progress, length)
-        elif name in ESTIMATES:
-            yield ESTIMATES[name](progress, length)
-        elif name in RESPONSES:
-            yield RESPONSES[name](progress, length=length)
-        elif name in NUMERICAL:
-            yield NUMERICAL[name](ingredients)
-        else:
-            yield LABORATORY[name](laboratory)
+    wanted = known if ALL in names or not names else dict.fromkeys(names)
+    return (known[name]() for name in wanted)
 
 
 def run(
@@ -104,6 +84,7 @@ def run(
     out: Path | None = None,
     json: str | None = None,
     length: float = 1.0,
+    studies: Studies = paper,
 ) -> bool:
     """Carry out studies; write figures, print the table, and say whether all agree with theory.
 
@@ -117,6 +98,8 @@ def run(
         File for every point, or ``-``.
     length
         Share of the paper's length to simulate.
+    studies
+        Those there are.
 
     Raises
     ------
@@ -127,10 +110,10 @@ def run(
     require("matplotlib")
     folder = DEFAULT_FOLDER if out is None else out
     started = time.monotonic()
-    studies: list[Study] = []
+    done: list[Study] = []
     files: list[Path] = []
     with _Progress() as report:
-        wanted = reproduce(names, progress=report, length=length)
+        wanted = reproduce(names, progress=report, length=length, studies=studies)
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -142,9 +125,9 @@ def run(
 
             report(f"{study.name}: figure", 1.0)
             files += save(study, folder)
-            studies.append(study)
+            done.append(study)
     elapsed = time.monotonic() - started
-    agrees = all(study.agrees for study in studies)
+    agrees = all(study.agrees for study in done)
     write_json(
         json,
         {
@@ -153,10 +136,10 @@ def run(
             "length": length,
             "elapsed": elapsed,
             "figures": [str(file) for file in files],
-            "studies": [study.as_json() for study in studies],
+            "studies": [study.as_json() for study in done],
         },
     )
-    _print(for_people(json), studies, folder, elapsed)
+    _print(for_people(json), done, folder, elapsed)
     return agrees
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from benchmarks.studies.synthesis import synthesise
 from daq.clocks.aligned_recording import AlignedRecording
 from daq.clocks.device_utc import corrected, from_device_utc
 from daq.estimation.estimation import estimate
@@ -15,7 +16,6 @@ from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
 from sim_devices.world.scenario import Scenario
 from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, counts, create, write
-from tui.studies.synthesis import synthesise
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from benchmarks.studies.synthesis import Latency, synthesise
 from daq.clocks.aligned_recording import AlignedRecording
 from daq.clocks.arrival_times import ArrivalTimes
 from daq.clocks.clock_model import MeasuredDelays
 from daq.estimation.estimation import estimate
 from daq.recording.reader import Recording
 from sim_devices.world.scenario import Scenario
-from tui.studies.synthesis import Latency, synthesise
 
 if TYPE_CHECKING:
     from pathlib import Path

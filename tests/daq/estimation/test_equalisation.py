@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
+from benchmarks.studies.synthesis import synthesise
 from daq.bench.response import Fir, Measured, PolesZeros, Response
 from daq.estimation import equalisation, noise_estimates
 from daq.estimation.estimation import Estimation, estimate
@@ -18,7 +19,6 @@ from estimator.methods import self_noise
 from sim_devices.world.scenario import Scenario
 from tests import known_clocks
 from tests.daq.clocks.recordings import Sensor, blocks, create, write
-from tui.studies.synthesis import synthesise
 
 if TYPE_CHECKING:
     from pathlib import Path

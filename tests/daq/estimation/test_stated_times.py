@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
+from benchmarks.studies.synthesis import synthesise
 from daq.clocks.aligned_recording import take_drift
 from daq.clocks.clock_model import ClockSource
 from daq.estimation.estimation import Estimation, estimate
@@ -21,7 +22,6 @@ from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
 from tests.daq.clock_facts import clock_facts
 from tests.daq.clocks.recordings import Sensor, blocks, create, write
-from tui.studies.synthesis import synthesise
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from benchmarks.studies.clocks import free_running
+from benchmarks.studies.synthesis import Latency, synthesise
 from daq.estimation.diagnosis import bias_of_clocks
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
@@ -15,8 +17,6 @@ from daq.results.band_summary import channel_means
 from estimator.methods import self_noise
 from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot
 from tui.output.results import result_table
-from tui.studies.clocks import free_running
-from tui.studies.synthesis import Latency, synthesise
 from tui.wording.formatting import level_with_error
 
 if TYPE_CHECKING:

@@ -17,8 +17,8 @@ from sim_devices.errors import ScenarioError
 from sim_devices.world import paper_scenarios
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
-from tui.studies.paper.laboratory import HANN, SHOWN, measure, smoothed
-from tui.studies.paper.numerical import (
+from tui.studies.laboratory import HANN, SHOWN, measure, smoothed
+from tui.studies.numerical import (
     BAND,
     NUMERICAL,
     PAPER,
@@ -221,7 +221,7 @@ def test_places_are_checked_before_anything_is_simulated(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a_file").touch()
     monkeypatch.setattr(
-        "tui.studies.reproduce._studies", lambda *_: (pytest.fail("simulated") for _ in ".")
+        "tui.studies.reproduce.NUMERICAL", {"fig4": lambda _: pytest.fail("simulated")}
     )
     out = Path(place["out"]) if "out" in place else tmp_path / "figures"
     with pytest.raises(typer.BadParameter, match=said):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tui.studies.responses import CASES, QUANTITIES, calibration
+from benchmarks.studies.responses import CASES, QUANTITIES, calibration
 
 
 def test_uncertainties_of_calibrations_cover_the_truth() -> None:

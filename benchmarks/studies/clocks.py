@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from benchmarks.studies.synthesis import ORIGIN, Latency, synthesise
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
 from tui.studies.study import Curve, Panel, Point, Series, Study
-from tui.studies.synthesis import ORIGIN, Latency, synthesise
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -150,7 +150,7 @@ def _row(clocks: str, snapshot: Snapshot, oracle: Snapshot, scenario: Scenario) 
     )
 
 
-def clocks(progress: ProgressCallback, *, length: float = 1.0) -> Study:
+def clocks(progress: ProgressCallback, length: float = 1.0) -> Study:
     """Study the effect of free-running clocks on the three-sensor estimate.
 
     Parameters
@@ -183,7 +183,7 @@ LOADED = Latency("batching", 16e-3, stalled=0.3)
 RUNS, RUN_DURATION = 10, 1200.0
 
 
-def clock_coverage(progress: ProgressCallback, *, length: float = 1.0) -> Study:
+def clock_coverage(progress: ProgressCallback, length: float = 1.0) -> Study:
     """Count how often intervals hold the true noise where clocks are hard to find.
 
     Parameters

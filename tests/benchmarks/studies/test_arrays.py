@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import welch
 
-from tui.studies.drawn.arrays import RATE, draw_scene, noise_psd, random_tests, simulate
+from benchmarks.studies.random_arrays import RATE, draw_scene, noise_psd, random_tests, simulate
 
 
 def test_without_motion_the_samples_have_the_stated_noise() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.studies.verdicts import WRONG, Outcome, SimulatedTest, outcomes, verdicts
 from estimator.decision.verdict import Obstacle, Verdict
-from tui.studies.verdicts import WRONG, Outcome, SimulatedTest, outcomes, verdicts
 
 N_TESTS = 60
 

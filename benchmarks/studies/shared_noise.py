@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from benchmarks.studies.draws import averaged, bench
+from benchmarks.studies.estimates import share
 from estimator.checks.shared_noise import LEVEL, shared_noise
 from estimator.likelihood.dimension import bands
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.score_test import pair_scores
-from tui.studies.draws import averaged, bench
-from tui.studies.estimates import share
 from tui.studies.study import Panel, Point, Series, Study
 
 if TYPE_CHECKING:

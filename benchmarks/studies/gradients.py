@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from benchmarks.studies.draws import averaged
 from estimator.likelihood.dimension import choose_dimension
 from estimator.likelihood.gradients import noise_by_gradients, with_gradients
 from estimator.likelihood.maximum_likelihood import maximum_likelihood
 from sim_devices.world.plane_waves import field
 from sim_devices.world.spectrum import White
 from sim_devices.world.tables import PlaneWaves
-from tui.studies.draws import averaged
 from tui.studies.study import Panel, Point, Series, Study
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def scene(rng: np.random.Generator, frequency: FloatArray, n_sensors: int) -> Co
     return np.asarray(motion + np.eye(3 * n_sensors))
 
 
-def gradients(progress: ProgressCallback, *, length: float = 1.0) -> Study:
+def gradients(progress: ProgressCallback, length: float = 1.0) -> Study:
     """Estimate the noise of sensors that waves cross.
 
     Parameters

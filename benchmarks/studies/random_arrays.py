@@ -14,6 +14,7 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from benchmarks.studies.judged import METHODS, Judged
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
@@ -27,7 +28,6 @@ from estimator.checks.advice import (
     UnequalResponses,
 )
 from estimator.checks.misfit import SharedNoise
-from tui.studies.drawn.judged import METHODS, Judged
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -166,7 +166,7 @@ FALSE: dict[type[Advice], Callable[[Scene], bool]] = {
 """Kinds of advice, and in which scenes they are wrong."""
 
 
-def random_tests(progress: ProgressCallback, *, length: float = 1.0) -> Study:
+def random_tests(progress: ProgressCallback, length: float = 1.0) -> Study:
     """Judge intervals and advice on tests drawn at random.
 
     Parameters

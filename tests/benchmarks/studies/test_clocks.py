@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from benchmarks.studies.clocks import free_running, residuals, study
+from benchmarks.studies.synthesis import Latency, synthesise
 from daq.clocks.clock_model import ClockSource, ClockState
 from daq.errors import CannotAlignError
 from daq.estimation.diagnosis import residuals as residuals_between
@@ -16,8 +18,6 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from sim_devices.world.scenario import Scenario
 from tui.commands.main import app
-from tui.studies.clocks import free_running, residuals, study
-from tui.studies.synthesis import Latency, synthesise
 from tui.wording.facts import known
 
 if TYPE_CHECKING:

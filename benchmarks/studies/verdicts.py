@@ -205,7 +205,7 @@ def outcomes(
     return found
 
 
-def verdicts(progress: ProgressCallback, *, length: float = 1.0) -> Study:
+def verdicts(progress: ProgressCallback, length: float = 1.0) -> Study:
     """Count verdicts that are wrong, and predictions that hold.
 
     Parameters

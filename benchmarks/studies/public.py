@@ -1,4 +1,4 @@
-"""``huddle reproduce public FOLDER…``: public huddle tests, every method beside a bound.
+"""``python -m benchmarks.studies public FOLDER…``: every method beside a bound.
 
 The bound needs no model of the motion: what all other sensors together cannot predict of a channel.
 Noise is below it, whatever the dimension of the motion, the gains and the orientations. It is

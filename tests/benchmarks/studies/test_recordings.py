@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from benchmarks.studies.random_recordings import draw, random_recordings
+from benchmarks.studies.synthesis import synthesise
 from daq.recording.reader import Recording
-from tui.studies.drawn.recordings import draw, random_recordings
-from tui.studies.synthesis import synthesise
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from benchmarks.studies.draws import averaged, bench
 from estimator.levels.bands import band_levels
 from estimator.likelihood.fisher import cramer_rao_cov
 from estimator.methods import self_noise
 from estimator.noise_parameters.fit import fit, terms_at
-from tui.studies.draws import averaged, bench
 from tui.studies.study import Panel, Point, Series, Study
 
 if TYPE_CHECKING:

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.studies.judged import METHODS, Judged
+from benchmarks.studies.synthesis import Latency, synthesise
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from estimator.checks.advice import (
@@ -25,8 +27,6 @@ from estimator.checks.advice import (
 )
 from estimator.checks.misfit import NoiseChanges, SharedNoise
 from sim_devices.world.scenario import Scenario
-from tui.studies.drawn.judged import METHODS, Judged
-from tui.studies.synthesis import Latency, synthesise
 
 if TYPE_CHECKING:
     from tui.studies.study import ProgressCallback, Study
@@ -180,7 +180,7 @@ def _directions(turned: str, rng: np.random.Generator) -> list[list[float]]:
     return [list(row) for row in rotation.as_matrix().tolist()]
 
 
-def random_recordings(progress: ProgressCallback, *, length: float = 1.0) -> Study:
+def random_recordings(progress: ProgressCallback, length: float = 1.0) -> Study:
     """Judge intervals and advice on recordings drawn at random.
 
     Parameters

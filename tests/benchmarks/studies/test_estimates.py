@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.studies.__main__ import STUDIES
+from benchmarks.studies.draws import averaged, bench
 from estimator.methods import self_noise
-from tui.studies.draws import averaged, bench
-from tui.studies.estimates import ESTIMATES
-from tui.studies.reproduce import STUDIES, reproduce
 
 
 def quiet(what: str, share: float) -> None:
@@ -28,13 +27,9 @@ def test_averages_scatter_about_the_true_matrix_as_so_many_do() -> None:
 
 @pytest.mark.parametrize("name", ["small-samples", "quiet", "unequal"])
 def test_short_studies_agree(name: str) -> None:
-    (study,) = reproduce([name], progress=quiet, length=0.02)
+    study = STUDIES[name](quiet, 0.02)
     assert study.name == name
     assert study.agrees
-
-
-def test_all_are_among_the_studies() -> None:
-    assert set(ESTIMATES) <= set(STUDIES)
 
 
 def test_an_estimate_that_is_wrong_fails(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -43,6 +38,6 @@ def test_an_estimate_that_is_wrong_fails(monkeypatch: pytest.MonkeyPatch) -> Non
     def twice(method: str, csm: object, *, n_effective: float, **known: object) -> object:
         return self_noise(method, csm, n_effective=2 * n_effective, **known)  # type: ignore[arg-type]
 
-    monkeypatch.setattr("tui.studies.estimates.self_noise", twice)
-    (study,) = reproduce(["coverage"], progress=quiet, length=0.05)
+    monkeypatch.setattr("benchmarks.studies.estimates.self_noise", twice)
+    study = STUDIES["coverage"](quiet, 0.05)
     assert not study.agrees

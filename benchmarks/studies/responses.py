@@ -38,7 +38,7 @@ _ALLOWED = 0.02
 _DIMS = (3, 3, 3)
 
 
-def calibration(progress: ProgressCallback, *, length: float = 1.0) -> Study:
+def calibration(progress: ProgressCallback, length: float = 1.0) -> Study:
     """Count how often the truth lies within the uncertainties of a calibration.
 
     Parameters
@@ -129,7 +129,7 @@ CASES = (
 """Name, SNR, response of sensors A and C, response of sensor B, and band."""
 
 
-def edges(progress: ProgressCallback, *, length: float = 1.0) -> Study:
+def edges(progress: ProgressCallback, length: float = 1.0) -> Study:
     """Predict and equalise what unequal responses leak, at segments of 10 s.
 
     Parameters
