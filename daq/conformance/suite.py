@@ -418,8 +418,10 @@ def check_truth(
 
 
 def _same(sent: NDArray[Any], counts: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return which rows are equal; what was sent may be given before it was rounded."""
-    most = 0.5 + 1e-8 * np.abs(sent)
+    """Return which rows are equal; of whole counts, what was sent may be given before rounding."""
+    is_whole = np.issubdtype(counts.dtype, np.integer)
+    relative = 1e-8 if is_whole else max(1e-8, float(np.finfo(counts.dtype).eps))
+    most = (0.5 if is_whole else 0.0) + relative * np.abs(sent)
     same: NDArray[np.bool_] = (np.abs(sent - counts.astype(np.float64)) <= most).all(axis=1)
     return same
 
