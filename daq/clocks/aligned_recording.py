@@ -276,14 +276,14 @@ class AlignedRecording:
         reference : int
             The sensor against which.
         """
-        unchecked = [source.unchecked for source in self._sources]
+        before = [(source.unchecked, source.lost) for source in self._sources]
         take_drift(self._sources, drift, reference)
         found = any(self._sources[number].doubted for number in drift)
         if found:
             self.stated_reference, self._measured_against = reference, None
             self.reset_delays()  # they were measured against another sensor
             self._lay_grid()
-        if found or unchecked != [source.unchecked for source in self._sources]:
+        if found or before != [(source.unchecked, source.lost) for source in self._sources]:
             self.set_clocks()
         return found
 

@@ -174,7 +174,8 @@ class ClockState:
         Standard deviation of the rate's change over the recording, in ppm.
     residual : float
         What is left between clock and truth, in seconds rms: predicted, or measured where the
-        common motion allows it; NaN where nobody knows.
+        common motion allows it; NaN where nobody knows, infinite where it is more than can be
+        measured.
     n_epochs : int
         One, plus the number of restarts.
     refined : bool

@@ -120,7 +120,8 @@ class SensorSource:
     drift: float | None = None
     """By how much its stated UTC drifts against the motion, in seconds rms.
 
-    NaN where they could not be compared, None where nobody tried.
+    NaN where they could not be compared, infinite where that is more than can be measured, None
+    where nobody tried.
     """
     polled: bool = False
     clock: Clock | None = None
@@ -139,12 +140,17 @@ class SensorSource:
     @property
     def doubted(self) -> bool:
         """Whether its stated UTC drifts, and is refined as arrival times are."""
-        return self.drift is not None and self.drift > 0
+        return self.drift is not None and 0 < self.drift < math.inf
 
     @property
     def unchecked(self) -> bool:
         """Whether its stated UTC could not be compared with the motion."""
         return self.drift is not None and math.isnan(self.drift)
+
+    @property
+    def lost(self) -> bool:
+        """Whether its stated UTC is off by more than can be measured in a part of the recording."""
+        return self.drift is not None and math.isinf(self.drift)
 
     @property
     def end_sample(self) -> int:
@@ -315,6 +321,9 @@ class SensorSource:
         """Return the clock of stated UTC with what its comparison with the motion says of it."""
         if self.drift is None or clock.state.refined:
             return clock
+        if self.lost:
+            lost = replace(clock.state, residual=math.inf, is_understood=False)
+            return replace(clock, state=lost)
         if self.unchecked:
             return replace(clock, state=replace(clock.state, unchecked=True))
         return replace(clock, state=replace(clock.state, residual=self.drift, drifts=self.doubted))

@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 
 MIN_AVERAGES = 2.0
 """Without which nothing is diagnosed: in one average all channels are coherent, as copies are."""
+_MOST_RESIDUAL = 1e3  # s: beyond any segment; infinite where an error cannot be measured
 _MOST_TURN = 50.0  # rad²: no motion is left in common
 _UP = {"z", "up", "down", "vertical", "+z", "-z"}
 
@@ -198,7 +199,7 @@ def bias_of_clocks(
     by errors of its own clock, too low by at most ``ω² S (σ_j + σ_k)²/4`` if j and k err in
     opposite ways. Two sensors have no such third one: their noise can only be too high.
     """
-    residual = np.array(list(found.residual.values()))
+    residual = np.minimum(list(found.residual.values()), _MOST_RESIDUAL)
     if not results or len(residual) != len(dims):
         return found
     noise = next(iter(results.values())).noise_psd

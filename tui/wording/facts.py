@@ -410,6 +410,15 @@ def _uncounted(fact: SamplesUncounted, names: Names) -> Wording:
 @word.register(ClockNotUnderstood)
 def _not_understood(fact: ClockNotUnderstood, names: Names) -> Wording:
     del names
+    if math.isinf(fact.error):
+        head = f"{listed(fact.sensors)} does not follow the common motion in a part of the recording"
+        return Wording(
+            f"{head}: its clock is not understood",
+            f"{head}. Its times are off by more than can be measured, or it measures something else"
+            " there. The intervals include this, and limits are not decided.",
+            "Compare the traces of the sensors before and after that part. Check the clock of the"
+            " logger, and whether the sensor was moved, switched off or set to another channel.",
+        )
     head = f"The clock of {listed(fact.sensors)} ({signed(fact.ppm, '+.0f')} ppm) is not understood"
     return Wording(
         f"{head} (off by {_us(fact.error)} rms): check for lost samples, and the rate",

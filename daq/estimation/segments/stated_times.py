@@ -85,12 +85,12 @@ def compare(aligned: AlignedRecording, settings: Settings, welch: WelchSettings)
         return False
     longest = _LONGEST
     drift, reference = _drifts(aligned, welch, sensors, most=settings.bridge, longest=longest)
-    unknown = sum(map(math.isnan, drift.values()))
+    unknown = sum(not math.isfinite(each) for each in drift.values())
     short = settings.segment
     of_short = aligned.n_available / welch.sampling_rate / _PIECES
     if unknown and short < min(longest, of_short):  # gaps may leave nothing of long pieces
         found, against = _drifts(aligned, welch, sensors, most=settings.bridge, longest=short)
-        if sum(map(math.isnan, found.values())) < unknown:
+        if sum(not math.isfinite(each) for each in found.values()) < unknown:
             drift, reference, longest = found, against, short
     if not aligned.compare_stated(drift, reference):
         return False
@@ -225,9 +225,9 @@ def drift_of(
 ) -> float:
     """Return by how much delays of a sensor drift over a recording, in s rms.
 
-    0 where that is not more than they scatter, NaN where too few are known or too many are false,
-    and where the sensor does not follow a strong motion in a part of the recording: its times may
-    be off by more than can be measured.
+    0 where that is not more than they scatter, NaN where too few are known or too many are false.
+    Infinite where the sensor does not follow a strong motion in a part of the recording: its times
+    are off by more than can be measured, or it measures something else there.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ def drift_of(
     """
     known = np.isfinite(std) & (std > 0)
     if _is_elsewhere(at, np.isnan(std), known):
-        return math.nan
+        return math.inf
     at, delays, std = at[known], delays[known], std[known]
     if len(at) < 2 * _PARTS:
         return math.nan
@@ -258,8 +258,9 @@ def drift_of(
         return math.nan
     scatter = max(within, least)
     away = np.abs(delays - middle[part])
-    false = away > _FALSE * np.maximum(scatter, std)
-    agrees = away <= _FALSE * scatter
+    spread = _scatter_of_parts(away, part, scatter, most=_COARSE / sampling_rate)
+    false = away > _FALSE * np.maximum(spread[part], std)
+    agrees = away <= _FALSE * spread[part]
     agrees &= np.bincount(part[agrees], minlength=_PARTS)[part] >= _FEWEST
     if np.mean(false) > _MOST_FALSE or np.count_nonzero(agrees) < 2 * _PARTS:
         return math.nan
@@ -267,11 +268,29 @@ def drift_of(
     n = np.bincount(part, minlength=_PARTS)
     means = np.bincount(part, delays, minlength=_PARTS) / np.maximum(n, 1)
     between = float(n @ (means - delays.mean()) ** 2)
-    drifts = between > max(_DRIFTS * _OVERLAPS * scatter**2, len(at) * least**2)
+    weight = n / spread**2
+    chi_square = float(weight @ (means - weight @ means / weight.sum()) ** 2)
+    drifts = chi_square > _DRIFTS * _OVERLAPS and between > len(at) * least**2
     if not drifts and (nominal or within <= _SCATTERS * least):
         return 0.0
     slope = float(np.polyfit(at, delays, 1)[0])
     return max(abs(slope) * duration / math.sqrt(12), float(np.std(delays)))
+
+
+def _scatter_of_parts(
+    away: FloatArray, part: IntArray, scatter: float, *, most: float
+) -> FloatArray:
+    """Return the scatter in each part: the common one, or its own where that is clearly larger.
+
+    Where samples are far out of step, less of a piece is common, and delays are less certain. What
+    scatters by more than `most` is no such thing: it has false peaks.
+    """
+    found = np.full(_PARTS, scatter)
+    for each in np.unique(part):
+        own = _NORMAL * median(away[part == each])
+        if own > _SCATTERS * scatter:
+            found[each] = max(scatter, min(own, most))
+    return found
 
 
 def _is_elsewhere(at: FloatArray, unmet: BoolArray, known: BoolArray) -> bool:
