@@ -404,6 +404,11 @@ class Bench(Table):
         return hashlib.sha256(repr(devices).encode()).hexdigest()
 
     @property
+    def has_limits(self) -> bool:
+        """Whether there are limits to judge by."""
+        return bool(self.limits)
+
+    @property
     def runs_simulated(self) -> bool:
         """Whether its ports are those of simulated devices, by their clock or their speed."""
         return bool(self.simulated_clock) or self.speed != 1.0

@@ -83,12 +83,16 @@ class Settings(EstimateSettings):
 
     @classmethod
     def of(cls, bench: Bench | BenchOutline | None) -> Settings:
-        """Return the settings of a bench file, or the defaults if there is none."""
+        """Return the settings of a bench file, or the defaults if there is none.
+
+        A test with limits lasts until they are decided: its bench file sets no other target.
+        """
         if bench is None:
             return cls()
-        return cls(
+        found = cls(
             **{each.name: getattr(bench.estimate, each.name) for each in fields(EstimateSettings)}
         )
+        return replace(found, target_cov=None, target_cov_bin=None) if bench.has_limits else found
 
 
 class ConflictingOptionError(WrongSettingError):

@@ -129,10 +129,11 @@ class Comparison:
         with np.errstate(invalid="ignore", divide="ignore"):
             in_log = np.log(self.mask / self.mean)
             in_linear = (self.mask - self.mean) / spread
-        added, removed = (
-            np.where(np.isfinite(part), np.maximum(part, 0.0), math.inf)
-            for part in (self.low - self.outer_low, self.outer_high - self.high)
-        )
+        with np.errstate(invalid="ignore"):  # of ends that are infinite, both parts are
+            added, removed = (
+                np.where(np.isfinite(part), np.maximum(part, 0.0), math.inf)
+                for part in (self.low - self.outer_low, self.outer_high - self.high)
+            )
         return Margins(
             margin=np.where(positive, in_log, in_linear),
             cumulants=self.cumulants / np.stack([unit**k for k in (2, 3, 4)]),

@@ -54,7 +54,7 @@ class StartForm(Form[TestPlan]):
     def __init__(self, bench: Bench | None, kept: str) -> None:
         self._operator = "" if bench is None else bench.operator
         duration = None if bench is None else bench.recording.duration
-        self._has_limits = bench is not None and bool(bench.limits)
+        self._has_limits = bench is not None and bench.has_limits
         fields = (
             Field("operator", "operator", self._operator),
             Field("note", "note"),

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from daq.bench.durations import format_duration
-from daq.bench.estimate_settings import EstimateSettings, to_table
+from daq.bench.estimate_settings import to_table
 from daq.bench.tables.certificate import CertificateTable, Customer, Laboratory
+from daq.estimation.settings import Settings
 from tui.report.parts import Facts, Paragraph, Section, Table
 from tui.report.wording import plain_number, utc_time
 
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from daq.bench.model import Bench
-    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.results.sources import Source
     from tui.report.parts import Part
@@ -193,7 +193,7 @@ def settings_line(settings: Settings, bench: Bench | None) -> Paragraph:
         for key, value in (("start", settings.start), ("end", settings.end))
         if value is not None
     }
-    changed = changes(to_table(bench.estimate if bench else EstimateSettings()), shown)
+    changed = changes(to_table(Settings.of(bench)), shown)
     text = "Settings: " + (_listed(shown) or "all defaults") + "."
     if changed:
         of = "the bench file" if bench else "the defaults"

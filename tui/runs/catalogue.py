@@ -164,7 +164,7 @@ def _entry(path: Path, size: int, modified_ns: int) -> Entry:
                 length=max(lengths),
                 is_growing=not recording.closed and is_being_written(path),
                 is_closed=recording.closed,
-                has_limits=bench is not None and bool(bench.limits),
+                has_limits=bench is not None and bench.has_limits,
                 has_result=has_result,
                 verdict=verdict,
                 run_id=recording.run_id,

@@ -411,7 +411,9 @@ def _uncounted(fact: SamplesUncounted, names: Names) -> Wording:
 def _not_understood(fact: ClockNotUnderstood, names: Names) -> Wording:
     del names
     if math.isinf(fact.error):
-        head = f"{listed(fact.sensors)} does not follow the common motion in a part of the recording"
+        head = (
+            f"{listed(fact.sensors)} does not follow the common motion in a part of the recording"
+        )
         return Wording(
             f"{head}: its clock is not understood",
             f"{head}. Its times are off by more than can be measured, or it measures something else"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -82,6 +83,14 @@ def test_only_what_time_removes_is_predicted() -> None:
     assert ahead.resolution_db < 0.1
     assert prediction(found, [Obstacle.CLOCKS], quantile=QUANTILE, elapsed=100.0) is None
     assert prediction(found, [], quantile=QUANTILE, elapsed=100.0) is None
+
+
+def test_nothing_is_known_of_the_margins_of_ends_that_are_infinite() -> None:
+    low, high = np.full(3, -math.inf), np.full(3, math.inf)
+    known = comparison(0.5, 2.0, outer_low=low, outer_high=high)
+    margins = replace(known, low=low, high=high).margins()
+    assert np.isinf(margins.added).all()
+    assert np.isinf(margins.removed).all()
 
 
 def test_more_bands_take_wider_intervals() -> None:

@@ -77,6 +77,12 @@ def bench(*, method: str = "all") -> Bench:
     return parse(text.replace('"C.X"', '"C.Z"').replace("10s", "2s"), "bench.toml")
 
 
+def test_limits_are_the_only_target_of_a_bench_file_that_has_them() -> None:
+    assert Settings.of(bench()).target_cov is not None
+    limits = '\n[[limits]]\nname = "quiet site"\nmodel = "nlnm"\n'
+    assert Settings.of(parse(TEMPLATE + limits, "bench.toml")).target_cov is None
+
+
 def test_the_template_names_every_option_and_means_nothing_by_it() -> None:
     plain = parse(TEMPLATE, "bench.toml")
     assert Settings.of(plain).reject is None
