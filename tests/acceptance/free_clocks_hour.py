@@ -10,10 +10,10 @@ Make a bench, record it from simulated devices at life's pace, compare::
 ``bench DIMENSIONS LATENCY [SNR] [HOURS]`` has three sensors on an Epson burst over a
 pseudo-terminal and text rows over a pseudo-terminal and TCP, with the scenario of
 `benchmarks.studies.clocks.free_running`. ``compare`` needs nothing but the recording, whose bench
-holds the whole world: every recorded row is found there by its counts, exactly. A copy of the recording
-is written that has the true instant of every sample (the oracle), and ``huddle estimate`` is run on
-it, and on the recording with its samples at face value, with clocks from arrival times alone, and
-refined. Exit code 1 where something issue 5 asks for does not hold.
+holds the whole world: every recorded row is found there by its counts, exactly. A copy of the
+recording is written that has the true instant of every sample (the oracle), and ``huddle estimate``
+is run on it, and on the recording with its samples at face value, with clocks from arrival times
+alone, and refined. Exit code 1 where something issue 5 asks for does not hold.
 """
 
 from __future__ import annotations
