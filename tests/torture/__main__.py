@@ -7,35 +7,32 @@ Writes the counts to docs/validation/torture.md. A share of the cases, as in
 from __future__ import annotations
 
 import argparse
-import itertools
 import sys
 import tempfile
-from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from tests.torture.crashes import disk_faults, kill_faults
 from tests.torture.damaged_files import (
     FAULTS,
     LIMIT,
-    changed_blocks,
-    changed_sectors,
-    contents,
-    flips,
     make_recording,
     tally,
 )
 from tests.torture.long_history import N_RUNS, command_faults, loop_faults, make_history
 from tests.torture.power_cuts import MODELS, faults, recorded, shim
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
 PAGE = Path(__file__).parents[2] / "docs" / "validation" / "torture.md"
-KILLS, CUTS, DISK_ERRORS, FLIPS, SECTORS = 300, 100, 50, 50_000, 10_000
-_FILES = 200
-"""Damaged files on disk at the same time."""
+KILLS, CUTS, DISK_ERRORS = 300, 100, 50
+CHANGES = {
+    "flipped bits": ("bits", 100_000),
+    "flipped bits in block tables": ("blocks", 10_000),
+    "flipped bits in global heaps": ("heaps", 1000),
+    "changed sectors": ("sectors", 10_000),
+}
+"""Kind of change, and number of cases."""
+KEPT = PAGE.parents[2] / "build" / "torture"
+"""Folder of the files in which something was not seen."""
 HEAD = """# Recordings under torture
 
 `make torture` records with the writer of the product, and lets the process be killed, the power be
@@ -101,9 +98,8 @@ def torture(share: float, folder: Path) -> list[Row]:
             add(Row(f"power cuts, {model}", n, faults(operations, model, n, folder, seed=seed)))
         n = max(1, round(DISK_ERRORS * share))
         add(Row("disk errors", n, disk_faults(library, folder, n, seed=2)))
-    add(_changes("flipped bits", flips, round(FLIPS * share), folder))
-    add(_changes("flipped bits in block tables", changed_blocks, round(FLIPS * share), folder))
-    add(_changes("changed sectors", changed_sectors, round(SECTORS * share), folder))
+    for name, (kind, n_cases) in CHANGES.items():
+        add(_changes(name, kind, max(1, round(n_cases * share)), folder))
     n = max(1000, round(N_RUNS * share))
     bench = make_history(folder / "history", n, seed=4)
     found, remark = command_faults(folder / "history")
@@ -113,18 +109,15 @@ def torture(share: float, folder: Path) -> list[Row]:
     return rows
 
 
-def _changes(name: str, change: Callable[..., Iterator[bytes]], n: int, folder: Path) -> Row:
+def _changes(name: str, kind: str, n: int, folder: Path) -> Row:
     """Return the row of one kind of damage to a closed recording."""
-    whole, n = folder / "whole.h5", max(1, n)
+    whole = folder / "whole.h5"
     if not whole.exists():
         make_recording(whole)
-    counts: Counter[str] = Counter()
-    changed, expected = change(whole, n, seed=3), contents(whole)
-    while files := list(itertools.islice(changed, _FILES)):
-        counts += tally(files, expected, folder, limit=LIMIT)
-    wrong = Counter({what: count for what, count in counts.items() if what in FAULTS})
+    counts = tally(kind, whole, n, seed=3, limit=LIMIT, keep=KEPT)
+    wrong = [what for what in counts.elements() if what in FAULTS]
     good = ", ".join(f"{n} {what}" for what, n in counts.items() if what not in FAULTS)
-    return Row(name, n, list(wrong.elements()), f" ({good})")
+    return Row(name, n, wrong, f" ({good})")
 
 
 def main() -> int:

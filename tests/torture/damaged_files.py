@@ -1,16 +1,24 @@
 """Bits and sectors of a recording are changed: what is read is right, or its damage is named.
 
-A child process reads the files one after another, so that neither a hang nor a crash of a library
-ends the tests.
+``python -m tests.torture.damaged_files KIND RECORDING N SEED LIMIT FOLDER`` makes N changes of a
+kind and prints the outcome of each. It reads the changed files in children that are forked after
+everything is imported: so neither a hang nor a crash of HDF5 ends the tests, and a child costs
+little. Files whose outcome is a fault are kept in FOLDER.
 """
 
 from __future__ import annotations
 
 import hashlib
-import selectors
+import itertools
+import logging
+import multiprocessing
+import os
+import shutil
 import subprocess
 import sys
+import tempfile
 from collections import Counter
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import h5py
@@ -22,18 +30,22 @@ from daq.protocols.block import Block, BlockFlag, Event, HostTime
 from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
 from daq.recording.repair import verify, write_results
-from daq.recording.storage.trial import remember
+from daq.recording.storage.trial import remember, trials
 from daq.recording.writer import RecordingWriter
+from tests.daq.recording.version_1 import as_version_1, heap_headers
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-    from pathlib import Path
+    from collections.abc import Callable, Iterator, Sequence
+    from multiprocessing.connection import Connection
 
 CREATED = HostTime(1_000_000_000, 1_790_000_000_000_000_000)
 SECTOR = 512
-FAULTS = ("hang", "crash", "changed silently", "intact but unreadable")
+FATAL = ("hang", "crash")
+FAULTS = (*FATAL, "changed silently", "intact but unreadable")
 LIMIT = 10.0
 """Seconds that reading a file may take before it counts as a hang."""
+_FILES = 200
+"""Changed files in memory at the same time."""
 
 
 def make_recording(path: Path) -> None:
@@ -100,6 +112,24 @@ def changed_blocks(path: Path, n: int, *, seed: int) -> Iterator[bytes]:
         yield bytes(changed)
 
 
+def changed_heaps(path: Path, n: int, *, seed: int) -> Iterator[bytes]:
+    """Yield copies of a file as version 1 with one flipped bit each in a header of a global heap.
+
+    Since version 2 recordings have no global heap.
+    """
+    rng = np.random.default_rng(seed)
+    with tempfile.TemporaryDirectory() as folder:
+        old = Path(folder, "old.h5")
+        shutil.copyfile(path, old)
+        as_version_1(old)
+        content = old.read_bytes()
+    places = np.flatnonzero(heap_headers(content))
+    for _ in range(n):
+        changed = bytearray(content)
+        changed[int(rng.choice(places))] ^= 1 << int(rng.integers(8))
+        yield bytes(changed)
+
+
 def changed_sectors(path: Path, n: int, *, seed: int) -> Iterator[bytes]:
     """Yield copies of a file with one sector each that is zero, random, or another sector's."""
     rng = np.random.default_rng(seed)
@@ -127,7 +157,7 @@ def contents(path: Path) -> str:
         found.update(repr(about).encode())
         found.update(repr(recording.events).encode())
         for sensor in recording.sensors:
-            names = (sensor.name, sensor.model, sensor.clock)
+            names = (sensor.name, sensor.model, sensor.clock, sensor.serial_number, sensor.port)
             found.update(repr((names, sensor.sampling_rate, sensor.channels)).encode())
             for rows in (sensor.counts(), sensor.blocks[:], sensor.gaps, sensor.blocks.clipped):
                 found.update(rows.tobytes())
@@ -172,67 +202,102 @@ def plain_h5py_reads(path: Path) -> bool:
     return True
 
 
-def tally(files: Sequence[bytes], expected: str, folder: Path, *, limit: float) -> Counter[str]:
-    """Return how many of the files have which outcome; ``limit`` is in seconds a file."""
-    counts: Counter[str] = Counter()
-    paths = []
-    for number, content in enumerate(files):
-        paths.append(folder / f"{number}.h5")
-        paths[-1].write_bytes(content)
-    left = list(paths)
-    while left:
-        for outcome in _outcomes(left, expected, limit):
-            path = left.pop(0)
-            if outcome in {"hang", "crash"}:  # of HDF5: the program must notice it
-                found = next(_outcomes([path], expected, 3 * limit, task="as a stranger"), "crash")
-                counts[found if found in FAULTS else f"{found} (HDF5: {outcome})"] += 1
-            else:
-                counts[outcome] += 1
-    return counts
+CHANGES: dict[str, Callable[..., Iterator[bytes]]] = {
+    "bits": flips,
+    "blocks": changed_blocks,
+    "heaps": changed_heaps,
+    "sectors": changed_sectors,
+}
 
 
-def _outcomes(
-    paths: Iterable[Path], expected: str, limit: float, *, task: str = "as written here"
-) -> Iterator[str]:
-    """Yield outcomes from a child process, up to the first file that hangs or crashes it.
+def tally(kind: str, whole: Path, n: int, *, seed: int, limit: float, keep: Path) -> Counter[str]:
+    """Return how many of the changed files have which outcome.
 
-    A file "as written here" is opened without a trial in a process of its own, which takes most of
-    the time.
+    Parameters
+    ----------
+    kind : str
+        Of `CHANGES`.
+    whole : Path
+        Recording.
+    n, seed : int
+        Number of changes, and the seed of their random places.
+    limit : float
+        Seconds that a file may take.
+    keep : Path
+        Folder for the files whose outcome is a fault.
     """
-    command = [sys.executable, "-m", "tests.torture.damaged_files", task, expected]
-    command += map(str, paths)
-    with (
-        subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, bufsize=0
-        ) as child,
-        selectors.DefaultSelector() as ready,
-    ):
-        assert child.stdout is not None
-        ready.register(child.stdout, selectors.EVENT_READ)
-        child.stdout.readline()  # it has imported what it needs
-        while ready.select(limit):
-            line = child.stdout.readline()
-            if not line:
-                break
-            yield line.decode().strip()
-        else:
-            child.kill()
-            yield "hang"
-            return
-        if child.wait() != 0:
-            yield "crash"
+    command = [sys.executable, "-m", "tests.torture.damaged_files", kind, str(whole), str(n)]
+    done = subprocess.run(
+        [*command, str(seed), str(limit), str(keep)],
+        check=True,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},  # a process with threads must not fork
+    )
+    return Counter(done.stdout.splitlines())
+
+
+def _outcomes(files: Sequence[Path], expected: str, limit: float) -> Iterator[str]:
+    """Yield the outcome of each file."""
+    first = 0
+    while first < len(files):
+        for found in _until_fatal(files[first:], expected, limit):
+            # HDF5 hangs or crashes: the program must notice it by a trial of its own.
+            yield found if found not in FATAL else _of_stranger(files[first], found)
+            first += 1
+
+
+def _until_fatal(files: Sequence[Path], expected: str, limit: float) -> Iterator[str]:
+    """Yield outcomes from one child, up to the first file that hangs or crashes it."""
+    context = multiprocessing.get_context("fork")
+    here, there = context.Pipe(duplex=False)
+    child = context.Process(target=_read_all, args=(there, files, expected))
+    child.start()
+    there.close()
+    try:
+        for _ in files:
+            if not here.poll(limit):
+                yield "hang"
+                return
+            yield here.recv()
+    except EOFError:
+        yield "crash"
+    finally:
+        child.kill()
+        child.join()
+        here.close()
+
+
+def _read_all(send: Connection, files: Sequence[Path], expected: str) -> None:
+    for path in files:
+        remember(path)  # no trial in a process of its own, which takes most of the time
+        send.send(outcome(path, expected))
+
+
+def _of_stranger(path: Path, fatal: str) -> str:
+    """Return what `huddle verify` says of a file at which HDF5 hangs or crashes."""
+    [(_, found)] = trials([path], "verify")
+    return f"damage named (HDF5: {fatal})" if found.get("fatal") else fatal
 
 
 def main() -> None:
-    """Print the outcome of each file that is named."""
-    from pathlib import Path  # noqa: PLC0415 - needed at run time here only
-
-    task, expected, *paths = sys.argv[1:]
-    print("ready", flush=True)
-    for path in map(Path, paths):
-        if task == "as written here":
-            remember(path)
-        print(outcome(path, expected), flush=True)
+    """Change a recording in many ways, and print the outcome of each."""
+    logging.disable()
+    kind, whole, n, seed, limit, keep = sys.argv[1:]
+    changed, expected = CHANGES[kind](Path(whole), int(n), seed=int(seed)), contents(Path(whole))
+    memory = Path("/dev/shm")  # noqa: S108 - for a folder with a random name
+    number = 0
+    while contents_of_files := list(itertools.islice(changed, _FILES)):
+        with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as folder:
+            files = [Path(folder, f"{n}.h5") for n in range(len(contents_of_files))]
+            for path, content in zip(files, contents_of_files, strict=True):
+                path.write_bytes(content)
+            for path, found in zip(files, _outcomes(files, expected, float(limit)), strict=True):
+                print(found, flush=True)
+                if found in FAULTS:
+                    Path(keep).mkdir(parents=True, exist_ok=True)
+                    shutil.copyfile(path, Path(keep, f"{kind}-{seed}-{number} {found}.h5"))
+                number += 1
 
 
 if __name__ == "__main__":

@@ -6,33 +6,22 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.torture.damaged_files import (
-    FAULTS,
-    LIMIT,
-    changed_blocks,
-    changed_sectors,
-    contents,
-    flips,
-    make_recording,
-    tally,
-)
+from tests.torture.damaged_files import FAULTS, LIMIT, make_recording, tally
 from tests.waiting import limit
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
     from pathlib import Path
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("change", [flips, changed_blocks, changed_sectors])
-def test_no_change_is_taken_for_data_or_stops_the_reader(
-    tmp_path: Path, change: Callable[..., Iterator[bytes]]
-) -> None:
+@pytest.mark.parametrize(
+    ("kind", "n"), [("bits", 80), ("blocks", 80), ("heaps", 20), ("sectors", 80)]
+)
+def test_no_change_is_taken_for_data_or_stops_the_reader(tmp_path: Path, kind: str, n: int) -> None:
     whole = tmp_path / "whole.h5"
     make_recording(whole)
-    files = list(change(whole, 80, seed=4))
-    counts = tally(files, contents(whole), tmp_path, limit=limit(LIMIT))
-    assert counts.total() == 80
+    counts = tally(kind, whole, n, seed=4, limit=limit(LIMIT), keep=tmp_path / "kept")
+    assert counts.total() == n
     for fault in FAULTS:
         assert counts[fault] == 0, counts
     assert counts["damage named"] + counts["refused"] > 0

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import re
-import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +14,7 @@ from daq.errors import RecordingError
 from daq.recording.chunks.manifest import MANIFEST, RESULTS_MANIFEST
 from daq.recording.reader import Recording
 from daq.recording.repair import verify, write_results
-from tests.daq.recording.heap_loops import with_variable_strings
+from tests.daq.recording.version_1 import as_version_1
 from tests.torture.damaged_files import make_recording
 
 if TYPE_CHECKING:
@@ -144,11 +142,7 @@ def test_a_file_that_plain_hdf5_refuses_is_not_intact(closed: Path) -> None:
 
 
 def test_a_recording_of_version_1_is_read_and_verified(closed: Path) -> None:
-    with_variable_strings(closed)
-    with h5py.File(closed, "r+") as file:
-        file.attrs["format_version"] = 1
-        del file[MANIFEST], file[RESULTS_MANIFEST]
-        file["checksums"][-1, 0] = _description_crc32(file)
+    as_version_1(closed)
     assert b"GCOL" in closed.read_bytes()
     report = verify(closed)
     assert report.intact
@@ -159,16 +153,6 @@ def test_a_recording_of_version_1_is_read_and_verified(closed: Path) -> None:
     content[place.byte_offset + 9] ^= 1
     closed.write_bytes(content)
     assert verify(closed).changed == ("/sensors/b/instants",)
-
-
-def _description_crc32(file: h5py.File) -> int:
-    """Return the checksum of the file's attributes, which include the version."""
-    names = ["format", "format_version", "run_id", "created", "created_utc_ns"]
-    names += ["created_monotonic_ns", "software", "bench", "operator", "location"]
-    values = [file.attrs[name] for name in names]
-    pairs = [[n, v if isinstance(v, str) else v.item()] for n, v in zip(names, values, strict=True)]
-    sensors = list(file["committed"].attrs["sensors"])
-    return zlib.crc32((json.dumps(pairs) + json.dumps(sensors)).encode())
 
 
 def test_a_recording_has_no_global_heap(closed: Path) -> None:

@@ -12,7 +12,7 @@ from daq.errors import NotARecordingError
 from daq.recording.reader import Recording, control_address
 from daq.recording.repair import repair, verify
 from daq.recording.storage import trial
-from tests.daq.recording.heap_loops import with_heap_loop
+from tests.daq.recording.version_1 import with_heap_loop
 from tests.torture.damaged_files import make_recording
 from tests.waiting import limit
 
