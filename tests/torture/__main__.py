@@ -113,7 +113,7 @@ def _changes(name: str, kind: str, n: int, folder: Path) -> Row:
     """Return the row of one kind of damage to a closed recording."""
     whole = folder / "whole.h5"
     if not whole.exists():
-        make_recording(whole)
+        make_recording(whole, "b")  # of one sensor, in half the time
     counts = tally(kind, whole, n, seed=3, limit=LIMIT, keep=KEPT)
     wrong = [what for what in counts.elements() if what in FAULTS]
     good = ", ".join(f"{n} {what}" for what, n in counts.items() if what not in FAULTS)

@@ -48,15 +48,15 @@ _FILES = 200
 """Changed files in memory at the same time."""
 
 
-def make_recording(path: Path) -> None:
-    """Write a closed recording that has something of everything."""
+def make_recording(path: Path, names: str = "ab") -> None:
+    """Write a closed recording that has something of everything; sensor b is polled."""
     rng = np.random.default_rng(1)
     channels = tuple(Channel(name=name, sensitivity=1e6) for name in "xyz")
-    sensors = [SensorLayout(name, channels, 100.0, np.dtype("i4")) for name in "ab"]
+    sensors = [SensorLayout(name, channels, 100.0, np.dtype("i4")) for name in names]
     writer = RecordingWriter.create(path, sensors=sensors, created=CREATED)
     for number, first in enumerate(range(0, 3000, 50)):
         at = HostTime(CREATED.monotonic_ns + first * 10**7, CREATED.utc_ns + first * 10**7)
-        for name in "ab":
+        for name in names:
             flags = BlockFlag.CLIPPED if number % 7 == 0 else BlockFlag.NONE
             counts = rng.integers(-1000, 1000, (50, 3)).astype(np.int32)
             instants = at.monotonic_ns + np.arange(50) * 10**7 if name == "b" else None
@@ -65,10 +65,10 @@ def make_recording(path: Path) -> None:
                 Block(name, first + skipped, counts, at, flags=flags, instants_ns=instants)
             )
         if number == 40:
-            for name in "ab":
+            for name in names:
                 writer.gap(name, first, 50, reason="cable pulled")
         if number % 9 == 0:
-            writer.event(Event("a", "mark", f"remark {number}", at))
+            writer.event(Event(names[0], "mark", f"remark {number}", at))
             writer.commit()
     writer.close()
     write_results(path, {"m": ({"noise_psd": rng.random(100)}, {"unit": "m/s²"})})

@@ -114,8 +114,11 @@ class ClearedFile(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        """Set the position in the file."""
-        return self._file.seek(offset, whence)
+        """Set the position in the file; raise OSError where no file can have it."""
+        try:
+            return self._file.seek(offset, whence)
+        except (ValueError, OverflowError) as error:  # a damaged address
+            raise OSError(f"address {offset} is beyond the end of the file") from error
 
     def tell(self) -> int:
         """Return the position in the file."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from typing import TYPE_CHECKING
 
@@ -69,3 +70,13 @@ def test_a_recording_left_open_is_cut_to_its_whole_blocks(tmp_path: Path) -> Non
         file["committed"][0, 0] = 2960  # older than the row of the table
     with Recording.open(path) as recording:
         assert recording.sensor("a").n_samples == 2950
+
+
+def test_a_changed_byte_of_the_superblock_is_damage(closed: Path) -> None:
+    content = closed.read_bytes()
+    for at in range(48):
+        changed = bytearray(content)
+        changed[at] ^= 0x80  # an offset becomes one that no file can have
+        closed.write_bytes(changed)
+        with contextlib.suppress(NotARecordingError):
+            assert not verify(closed, tried=True).intact
