@@ -8,6 +8,7 @@ of data set 164. In a WAV file the file is a sensor, its channels are numbered. 
 
 from __future__ import annotations
 
+import logging
 import re
 import warnings
 from typing import TYPE_CHECKING, Any
@@ -30,6 +31,7 @@ _DIRECTIONS = {0: "S", 1: "X", 2: "Y", 3: "Z", 4: "RX", 5: "RY", 6: "RZ"}
 _QUANTITIES = {8: "m", 11: "m/s", 12: "m/s²"}
 """By the ordinate's specific data type: displacement, velocity, acceleration."""
 _UINT8_ZERO = 128
+_LOGGER = logging.getLogger(__name__)
 
 
 def read_uff(path: Path) -> list[Trace]:
@@ -124,6 +126,15 @@ def read_wav(path: Path, sampling_rate: float | None = None) -> tuple[ForeignSen
     stretches = finite_stretches(samples, start_utc_ns=0, sampling_rate=float(rate))
     if not stretches:
         raise ImportFormatError(f"{path}: no samples in it")
+    with path.open("rb") as file:
+        head = file.read(8)
+    n_bytes = 8 + int.from_bytes(head[4:], "little")
+    if head[:4] == b"RIFF" and path.stat().st_size < n_bytes:
+        _LOGGER.warning(
+            "%s: ends after %d samples, before its header says: cut off, or written to a pipe",
+            path,
+            len(samples),
+        )
     channels = tuple(str(number) for number in range(1, samples.shape[1] + 1))
     return (ForeignSensor(path.stem, channels, float(rate), stretches, str(path)),)
 
@@ -133,7 +144,7 @@ def _wav_fault(path: Path, error: str) -> str:
     with path.open("rb") as file:
         head = file.read(12)
     if head[:4] not in {b"RIFF", b"RIFX", b"RF64"} or head[8:12] != b"WAVE":
-        return f"begins with {head[:4]!r}; a WAV file begins with RIFF, its length, and WAVE"
+        return "not a WAV file: it does not begin with RIFF, its length, and WAVE"
     found = re.search(r"Unknown wave file format: (\w+)", error)
     if found is not None:
         return f"WAV samples of format {found[1]}; expected PCM or floating-point samples"

@@ -16,6 +16,7 @@ from daq.errors import ImportFormatError
 from daq.formats.importer import import_files
 from daq.formats.readers import npz
 from daq.recording.reader import Recording
+from tests.daq.formats.test_libraries import opened
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -99,7 +100,7 @@ _WAV = b"RIFF\x24\0\0\0WAVEfmt "
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (b"hello, world", "begins with b'hell'; a WAV file begins with RIFF"),
+        (b"\x86\xa8 world \xff", "not a WAV file: it does not begin with RIFF"),
         (_WAV, "damaged or cut off"),
         (_WAV + struct.pack("<IHHIIHH", 16, 7, 1, 8000, 8000, 1, 8) + b"data\0\0\0\0", "MULAW"),
     ],
@@ -108,6 +109,24 @@ def test_what_a_wav_file_has_wrong_is_named(tmp_path: Path, content: bytes, said
     (tmp_path / "a.wav").write_bytes(content)
     with pytest.raises(ImportFormatError, match=said):
         import_files([tmp_path / "a.wav"], tmp_path / "a.h5")
+
+
+def test_a_wav_file_that_is_cut_off_is_read_and_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    described = struct.pack("<IHHIIHH", 16, 1, 1, 100, 200, 2, 16) + b"data\xff\xff\0\0"
+    (tmp_path / "a.wav").write_bytes(b"RIFF\x23\0\1\0" + _WAV[8:] + described + bytes(400))
+    assert opened(tmp_path / "a.wav")["a"].stretches[0].n_samples == 200
+    assert "ends after 200 samples, before its header says" in caplog.text
+
+
+def test_the_unit_of_times_without_one_is_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    (tmp_path / "a.csv").write_bytes(b"time,A.X\n1e12,1\n1000000000010,2\n")
+    assert opened(tmp_path / "a.csv")["A"].sampling_rate == 100.0
+    assert "times such as 1e12 have no unit; read as ms since 1970" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -98,6 +98,10 @@ def test_sensors_of_different_rates_have_blocks_of_a_second(tmp_path: Path) -> N
             assert abs(steps.mean() - 1e9) < 1e6
             ends = (blocks["monotonic_ns"] - recording.created_at.monotonic_ns) / 1e9
             np.testing.assert_allclose(ends, np.arange(1, 31), atol=1 / rates[sensor.name] + 1e-6)
+    far = tmp_path / "far.toml"
+    far.write_text(f"{text}clock = {{ppm = -800000.0}}\n", encoding="utf-8")
+    with pytest.raises(ScenarioError, match=r"ppm.*-1000"):
+        simulate_recording(str(far), out=tmp_path / "far.h5", duration=30.0, json=None)
     result = tmp_path / "wrong.toml"
     result.write_text(text + "sampling_rate = 50.0\n", encoding="utf-8")
     with pytest.raises(BenchFileError, match="is 50 Hz; expected 20 Hz, as of the sensor"):

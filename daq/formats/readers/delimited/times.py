@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 from datetime import datetime, timedelta
@@ -32,8 +33,9 @@ _SCALES = {
     **dict.fromkeys(("min", "minutes"), 60 * NS_PER_S),
     **dict.fromkeys(("h", "hours"), 3600 * NS_PER_S),
 }
-_EPOCHS = ((1e17, 1), (1e14, 1000), (1e11, 1_000_000))
+_EPOCHS = ((1e17, "ns"), (1e14, "µs"), (1e11, "ms"))
 """Numbers without a unit above these are ns, µs or ms since 1970: as seconds, the year 5138."""
+_LOGGER = logging.getLogger(__name__)
 
 
 def is_time(cell: str) -> bool:
@@ -65,7 +67,15 @@ def nanoseconds(cells: Sequence[str], unit: str, *, decimal_comma: bool) -> NDAr
         return _within_range([_dated(cell, order) for cell in cells], cells)
     scale = _SCALES.get(unit.lower())
     if scale is None:
-        scale = next((each for least, each in _EPOCHS if abs(value) > least), NS_PER_S)
+        guessed = next((each for least, each in _EPOCHS if abs(value) > least), "s")
+        scale = _SCALES[guessed]
+        if guessed != "s":
+            _LOGGER.info(
+                "times such as %s have no unit; read as %s since 1970: state the unit in the"
+                " header, as in time (s)",
+                cells[0],
+                guessed,
+            )
     return _within_range([_scaled(cell, scale, comma=decimal_comma) for cell in cells], cells)
 
 
