@@ -64,7 +64,7 @@ class SensorClock(Table):
     """
 
     offset: float = 0.0
-    ppm: float = Field(0.0, ge=-1000.0, le=1000.0)  # as far off as estimates accept
+    ppm: float = Field(default=0.0, ge=-1000.0, le=1000.0)  # as far off as estimates accept
     wander: NonNegativeFloat = 0.0
     step: TemperatureStep | None = None
     ramp: TemperatureRamp | None = None
