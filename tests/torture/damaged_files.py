@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 CREATED = HostTime(1_000_000_000, 1_790_000_000_000_000_000)
 SECTOR = 512
 FATAL = ("hang", "crash")
-FAULTS = (*FATAL, "changed silently", "intact but unreadable")
+FAULTS = (*FATAL, "traceback", "changed silently", "intact but unreadable")
 LIMIT = 10.0
 """Seconds that reading a file may take before it counts as a hang."""
 _FILES = 200
@@ -177,6 +177,8 @@ def outcome(path: Path, expected: str) -> str:
         intact = verify(path).intact
     except RecordingError:
         return "refused"
+    except Exception:  # noqa: BLE001 - an error that no command expects
+        return "traceback"
     if not intact:
         return "damage named"
     if not plain_h5py_reads(path):
