@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -317,17 +318,25 @@ def remarks(entry: SensorCheck, serial_number: str) -> Iterator[str]:
 
 
 def _channel_table(found: Sequence[SensorCheck]) -> Table:
-    from tui.wording.formatting import signed
+    from tui.wording.formatting import readings
 
     table = _table(("channel", "mean", "rms", "range", "unit", ""))
+    values: dict[str, list[float]] = {}
+    for channel in (channel for entry in found for channel in entry.channels):
+        values.setdefault(channel.unit, []).extend(
+            (channel.mean, channel.rms, channel.minimum, channel.maximum)
+        )
+    shown = {unit: readings(known, unit) for unit, known in values.items()}
+    texts = {unit: iter(of_unit) for unit, (of_unit, _) in shown.items()}
     for entry in found:
         for channel in entry.channels:
+            mean, rms, least, most = itertools.islice(texts[channel.unit], 4)
             table.add_row(
                 f"{entry.information.sensor}.{channel.name}",
-                signed(channel.mean, ".4g"),
-                signed(channel.rms, ".3g"),
-                f"{signed(channel.minimum, '.4g')} … {signed(channel.maximum, '.4g')}",
-                channel.unit,
+                mean,
+                rms,
+                f"{least} … {most}",
+                shown[channel.unit][1],
                 "constant: nothing connected?" if channel.is_stuck else "",
             )
     return table
