@@ -28,7 +28,15 @@ from daq.bench.response import PolesZeros, Response
 from daq.bench.tables.certificate import CertificateTable, Customer, Laboratory
 from daq.bench.tables.fields import Duration, Name, Number, PositiveNumber, Table
 from daq.bench.tables.toml_text import to_toml
-from daq.bench.tables.unattended import History, Hooks, Metrics, Schedule, Signing, Storage
+from daq.bench.tables.unattended import (
+    History,
+    Hooks,
+    Metrics,
+    Schedule,
+    Signing,
+    Storage,
+    Web,
+)
 from daq.bench.units import DensityUnit
 
 Day: TypeAlias = dt.date
@@ -339,6 +347,7 @@ class Bench(Table):
     storage: Storage = Storage()
     hooks: Hooks = Hooks()
     metrics: Metrics | None = None
+    web: Web | None = None
     signing: Signing | None = None
     history: History = History()
     limits: tuple[Limit, ...] = ()

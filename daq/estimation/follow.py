@@ -147,6 +147,7 @@ def follow(
     of_diagnoses: float = 0.1,
     silence: float = SILENCE,
     whole: bool = False,
+    look: Callable[[Recording], None] | None = None,
 ) -> Snapshot | None:
     """Follow a recording until it is closed, and return its result.
 
@@ -175,6 +176,9 @@ def follow(
     whole : bool
         Whether estimates of the growing recording have all sensors, however much memory they take:
         the observer decides by them.
+    look : callable, optional
+        Reads more of the recording, before each state of the sensors: nobody else in this process
+        may open it, for HDF5 shares what it knows of a file.
 
     Returns
     -------
@@ -199,7 +203,7 @@ def follow(
 
         def seen(recording: Recording) -> tuple[Recorder, _Sensors | None]:
             remote = _RemoteRecorder(recording, cancelled, silence)
-            sensors = _Sensors(recording, observer, first) if watch_sensors else None
+            sensors = _Sensors(recording, observer, first, look) if watch_sensors else None
             return remote if recorder is None else recorder, sensors
 
         known, sensors = seen(recording)
@@ -326,8 +330,15 @@ def _is_among(sensor: str, one: Uncounted, others: Iterable[tuple[str, Uncounted
 class _Sensors:
     """States of the sensors: from the file, and from the recorder where the file is silent."""
 
-    def __init__(self, recording: Recording, observer: Observer, first: Recording) -> None:
+    def __init__(
+        self,
+        recording: Recording,
+        observer: Observer,
+        first: Recording,
+        further: Callable[[Recording], None] | None,
+    ) -> None:
         self._monitor, self._observer = RecordingMonitor(recording, first=first), observer
+        self._recording, self._further = recording, further
         self._path = recording.path
         self._address: tuple[int, str] | None = None
 
@@ -336,11 +347,16 @@ class _Sensors:
         status = self._monitor.status()
         if self._monitor.is_any_sensor_quiet():
             status = self._monitor.with_late_sensors(status, self._recorder_states())
-        self._observer.status(status)
+        self._pass_on(status)
 
     def look_closely(self) -> None:
         """Pass on the state of the sensors, and which channels are stuck."""
-        self._observer.status(self._monitor.status_with_stuck_channels())
+        self._pass_on(self._monitor.status_with_stuck_channels())
+
+    def _pass_on(self, status: RecordingStatus) -> None:
+        if self._further is not None:
+            self._further(self._recording)
+        self._observer.status(status)
 
     def _recorder_states(self) -> dict[str, str]:
         """Ask the recorder, the first to know that a sensor is late."""

@@ -61,7 +61,8 @@ def recorded_text(bench: Bench) -> str:
 
     A recording is passed on. Commands and addresses of a service are of no use in it.
     """
-    if bench.hooks == Hooks() and bench.metrics is None and bench.signing is None:
+    private = bench.metrics, bench.signing, bench.web
+    if bench.hooks == Hooks() and private == (None, None, None):
         return bench.text
     from daq.bench.editing import without_tables  # noqa: PLC0415 - tomlkit takes 30 ms to import
 

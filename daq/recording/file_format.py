@@ -30,7 +30,7 @@ SIMULATED = "simulated"
 """Origin of a recording made without devices, and the driver of its sensors; the attribute that
 marks a recording of simulated devices."""
 
-PRIVATE_TABLES = ("hooks", "metrics", "signing")
+PRIVATE_TABLES = ("hooks", "metrics", "signing", "web")
 """Tables of the bench file that are not recorded."""
 
 NO_COUNTER = -1

@@ -60,13 +60,6 @@ def help_text(keys: tuple[tuple[str, str], ...]) -> RenderableType:
     return Group(_pairs((*keys, *GLOBAL_KEYS), "bold #4cc9f0"), "", _pairs(WORDS, "bold"))
 
 
-def item(text: str, mark: str = "·", style: str = "#9aa5b8") -> Table:
-    """Return a paragraph of a list behind a mark."""
-    table = Table.grid(padding=(0, 1, 0, 0))
-    table.add_row(Text(mark, style), Text(text))
-    return table
-
-
 class TextScreen(ModalScreen[None]):
     """A text that scrolls and is updated while it is open.
 

@@ -17,7 +17,6 @@ from daq.results.decision.limits import judge
 from daq.results.sources import sources
 from tui.certificate.dcc import NAME as DCC_NAME
 from tui.certificate.dcc import dcc
-from tui.certificate.ledger import Entry, Ledger
 from tui.output.console import finite
 from tui.output.json_document import document
 from tui.report.certificate import Issue, changes, missing
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.results.sources import Source
+    from tui.certificate.ledger import Entry, Ledger
     from tui.report.parts import Report
 
 JSON_NAME = "result.json"
@@ -47,12 +47,6 @@ class NotIssuedError(HuddleError, ValueError):
 
 class VerificationError(HuddleError, ValueError):
     """A certificate is not what the ledger says, or not of the recording that is there."""
-
-
-def ledger_of(recording: Path, about: Bench | None) -> Ledger:
-    """Return the ledger for a recording: in the folder that the bench file names."""
-    folder = "certificates" if about is None else about.certificate.folder.expanduser()
-    return Ledger(recording.resolve().parent / folder)
 
 
 def refuse_unfit(found: Sequence[Source], about: Bench | None, *, by: str, complete: bool) -> None:

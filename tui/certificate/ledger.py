@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from daq.bench.model import Bench
+
 NAME, LOCK = "ledger.sqlite", "ledger.lock"
 PATIENCE = 600.0
 """Seconds to wait for another process that issues."""
@@ -364,3 +366,9 @@ def _name(part: Path, path: Path) -> None:
 def _sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def ledger_of(recording: Path, about: Bench | None) -> Ledger:
+    """Return the ledger for a recording: in the folder that the bench file names."""
+    folder = "certificates" if about is None else about.certificate.folder.expanduser()
+    return Ledger(recording.resolve().parent / folder)

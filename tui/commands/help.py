@@ -36,6 +36,7 @@ PANELS: dict[str, dict[str, str]] = {
     },
     "Unattended": {
         "serve": "Run huddle tests on the schedule of the bench file, until Ctrl-C.",
+        "web": "Show a bench in the browser, until Ctrl-C.",
         "status": "Show the state of the service of a bench: runs, sensors, disk, clock.",
         "runs": "List the runs of a service: state, verdict, recordings, reason.",
         "history": "Show the noise of every channel from run to run, and whether it has changed.",

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from tui.certificate.ledger import Ledger, LedgerError
+from tui.certificate.ledger import Ledger, LedgerError, ledger_of
 from tui.commands.estimate import estimated, exit_with
 from tui.commands.options import (
     EndOption,
@@ -98,11 +98,7 @@ def issue(
     from tui.output.console import console, notices
 
     require("matplotlib", "jinja2", "fpdf", *(["pyhanko"] if sign is not None else []))
-    from tui.certificate.issuing import (
-        issue,
-        ledger_of,
-        refuse_unfit,
-    )
+    from tui.certificate.issuing import issue, refuse_unfit
 
     signer = None
     if sign is not None:
@@ -150,7 +146,6 @@ def issues(
     from rich.table import Table
 
     from daq.recording.reader import Recording
-    from tui.certificate.issuing import ledger_of
     from tui.output.console import for_people, write_json
 
     if source.is_dir():

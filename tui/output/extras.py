@@ -23,6 +23,8 @@ _EXTRA = {
     "prometheus_client": "metrics",
     "distributed": "cluster",
     "pyhanko": "sign",
+    "starlette": "web",
+    "uvicorn": "web",
 }
 
 

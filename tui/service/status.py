@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from typing import TYPE_CHECKING, Any
 
+from daq.bench.durations import format_duration
 from daq.errors import HuddleError
 from daq.recording.control import ask
 from tui.service.clock import SystemTime
@@ -13,6 +14,7 @@ from tui.service.records.places import service_lock
 from tui.service.records.run_state import UNFINISHED, RunState, utc_text
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from datetime import datetime
     from pathlib import Path
 
@@ -65,3 +67,37 @@ def _recording(run: Run, folder: Path) -> dict[str, Any]:
 def _disk(folder: Path, least: int) -> dict[str, Any]:
     usage = shutil.disk_usage(folder)
     return {"free_bytes": usage.free, "total_bytes": usage.total, "min_free_bytes": least}
+
+
+def status_lines(found: dict[str, Any]) -> Iterator[str]:
+    """Yield what `service_status` has found, for people."""
+    yield f"service    {'running' if found['running'] else 'not running'}, bench {found['bench']}"
+    recording = found["recording"]
+    if recording is not None:
+        yield f"recording  {recording['entry']} since {recording['started']}" + (
+            "" if recording["ends"] is None else f", until {recording['ends']}"
+        )
+        if recording["elapsed"] is not None:
+            yield f"           {format_duration(round(recording['elapsed']))} are safe on disk"
+        for name, sensor in recording["sensors"].items():
+            missing = f", {sensor['missing']} missing" if sensor["missing"] else ""
+            yield f"  sensor   {name}: {sensor['state']}, {sensor['samples']} samples{missing}"
+    for key, title in (("estimating", "estimating"), ("waiting", "waiting")):
+        for run in found[key]:
+            yield f"{title:<10} {run['entry']} of {run['due']}"
+    for key in ("last", "next"):
+        run = found[key]
+        text = "none" if run is None else f"{run['entry']} of {run['due']}"
+        if run is not None and key == "last":
+            text += f": {run['state']}" + (f", {run['verdict']}" if run["verdict"] else "")
+            text += f" ({run['reason']})" if run["reason"] else ""
+        yield f"{key + ' run':<10} {text}"
+    disk = found["disk"]
+    yield (
+        f"disk       {disk['free_bytes'] / 1e9:.1f} GB free; recordings end below"
+        f" {disk['min_free_bytes'] / 1e9:.1f} GB"
+    )
+    synchronised = {True: "synchronised", False: "NOT synchronised", None: "not known to be right"}
+    yield f"clock      {found['clock']['utc']}, {synchronised[found['clock']['synchronised']]}"
+    if found["untold"]:
+        yield f"hooks      {found['untold']} not carried out yet"

@@ -1,4 +1,4 @@
-"""Tables of the bench file for unattended use: schedule, storage, hooks, metrics."""
+"""Tables of the bench file for unattended use: schedule, storage, hooks, metrics, pages."""
 
 from __future__ import annotations
 
@@ -191,6 +191,60 @@ class Metrics(Table):
 
     port: Annotated[int, Field(strict=True, ge=0, le=65535)]
     address: Annotated[str, AfterValidator(_address)] = "127.0.0.1"
+
+
+def _secret(value: str) -> str:
+    if _SECRET.fullmatch(value) is None:
+        raise ValueError(
+            "expected a line that huddle web --password or huddle web --token prints, or the name"
+            ' of a variable of the environment with a token, such as "${HUDDLE_WEB_TOKEN}"'
+        )
+    return value
+
+
+_SECRET = re.compile(r"scrypt:[0-9a-f]{32}:[0-9a-f]{64}|sha256:[0-9a-f]{64}|\$\{[A-Za-z_]\w*\}")
+Secret = Annotated[str, AfterValidator(_secret)]
+"""Hash of a password or of a token, or the variable of the environment that holds a token."""
+
+
+class Web(Table):
+    """The pages of the bench in a browser: ``huddle web``, and beside ``huddle serve``."""
+
+    port: Annotated[int, Field(strict=True, ge=0, le=65535)] = 8040
+    address: Annotated[str, AfterValidator(_address)] = "127.0.0.1"
+    read: Secret | None = None
+    """Who may look; anybody on this computer where it is not given."""
+    steer: Secret | None = None
+    """Who may also start, stop, mark and confirm; nobody where it is not given."""
+    hosts: tuple[str, ...] = ()
+    """Further names of this computer in addresses of the pages, as behind a reverse proxy."""
+    certificate: Annotated[str, Field(min_length=1)] | None = None
+    """Absolute path of a TLS certificate (PEM)."""
+    key: Annotated[str, Field(min_length=1)] | None = None
+    """Absolute path of its private key."""
+    archive: Annotated[str, Field(min_length=1)] | None = None
+    """Folder of an archive that the pages show; relative to the bench file."""
+
+    @model_validator(mode="after")
+    def _is_safe(self) -> Web:
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("expected certificate and key, or neither")
+        self.check_address(self.address)
+        return self
+
+    def check_address(self, address: str) -> None:
+        """Refuse an address that other computers reach, if anybody could look there.
+
+        Raises
+        ------
+        ValueError
+            Saying what is missing.
+        """
+        if self.read is None and not ipaddress.ip_address(address).is_loopback:
+            raise ValueError(
+                f"address {address}: other computers reach it; expected read = a line that huddle"
+                " web --password or huddle web --token prints"
+            )
 
 
 class Signing(Table):

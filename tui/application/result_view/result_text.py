@@ -14,7 +14,6 @@ from daq.results.comparison import compare
 from daq.results.facts import Rank
 from daq.results.partners import without_partners
 from daq.results.precision import channel_covs, precision
-from tui.application.dialogs import item
 from tui.application.test_view.panels import alerts, known_to
 from tui.output.results import averages_line
 from tui.wording.facts import MARKS as MARKS_OF_RANKS
@@ -71,6 +70,13 @@ def result(state: State, *, width: int) -> RenderableType:
     if path is not None:
         parts += ["", Text.assemble(("recording  ", MUTED), str(path.resolve()))]
     return Group(*parts)
+
+
+def item(text: str, mark: str = "·", style: str = "#9aa5b8") -> Table:
+    """Return a paragraph of a list behind a mark."""
+    table = Table.grid(padding=(0, 1, 0, 0))
+    table.add_row(Text(mark, style), Text(text))
+    return table
 
 
 def _verdict(snapshot: Snapshot, settings: Settings, found: TestVerdict | None) -> Iterator[Text]:

@@ -39,7 +39,8 @@ def channel_table(state: State, choice: Choice, *, means: Sequence[BandMeans], w
         del columns["margin, dB"]
     alone, covs = without_partners(snapshot, band), channel_covs(snapshot, settings)
     data = data_means(snapshot, band)
-    gaps = {} if state.now is None else {sensor.name: sensor.n_gaps for sensor in state.now.sensors}
+    totals = snapshot.sensors if state.now is None else state.now.sensors
+    gaps = {sensor.name: sensor.n_gaps for sensor in totals}
     for column, label in enumerate(snapshot.channels):
         name = Text(label.name, "bold reverse" if column == choice.channel else "bold")
         cells = {"channel": name, "data": Text(level(float(data[column])))}
@@ -70,7 +71,7 @@ def channel_table(state: State, choice: Choice, *, means: Sequence[BandMeans], w
 
 def _ratio(data: float, noise: float) -> str:
     """Return the motion over the noise in dB."""
-    if noise <= 0:
+    if not noise > 0:
         return "?"
     motion = data - noise
     return "< 0" if motion <= noise else signed(decibels(motion / noise), ".1f")

@@ -318,13 +318,19 @@ def read_out(snapshot: Snapshot, choice: Choice, curves: Sequence[Curve]) -> str
     estimates = [each for each in curves if each.label in choice.methods]
     for curve in (*estimates, *(each for each in curves if each.label not in choice.methods)):
         at = int(np.argmin(np.abs(curve.log_frequency - cursor)))
-        level, low, high = curve.level_db[at], curve.low_db[at], curve.high_db[at]
-        if math.isnan(level) and math.isnan(high):
-            continue
-        text = f"below {unit.text(high)}" if math.isnan(level) else unit.text(level)
-        if math.isfinite(level) and math.isfinite(high):
-            text += f" ({'0' if math.isnan(low) else unit.text(low)} to {unit.text(high)})"
-        parts.append(f"{curve.label} {text}")
+        if text := reading(curve, at, unit):
+            parts.append(f"{curve.label} {text}")
     name = snapshot.channels[choice.channel].name
     what = "" if choice.overlay or choice.picked else f"{name}  "
     return f"{10**cursor:.3g} Hz  {what}{unit.name}:  {' · '.join(parts)}"
+
+
+def reading(curve: Curve, at: int, unit: SpectrumUnit) -> str:
+    """Return the value of a curve at one of its points with its interval; empty if it has none."""
+    level, low, high = curve.level_db[at], curve.low_db[at], curve.high_db[at]
+    if math.isnan(level) and math.isnan(high):
+        return ""
+    text = f"below {unit.text(high)}" if math.isnan(level) else unit.text(level)
+    if math.isfinite(level) and math.isfinite(high):
+        text += f" ({'0' if math.isnan(low) else unit.text(low)} to {unit.text(high)})"
+    return text

@@ -1,0 +1,234 @@
+"""The pages as any program sees them: who may, what they hold, and that nothing of a test acts."""
+
+from __future__ import annotations
+
+import html
+import json
+import os
+import re
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.tui.night_recording import HOSTILE
+from tests.tui.web.pages import READER, SECRETS, STEERER, Server, bench_file, serving
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+HEADERS = {
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "same-origin",
+    "cache-control": "no-store",
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("open")
+
+
+@pytest.fixture(scope="module")
+def server(folder: Path) -> Iterator[Server]:
+    """Serve without secrets, on this computer."""
+    with serving(bench_file(folder)) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def closed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """Serve with secrets, which nobody tries to guess."""
+    with serving(bench_file(tmp_path_factory.mktemp("closed"), SECRETS)) as found:
+        yield found
+
+
+@pytest.mark.parametrize(
+    "path", ["/", "/tests", "/tests/night.h5", "/login", "/nothing", "/tests/night.h5/curves"]
+)
+def test_every_answer_has_a_strict_policy(server: Server, path: str) -> None:
+    found = server.visit().get(path).headers
+    assert {name: found[name] for name in HEADERS} == HEADERS
+    policy = found["content-security-policy"]
+    assert "default-src 'none'; script-src 'self'; style-src 'self'" in policy
+    assert "unsafe" not in policy
+
+
+def test_the_report_may_run_no_script(server: Server) -> None:
+    found = server.visit().get("/tests/night.h5/report.html")
+    assert found.status == 200
+    policy = found.headers["content-security-policy"]
+    assert "sandbox" in policy
+    assert "script-src" not in policy
+    assert "default-src 'none'" in policy
+
+
+@pytest.mark.parametrize("path", ["/", "/tests", "/tests/night.h5", "/tests?text=<script>"])
+def test_no_text_of_a_recording_reaches_a_page_unescaped(server: Server, path: str) -> None:
+    text = server.visit().get(path).text
+    scripts = re.findall(r"<script[^>]*>", text)
+    assert all(re.fullmatch(r'<script src="/static/[\w.]+" defer>', each) for each in scripts)
+    assert "<b>" not in text
+    assert "cellar &lt;b&gt;" in text
+    assert "49" not in re.findall(r"\{\{.*?\}\}", text)
+    if path == "/tests/night.h5":
+        assert html.escape(HOSTILE, quote=False).replace("'", "&#39;") in text
+
+
+def test_a_test_has_verdict_table_picture_facts_and_settings(server: Server) -> None:
+    text = server.visit().get("/tests/night.h5").text
+    assert "NOT DECIDED: whether 1 of 8 channels are below data sheet cannot be said yet." in text
+    assert re.search(r'<th class="" scope="row">A\.X</th><td class="number">−97\.\d\d ±0', text)
+    (gaps,) = re.findall(r'scope="row">B\.X</th>.*?<td class="number">(\d+)</td></tr>', text)
+    assert gaps == "2"
+    assert 'role="img" aria-label="A X   power spectral density' in text
+    assert len(re.findall(r'<path d="M[^"]+" fill="none"', text)) == 3  # data, limit, noise
+    assert "B: 2 gaps, 131 samples missing" in text
+    assert '<th scope="row">segment</th><td>1.0</td>' in text
+
+
+def test_the_downloads_are_those_of_the_command(server: Server, folder: Path) -> None:
+    recording = folder / "recordings" / "night.h5"
+    subprocess.run(
+        [
+            *(sys.executable, "-m", "tui", "estimate", str(recording)),
+            *("--json", str(folder / "night.json"), "--csv", str(folder / "night.csv")),
+        ],
+        check=False,
+        capture_output=True,
+        env=os.environ | {"PYTHONUNBUFFERED": "1"},
+    )
+    visit = server.visit()
+    found = visit.get("/tests/night.h5/result.json")
+    assert found.headers["content-disposition"] == "attachment; filename*=UTF-8''night.json"
+    assert json.loads(found.content) == json.loads((folder / "night.json").read_text())
+    curves = visit.get("/tests/night.h5/curves.csv").content
+    assert curves == (folder / "night.csv").read_bytes()
+    assert visit.get("/tests/night.h5/report.pdf").content.startswith(b"%PDF-")
+
+
+def test_curves_are_finer_where_less_is_shown(server: Server) -> None:
+    visit = server.visit()
+    whole = json.loads(visit.get("/tests/night.h5/curves?channel=2").content)
+    assert whole["title"].startswith("B X")
+    part = json.loads(visit.get("/tests/night.h5/curves?channel=2&from=10&to=20").content)
+    noise = part["curves"][-1]
+    assert all(9.9 <= each <= 20.1 for each in noise["frequency"])
+    of_whole = sum(9.9 <= each <= 20.1 for each in whole["curves"][-1]["frequency"])
+    assert len(noise["frequency"]) >= of_whole
+    assert re.fullmatch(r"−\d+\.\d \(−\d+\.\d to −\d+\.\d\)", noise["words"][0])
+    for wrong in ("channel=99", "channel=x", "unit=9", "from=20&to=10", "from=nan&to=1"):
+        assert visit.get(f"/tests/night.h5/curves?{wrong}").status == 400
+
+
+@pytest.mark.parametrize(
+    "name", ["..%2Fcellar.toml", "..%2f..%2fetc%2fpasswd", "cellar.toml", "runs.sqlite", "%00"]
+)
+def test_only_recordings_of_the_bench_are_shown(server: Server, name: str) -> None:
+    found = server.visit().get(f"/tests/{name}")
+    assert found.status == 404
+    assert b"sampling_rate = " not in found.content
+
+
+def test_another_name_does_not_lead_to_an_open_server(server: Server) -> None:
+    assert server.visit().get("/tests", Host="evil.example").status == 421
+    assert server.visit().get("/tests", Host="evil.example:80").status == 421
+
+
+def test_nobody_steers_an_open_server(server: Server) -> None:
+    for path in ("/start", "/stop", "/mark"):
+        found = server.visit().post(path, {"token": ""})
+        assert found.status == 403
+    assert "/start" not in server.visit().get("/").text
+
+
+def test_an_address_that_others_reach_needs_a_secret(folder: Path) -> None:
+    command = [sys.executable, "-m", "tui", "web", str(bench_file(folder)), "--address", "0.0.0.0"]  # noqa: S104
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2
+    assert "address 0.0.0.0: other computers reach it; expected read =" in ended.stderr
+
+
+@pytest.mark.parametrize("path", ["/", "/tests", "/events", "/tests/night.h5/result.json"])
+def test_without_a_secret_nothing_is_seen(closed: Server, path: str) -> None:
+    found = closed.visit().get(path)
+    assert found.status == 303
+    assert found.headers["location"].startswith("/login?next=")
+    assert closed.visit().get(path, Accept="application/json").status == 401
+    assert closed.visit().get(path, Cookie="huddle-0=e30.00").status == 303
+
+
+def test_who_looks_does_not_steer(closed: Server) -> None:
+    visit = closed.visit()
+    answer = visit.log_in(READER)
+    assert (answer.status, answer.headers["location"]) == (303, "/tests")
+    assert {"HttpOnly", "SameSite=strict"} <= set(answer.headers["set-cookie"].split("; "))
+    page = visit.get("/").text
+    assert "Ada, may look" in page
+    assert visit.get("/start").status == 403
+    (token,) = set(re.findall(r'name="token" value="(\w+)"', page))
+    assert visit.post("/stop", {"token": token}).status == 403
+
+
+def test_forms_of_other_sites_do_nothing(closed: Server) -> None:
+    visit = closed.visit()
+    visit.log_in(STEERER)
+    (token,) = set(re.findall(r'name="token" value="(\w+)"', visit.get("/start").text))
+    for form in ({}, {"token": ""}, {"token": token[:-1] + "x"}):
+        assert visit.post("/mark", form | {"text": "x"}).status == 403
+    wrong = visit.post("/mark", {"token": token, "text": "x"}, Origin="https://evil.example")
+    assert wrong.status == 403
+    right = visit.post("/mark", {"token": token, "text": "x"}, Origin=closed.url.rstrip("/"))
+    assert (right.status, "no test is running" in right.text) == (404, True)
+    other = closed.visit()
+    other.log_in(STEERER, name="Bob")
+    assert other.post("/mark", {"token": token, "text": "x"}).status == 403
+
+
+def test_wrong_passwords_are_soon_not_looked_at(tmp_path: Path) -> None:
+    with serving(bench_file(tmp_path, SECRETS)) as closed:
+        _guess(closed)
+
+
+def _guess(closed: Server) -> None:
+    visit = closed.visit()
+    found = [visit.log_in(f"wrong {n}").status for n in range(7)]
+    assert found == [403, 403, 403, 403, 403, 429, 429]
+    late = visit.log_in(READER)  # the right one neither: it must not be found by trying
+    assert late.status == 429
+    assert 0 < int(late.headers["retry-after"]) <= 60
+    by_token = closed.visit().get("/tests", Authorization=f"Bearer {READER}")
+    assert by_token.status == 429
+    assert "wrong password for the pages from 127.0.0.1" in closed.log.read_text()
+
+
+def test_programs_send_a_token(closed: Server) -> None:
+    found = closed.visit().get("/tests/night.h5/result.json", Authorization=f"Bearer {READER}")
+    assert json.loads(found.content)["verdict"] == "not-decided"
+    assert closed.visit().get("/tests", Authorization=f"Bearer {STEERER}").status == 401
+
+
+def test_a_visit_lasts_over_a_restart_and_ends_with_the_secret(tmp_path: Path) -> None:
+    bench = bench_file(tmp_path, SECRETS)
+    with serving(bench) as first:
+        visit = first.visit()
+        visit.log_in(READER)
+        assert visit.get("/tests").status == 200
+        port = int(first.url.rsplit(":", 1)[1].strip("/"))
+    with serving(bench, port=port):
+        assert visit.get("/tests").status == 200
+    bench.write_text(re.sub(r"sha256:\w{64}", "sha256:" + 64 * "0", bench.read_text()))
+    with serving(bench, port=port):
+        assert visit.get("/tests").status == 303
+
+
+def test_a_form_may_not_be_large(closed: Server) -> None:
+    assert closed.visit().post("/login", {"name": "x" * 100_000}).status == 413
+
+
+def test_the_login_leads_to_these_pages_only(closed: Server) -> None:
+    for after in ("https://evil.example/", "//evil.example", "/\\evil.example"):
+        form = {"name": "Ada", "secret": READER, "next": after}
+        assert closed.visit().post("/login", form).headers["location"] == "/"

@@ -1,0 +1,192 @@
+"""Curves of a test for the browser: as numbers that a script draws, and as a picture without one.
+
+The curves are those of the application, made where it makes them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tui.application.test_view.curves import level_limits
+from tui.application.test_view.plotted import (
+    Choice,
+    curves,
+    plot_title,
+    reading,
+    unit_of,
+    whole_span,
+)
+from tui.application.test_view.units import units_of
+from tui.web.html import page
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from estimator.types import FloatArray
+    from tui.application.state import State
+    from tui.application.test_view.curves import Curve
+    from tui.application.test_view.units import SpectrumUnit
+
+POINTS = 240
+"""Points of a curve over all frequencies."""
+_WIDTH, _HEIGHT = 900, 420
+_LEFT, _RIGHT, _TOP, _BOTTOM = 80, 12, 12, 48
+"""Of a picture, in its own units: its size, and its margins."""
+
+
+def choice_of(state: State, asked: Mapping[str, str]) -> Choice:
+    """Return what a request asks to see: channel and unit by number, a span in Hz.
+
+    Raises
+    ------
+    ValueError
+        If it asks for what there is not.
+    """
+    snapshot, settings = state.snapshot, state.settings
+    if snapshot is None or settings is None:
+        return Choice()
+    channel, unit = int(asked.get("channel", 0)), int(asked.get("unit", 0))
+    if not 0 <= channel < len(snapshot.channels) or not 0 <= unit < len(units_of(snapshot.unit)):
+        raise ValueError("no such channel or unit")
+    span = None
+    if "from" in asked and "to" in asked:
+        low, high = (math.log10(float(asked[end])) for end in ("from", "to"))
+        first, last = whole_span(snapshot)
+        span = max(low, first), min(high, last)
+        if not span[1] - span[0] > 1e-3:
+            raise ValueError("no such span")
+    wanted = settings.for_sensors(snapshot.dims).methods
+    methods = sorted(snapshot.results, key=lambda name: (*wanted, name).index(name))
+    return Choice(channel=channel, methods=tuple(methods), unit=unit, span=span)
+
+
+@lru_cache(maxsize=64)
+def drawn(state: State, choice: Choice) -> tuple[Curve, ...]:
+    """Return the curves of a choice; those of a state are made once for all who look."""
+    found = curves(state, choice, n_points=POINTS)
+    if choice.span is None:
+        return tuple(found)
+    return tuple(each.within(*choice.span) for each in found)
+
+
+def numbers(state: State, choice: Choice) -> dict[str, Any]:
+    """Return what a script draws, in the chosen unit, with each value in words."""
+    snapshot = state.snapshot
+    if snapshot is None or not (found := drawn(state, choice)):
+        return {"curves": []}
+    unit, low_high = unit_of(snapshot, choice), level_limits(found)
+    return {
+        "title": plot_title(snapshot, choice),
+        "unit": unit.name,
+        "is_logarithmic": not unit.is_db,
+        "range": [unit.value(end) for end in low_high],
+        "span": [10**end for end in choice.span or whole_span(snapshot)],
+        "channels": [label.name for label in snapshot.channels],
+        "units": [each.name for each in units_of(snapshot.unit)],
+        "curves": [_numbers(each, unit, low_high[0]) for each in found],
+    }
+
+
+def _numbers(curve: Curve, unit: SpectrumUnit, floor: float) -> dict[str, Any]:
+    has_interval = bool(np.isfinite(curve.high_db).any())
+    low = np.where(np.isnan(curve.low_db) & np.isfinite(curve.high_db), floor, curve.low_db)
+    return {
+        "label": curve.label,
+        "colour": curve.style,
+        "frequency": [float(f"{10**each:.6g}") for each in curve.log_frequency],
+        "level": _values(curve.level_db, unit),
+        "low": _values(low, unit) if has_interval else [],
+        "high": _values(curve.high_db, unit) if has_interval else [],
+        "words": [reading(curve, at, unit) for at in range(curve.level_db.size)],
+    }
+
+
+def _values(levels: FloatArray, unit: SpectrumUnit) -> list[float | None]:
+    return [
+        float(f"{unit.value(float(each)):.6g}") if math.isfinite(each) else None for each in levels
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class _Axes:
+    """Where values are in a picture."""
+
+    span: tuple[float, float]
+    levels: tuple[float, float]
+
+    def x(self, log_frequency: float) -> float:
+        low, high = self.span
+        return _LEFT + (_WIDTH - _LEFT - _RIGHT) * (log_frequency - low) / (high - low)
+
+    def y(self, level: float) -> float:
+        low, high = self.levels
+        share = (min(max(level, low), high) - low) / (high - low)
+        return _HEIGHT - _BOTTOM - (_HEIGHT - _TOP - _BOTTOM) * share
+
+    def path(self, x: Sequence[float] | FloatArray, y: Sequence[float] | FloatArray) -> str:
+        """Return a line, interrupted where there is no value."""
+        parts, is_down = [], False
+        for at, value in zip(x, y, strict=True):
+            if math.isfinite(value):
+                parts.append(f"{'L' if is_down else 'M'}{self.x(at):.1f} {self.y(value):.1f}")
+            is_down = math.isfinite(value)
+        return "".join(parts)
+
+    def band(self, curve: Curve) -> str:
+        """Return the area of the intervals; to the floor where a lower end is not above zero."""
+        known = np.isfinite(curve.high_db)
+        low = np.where(np.isnan(curve.low_db), self.levels[0], curve.low_db)
+        edges = np.flatnonzero(np.diff(np.concatenate(([False], known, [False])).astype(np.int8)))
+        parts = []
+        for first, last in edges.reshape(-1, 2):
+            here = slice(int(first), int(last))
+            x = curve.log_frequency[here]
+            there = np.concatenate((curve.high_db[here], low[here][::-1]))
+            parts.append(self.path(np.concatenate((x, x[::-1])), there) + "Z")
+        return "".join(parts)
+
+
+def picture(state: State, choice: Choice) -> str:
+    """Return the curves as SVG, without styles of its own; empty before there are any."""
+    snapshot = state.snapshot
+    if snapshot is None or not (found := drawn(state, choice)):
+        return ""
+    unit = unit_of(snapshot, choice)
+    axes = _Axes(choice.span or whole_span(snapshot), level_limits(found))
+    ticks = unit.ticks(*axes.levels)
+    return page(
+        "picture",
+        title=plot_title(snapshot, choice),
+        width=_WIDTH,
+        height=_HEIGHT,
+        left=_LEFT,
+        right=_WIDTH - _RIGHT,
+        top=_TOP,
+        bottom=_HEIGHT - _BOTTOM,
+        rows=[(axes.y(tick), label) for tick, label in zip(ticks, unit.labels(ticks), strict=True)],
+        columns=[(axes.x(at), label) for at, label in _frequencies(axes.span)],
+        curves=[
+            {
+                "label": each.label,
+                "colour": each.style,
+                "path": axes.path(each.log_frequency, each.level_db),
+                "band": axes.band(each),
+            }
+            for each in found
+        ],
+    )
+
+
+def _frequencies(span: tuple[float, float]) -> Iterator[tuple[float, str]]:
+    """Yield ticks of the horizontal axis: decades, with 2 and 5 between them where few are seen."""
+    digits = (1, 2, 5) if span[1] - span[0] < 3 else (1,)
+    for decade in range(math.floor(span[0]), math.ceil(span[1]) + 1):
+        for digit in digits:
+            at = decade + math.log10(digit)
+            if span[0] <= at <= span[1]:
+                yield at, f"{digit * 10.0**decade:g}"

@@ -1,0 +1,105 @@
+"""HTML of the pages: templates that escape all text, and what the application draws as HTML."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+from rich.text import Text
+
+from daq.results.facts import Rank
+from estimator.decision.verdict import Verdict
+from tui.wording.formatting import clock_time, several, utc
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+    from rich.table import Table
+
+_TONES = {"#ff6b6b": "bad", "red": "bad", "yellow": "doubtful", "green": "good", "#9aa5b8": "muted"}
+"""Classes for what the colours of the application mean; all else is plain."""
+_VERDICTS = {
+    None: "",
+    Verdict.PASS: "good",
+    Verdict.FAIL: "bad",
+    Verdict.NOT_DECIDED: "doubtful",
+}
+_RANKS = {Rank.INVALIDATES: "bad", Rank.DELAYS: "doubtful", Rank.TO_KNOW: ""}
+_CELL = Markup('<{name} class="{tone}"{scope}>{text}</{name}>')
+
+
+@cache
+def environment() -> Environment:
+    """Return the templates: undefined names are errors, and all text is escaped."""
+    made = Environment(
+        loader=PackageLoader("tui.web"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    made.filters |= {
+        "clock_time": clock_time,
+        "rank_tone": _RANKS.get,
+        "rich": line,
+        "several": several,
+        "table": table,
+        "tone_of": _VERDICTS.get,
+        "utc": utc,
+    }
+    return made
+
+
+def page(name: str, /, **values: object) -> str:
+    """Return a page, or a part of one."""
+    return environment().get_template(f"{name}.html.j2").render(values)
+
+
+def tone(text: RenderableType) -> str:
+    """Return the class for the colour of a text."""
+    styles = (
+        [str(text.style), *(str(s.style) for s in text.spans)] if isinstance(text, Text) else []
+    )
+    return next((tone for word, tone in _TONES.items() for s in styles if word in s), "")
+
+
+def line(text: RenderableType) -> Markup:
+    """Return a text of the application as a paragraph."""
+    return _CELL.format(name="p", tone=tone(text), scope="", text=_plain(text))
+
+
+def table(made: Table) -> Markup:
+    """Return a table of the application; the first cell of a row names it."""
+    columns = [
+        (_plain(column.header), column.justify == "right", list(column.cells))
+        for column in made.columns
+    ]
+    head = Markup("").join(
+        _CELL.format(name="th", tone="number" * right, scope=Markup(' scope="col"'), text=title)
+        for title, right, _ in columns
+    )
+    rows = []
+    for number in range(len(made.rows)):
+        cells = []
+        for at, (_, right, column) in enumerate(columns):
+            cell = column[number]
+            cells.append(
+                _CELL.format(
+                    name="td" if at else "th",
+                    tone=f"{tone(cell)} {'number' * right}".strip(),
+                    scope="" if at else Markup(' scope="row"'),
+                    text=_plain(cell),
+                )
+            )
+        rows.append(Markup("<tr>{}</tr>").format(Markup("").join(cells)))
+    return Markup(
+        '<div class="wide" tabindex="0" role="region" aria-label="{}">'
+        "<table><thead><tr>{}</tr></thead><tbody>{}</tbody></table></div>"
+    ).format(
+        ", ".join(title for title, _, _ in columns if title.strip()), head, Markup("").join(rows)
+    )
+
+
+def _plain(text: RenderableType) -> str:
+    return text.plain if isinstance(text, Text) else str(text)

@@ -1,0 +1,81 @@
+"""What the page of a test says, in the words of the application."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rich.table import Table
+from rich.text import Text
+
+from daq.results.band_summary import band_of
+from daq.results.comparison import compare
+from tui.application.result_view.result_text import difference_text
+from tui.application.test_view.channels import channel_table
+from tui.web.chart import choice_of
+from tui.web.live import WIDE, band_means
+from tui.wording.facts import MARKS, NOTHING_TO_DO, known
+from tui.wording.formatting import span
+from tui.wording.verdict_text import headline, limit_line, not_judged, what_to_do
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from tui.application.state import State
+
+
+def about_test(state: State, settings_table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the page of a closed test shows beside its curves."""
+    snapshot, settings, verdict = state.snapshot, state.settings, state.verdict
+    if snapshot is None or settings is None:
+        raise ValueError("not estimated")
+    has_noise = bool(snapshot.results) and snapshot.n_segments > 0
+    differences = None if state.reference is None else _differences(state)
+    return {
+        "title": state.name,
+        "verdict": verdict,
+        "headline": "" if verdict is None else headline(verdict),
+        "todo": [] if verdict is None else [*what_to_do(verdict), *not_judged(verdict)],
+        "refused": [f"{method}: {why}" for method, why in snapshot.refused.items()],
+        "noise": channel_table(
+            state, choice_of(state, {}), means=band_means(snapshot, settings), width=WIDE
+        )
+        if has_noise
+        else None,
+        "band": f"mean over {span(*band_of(settings, snapshot))}, dB re 1 ({snapshot.unit})²/Hz",
+        "differences": differences,
+        "comparison": ""
+        if state.reference is None or differences is not None
+        else "The two tests cannot be compared: no channel, method, unit or band in common.",
+        "facts": known(snapshot, settings),
+        "marks": MARKS,
+        "nothing_to_do": NOTHING_TO_DO,
+        "limits": [] if verdict is None else [limit_line(each) for each in verdict.limits],
+        "settings": [(name, _value(value)) for name, value in settings_table.items()],
+    }
+
+
+def _differences(state: State) -> Table | None:
+    """Return by how much the noise of each channel differs from that of the other test."""
+    reference = state.reference
+    if reference is None or state.snapshot is None or state.settings is None:
+        return None
+    found = compare(state.snapshot, state.settings, reference.snapshot, reference.settings)
+    if not found:
+        return None
+    table = Table()
+    table.add_column("channel")
+    table.add_column("difference, dB", justify="right")
+    for (sensor, channel), difference in found.items():
+        table.add_row(Text(f"{sensor}.{channel}"), difference_text(difference))
+    return table
+
+
+def _value(value: object) -> str:
+    if isinstance(value, list):
+        return ", ".join(map(_value, value))
+    if isinstance(value, dict):
+        parts = (f"{name} {_value(each)}".strip() for name, each in value.items())
+        return ", ".join(parts) or "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return "–" if value is None else str(value)

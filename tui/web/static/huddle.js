@@ -1,0 +1,195 @@
+/* The pages work without this script. It draws the curves so that they can be zoomed and read off,
+   and keeps the page of the running test up to date. */
+"use strict";
+
+const byId = (id) => document.getElementById(id);
+
+/* -------------------------------------------------------------------- curves */
+
+function curves() {
+  const box = byId("chart");
+  if (!box || !window.uPlot) return () => {};
+  const form = byId("choice"), plot = byId("plot"), reading = byId("reading"), whole = byId("whole");
+  const RESTING = reading.textContent;
+  let chart = null, span = null, asked = 0;
+
+  const query = () => {
+    const found = new URLSearchParams(form ? new FormData(form) : {});
+    if (!found.get("with")) found.delete("with");
+    return found;
+  };
+
+  async function load() {
+    const number = ++asked, wanted = query();
+    if (span) { wanted.set("from", span[0]); wanted.set("to", span[1]); }
+    const answer = await fetch(`${box.dataset.source}?${wanted}`).catch(() => null);
+    if (!answer || !answer.ok || number !== asked) return;
+    const found = await answer.json();
+    if (number !== asked) return;
+    if (found.curves.length) { choices(found); draw(found); }
+  }
+
+  /* A page that was opened before there were channels gets its choices now. */
+  function choices(found) {
+    if (form.elements.channel.options.length) return;
+    for (const [name, words] of [["channel", found.channels], ["unit", found.units]])
+      words.forEach((word, n) => form.elements[name].add(new Option(word, n)));
+  }
+
+  function draw(found) {
+    const tables = [], series = [{}], bands = [], words = [];
+    for (const curve of found.curves) {
+      const columns = [curve.frequency, curve.level], at = series.length;
+      const style = { stroke: curve.colour, width: 1.5, points: { show: false } };
+      series.push({ ...style, label: curve.label });
+      if (curve.high.length) {
+        columns.push(curve.high, curve.low);
+        series.push({ ...style, width: 0 }, { ...style, width: 0 });
+        bands.push({ series: [at + 1, at + 2], fill: curve.colour + "40" });
+      }
+      words.push({ at, label: curve.label, of: new Map(curve.frequency.map((f, n) => [f, curve.words[n]])) });
+      tables.push(columns);
+    }
+    const data = tables.length > 1 ? uPlot.join(tables) : tables[0];
+    const keep = chart;
+    const axis = { stroke: "#a9b4c4", grid: { stroke: "#2b3442", width: 1 }, ticks: { stroke: "#2b3442", width: 1 } };
+    const options = {
+      width: plot.clientWidth, height: Math.max(300, Math.min(440, plot.clientWidth * 0.55)),
+      scales: {
+        x: { time: false, distr: 3, log: 10, range: () => found.span },
+        y: { distr: found.is_logarithmic ? 3 : 1, log: 10, range: () => found.range },
+      },
+      axes: [
+        { ...axis, label: "frequency (Hz)", values: (_, ticks) => ticks.map((t) => (t === null ? "" : String(+t.toPrecision(6)))) },
+        { ...axis, label: found.unit, size: 70, values: (_, ticks) => ticks.map((t) => (t === null ? "" : found.is_logarithmic ? t.toExponential(0) : String(t).replace("-", "−"))) },
+      ],
+      series, bands,
+      legend: { show: false },
+      cursor: { drag: { x: true, y: false, setScale: false } },
+      hooks: {
+        setCursor: [(u) => {
+          const at = u.cursor.idx;
+          if (at === null || at === undefined || u.cursor.left < 0) { reading.textContent = RESTING; return; }
+          const frequency = u.data[0][at];
+          const parts = words.map((each) => [each.label, nearest(each, u.data[0], at)]).filter((each) => each[1]);
+          reading.textContent = `${+frequency.toPrecision(3)} Hz, ${found.unit}: ` +
+            parts.map(([label, text]) => `${label} ${text}`).join(" · ");
+        }],
+        setSelect: [(u) => {
+          if (u.select.width < 8) return;
+          span = [u.posToVal(u.select.left, "x"), u.posToVal(u.select.left + u.select.width, "x")];
+          whole.hidden = false;
+          load();
+        }],
+      },
+    };
+    plot.querySelectorAll(":scope > svg").forEach((each) => each.remove());
+    const key = plot.querySelector(".key") || plot.appendChild(Object.assign(document.createElement("ul"), { className: "key" }));
+    key.replaceChildren(...found.curves.map(entry));
+    chart = new uPlot(options, data, (u, init) => { plot.prepend(u.root); init(); });
+    chart.root.setAttribute("role", "img");
+    chart.root.setAttribute("aria-label", found.title);
+    if (keep) keep.destroy();
+    reading.hidden = false;
+    box.dataset.drawn = found.curves.map((each) => each.label).join(" ");
+    box.dataset.span = found.span.join(" ");
+  }
+
+  /* Curves of two tests have frequencies of their own: the value nearest to the cursor is read. */
+  function nearest(curve, frequencies, at) {
+    for (let far = 0; far < 4; far++)
+      for (const n of [at - far, at + far])
+        if (curve.of.has(frequencies[n])) return curve.of.get(frequencies[n]);
+    return "";
+  }
+
+  function entry(curve) {
+    const item = document.createElement("li"), space = "http://www.w3.org/2000/svg";
+    const mark = document.createElementNS(space, "svg"), line = document.createElementNS(space, "path");
+    mark.setAttribute("viewBox", "0 0 20 6");
+    mark.setAttribute("aria-hidden", "true");
+    for (const [name, value] of [["d", "M0 3H20"], ["stroke", curve.colour], ["stroke-width", "3"]]) line.setAttribute(name, value);
+    mark.append(line);
+    item.append(mark, ` ${curve.label}${curve.high.length ? ", with its 95 % interval" : ""}`);
+    return item;
+  }
+
+  if (form) {
+    form.addEventListener("change", (event) => {
+      if (event.target.name === "with") { form.submit(); return; }
+      history.replaceState(null, "", `?${query()}`);
+      load();
+    });
+    form.querySelector("button:not([type])").hidden = true;
+    whole.addEventListener("click", () => { span = null; whole.hidden = true; load(); });
+  }
+  let width = plot.clientWidth;
+  new ResizeObserver(() => {
+    if (chart && plot.clientWidth !== width) {
+      width = plot.clientWidth;
+      chart.setSize({ width, height: chart.height });
+    }
+  }).observe(plot);
+  load();
+  return load;
+}
+
+/* ------------------------------------------------------------- the running test */
+
+function live(reload) {
+  const box = byId("live");
+  if (!box) return;
+  const SILENT = 12000, AGAIN = 2000;
+  let source = null, since = null, heard = Date.now(), tried = 0, version = Number(box.dataset.version);
+
+  function lost() {
+    if (since) return;
+    since = new Date(heard);
+    const clock = since.toLocaleTimeString("en-GB", { hour: "2-digit", minute: "2-digit" });
+    byId("lost").textContent = `, connection lost since ${clock}`;
+    box.classList.add("stale");
+  }
+
+  function back() {
+    heard = Date.now();
+    if (!since) return;
+    since = null;
+    byId("lost").textContent = "";
+    box.classList.remove("stale");
+  }
+
+  function show(message) {
+    back();
+    const { parts, version: now } = JSON.parse(message.data);
+    for (const [name, html] of Object.entries(parts)) {
+      const place = byId(name);
+      if (!place || place.contains(document.activeElement) && document.activeElement !== document.body) continue;
+      if (name === "at") place.textContent = html; else place.innerHTML = html; // escaped by the server
+    }
+    if (now !== version) { version = now; reload(); }
+  }
+
+  function connect() {
+    if (source) source.close();
+    tried = Date.now();
+    source = new EventSource("/events");
+    source.onmessage = show;
+    source.addEventListener("tick", back);
+    source.onerror = async () => {
+      lost();
+      if (source.readyState !== EventSource.CLOSED) return; // it tries again by itself
+      const answer = await fetch("/now/curves", { method: "HEAD" }).catch(() => null);
+      if (answer && answer.status === 401) { location.reload(); return; } // the visit has ended
+      setTimeout(connect, AGAIN);
+    };
+  }
+
+  setInterval(() => { // a network that is gone closes nothing
+    if (Date.now() - heard < SILENT) return;
+    lost();
+    if (Date.now() - tried > SILENT) connect();
+  }, 1000);
+  connect();
+}
+
+live(curves());

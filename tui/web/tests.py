@@ -1,0 +1,208 @@
+"""Tests of a bench for the pages: their list, and the estimate of each, made once for all."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from daq.errors import HuddleError
+from daq.estimation.estimation import estimate
+from daq.estimation.snapshot import NoResultError
+from daq.recording.storage.locking import is_being_written
+from daq.results.decision.limits import judge
+from daq.results.sources import sources
+from tui.application.state import Reference, State
+from tui.certificate.ledger import ledger_of
+from tui.output.json_document import document
+from tui.runs.catalogue import Entry, catalogue
+from tui.runs.estimate_settings import settings_for
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from tui.application.controls import Controls
+    from tui.certificate.ledger import Entry as Certificate
+
+KEPT = 8
+"""Estimates that are kept."""
+PAGE = 50
+"""Tests on a page of the list."""
+_Key = tuple[str, int, int]
+
+
+class NoSuchTestError(HuddleError):
+    """The bench has no recording of this name, or it is not there to be estimated."""
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A page of the list of tests: its entries, and how many there are in all."""
+
+    entries: tuple[Entry, ...]
+    n: int
+
+
+class Tests:
+    """The closed recordings of a bench.
+
+    One thread makes all estimates and reports, one after the other: whoever looks at pages takes
+    no more than one core, and a test that many look at is estimated once.
+
+    Parameters
+    ----------
+    controls : Controls
+    followed : callable
+        Returns the recording that is followed just now: HDF5 must not open it a second time.
+    """
+
+    __test__ = False  # for pytest
+
+    def __init__(self, controls: Controls, followed: Callable[[], Path | None]) -> None:
+        self._controls, self._followed = controls, followed
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="estimates")
+        self._kept: OrderedDict[_Key, Future[State]] = OrderedDict()
+        self._known: dict[Path, Entry] = {}
+        self._lock, self._listing = threading.Lock(), threading.Lock()
+
+    def close(self) -> None:
+        """Make no further estimate."""
+        self._worker.shutdown(wait=False, cancel_futures=True)
+
+    def listed(self, *, text: str = "", verdict: str = "", first: int = 0) -> Found:
+        """Return tests, the newest first, whose name, bench or operator has a text. Blocks.
+
+        Parameters
+        ----------
+        text : str
+            In any case of letters.
+        verdict : str
+            A `Verdict`, or ``none`` for those without; all, if empty.
+        first : int
+            Number of the first one that is returned.
+        """
+        folder = self._controls.folder
+        with self._listing:
+            found = catalogue(folder, self._known, besides=self._followed())
+            self._known = {each.path: each for each in found}
+        wanted = text.lower()
+        found = [
+            each
+            for each in found
+            if wanted in f"{each.path.stem}\n{each.bench}\n{each.operator}".lower()
+            and verdict in {"", each.verdict or "none"}
+        ]
+        return Found(tuple(found[first : first + PAGE]), len(found))
+
+    def path_of(self, name: str) -> Path:
+        """Return the recording of a name that a request gives.
+
+        Raises
+        ------
+        NoSuchTestError
+            If there is none in the folder of the bench.
+        """
+        folder = self._controls.folder
+        path = next((each for each in folder.glob("*.h5") if each.name == name), None)
+        if path is None or not path.is_file():
+            raise NoSuchTestError(f"{name}: no such test")
+        return path
+
+    def is_running(self, path: Path) -> bool:
+        """Return whether a recording is still being written, or followed to its end."""
+        return path == self._followed() or is_being_written(path)
+
+    def estimated(self, name: str) -> Future[State]:
+        """Return the estimate of a test, begun if it is not kept.
+
+        Raises
+        ------
+        NoSuchTestError
+            If there is no such test, or it is still being recorded.
+        """
+        path = self.path_of(name)
+        if self.is_running(path):
+            raise NoSuchTestError(f"{name} is still being recorded: its result follows at its end")
+        about = path.stat()
+        key = name, about.st_mtime_ns, about.st_size
+        with self._lock:
+            found = self._kept.get(key)
+            if found is None or (found.done() and found.exception() is not None):
+                found = self._kept[key] = self._worker.submit(self._estimate, path)
+            self._kept.move_to_end(key)
+            while len(self._kept) > KEPT:
+                self._kept.popitem(last=False)
+        return found
+
+    def _estimate(self, path: Path) -> State:
+        settings, bench = settings_for(path)
+        try:
+            snapshot = estimate([path], settings)
+        except NoResultError as error:
+            snapshot = error.snapshot
+        return State(
+            path.stem,
+            bench,
+            path=path,
+            snapshot=snapshot,
+            settings=settings,
+            judged_by=bench,
+            verdict=judge(bench, snapshot, settings),
+        )
+
+    def in_worker(self, act: Callable[[], Any]) -> Future[Any]:
+        """Do what takes long where estimates are made: reports, documents."""
+        return self._worker.submit(act)
+
+    def document(self, state: State) -> dict[str, Any]:
+        """Return the result as `huddle estimate --json` writes it. Blocks."""
+        snapshot, settings, path = _known(state)
+        return document(snapshot, settings, sources=sources([path]), verdict=state.verdict)
+
+    def report(self, state: State, suffix: str) -> bytes:
+        """Return the draft of a report as the content of a file. Blocks.
+
+        Raises
+        ------
+        HuddleError
+            If it cannot be made.
+        """
+        from tui.report.contents import report_of  # noqa: PLC0415 - loads matplotlib
+        from tui.report.writing import written  # noqa: PLC0415
+
+        snapshot, settings, path = _known(state)
+        return written(report_of(snapshot, settings, sources([path]), ()), suffix)
+
+    def certificates(self, state: State) -> list[tuple[Certificate, Path]]:
+        """Return the certificates of a test, and their files. Blocks.
+
+        Raises
+        ------
+        HuddleError
+            If the ledger cannot be read.
+        """
+        *_, path = _known(state)
+        ledger = ledger_of(path, state.judged_by)
+        if not ledger.exists:
+            return []
+        (source, *_) = sources([path])
+        return [
+            (entry, ledger.folder / entry.file)
+            for entry in ledger.entries()
+            if source.run_id in entry.runs and entry.file
+        ]
+
+
+def compared(state: State, other: State) -> State:
+    """Return a test beside which another one is drawn."""
+    snapshot, settings, path = _known(other)
+    return replace(state, reference=Reference(path, snapshot, settings))
+
+
+def _known(state: State) -> tuple[Any, Any, Path]:
+    if state.snapshot is None or state.settings is None or state.path is None:
+        raise NoSuchTestError(f"{state.name}: not estimated yet")
+    return state.snapshot, state.settings, state.path
