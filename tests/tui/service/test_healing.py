@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import logging
 import math
@@ -106,6 +107,20 @@ def test_all_runs_are_there_again(tmp_path: Path, damage: object, *, copied: boo
     assert found.noise == run.noise
     assert not math.isnan(found.noise[0].psd)
     assert not heal(place.store, place.bench, START)
+
+
+def test_a_damaged_text_hides_no_other(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    run = done_run(place)
+    place.store.save(run)
+    with contextlib.closing(sqlite3.connect(place.store.path)) as database:
+        database.execute("UPDATE runs SET reason = CAST(x'ff6f6b' AS TEXT)")
+        database.execute("UPDATE noise SET unit = CAST(x'ff' AS TEXT)")
+        database.commit()
+    assert not heal(place.store, place.bench, START)  # SQLite has no checksums
+    assert place.store.runs() == [replace(run, reason="\ufffdok", noise=())]
+    noise = [each for _, _, each in place.store.noise()]
+    assert [(each.psd, each.unit) for each in noise] == [(n.psd, "\ufffd") for n in run.noise]
 
 
 def test_a_damaged_database_is_moved_away_and_named_once(

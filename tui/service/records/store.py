@@ -294,7 +294,14 @@ class RunStore:
         if not self.path.exists():
             return []
         with self._opened() as database:
-            return database.execute(question, values).fetchall()
+            try:
+                return database.execute(question, values).fetchall()
+            except sqlite3.OperationalError as error:
+                if "decode" not in str(error):
+                    raise
+                # A damaged text must not hide the others; replacing all would take twice as long.
+                database.text_factory = lambda text: text.decode(errors="replace")
+                return database.execute(question, values).fetchall()
 
     def damage(self) -> str:
         """Return what is wrong with the database; empty if nothing is, or it cannot be asked now.
