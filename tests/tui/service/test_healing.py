@@ -75,6 +75,24 @@ def wrong_row(path: Path) -> None:
     database.close()
 
 
+def wrong_index(path: Path) -> None:
+    """Change a date in the index only: SQLite's quick check does not see it."""
+    content = path.read_bytes()
+    (number,) = _page_of(path, "runs_by_due")
+    page = content[4096 * (number - 1) : 4096 * number]
+    changed = page.replace(b"2026-", b"202&-")
+    assert changed != page
+    path.write_bytes(content[: 4096 * (number - 1)] + changed + content[4096 * number :])
+
+
+def _page_of(path: Path, index: str) -> tuple[int]:
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        found: tuple[int] = database.execute(
+            "SELECT rootpage FROM sqlite_master WHERE name = ?", (index,)
+        ).fetchone()
+    return found
+
+
 def without_rows(path: Path) -> None:
     database = sqlite3.connect(path)
     database.execute("DELETE FROM runs")
@@ -89,6 +107,7 @@ def without_rows(path: Path) -> None:
         (overwritten, False),
         (removed, True),
         (wrong_row, True),
+        (wrong_index, True),
         (without_rows, True),
     ],
 )

@@ -458,7 +458,8 @@ def _check(path: Path) -> str:
     if not path.exists():
         raise FileNotFoundError(path)
     with contextlib.closing(sqlite3.connect(path, timeout=_BUSY)) as database:
-        found = [str(row[0]) for row in database.execute("PRAGMA quick_check(1)")]
+        # Not quick_check: it takes a third of the time, and sees no damage of indexes.
+        found = [str(row[0]) for row in database.execute("PRAGMA integrity_check(1)")]
         if found != ["ok"]:
             return "; ".join(found)
         if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'runs'").fetchone():
