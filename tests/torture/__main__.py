@@ -11,7 +11,9 @@ import sys
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from tests.torture.bench_files import bench_faults
 from tests.torture.crashes import disk_faults, kill_faults
 from tests.torture.damaged_files import (
     FAULTS,
@@ -21,6 +23,12 @@ from tests.torture.damaged_files import (
 )
 from tests.torture.long_history import N_RUNS, command_faults, loop_faults, make_history
 from tests.torture.power_cuts import MODELS, faults, recorded, shim
+from tests.torture.service_database import database_faults
+from tests.torture.service_kills import RATE, soak
+from tests.torture.starved_recorder import starved_faults
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 PAGE = Path(__file__).parents[2] / "docs" / "validation" / "torture.md"
 KILLS, CUTS, DISK_ERRORS = 300, 100, 50
@@ -31,15 +39,18 @@ CHANGES = {
     "changed sectors": ("sectors", 10_000),
 }
 """Kind of change, and number of cases."""
+PAGES, BENCH_FILES, CLOCK_STEPS = 2000, 20_000, 24
+STARVED, DAY = 300.0, 86_400.0
+"""Seconds of a recorder that shares its processors, and of a service."""
 KEPT = PAGE.parents[2] / "build" / "torture"
 """Folder of the files in which something was not seen."""
-HEAD = """# Recordings under torture
+HEAD = """# Recordings and the service under torture
 
 `make torture` records with the writer of the product, and lets the process be killed, the power be
 cut, the disk fail, or a bit of the file flip. After each crash the recording is repaired. It must
 then have every acknowledged row, with the right samples, and open in plain HDF5. A damaged file
-must be refused, have its damage named, or be read as it was. The table is the outcome of one
-complete run.
+must be refused, have its damage named, or be read as it was. A service must live on with a damaged
+database, a clock that is set and a long history. The table is the outcome of one complete run.
 
 | torture | cases | good | faults |
 |---|---:|---:|---|
@@ -53,10 +64,17 @@ TAIL = """
 - *Disk errors*: from a random call on, once or permanently, `pwrite`, `fsync`, `write` or
   `ftruncate` fails with ENOSPC or EIO. One `pwrite` or `write` that fails must not end the
   recording; otherwise the recorder must end with an error message.
-- *Flipped bits*: one bit of a closed recording, in 80 % of the cases outside of the samples; or
-  one bit of a row of a table of blocks. *Changed sectors*: 512 bytes that become zero, random, or
-  those of another sector. Reader and `huddle verify` may take ten seconds at most; whatever they
-  call intact, a program with plain h5py must be able to read.
+- *Flipped bits*: one bit of a closed recording, in 80 % of the cases outside of the samples; one
+  bit of a row of a table of blocks; or one of the headers in the global heap of a recording of
+  version 1. *Changed sectors*: 512 bytes that become zero, random, or those of another sector.
+  Reader and `huddle verify` may take ten seconds at most; whatever they call intact, a program with
+  plain h5py must be able to read. Where HDF5 hangs or crashes, `huddle verify` must name it.
+- *Database*: one bit or page of 300 runs with their noise, or the end, is changed. The next start
+  must have all runs. SQLite has no checksums, so a bit of a number changes it unseen.
+- *Bench files*: one to three lines lost, repeated, exchanged, or with another value or byte.
+- *Clocks*: a service at 20 times real time, whose clock is set by −25 to 30 min once a minute.
+- *Starved recorder*: two busy processes for each processor while it records.
+- *Accelerated day*: a service at 20 times real time. It may grow by 50 kB a run.
 """
 
 
@@ -78,35 +96,97 @@ class Row:
         )
 
 
-def torture(share: float, folder: Path) -> list[Row]:
-    """Do all of it, or a share; return the rows of the table."""
+def torture(share: float, folder: Path, only: str = "") -> list[Row]:
+    """Do all of it, or a share, or what has a word in its name; return the rows of the table."""
     rows = []
+    for name, kind in _KINDS.items():
+        if only in name:
+            of_kind = folder / name.replace(" ", "-")
+            of_kind.mkdir()
+            for row in kind(share, of_kind):
+                print(row, flush=True)
+                rows.append(row)
+    return rows
 
-    def add(row: Row) -> None:
-        print(row, flush=True)
-        rows.append(row)
 
-    n = max(1, round(KILLS * share))
-    add(Row("kills", n, kill_faults(folder, n, seed=1)))
+def _kills(share: float, folder: Path) -> Iterator[Row]:
+    n = _share(KILLS, share)
+    yield Row("kills", n, kill_faults(folder, n, seed=1))
+
+
+def _power_and_disk(share: float, folder: Path) -> Iterator[Row]:
     library = shim(folder)
     if library is None:
         print("no C compiler, or not Linux: no power cuts and no disk errors")
-    else:
-        operations = recorded(library, folder, 30)
-        n = max(1, round(CUTS * share))
-        for seed, model in enumerate(MODELS):
-            add(Row(f"power cuts, {model}", n, faults(operations, model, n, folder, seed=seed)))
-        n = max(1, round(DISK_ERRORS * share))
-        add(Row("disk errors", n, disk_faults(library, folder, n, seed=2)))
+        return
+    operations = recorded(library, folder, 30)
+    n = _share(CUTS, share)
+    for seed, model in enumerate(MODELS):
+        yield Row(f"power cuts, {model}", n, faults(operations, model, n, folder, seed=seed))
+    n = _share(DISK_ERRORS, share)
+    yield Row("disk errors", n, disk_faults(library, folder, n, seed=2))
+
+
+def _changed_files(share: float, folder: Path) -> Iterator[Row]:
     for name, (kind, n_cases) in CHANGES.items():
-        add(_changes(name, kind, max(1, round(n_cases * share)), folder))
+        yield _changes(name, kind, _share(n_cases, share), folder)
+
+
+def _database(share: float, folder: Path) -> Iterator[Row]:
+    n = _share(PAGES, share)
+    found, remark = database_faults(folder / "history", n, seed=5)
+    yield Row("bits and pages of the database of runs", n, found, f" ({remark})")
+
+
+def _bench_files(share: float, folder: Path) -> Iterator[Row]:
+    n = _share(BENCH_FILES, share)
+    found, remark = bench_faults(folder, n, seed=6)
+    yield Row("bench files with errors", n, found, f" ({remark})")
+
+
+def _history(share: float, folder: Path) -> Iterator[Row]:
     n = max(1000, round(N_RUNS * share))
     bench = make_history(folder / "history", n, seed=4)
     found, remark = command_faults(folder / "history")
-    add(Row(f"commands with {n} runs of a service", 3, found, f" ({remark})"))
+    yield Row(f"commands with {n} runs of a service", 3, found, f" ({remark})")
     found, remark = loop_faults(bench)
-    add(Row(f"start of a service with {n} runs", 1, found, f" ({remark})"))
-    return rows
+    yield Row(f"start of a service with {n} runs", 1, found, f" ({remark})")
+
+
+def _clocks(share: float, _: Path) -> Iterator[Row]:
+    n = _share(CLOCK_STEPS, share)
+    found, remarks = soak(60.0 * n, n_steps=n)
+    yield Row("clock set while a service runs", n, found, f" ({'; '.join(remarks)})")
+
+
+def _starved(share: float, _: Path) -> Iterator[Row]:
+    seconds = max(60, round(STARVED * share))  # it takes half of one to connect
+    found, remark = starved_faults(seconds)
+    yield Row(f"64 × 3 channels at 1 kHz, starved, {seconds} s", 1, found, f" ({remark})")
+
+
+def _day(share: float, _: Path) -> Iterator[Row]:
+    seconds = DAY / RATE * share
+    found, remarks = soak(seconds)
+    hours = seconds * RATE / 3600
+    yield Row(f"service of {hours:.1f} h, accelerated", 1, found, f" ({'; '.join(remarks)})")
+
+
+_KINDS = {
+    "kills": _kills,
+    "power cuts and disk errors": _power_and_disk,
+    "changed files": _changed_files,
+    "database": _database,
+    "bench files": _bench_files,
+    "history": _history,
+    "clocks": _clocks,
+    "starved recorder": _starved,
+    "accelerated day": _day,
+}
+
+
+def _share(n: int, share: float) -> int:
+    return max(1, round(n * share))
 
 
 def _changes(name: str, kind: str, n: int, folder: Path) -> Row:
@@ -130,12 +210,14 @@ def main() -> int:
     parser.add_argument(
         "share", nargs="?", type=float, default=1.0, help="share of all cases, above 0 (default 1)"
     )
-    share = parser.parse_args().share
+    parser.add_argument("--only", default="", help=f"a word of: {', '.join(_KINDS)}")
+    given = parser.parse_args()
+    share = given.share
     if not 0 < share <= 100:
         parser.error(f"share {share}; expected a number above 0, such as 0.1")
     with tempfile.TemporaryDirectory(prefix="huddle-torture-") as folder:
-        rows = torture(share, Path(folder))
-    if share == 1.0:
+        rows = torture(share, Path(folder), given.only)
+    if share == 1.0 and not given.only:
         _, mark, by_hand = PAGE.read_text(encoding="utf-8").partition("\n## ")
         table = "\n".join(map(str, rows))
         PAGE.write_text(f"{HEAD}{table}\n{TAIL}{mark}{by_hand}", encoding="utf-8")

@@ -46,6 +46,8 @@ if TYPE_CHECKING:
     from tui.service.records.run_state import Run
 
 RATE = 20.0
+LEAK = 0.05
+"""MB that the service may grow with each run that is done."""
 BEGIN = datetime(2026, 10, 24, 23, 55, tzinfo=UTC)  # an hour and five minutes before clocks change
 ENTRY = ScheduledRun(
     name="soak", cron="*/20 * * * *", time_zone="Europe/Berlin", duration=480.0, when_busy="queue"
@@ -206,15 +208,15 @@ def faults(
     return found + [f"{part}: of no run" for part in sorted(there - kept)]
 
 
-def slope(usage: list[tuple[float, ...]], column: int) -> str:
-    """Return the trend per hour within processes, with its standard error.
+def slope(usage: list[tuple[float, ...]], column: int) -> tuple[float, float] | None:
+    """Return the trend per hour within processes, and its standard error; None if it is too short.
 
     Each process has a level of its own; a recorder and an estimate that run have theirs. The error
     allows for residuals that are correlated over five minutes (Newey and West 1987).
     """
     values = np.array(usage)
     if len(values) < 60:
-        return "too short"
+        return None
     t, y = (values[:, 0] - values[0, 0]) / 3600, values[:, column]
     levels = values[:, 3:4] == np.unique(values[:, 3])
     matrix = np.column_stack([t, levels, values[:, 4:6]])
@@ -225,18 +227,19 @@ def slope(usage: list[tuple[float, ...]], column: int) -> str:
         product = scores[lag:].T @ scores[:-lag]
         middle += (1 - lag / 31) * (product + product.T)
     gradient = (inverse @ matrix.T @ y)[0]
-    error = np.sqrt((inverse @ middle @ inverse)[0, 0])
-    return f"{gradient:+.2f} ± {error:.2f} an hour, {y.min():.0f} to {y.max():.0f}"
+    return float(gradient), float(np.sqrt((inverse @ middle @ inverse)[0, 0]))
 
 
-def main() -> int:
-    """Do it."""
-    n_kills = int(sys.argv[1]) if len(sys.argv) > 1 else 300
-    seconds = float(sys.argv[2]) if len(sys.argv) > 2 else 3600.0
-    interval = float(sys.argv[3]) if len(sys.argv) > 3 else 4.0
-    n_steps = int(sys.argv[4]) if len(sys.argv) > 4 else 0
-    rate = float(sys.argv[5]) if len(sys.argv) > 5 else RATE
-    calm = float(sys.argv[6]) if len(sys.argv) > 6 else 0.0
+def soak(
+    seconds: float,
+    *,
+    n_kills: int = 0,
+    interval: float = 4.0,
+    n_steps: int = 0,
+    rate: float = RATE,
+    calm: float = 0.0,
+) -> tuple[list[str], list[str]]:
+    """Serve for a while; return what is wrong, and what came of the runs and the memory."""
     text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
     with tempfile.TemporaryDirectory(prefix="huddle-soak-") as name:
         folder = Path(name)
@@ -248,47 +251,63 @@ def main() -> int:
             }
             bench = reachable.model_copy(update=changes)
             (folder / "bench.toml").write_text(dump(bench), encoding="utf-8")
-            soak = Soak(folder, rate, seed=1)
+            service = Soak(folder, rate, seed=1)
             begin = time.monotonic()
             next_kill = begin + 5.0
             steps = [begin + seconds * (k + 1) / (n_steps + 1) for k in range(n_steps)]
             while time.monotonic() < begin + seconds and (
-                not n_kills or sum(soak.kills.values()) < n_kills
+                not n_kills or sum(service.kills.values()) < n_kills
             ):
-                soak.keep_alive()
-                soak.measure()
+                service.keep_alive()
+                service.measure()
                 if n_kills and time.monotonic() > next_kill:
-                    soak.kill(spare_service=time.monotonic() > begin + seconds - calm)
-                    next_kill = time.monotonic() + float(soak.rng.exponential(interval))
+                    service.kill(spare_service=time.monotonic() > begin + seconds - calm)
+                    next_kill = time.monotonic() + float(service.rng.exponential(interval))
                 if steps and time.monotonic() > steps[0]:
                     steps.pop(0)
-                    soak.clock.set_by(float(soak.rng.choice([-1500.0, -40.0, 90.0, 1800.0])))
+                    service.clock.set_by(float(service.rng.choice([-1500.0, -40.0, 90.0, 1800.0])))
                 time.sleep(0.1)
-            until = soak.clock.now() - timedelta(minutes=2)
-            soak.finish(until)
+            until = service.clock.now() - timedelta(minutes=2)
+            service.finish(until)
         runs = RunStore(load(folder / "bench.toml").recording_directory).runs()
         wrong = faults(folder / "bench.toml", ENTRY, until)
-        print(f"{time.monotonic() - begin:.0f} s, kills {dict(soak.kills)}, {n_steps} clock steps")
-        print("runs", dict(Counter(str(run.state) for run in runs)))
-        print("of several parts", sum(len(run.parts) > 1 for run in runs))
-        print("reasons", Counter(re.sub(r"\d+", "N", run.reason)[:100] for run in runs))
-        print("memory in MB", slope(soak.usage, 1), "; descriptors", slope(soak.usage, 2))
-        if soak.usage:
-            loads = np.array(soak.usage)[:, 6]
-            print(f"load of the computer {loads.mean():.1f}, at most {loads.max():.1f}")
-        print(
-            "log",
-            Counter(
-                re.findall(
-                    r" (WARNING|ERROR|CRITICAL) ",
-                    (folder / "service.log").read_text(encoding="utf-8"),
-                )
-            ),
-        )
-        print("faults", wrong or "none", flush=True)
-        (Path(tempfile.gettempdir()) / f"huddle-service-{os.getpid()}.log").write_bytes(
-            (folder / "service.log").read_bytes()
-        )
+        log = (folder / "service.log").read_text(encoding="utf-8")
+    if "Traceback" in log:
+        wrong.append("a traceback in the log")
+    states = Counter(str(run.state) for run in runs)
+    remarks = [
+        f"{time.monotonic() - begin:.0f} s at {rate:g} times real time",
+        f"kills {dict(service.kills)}, {n_steps} clock steps",
+        f"runs {dict(states)}, {sum(len(run.parts) > 1 for run in runs)} of several parts",
+        f"reasons {dict(Counter(re.sub(r'[0-9]+', 'N', run.reason)[:100] for run in runs))}",
+    ]
+    used = np.array(service.usage)
+    for column, what, most in ((1, "memory in MB", LEAK * states["done"]), (2, "descriptors", 1)):
+        if len(used):
+            ends = f"{what} {used[:, column].min():.0f} to {used[:, column].max():.0f}"
+            trend = slope(service.usage, column)
+            hours = (used[-1, 0] - used[0, 0]) / 3600
+            if trend is not None:
+                ends += f", {trend[0]:+.2f} ± {trend[1]:.2f} an hour"
+                if (trend[0] - 2 * trend[1]) * hours > most:
+                    wrong.append(f"growing: {ends}")
+            remarks.append(ends)
+    return wrong, remarks
+
+
+def main() -> int:
+    """Do it."""
+    given = dict(enumerate(map(float, sys.argv[1:])))
+    wrong, remarks = soak(
+        given.get(1, 3600.0),
+        n_kills=int(given.get(0, 300)),
+        interval=given.get(2, 4.0),
+        n_steps=int(given.get(3, 0)),
+        rate=given.get(4, RATE),
+        calm=given.get(5, 0.0),
+    )
+    print(*remarks, sep="\n")
+    print("faults", wrong or "none", flush=True)
     return 1 if wrong else 0
 
 
