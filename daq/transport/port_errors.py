@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import socket
+import ssl
 
 from serial.tools import list_ports
 
@@ -27,6 +28,10 @@ def why(error: BaseException) -> str:
     """Return cause and remedy of a port's failure."""
     if isinstance(error, socket.gaierror):
         return f"unknown host ({error.strerror})"
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return f"the certificate of the other end is not trusted: {error.verify_message}"
+    if isinstance(error, ssl.SSLError):  # its number is none of the system's
+        return f"no encrypted connection: {error.reason or error}"
     number = getattr(error, "errno", None)
     if number in {errno.ENOENT, errno.ENODEV}:
         present = ", ".join(sorted(port.device for port in list_ports.comports())) or "none"

@@ -32,6 +32,7 @@ from daq.transport.port_errors import why
 from daq.transport.serial_tcp import open_serial, open_tcp
 
 if TYPE_CHECKING:
+    import ssl
     from collections.abc import AsyncIterator
 
     from daq.host_clock import HostClock
@@ -46,6 +47,7 @@ async def open_port(
     baud_rate: int = 115200,
     parity: str = "N",
     stop_bits: float = 1,
+    tls: ssl.SSLContext | None = None,
 ) -> AsyncIterator[ByteStream]:
     """Open ``port`` and close it on exit.
 
@@ -59,6 +61,8 @@ async def open_port(
         Start of every error message, with sensor and port.
     parity, stop_bits
         As in pyserial: ``"N"``, ``"E"``, ``"O"``; 1, 1.5, 2.
+    tls
+        Encrypts a TCP connection, and verifies the certificate of the host.
 
     Raises
     ------
@@ -75,7 +79,7 @@ async def open_port(
     try:
         if port.startswith(("socket://", "tcp://")):
             host, number = host_and_port(port)
-            wire = await open_tcp(host, number, stream)
+            wire = await open_tcp(host, number, stream, tls=tls)
         else:
             check_serial(port)
             wire = await open_serial(

@@ -21,6 +21,8 @@ if sys.platform != "win32":
     import termios
 
 if TYPE_CHECKING:
+    import ssl
+
     from daq.host_clock import HostClock
     from daq.transport.byte_stream import ByteStream, Transport
 
@@ -55,6 +57,8 @@ class _TcpWire(asyncio.Protocol):
         self._transport.write(payload)
 
     def expect(self, n_bytes: int) -> None:
+        if self._transport.get_extra_info("sslcontext") is not None:
+            return  # the kernel counts the bytes of records of TLS, not these
         connection = self._transport.get_extra_info("socket")
         with contextlib.suppress(OSError):  # port closed: the next read reports it
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVLOWAT, n_bytes)
@@ -75,12 +79,16 @@ class _TcpWire(asyncio.Protocol):
             await self._closed
 
 
-async def open_tcp(host: str, number: int, stream: ByteStream) -> Transport:
+async def open_tcp(
+    host: str, number: int, stream: ByteStream, *, tls: ssl.SSLContext | None = None
+) -> Transport:
     """Connect; raise OSError on failure."""
     loop = asyncio.get_running_loop()
     try:
         async with asyncio.timeout(CONNECT_TIMEOUT):
-            transport, wire = await loop.create_connection(lambda: _TcpWire(stream), host, number)
+            transport, wire = await loop.create_connection(
+                lambda: _TcpWire(stream), host, number, ssl=tls
+            )
     except TimeoutError as error:
         raise OSError(errno.ETIMEDOUT, f"no connection within {CONNECT_TIMEOUT:g} s") from error
     transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

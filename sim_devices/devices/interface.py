@@ -80,6 +80,8 @@ class Line:
     setting: str = ""
     carries_samples: bool = True
     """Whether faults of the script affect this line; a pulled cable affects all lines."""
+    tls: bool = False
+    """Whether a TCP line is encrypted."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,16 +1,18 @@
 """A simulated SeedLink server with the stations of a bench, in protocol versions 3 and 4.
 
-Simulated functions: ``HELLO``, ``SLPROTO``, ``STATION``, ``SELECT``, ``DATA`` with a sequence
-number, ``END``, ``INFO ID``, ``CAT``, ``BYE``; a ring of packets that is filled also while no
-client is connected and holds the last ``keep`` seconds. Each sensor is a station; a record holds
+Simulated functions: ``HELLO``, ``SLPROTO``, ``AUTH``, ``STATION``, ``SELECT``, ``DATA`` with a
+sequence number, ``END``, ``INFO ID``, ``CAT``, ``BYE``; a ring of packets that is filled also while
+no client is connected and holds the last ``keep`` seconds. Each sensor is a station; a record holds
 100 samples of a channel. The setting ``delays`` delays the records of a channel by a number of
-records. The fault ``reset`` restarts the server with an empty ring and sequence number 1.
+records. With ``tls`` the connection is encrypted; with ``credentials`` only clients that state them
+get stations. The fault ``reset`` restarts the server with an empty ring and sequence number 1.
 """
 
 from __future__ import annotations
 
 import math
 from fractions import Fraction
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -149,9 +151,13 @@ class SeedLinkServer:
     def __init__(self, device: DeviceSpec, source: Source) -> None:
         self._stations = [Station(device, source, sensor) for sensor in device.sensors]
         self._hello = HELLO if device.settings.get("offers_version_4", True) else HELLO[:24]
+        path = device.settings.get("credentials")
+        words = Path(path).expanduser().read_text(encoding="utf-8").split() if path else []
+        self._wanted = ["USERPASS" if len(words) == 2 else "JWT", *words] if words else None
         self._forget()
 
     def _forget(self) -> None:
+        self._is_known = self._wanted is None
         self._received = b""
         self._version: Version = 3
         self._chosen: Station | None = None
@@ -200,10 +206,18 @@ class SeedLinkServer:
         if command == "BYE":
             self._sends = False
             return []
-        accepted = self._configure(command, rest, now)
-        return [(b"OK" if accepted else b"ERROR") + LINE_END]
+        return [self._configure(command, rest, now) + LINE_END]
 
-    def _configure(self, command: str, rest: list[str], now: float) -> bool:
+    def _configure(self, command: str, rest: list[str], now: float) -> bytes:
+        """Carry out a command; return the reply."""
+        if command == "AUTH" and self._version == 4:
+            self._is_known = self._is_known or rest == self._wanted
+            return b"OK" if self._is_known else b"ERROR AUTH not allowed to connect"
+        if command == "STATION" and not self._is_known:
+            return b"ERROR UNAUTHORIZED authentication required"
+        return b"OK" if self._accepts(command, rest, now) else b"ERROR"
+
+    def _accepts(self, command: str, rest: list[str], now: float) -> bool:
         if command == "SLPROTO":
             offered = "SLPROTO:4.0" in self._hello and rest == ["4.0"]
             self._version = 4 if offered else self._version
@@ -265,4 +279,5 @@ class SeedLinkServer:
 
 def create(device: DeviceSpec, source: Source) -> list[Line]:
     """Return the server's one line."""
-    return [Line(SeedLinkServer(device, source), "tcp", scheme="seedlink")]
+    tls = bool(device.settings.get("tls"))
+    return [Line(SeedLinkServer(device, source), "tcp", scheme="seedlink", tls=tls)]

@@ -13,10 +13,13 @@ import os
 import select
 import shutil
 import socket
+import ssl
 import tempfile
 import tty
+from datetime import UTC, datetime, timedelta
+from ipaddress import ip_address
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from sim_devices.errors import ServeError
 
@@ -48,6 +51,8 @@ class DevicePort(Protocol):
     """A line as its server sees it."""
 
     address: str
+    settings: dict[str, Any]
+    """Settings that its driver needs."""
 
     async def open(self) -> None:
         """Make the line; it can be opened from elsewhere after this."""
@@ -75,6 +80,7 @@ class PseudoTerminal:
         self._listener = listener
         self._folder = tempfile.mkdtemp(prefix="huddle-")
         self.address = str(Path(self._folder) / "tty")
+        self.settings: dict[str, Any] = {}
         self._master = -1
         self._open = False
         self._waiting = bytearray()
@@ -189,10 +195,14 @@ class PseudoTerminal:
 class TcpPort:
     """A TCP port that serves one connection at a time, as serial servers do.
 
-    ``number`` is the port number; 0 for any free one.
+    ``number`` is the port number; 0 for any free one. With ``tls`` it has a certificate of its own.
     """
 
-    def __init__(self, listener: Listener, scheme: str, number: int = 0) -> None:
+    def __init__(
+        self, listener: Listener, scheme: str, number: int = 0, *, tls: bool = False
+    ) -> None:
+        self._tls = tls
+        self._folder = ""
         self._listener = listener
         self._scheme = scheme
         self._number = number
@@ -200,11 +210,18 @@ class TcpPort:
         self._writer: asyncio.StreamWriter | None = None
         self._down = False
         self.address = ""
+        self.settings: dict[str, Any] = {}
 
     async def open(self) -> None:
         """Listen on a port of this machine."""
+        context = None
+        if self._tls:
+            folder = self._folder = tempfile.mkdtemp(prefix="huddle-")
+            context, self.settings["ca_file"] = self_signed(Path(folder))
         try:
-            self._server = await asyncio.start_server(self._serve, "127.0.0.1", self._number)
+            self._server = await asyncio.start_server(
+                self._serve, "127.0.0.1", self._number, ssl=context
+            )
         except OSError as error:
             raise ServeError(
                 f"cannot listen on port {self._number} of this machine: {error.strerror};"
@@ -265,6 +282,8 @@ class TcpPort:
         if self._server is not None:
             self._server.close()
             await self._server.wait_closed()
+        if self._folder:
+            shutil.rmtree(self._folder)
 
 
 class UdpPort:
@@ -275,6 +294,7 @@ class UdpPort:
         self._scheme = scheme
         self._down = False
         self.address = ""
+        self.settings: dict[str, Any] = {}
 
     async def open(self) -> None:
         """Select a free port of this machine and start to send to it."""
@@ -323,6 +343,7 @@ class UdpServer(asyncio.DatagramProtocol):
         self._to: tuple[str, int] | None = None
         self._down = False
         self.address = ""
+        self.settings: dict[str, Any] = {}
 
     async def open(self) -> None:
         """Listen on a free port of this machine."""
@@ -368,10 +389,48 @@ class UdpServer(asyncio.DatagramProtocol):
         self._listener.disconnected()
 
 
-def make_port(kind: Kind, listener: Listener, *, scheme: str, number: int = 0) -> DevicePort:
+def self_signed(folder: Path) -> tuple[ssl.SSLContext, str]:
+    """Return a context with a new certificate for this machine, and its file for clients."""
+    try:
+        from cryptography import x509  # noqa: PLC0415 -- an extra
+        from cryptography.hazmat.primitives import hashes, serialization  # noqa: PLC0415
+        from cryptography.hazmat.primitives.asymmetric import ec  # noqa: PLC0415
+    except ImportError as error:
+        raise ServeError(f"tls needs a certificate: {error}; huddle-bench[signing]") from error
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "simulated device")])
+    names = [x509.IPAddress(ip_address("127.0.0.1")), x509.DNSName("localhost")]
+    today = datetime.now(UTC)
+    certificate = (
+        x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
+        .not_valid_before(today - timedelta(days=1))
+        .not_valid_after(today + timedelta(days=365))
+        .add_extension(x509.SubjectAlternativeName(names), critical=False)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=None), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    public, private = folder / "certificate.pem", folder / "key.pem"
+    public.write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
+    private.write_bytes(
+        key.private_bytes(
+            serialization.Encoding.PEM,
+            serialization.PrivateFormat.PKCS8,
+            serialization.NoEncryption(),
+        )
+    )
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    context.load_cert_chain(public, private)
+    return context, str(public)
+
+
+def make_port(
+    kind: Kind, listener: Listener, *, scheme: str, number: int = 0, tls: bool = False
+) -> DevicePort:
     """Return a line of this kind, not yet open; ``number`` is that of a TCP port."""
     if kind == "pty":
         return PseudoTerminal(listener)
     if kind == "udp-server":
         return UdpServer(listener, scheme)
-    return TcpPort(listener, scheme, number) if kind == "tcp" else UdpPort(listener, scheme)
+    return (
+        TcpPort(listener, scheme, number, tls=tls) if kind == "tcp" else UdpPort(listener, scheme)
+    )

@@ -26,8 +26,9 @@ accepts connections::
 
     {"sensors": ["A"], "driver": "epson", "port": "/tmp/huddle-x/tty", "settings": {}}
 
-``settings`` has additions to the sensors' settings (numbers of further ports). ``python -m
-sim_devices`` prints one such line per device and ends when its standard input is closed.
+``settings`` has additions to the sensors' settings (numbers of further ports, certificates).
+``python -m sim_devices`` prints one such line per device and ends when its standard input is
+closed.
 
 Device families (``FAMILIES``) are imported when served; :mod:`sim_devices.devices.interface`
 describes their interface.
@@ -147,7 +148,9 @@ class Served:
         self._last = -math.inf
         self._down = self._muted = False
         self._pending_hang_up: asyncio.TimerHandle | None = None
-        self.port: DevicePort = make_port(line.kind, self, scheme=line.scheme, number=number)
+        self.port: DevicePort = make_port(
+            line.kind, self, scheme=line.scheme, number=number, tls=line.tls
+        )
 
     def connected(self) -> None:
         """Handle a reader that opened the line."""
@@ -353,9 +356,8 @@ def _announcement(device: DeviceSpec, served: Sequence[Served]) -> dict[str, Any
         "sensors": list(device.sensors),
         "driver": device.driver,
         "port": served[0].port.address,
-        "settings": {
-            one.line.setting: int(one.port.address.rpartition(":")[2]) for one in served[1:]
-        },
+        "settings": served[0].port.settings
+        | {one.line.setting: int(one.port.address.rpartition(":")[2]) for one in served[1:]},
     }
 
 

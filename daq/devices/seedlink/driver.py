@@ -1,7 +1,8 @@
 """Driver for SeedLink servers: seismic digitizers and servers that forward their records.
 
-``port`` is ``seedlink://host`` or ``seedlink://host:port`` (default 18000). All sensors of a port
-share one connection. The driver uses version 4 of the protocol if the server offers it, else 3.
+``port`` is ``seedlink://host`` or ``seedlink://host:port`` (default 18000, with TLS 18500). All
+sensors of a port share one connection. The driver uses version 4 of the protocol if the server
+offers it, else 3.
 
 Blocks state the digitizer's UTC, so no clock model is fitted. After a reconnection each station
 continues with the packet after its last one. No samples are lost while the server still has the
@@ -13,6 +14,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ssl
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 from urllib.parse import urlsplit
 
@@ -23,7 +26,13 @@ from daq.devices.interface import DeviceInformation
 from daq.devices.port_rules import port_label, require_alike
 from daq.devices.seedlink import packets
 from daq.devices.seedlink.decoder import SeedLinkDecoder, Selection
-from daq.errors import BenchFileError, FileFault, NoAnswerError, WrongDeviceError
+from daq.errors import (
+    BenchFileError,
+    FileFault,
+    NoAnswerError,
+    NotConnectedError,
+    WrongDeviceError,
+)
 from daq.transport.address import host_and_port
 from daq.transport.ports import open_port
 
@@ -38,10 +47,10 @@ if TYPE_CHECKING:
     from daq.protocols.block import Block, Event, HostTime
     from daq.transport.byte_stream import ByteStream
 
-PORT = 18000
+PORT, TLS_PORT = 18000, 18500
 SCHEME = "seedlink"
 REPLY_TIMEOUT = 10.0
-OF_THE_SERVER = ("protocol", "late", "patience")
+OF_THE_SERVER = ("protocol", "tls", "ca_file", "credentials", "late", "patience")
 """Settings that all sensors of a port share."""
 
 Code = Annotated[str, Field(pattern=r"^[A-Z0-9]{1,8}$")]
@@ -65,12 +74,55 @@ class SeedLinkSettings(BaseModel):
     sensor's channels."""
     protocol: Literal["auto", "3", "4"] = "auto"
     """Version of SeedLink; default: 4 if the server offers it, else 3."""
+    tls: bool | None = None
+    """Encrypt the connection and verify the server's certificate; default: on port 18500."""
+    ca_file: str | None = None
+    """File with the certificates (PEM) that are trusted; default: those that the system trusts."""
+    credentials: str | None = None
+    """File with user and password, or a token (JWT), in one line; its path is absolute or begins
+    with ``~``. They are not in the bench file because recordings have a copy of that."""
     samples: Literal["int32", "float32", "float64"] = "int32"
     """Type of the samples in the records."""
     late: PositiveFloat = 10.0
     """Seconds to wait for a late record before a hole becomes a gap."""
     patience: PositiveFloat = 60.0
     """Seconds without a record after which the server is lost and reconnected."""
+
+    def is_encrypted(self, number: int) -> bool:
+        """Return whether the connection to a TCP port is encrypted."""
+        return number == TLS_PORT if self.tls is None else self.tls
+
+    def context(self) -> ssl.SSLContext:
+        """Return what a server's certificate is verified with; raise OSError if unreadable."""
+        return ssl.create_default_context(cafile=self.ca_file and Path(self.ca_file).expanduser())
+
+    def check_credentials(self, sensor: Sensor, number: int) -> None:
+        """Raise BenchFileError if credentials cannot, or should not, be sent."""
+        if self.credentials is None:
+            return
+        expected = ""
+        if not Path(self.credentials).expanduser().is_absolute():
+            expected = "expected an absolute path, or one that begins with ~"
+        elif self.protocol == "3":
+            expected = "SeedLink 3 has no credentials; expected protocol 4"
+        elif self.tls is None and not self.is_encrypted(number):
+            expected = "others on the network can read them; expected tls = true (or false: send)"
+        if expected:
+            fault = FileFault("settings.credentials", expected, self.credentials, sensor.name)
+            raise BenchFileError(fault)
+
+    def read_credentials(self, sensor: Sensor) -> list[str]:
+        """Return user and password, or a token; raise BenchFileError if the file has neither."""
+        path = Path(self.credentials or "").expanduser()
+        try:
+            words = path.read_text(encoding="utf-8").split()
+            expected = "expected a file of one or two words: a token, or user and password"
+        except (OSError, UnicodeDecodeError) as error:
+            words, expected = [], f"cannot be read: {error}"
+        if len(words) not in {1, 2}:
+            fault = FileFault("settings.credentials", expected, str(path), sensor.name)
+            raise BenchFileError(fault)
+        return words
 
     def selection(self, sensor: Sensor) -> Selection:
         """Return the selection of the sensor's streams; raise BenchFileError if invalid."""
@@ -154,7 +206,8 @@ class SeedLinkDriver:
 def _selections(sensors: Sequence[Sensor]) -> dict[str, Selection]:
     settings = {s.name: SeedLinkSettings.model_validate(s.settings) for s in sensors}
     require_alike(sensors, settings, OF_THE_SERVER)
-    _address(sensors[0])
+    _, number = _address(sensors[0])
+    settings[sensors[0].name].check_credentials(sensors[0], number)
     return {s.name: settings[s.name].selection(s) for s in sensors}
 
 
@@ -165,7 +218,9 @@ def _address(sensor: Sensor) -> tuple[str, int]:
     if not port.startswith(f"{SCHEME}://"):
         raise BenchFileError(fault)
     try:
-        host, number = host_and_port(port if urlsplit(port).port else f"{port}:{PORT}")
+        tls = SeedLinkSettings.model_validate(sensor.settings).tls
+        default = TLS_PORT if tls else PORT
+        host, number = host_and_port(port if urlsplit(port).port else f"{port}:{default}")
     except ValueError as error:
         raise BenchFileError(fault) from error
     return f"[{host}]" if ":" in host else host, number
@@ -180,9 +235,17 @@ async def _opened(
     settings = SeedLinkSettings.model_validate(first.settings)
     host, number = _address(first)
     label = port_label(sensors)
-    async with open_port(f"socket://{host}:{number}", clock, label=label) as stream:
-        server = _Server(stream)
+    tls = None
+    if settings.is_encrypted(number):
+        try:
+            tls = await asyncio.to_thread(settings.context)
+        except OSError as error:
+            raise NotConnectedError(f"{label}: settings.ca_file cannot be read: {error}") from error
+    async with open_port(f"socket://{host}:{number}", clock, label=label, tls=tls) as stream:
+        server = _Server(stream, is_encrypted=tls is not None)
         await server.greet(settings.protocol)
+        if settings.credentials is not None:
+            await server.authenticate(settings.read_credentials(first))
         decoder = before.decoder if before is not None else None
         if decoder is None:
             dtypes = {s.name: SeedLinkDriver().counts_dtype(s) for s in sensors}
@@ -206,8 +269,9 @@ async def _opened(
 class _Server:
     """Commands to a server, and its replies."""
 
-    def __init__(self, stream: ByteStream) -> None:
+    def __init__(self, stream: ByteStream, *, is_encrypted: bool) -> None:
         self.version: Version = 3
+        self.is_encrypted = is_encrypted
         self.software = self.organisation = ""
         self.rest: tuple[bytes, HostTime] | None = None
         """Bytes received after the last reply."""
@@ -233,6 +297,15 @@ class _Server:
             await self._ask("SLPROTO 4.0")
             self.version = 4
 
+    async def authenticate(self, credentials: Sequence[str]) -> None:
+        """State who the client is."""
+        if self.version == 3:
+            raise WrongDeviceError(
+                f"{self._stream.label}: the server speaks SeedLink 3, which has no credentials;"
+                " remove settings.credentials"
+            )
+        await self._ask(packets.auth_command(credentials), shown="AUTH …")
+
     async def choose(
         self, selections: Mapping[str, Selection], last: Mapping[str, tuple[int, int]]
     ) -> None:
@@ -250,13 +323,15 @@ class _Server:
         if self._buffer and self._at is not None:
             self.rest = self._buffer, self._at
 
-    async def _ask(self, command: str) -> None:
+    async def _ask(self, command: str, *, shown: str = "") -> None:
         await self._send(command)
-        reply = await self._line(command)
+        reply = await self._line(shown or command)
         if reply != "OK":
+            is_about_access = bool(shown) or "AUTH" in reply
+            which = "credentials" if is_about_access else "network, station, location and channels"
             raise WrongDeviceError(
-                f"{self._stream.label}: expected OK to {command!r}, got {reply[:80]!r}; check"
-                " network, station, location and channels"
+                f"{self._stream.label}: expected OK to {shown or command!r}, got {reply[:80]!r};"
+                f" check {which}"
             )
 
     async def _send(self, command: str) -> None:
@@ -322,7 +397,7 @@ def _information(
         details = {
             "server": server.software[:80],
             "organisation": server.organisation[:80],
-            "protocol": f"SeedLink {server.version}",
+            "protocol": f"SeedLink {server.version}{', encrypted' if server.is_encrypted else ''}",
             "streams": ", ".join(decoder.streams(sensor.name)),
         }
         found.append(

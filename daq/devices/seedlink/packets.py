@@ -5,8 +5,9 @@ Theory of operation
 A client sends commands, lines that end in CR LF, over TCP (port 18000, usually). The server replies
 to ``HELLO`` with two lines, the first with its protocol versions. Then the client sends
 ``STATION``, ``SELECT`` and ``DATA`` for each station; the server replies ``OK`` or ``ERROR`` to
-each. After ``END`` the server sends packets until the connection is closed. Version 3 (SeisComP,
-"SeedLink" 2 to 3.3)::
+each. Version 4 has ``AUTH`` before them, for servers that ask who the client is, and is also spoken
+over TLS (port 18500). After ``END`` the server sends packets until the connection is closed.
+Version 3 (SeisComP, "SeedLink" 2 to 3.3)::
 
     SL  sequence, 6 hexadecimal digits  miniSEED 2 record of 512 bytes
     SLINFO  * or blank                  miniSEED 2 record of 512 bytes, in reply to INFO
@@ -28,9 +29,12 @@ import re
 import struct
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from daq.protocols.errors import RemoteProtocolError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 Version: TypeAlias = Literal[3, 4]
 WRAP = 1 << 24
@@ -75,6 +79,11 @@ def speaks_version_4(hello: str) -> bool:
 def station_command(version: Version, network: str, station: str) -> str:
     """Return the command that selects a station."""
     return f"STATION {network}_{station}" if version == 4 else f"STATION {station} {network}"
+
+
+def auth_command(credentials: Sequence[str]) -> str:
+    """Return the command that states user and password, or a token (version 4)."""
+    return f"AUTH {'JWT' if len(credentials) == 1 else 'USERPASS'} {' '.join(credentials)}"
 
 
 def select_command(version: Version, location: str, channel: str) -> str:
@@ -178,6 +187,9 @@ class PacketFinder:
         return Packet(sequence if is_miniseed else None, payload, name, is_miniseed)
 
     def _refuse(self, head: bytes) -> None:
+        if head.startswith(b"ERROR"):  # in reply to END, as by a server that wants AUTH
+            line = bytes(self._buffer[:200]).partition(LINE_END)[0].decode("ascii", "replace")
+            raise RemoteProtocolError(f"the server sends no packets: {line!r}")
         text = head.decode("ascii", "replace")
         expected = "SE" if self._version == 4 else "SL and a sequence number"
         raise RemoteProtocolError(f"no SeedLink packet: {text!r}; expected {expected}")

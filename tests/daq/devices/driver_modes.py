@@ -63,6 +63,15 @@ CASES: dict[str, dict[str, Any]] = {
         **SEEDLINK,
         "settings": {**STATION, "station": "S2", "protocol": "3", "channels": ["HN?"]},
     },
+    "seedlink tls": {
+        **SEEDLINK,
+        "settings": {
+            **STATION,
+            "station": "S3",
+            "tls": True,
+            "credentials": str(Path(__file__).with_name("seedlink_credentials.txt")),
+        },
+    },
     "iio": {"driver": "iio", "port": "tcp", "settings": {}},
     "text serial": {
         "driver": "text",

@@ -79,6 +79,7 @@ FAULTS: dict[str, dict[str, dict[str, Any]]] = {
     "fifo tcp": _CHECKED,
     "seedlink 4": _RESET | _GARBAGE,
     "seedlink 3": _RESET | _GARBAGE,
+    "seedlink tls": _RESET | _GARBAGE,
     "iio": {
         "overflow": {"duration": 1.5},
         "stall": {"duration": 1.6},
@@ -99,6 +100,7 @@ COUNT_ON = (
     "scream tcp",
     "seedlink 4",
     "seedlink 3",
+    "seedlink tls",
 )
 """Gaps are exact, also over a pulled cable; but for one at most after a power failure."""
 

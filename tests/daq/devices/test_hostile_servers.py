@@ -42,6 +42,7 @@ FAULTS: dict[str, dict[str, dict[str, Any]]] = {
     "scream tcp": {"duplicate": {"count": 2}, "drop": {}, "late": {"duration": 0.6}},
     "fifo tcp": {"duplicate": {}, "corrupt": {"count": 3}, "drop": {}},
     "seedlink 4": {"duplicate": {"count": 2}, "drop": {}, "late": {"duration": 0.6}},
+    "seedlink tls": {"duplicate": {"count": 2}, "drop": {}, "late": {"duration": 0.6}},
     "seedlink 3": {"duplicate": {"count": 2}, "drop": {}, "late": {"duration": 0.6}},
     "text tcp": {"duplicate": {}, "drop": {}},
 }
