@@ -98,6 +98,29 @@ class DriverType(DriverRules, Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class PresentPort:
+    """A port of this computer: its name in a bench file, and what the system says of it."""
+
+    port: str
+    description: str
+
+
+@runtime_checkable
+class Listing(Protocol):
+    """A driver (:class:`DriverType`) whose ports the system can list without opening them."""
+
+    def ports(self) -> list[PresentPort]:
+        """Return the ports that are present; may take seconds.
+
+        Raises
+        ------
+        NotConnectedError
+            If the library is not installed.
+        """
+        ...
+
+
 class PatientSession(Session, Protocol):
     """A session that states how long its device may be silent before it counts as lost.
 

@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, Strict
 
 from daq.devices.blocking import BlockingSource, Samples
-from daq.devices.interface import DeviceInformation
+from daq.devices.interface import DeviceInformation, PresentPort
 from daq.devices.port_rules import port_label
 from daq.errors import BenchFileError, FileFault, NotConnectedError
 from daq.protocols.block import BlockFlag
@@ -156,6 +156,14 @@ class NiDriver:
     def check(self, sensors: Sequence[Sensor]) -> None:
         """See :meth:`daq.devices.interface.Checking.check`."""
         _inputs(sensors)
+
+    def ports(self) -> list[PresentPort]:
+        """See :class:`daq.devices.interface.Listing`."""
+        with _errors("devices of National Instruments"):
+            from nidaqmx.system import System  # noqa: PLC0415 -- an extra
+
+            devices = System.local().devices
+            return [PresentPort(f"{SCHEME}{one.name}", one.product_type) for one in devices]
 
     @contextlib.asynccontextmanager
     async def open(

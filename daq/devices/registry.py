@@ -18,10 +18,11 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, cast
 
-from daq.errors import DriverError
+from daq.devices.interface import Listing
+from daq.errors import DriverError, NotConnectedError
 
 if TYPE_CHECKING:
-    from daq.devices.interface import DriverType
+    from daq.devices.interface import DriverType, PresentPort
 
 GROUP = "huddle.drivers"
 _SEAM = ("name", "summary", "settings", "shares_clock", "counts_dtype", "open")
@@ -66,3 +67,18 @@ def driver_type(name: str) -> DriverType:
     if absent:
         raise DriverError(f"{which} is no driver: it has no {', '.join(absent)}")
     return cast("DriverType", driver)
+
+
+def present_ports() -> tuple[list[tuple[str, PresentPort]], dict[str, str]]:
+    """Return the ports that drivers list, each with its driver, and why drivers list none."""
+    found: list[tuple[str, PresentPort]] = []
+    reasons: dict[str, str] = {}
+    for name in driver_names():
+        try:
+            driver = driver_type(name)
+            found += (
+                [(name, port) for port in driver.ports()] if isinstance(driver, Listing) else []
+            )
+        except (DriverError, NotConnectedError) as error:
+            reasons[name] = str(error)
+    return found, reasons

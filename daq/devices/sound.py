@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from daq.devices.blocking import BlockingSource, Samples
-from daq.devices.interface import DeviceInformation
+from daq.devices.interface import DeviceInformation, PresentPort
 from daq.devices.port_rules import port_label
 from daq.errors import BenchFileError, FileFault, NotConnectedError, WrongDeviceError
 from daq.protocols.block import BlockFlag
@@ -135,6 +135,18 @@ class SoundDriver:
     def check(self, sensors: Sequence[Sensor]) -> None:
         """See :meth:`daq.devices.interface.Checking.check`."""
         _inputs(sensors)
+
+    def ports(self) -> list[PresentPort]:
+        """See :class:`daq.devices.interface.Listing`."""
+        with _portaudio("sound cards") as library:
+            return [
+                PresentPort(
+                    f"{SCHEME}{card['name']}",
+                    f"{card['max_input_channels']} inputs, {card['default_samplerate']:g} Hz",
+                )
+                for card in library.query_devices()
+                if card["max_input_channels"] > 0
+            ]
 
     @contextlib.asynccontextmanager
     async def open(

@@ -1,4 +1,4 @@
-"""``huddle devices``: simulated devices of a bench, and the settings of installed drivers."""
+"""``huddle devices``: ports of this computer, simulated devices, and settings of drivers."""
 
 # ruff: noqa: PLC0415 - what the command needs is imported when it runs
 
@@ -15,6 +15,7 @@ from tui.commands.options import JsonOption, SpeedOption, examples, with_logging
 
 
 @examples(
+    "huddle devices   (list the ports of this computer)",
     "huddle devices lab.toml",
     "huddle devices --driver labjack   (list the settings of a driver)",
     "huddle devices lab.toml --speed 10 -o simulated.toml   (then in another terminal:)",
@@ -59,22 +60,57 @@ def devices(
     ] = None,
     json: JsonOption = None,
 ) -> None:
-    """Serve simulated devices of a bench file, until Ctrl-C.
+    """List ports, or serve simulated devices of a bench file.
 
-    Each device is a separate process that speaks its real protocol on a
+    Without a bench file, the command lists serial ports, CAN buses, sound
+    cards and devices of National Instruments of this computer. Ctrl-C ends
+    simulated devices.
+
+    Each simulated device is a separate process that speaks its real protocol on a
     pseudo-terminal or a TCP port. The command makes a bench file that
     connects to them.
 
     The table simulation of the bench file defines motion and noise.
     """
-    if (bench is None) == (driver is None):
+    if bench is not None and driver is not None:
         raise typer.BadParameter("expected either a bench file or --driver NAME")
     if driver is not None:
         list_settings(driver, json=json)
-    elif bench is not None:
+    elif bench is None:
+        list_ports(json=json)
+    else:
         from tui.simulation.devices import serve_devices
 
         serve_devices(bench, speed=speed, faults=faults, log=log, out=out, json=json)
+
+
+def list_ports(*, json: str | None) -> None:
+    """Print the ports of this computer."""
+    from rich.table import Table
+    from rich.text import Text
+
+    from daq.devices.registry import present_ports
+    from daq.transport.serial_ports import serial_ports
+    from tui.output.console import for_people, write_json
+
+    found, reasons = present_ports()
+    rows = [(one.path, "", one.identity) for one in serial_ports()]
+    rows += [(one.port, driver, one.description) for driver, one in found]
+    keys = ("port", "driver", "description")
+    present = [dict(zip(keys, row, strict=True)) for row in rows]
+    write_json(json, {"present": present, "not_listed": reasons})
+    screen = for_people(json)
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for column in keys:
+        table.add_column(column)
+    for row in rows:
+        table.add_row(*map(Text, row))
+    if rows:
+        screen.print(table)
+    else:
+        screen.print("This computer has no serial port, and no other port that drivers list.")
+    for driver, reason in reasons.items():
+        screen.print(f"not listed: {driver}: {reason}", markup=False, highlight=False)
 
 
 def list_settings(name: str, *, json: str | None) -> None:

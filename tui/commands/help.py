@@ -60,7 +60,7 @@ PANELS: dict[str, dict[str, str]] = {
     },
     "Without hardware": {
         "demo": "Run a complete huddle test on simulated sensors.",
-        "devices": "Serve simulated devices of a bench file, until Ctrl-C.",
+        "devices": "List ports, or serve simulated devices of a bench file.",
         "simulate": "Simulate a recording without devices.",
         "reproduce": "Reproduce the figures of the paper and compare them with theory.",
     },

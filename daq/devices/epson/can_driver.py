@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -15,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
 
 from daq.devices.epson import canopen as protocol
 from daq.devices.epson.commands import COUNTS_PER_G, FILTERS, USUAL_FILTER
-from daq.devices.interface import DeviceInformation
+from daq.devices.interface import DeviceInformation, PresentPort
 from daq.devices.port_rules import port_label, require_alike
 from daq.errors import (
     BenchFileError,
@@ -35,6 +37,10 @@ if TYPE_CHECKING:
 SCHEME = "can://"
 BLOCK_SECONDS = 0.1
 """Seconds of samples that are decoded together."""
+ARPHRD_CAN = 280
+"""Type of a network that is a CAN bus, in Linux."""
+ADAPTERS = ("pcan", "kvaser", "vector", "ixxat")
+"""Kinds of adapters that libraries of their vendors list."""
 OF_THE_BUS = ("interface", "bitrate", "filter")
 NOTIFIER_CYCLE = 0.1
 """Seconds after which the thread of the adapter looks whether it is to end."""
@@ -218,6 +224,29 @@ class EpsonCanDriver:
     def check(self, sensors: Sequence[Sensor]) -> None:
         """See :meth:`daq.devices.interface.Checking.check`."""
         _settings(sensors)
+
+    def ports(self, *, folder: Path = Path("/sys/class/net")) -> list[PresentPort]:
+        """See :class:`daq.devices.interface.Listing`; ``folder`` is where Linux lists networks."""
+        found = []
+        for network in sorted(folder.glob("*")):
+            with contextlib.suppress(OSError):  # removed meanwhile
+                if int((network / "type").read_text(encoding="utf-8")) == ARPHRD_CAN:
+                    state = (network / "operstate").read_text(encoding="utf-8").strip()
+                    found.append(PresentPort(f"{SCHEME}{network.name}", f"socketcan, {state}"))
+        try:
+            import can  # noqa: PLC0415 -- an extra
+        except ImportError as error:
+            raise NotConnectedError(f"{error}; pip install 'huddle-bench[can]'") from error
+        logger = logging.getLogger("can")
+        level = logger.level
+        logger.setLevel(logging.ERROR)  # it warns of each library that is not installed
+        try:
+            others = can.detect_available_configs(ADAPTERS)
+        finally:
+            logger.setLevel(level)
+        return found + [
+            PresentPort(f"{SCHEME}{one['channel']}", str(one["interface"])) for one in others
+        ]
 
     @contextlib.asynccontextmanager
     async def open(

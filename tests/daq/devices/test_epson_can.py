@@ -16,7 +16,9 @@ from hypothesis import strategies as st
 from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.conformance.suite import Sent, check_blocks, check_counters, check_truth
+from daq.devices.epson import can_driver
 from daq.devices.epson import canopen as protocol
+from daq.devices.interface import PresentPort
 from daq.devices.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.host_clock import SystemClock
@@ -25,6 +27,7 @@ from sim_devices.devices.epson_can import SimulatedBus
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -83,6 +86,19 @@ async def read(bench: list[Sensor], n_samples: int) -> list[Block | Event]:
             if min(ends.values()) >= n_samples:
                 break
     return found
+
+
+def test_networks_that_are_can_buses_are_listed(tmp_path: Path) -> None:
+    """As Linux lists them: a bus that is down can be brought up."""
+    for name, kind, state in (("can0", 280, "up"), ("eth0", 1, "up"), ("can1", 280, "down")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "type").write_text(f"{kind}\n", encoding="utf-8")
+        (tmp_path / name / "operstate").write_text(f"{state}\n", encoding="utf-8")
+    found = can_driver.DRIVER.ports(folder=tmp_path)
+    assert found == [
+        PresentPort("can://can0", "socketcan, up"),
+        PresentPort("can://can1", "socketcan, down"),
+    ]
 
 
 def test_messages_of_the_data_sheet() -> None:

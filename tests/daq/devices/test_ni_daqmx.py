@@ -22,6 +22,7 @@ import pytest
 from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.conformance.suite import PAUSE, DriverConformance, Sent, Served, check_truth
+from daq.devices.interface import PresentPort
 from daq.devices.ni_daqmx import DRIVER
 from daq.errors import BenchFileError, NotConnectedError
 from daq.host_clock import SystemClock
@@ -257,6 +258,16 @@ async def test_devices_and_rates_are_stated(device: StandIn) -> None:
     assert (first.model, first.serial_number) == ("NI 9234", "1A2B3C1")
     assert second.details == {"inputs": "cDAQ1Mod2/ai1, cDAQ1Mod2/ai3, cDAQ1Mod2/ai0"}
     assert first.sampling_rate == pytest.approx(51200 / 31)  # the lowest of an NI 9234
+
+
+def test_present_devices_are_listed(device: StandIn) -> None:
+    assert DRIVER.ports() == [
+        PresentPort("ni://cDAQ1", "cDAQ-9174"),
+        PresentPort("ni://cDAQ1Mod1", "NI 9234"),
+        PresentPort("ni://cDAQ1Mod2", "NI 9234"),
+    ]
+    device.unplug()
+    assert not DRIVER.ports()
 
 
 async def test_inputs_are_set_up(device: StandIn) -> None:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from typing import TYPE_CHECKING
 
 import pytest
@@ -11,6 +14,8 @@ from typer.testing import CliRunner
 from daq.devices.bench_file import parse
 from daq.devices.registry import driver_names, driver_type
 from daq.errors import BenchFileError
+from tests.daq.devices.test_sound import ALSA, CARD, has_portaudio
+from tests.waiting import limit
 from tui.commands.main import app
 
 if TYPE_CHECKING:
@@ -61,4 +66,31 @@ def test_a_driver_that_is_not_installed_is_named_with_those_that_are() -> None:
 
 
 def test_a_bench_file_or_a_driver() -> None:
-    assert CliRunner().invoke(app, ["devices"]).exit_code == 2
+    assert CliRunner().invoke(app, ["devices", "a.toml", "--driver", "epson"]).exit_code == 2
+
+
+@pytest.mark.skipif(not has_portaudio(), reason="PortAudio or ALSA is not installed")
+def test_without_either_ports_of_this_computer_are_listed(tmp_path: Path) -> None:
+    """In a process of its own: ALSA reads its configuration once."""
+    (tmp_path / "asound.conf").write_text(CARD.format(file="/dev/zero"), encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-m", "tui", "devices", "--json", "-"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "ALSA_CONFIG_PATH": f"{ALSA}:{tmp_path / 'asound.conf'}"},
+        timeout=limit(),
+    )
+    assert done.returncode == 0, done.stderr
+    present = json.loads(done.stdout)["present"]
+    (card,) = [one for one in present if one["port"] == "audio://bench_card"]
+    assert card["driver"] == "sound"
+    assert "inputs" in card["description"]
+
+
+def test_a_driver_without_its_library_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "sounddevice", None)
+    result = CliRunner().invoke(app, ["devices"])
+    assert result.exit_code == 0
+    assert "not listed: sound" in result.stdout
+    assert "huddle-bench[audio]" in " ".join(result.stdout.split())
