@@ -17,7 +17,6 @@ from daq.bench.model import Bench, Limit, Sensor
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import ChannelLabel, Snapshot
 from daq.results.decision.limits import judge
-from estimator.decision.decision_time import LIKELY
 from estimator.decision.verdict import Verdict
 from estimator.errors import InsufficientDataError
 from estimator.methods import self_noise
@@ -45,6 +44,8 @@ MAX_AGAIN = 4 * 3600.0
 SNRS = (1.0, 1e6)
 WRONG = 0.025
 """Share of tests that may pass, and of those that may fail, and should not."""
+HELD = 0.85
+"""Share of the tests that the predicted length is to decide at a single look, at least."""
 AT_ONCE = 20000
 SEED = 20261122
 
@@ -228,12 +229,12 @@ def verdicts(progress: ProgressCallback, length: float = 1.0) -> Study:
     prolonged = [each for each in found if each.second is not None]
     held = sum(each.second is not Verdict.NOT_DECIDED for each in prolonged)
     share = held / max(1, len(prolonged))
-    error = np.sqrt(LIKELY * (1 - LIKELY) / max(1, len(prolonged)))
+    error = np.sqrt(HELD * (1 - HELD) / max(1, len(prolonged)))
     kept = Series(
         "predicted time decides",
         METHOD,
         "share",
-        (Point(FARTHEST_DB / 2, share, 1.0, float(error), allowed=1 - LIKELY),),
+        (Point(FARTHEST_DB / 2, share, 1.0, float(error), allowed=1 - HELD),),
     )
     x_label = "distance of the true noise from the limit (dB)"
     return Study(

@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.bench.end_condition import NEVER
 from daq.protocols.block import BlockFlag
 from daq.recording.sensor_state import STATE_AFTER, SensorState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from daq.bench.end_condition import EndCondition
     from daq.protocols.block import Event
     from daq.recording.reader import Recording
     from daq.recording.sensor_record import SensorRecord
@@ -80,8 +83,10 @@ class RecordingStatus:
     sensors : tuple of SensorStatus
     events : tuple of Event
         All events.
-    ends_in : float or None
-        Seconds until the planned end of the recording; None without a planned end.
+    until : EndCondition
+        When it ends by itself.
+    speed : float
+        Seconds of the recording that pass in one second; 1, unless sensors are simulated.
     """
 
     elapsed: float
@@ -89,7 +94,15 @@ class RecordingStatus:
     closed: bool
     sensors: tuple[SensorStatus, ...]
     events: tuple[Event, ...]
-    ends_in: float | None = None
+    until: EndCondition = NEVER
+    speed: float = 1.0
+
+    def in_local_time(self, seconds: float | None) -> datetime | None:
+        """Return the moment so many seconds from now; None if the recording is not in real time."""
+        if seconds is None or self.speed != 1.0:
+            return None
+        now = self.started_utc_ns * _NS + self.elapsed
+        return datetime.fromtimestamp(now + seconds, UTC).astimezone()
 
 
 class RecordingMonitor:
@@ -136,7 +149,6 @@ class RecordingMonitor:
         )
         since_latest = self._since_latest(latest_ns, sensors)
         elapsed = (latest_ns - start_ns) * _NS + since_latest
-        duration = None if recording.closed else self._first.duration
         return RecordingStatus(
             elapsed=elapsed,
             started_utc_ns=self._first.created_at.utc_ns,
@@ -148,7 +160,8 @@ class RecordingMonitor:
                 for s in sensors
             ),
             events=self._events,
-            ends_in=None if duration is None else max(0.0, duration - elapsed),
+            until=replace(self._first.until, duration=self._first.duration),
+            speed=self._speed,
         )
 
     def _since_latest(self, latest_ns: int, sensors: tuple[SensorStatus, ...]) -> float:
@@ -160,8 +173,12 @@ class RecordingMonitor:
             self._latest_ns, self._since = latest_ns, self._now()
         if self._recording.closed or not all(sensor.state.is_overdue for sensor in sensors):
             return 0.0
+        return (self._now() - self._since) * self._speed
+
+    @property
+    def _speed(self) -> float:
         bench = self._recording.bench
-        return (self._now() - self._since) * (1.0 if bench is None else bench.speed)
+        return 1.0 if bench is None else bench.speed
 
     def status_with_stuck_channels(self) -> RecordingStatus:
         """Return the current status; read the latest samples to find stuck channels."""

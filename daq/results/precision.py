@@ -44,8 +44,10 @@ class Precision:
         return self.target is not None and self.cov <= self.target
 
 
-def precision(snapshot: Snapshot, settings: Settings) -> Precision:
+def precision(snapshot: Snapshot, settings: Settings, *, target: float | None = None) -> Precision:
     """Return the c.o.v. of the method that judges, and when it reaches its target.
+
+    Without `target` that of the settings.
 
     The c.o.v. falls with the root of the averages, and averages come at a steady pace. It is
     unknown where sensors are left out of a live estimate.
@@ -53,7 +55,8 @@ def precision(snapshot: Snapshot, settings: Settings) -> Precision:
     known = [cov for cov in channel_covs(snapshot, settings) if math.isfinite(cov)]
     if snapshot.not_estimated:
         known = []
-    cov, target = max(known, default=math.nan), settings.target_cov_bin or settings.target_cov
+    cov = max(known, default=math.nan)
+    target = target or settings.target_cov_bin or settings.target_cov
     left = total = None
     if target is not None and known:
         hop = settings.segment * (1 - settings.overlap)

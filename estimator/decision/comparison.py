@@ -175,14 +175,14 @@ def prediction(
     quantile: float,
     elapsed: float,
 ) -> Prediction | None:
-    """Return how long a recording takes to decide; None where something else than time is missing.
+    """Return how long a recording takes to decide surely; None where other than time is missing.
 
     `elapsed` is the length of the recording so far, in seconds.
     """
-    if not obstacles or not set(obstacles) <= REMOVED_BY_TIME:
+    if not found or not set(obstacles) <= REMOVED_BY_TIME:
         return None
     parts = [each.margins() for each in found]
-    return predict(
+    predicted = predict(
         Margins(
             margin=np.concatenate([part.margin for part in parts]),
             cumulants=np.concatenate([part.cumulants for part in parts], axis=1),
@@ -195,3 +195,7 @@ def prediction(
         averages=min(float(each.averages.min()) for each in found),
         least=MIN_AVERAGES,
     )
+    starts = np.cumsum([0, *(each.centre.size for each in found)])
+    at = int(np.searchsorted(starts, predicted.slowest, side="right")) - 1
+    frequency = float(found[at].centre[predicted.slowest - starts[at]])
+    return replace(predicted, slowest=at, frequency=frequency)

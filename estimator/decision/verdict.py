@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import math
 from dataclasses import dataclass
 
 
@@ -44,6 +45,8 @@ class Obstacle(enum.StrEnum):
     """The limit lies within the interval: a longer recording narrows it."""
 
 
+CLOSE = 1.3
+"""Length of a test over the predicted one up to which the prediction is a close one."""
 REMOVED_BY_TIME = frozenset({Obstacle.TOO_FEW_AVERAGES, Obstacle.SPANS_LIMIT})
 """Obstacles that a longer recording removes."""
 
@@ -55,14 +58,35 @@ class Prediction:
     Attributes
     ----------
     seconds : float or None
-        Total length that decides with a probability of 90 %; None where `longest` does not.
+        Total length after which a test that ends once it is decided is as likely to have ended as
+        not; None where `longest` does not.
+    earliest, latest : float or None
+        Between which lengths it has ended with a probability of 80 %.
     longest : float
         The longest recording considered, in seconds.
     resolution_db : float
         Half the width of the interval in that recording, in dB, where the noise is closest to the
         limit.
+    slowest : int
+        Which of the channels beside their limits takes longest to pass, or fails first.
+    frequency : float
+        Centre of the band where it does, in Hz.
+    is_pass : bool
+        Whether it is rather a pass that decides.
     """
 
     seconds: float | None
     longest: float
     resolution_db: float
+    earliest: float | None = None
+    latest: float | None = None
+    slowest: int = 0
+    frequency: float = math.nan
+    is_pass: bool = True
+
+    @property
+    def is_close(self) -> bool:
+        """Whether the length is right within 30 % with a probability of 80 %."""
+        if self.seconds is None or self.earliest is None or self.latest is None:
+            return False
+        return self.earliest >= self.seconds / CLOSE and self.latest <= CLOSE * self.seconds

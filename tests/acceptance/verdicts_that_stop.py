@@ -23,7 +23,6 @@ from benchmarks.studies.verdicts import (
     Outcome,
     SimulatedTest,
 )
-from daq.results.decision.end import is_surely_decided
 from estimator.decision.verdict import Verdict
 
 GROWTH = 0.05
@@ -38,7 +37,7 @@ def stopped(rng: np.random.Generator) -> Outcome:
     while True:
         test.record_until(seconds)
         verdict = test.verdict(limit)
-        if seconds >= LONGEST or is_surely_decided(verdict):
+        if seconds >= LONGEST or verdict.is_sure:
             return Outcome(above_db, seconds, verdict.verdict)
         seconds = min(LONGEST, seconds * (1 + GROWTH))
 

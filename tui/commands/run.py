@@ -133,7 +133,7 @@ def run(
         recorder.wait_for_file()
         hint("Ctrl-C stops the recording and shows the result")
         with defer_interrupt(recorder.request_stop) as interruption:
-            snapshot = result_of(recorder, settings, end=end)
+            snapshot = result_of(recorder, settings, end=end, bench=bench)
             # First into the recording, whatever becomes of screens and other files.
             stored = _Stored(out, snapshot, judge(bench, snapshot, settings))
             found = show_result(
@@ -190,6 +190,7 @@ def result_of(
     settings: Settings,
     *,
     end: EndCondition,
+    bench: Bench | None = None,
 ) -> Snapshot:
     """Follow the recording of a recorder to its end, and return its result.
 
@@ -205,7 +206,7 @@ def result_of(
     from daq.estimation.follow import RecordingLeftOpenError, follow
     from daq.recording.repair import repair
 
-    with _progress(end.duration) as bar:
+    with _progress(end.duration, bench) as bar:
         observer = _Run(bar)
         try:
             snapshot = follow(
@@ -259,9 +260,11 @@ class _Run:
     def __init__(self, bar: _Bar) -> None:
         self._bar = bar
         self._says_why = False
+        self._now: RecordingStatus | None = None
 
     def status(self, status: RecordingStatus) -> None:
-        """Show nothing; the progress line shows the estimate only."""
+        """Keep it for the progress line."""
+        self._now = status
 
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
         """Show the progress of the run."""
@@ -269,7 +272,7 @@ class _Run:
 
         if snapshot.closed:
             return
-        self._bar.estimated(snapshot, settings)
+        self._bar.estimated(snapshot, settings, self._now)
         reason = why_no_estimate(snapshot)
         if reason and not self._says_why:
             self._says_why = True
@@ -307,34 +310,40 @@ def refuse_hopeless(bench: Bench, settings: Settings, end: EndCondition) -> None
 
 
 class _Bar:
-    """Progress line of a run: time, segments, c.o.v., time left."""
+    """Progress line of a run: time, segments, c.o.v., how long it takes."""
 
-    def __init__(self, bar: Progress, duration: float | None) -> None:
-        self._bar, self._duration = bar, duration
+    def __init__(self, bar: Progress, duration: float | None, bench: Bench | None) -> None:
+        self._bar, self._bench = bar, bench
         self._task = bar.add_task("0:00", total=None, state="")
         self._end = duration
         self._cov = math.nan
+        self._left = ""
 
-    def estimated(self, snapshot: Snapshot, settings: Settings) -> None:
+    def estimated(
+        self, snapshot: Snapshot, settings: Settings, now: RecordingStatus | None
+    ) -> None:
         """Show the progress of the recording with the precision of its estimate."""
+        from daq.results.decision.end import remaining
+        from daq.results.decision.limits import judge
         from daq.results.precision import precision
+        from tui.wording.verdict_text import how_long
 
-        reached = precision(snapshot, settings)
-        self._cov = reached.cov
-        if settings.target_cov is not None and self._duration is None:
-            left = reached.seconds_left
-            self._end = None if left is None else snapshot.elapsed + left
+        self._cov = precision(snapshot, settings).cov
+        if now is not None and not self._bar.disable:
+            verdict = judge(self._bench, snapshot, settings)
+            left = remaining(now.until, verdict, snapshot, settings, elapsed=now.elapsed)
+            self._end = None if left.seconds is None else snapshot.elapsed + left.seconds
+            self._left = how_long(left, now.in_local_time(left.seconds))
         self.recording(snapshot.n_segments, snapshot.elapsed)
 
     def recording(self, n_segments: int, elapsed: float) -> None:
         """Show the progress of the recording."""
-        from tui.wording.formatting import clock_time, time_left
+        from tui.wording.formatting import clock_time
 
-        left = None if self._end is None else max(0.0, self._end - elapsed)
         parts = [f"{n_segments} segments"]
         if not math.isnan(self._cov):
             parts.append(f"c.o.v. {self._cov:.3f}")
-        parts.append(time_left(left))
+        parts += [self._left] if self._left else []
         self._bar.update(
             self._task,
             description=clock_time(elapsed),
@@ -355,7 +364,7 @@ class _Bar:
 
 
 @contextmanager
-def _progress(duration: float | None) -> Iterator[_Bar]:
+def _progress(duration: float | None, bench: Bench | None) -> Iterator[_Bar]:
     from rich.progress import BarColumn, TextColumn
 
     from tui.output.console import progress
@@ -366,4 +375,4 @@ def _progress(duration: float | None) -> Iterator[_Bar]:
         TextColumn("{task.fields[state]}"),
         per_second=1,
     ) as bar:
-        yield _Bar(bar, duration)
+        yield _Bar(bar, duration, bench)

@@ -109,7 +109,7 @@ class _Lines:
         if before is not None and not snapshot.closed and snapshot.n_segments == before.n_segments:
             return
         if self._json is None:
-            console().print(_line(snapshot, settings))
+            console().print(_line(snapshot, settings, self._now, self._bench), soft_wrap=True)
         else:
             self._write(_update(snapshot, settings, self._now, self._bench))
 
@@ -127,12 +127,23 @@ class _Lines:
             write_text(self._json, line, append=True)
 
 
-def _line(snapshot: Snapshot, settings: Settings) -> str:
+def _line(
+    snapshot: Snapshot, settings: Settings, now: RecordingStatus | None, bench: Bench | None
+) -> str:
+    from daq.bench.end_condition import NEVER
+    from daq.results.decision.end import remaining
+    from daq.results.decision.limits import judge
     from daq.results.precision import precision
-    from tui.wording.formatting import clock_time, time_left
+    from tui.wording.formatting import clock_time
+    from tui.wording.verdict_text import how_long
 
-    reached = precision(snapshot, settings)
-    state = "ended" if snapshot.closed else time_left(reached.seconds_left)
+    until = NEVER if now is None else now.until
+    reached = precision(snapshot, settings, target=until.cov)
+    state = "ended"
+    if not snapshot.closed and now is not None:
+        verdict = judge(bench, snapshot, settings)
+        left = remaining(until, verdict, snapshot, settings, elapsed=now.elapsed)
+        state = how_long(left, now.in_local_time(left.seconds))
     known = "" if math.isnan(reached.cov) else f"c.o.v. {reached.cov:.3f}  "
     return f"{clock_time(snapshot.elapsed)}  {snapshot.n_segments} segments  {known}{state}"
 
@@ -141,19 +152,25 @@ def _update(
     snapshot: Snapshot, settings: Settings, now: RecordingStatus | None, bench: Bench | None
 ) -> dict[str, Any]:
     """Return the update for programs: states, noise in the band, verdict."""
+    from daq.bench.end_condition import NEVER
     from daq.results.band_summary import band_of, channel_means
+    from daq.results.decision.end import remaining
     from daq.results.decision.limits import judge
     from daq.results.precision import precision
     from tui.output.json_document import verdict_document
     from tui.output.json_values import plain
 
-    reached = precision(snapshot, settings)
+    until, verdict = NEVER if now is None else now.until, judge(bench, snapshot, settings)
+    elapsed = snapshot.elapsed if now is None else now.elapsed
+    left = remaining(until, verdict, snapshot, settings, elapsed=elapsed)
     document: dict[str, Any] = {
         "elapsed": snapshot.elapsed,
         "segments": snapshot.n_segments,
         "effective_averages": snapshot.n_effective,
-        "cov": reached.cov,
-        "time_left": reached.seconds_left,
+        "cov": precision(snapshot, settings).cov,
+        "time_left": left.seconds,
+        "time_left_for": left.goal,
+        "ends_too_early_for": left.short_of,
         "closed": snapshot.closed,
         "sensors": {
             sensor.name: {
@@ -167,7 +184,7 @@ def _update(
             for sensor in (() if now is None else now.sensors)
         },
         "left_out": plain(snapshot.left_out),
-        **plain(verdict_document(judge(bench, snapshot, settings))),
+        **plain(verdict_document(verdict)),
     }
     if snapshot.results:
         band = band_of(settings, snapshot)

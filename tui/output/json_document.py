@@ -243,7 +243,7 @@ def verdict_document(found: TestVerdict | None) -> dict[str, Any]:
             "record_for": None,
             "limits": [],
         }
-    prediction = found.prediction
+    prediction = found.prediction if found.verdict == "not-decided" else None
     return {
         "verdict": found.verdict,
         "obstacles": list(found.obstacles),
@@ -252,8 +252,14 @@ def verdict_document(found: TestVerdict | None) -> dict[str, Any]:
         if prediction is None
         else {
             "seconds": prediction.seconds,
+            "earliest": prediction.earliest,
+            "latest": prediction.latest,
             "longest": prediction.longest,
             "resolution_db": prediction.resolution_db,
+            "slowest": {
+                "channel": found.limits[prediction.slowest].name,
+                "frequency_hz": prediction.frequency,
+            },
         },
         "limits": [
             {

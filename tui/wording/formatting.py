@@ -40,13 +40,6 @@ def clock_time(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{left:02d}" if hours else f"{minutes}:{left:02d}"
 
 
-def time_left(seconds: float | None) -> str:
-    """Return how long something still takes, roughly."""
-    if seconds is None or not math.isfinite(seconds):
-        return "time left unknown"
-    return f"{roughly(seconds)} left" if seconds > 0 else "done"
-
-
 def roughly(seconds: float) -> str:
     """Return a length of time in its largest unit, rounded up."""
     for limit, unit, size in ((90, "s", 1), (5400, "min", 60), (172800, "h", 3600)):

@@ -5,17 +5,18 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from daq.results.decision.end import Goal
 from estimator.checks.sensitivities import Cause
 from estimator.decision.comparison import MIN_AVERAGES
-from estimator.decision.decision_time import LIKELY
-from estimator.decision.verdict import Obstacle, Verdict
-from tui.wording.formatting import level, listed, roughly, several, signed
+from estimator.decision.verdict import REMOVED_BY_TIME, Obstacle, Verdict
+from tui.wording.formatting import level, listed, percent, roughly, several, signed
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+    from datetime import datetime
 
+    from daq.results.decision.end import Remaining
     from daq.results.decision.verdict import LimitResult, TestVerdict, WrongSensitivity
-    from estimator.decision.verdict import Prediction
 
 WORDS: Mapping[Verdict, str] = {
     Verdict.PASS: "PASS",
@@ -59,6 +60,13 @@ CAUSES: Mapping[Cause, str] = {
     Cause.GAIN_SWITCH: "another position of a gain switch, or another multiple of the unit",
 }
 """What makes a sensitivity wrong by a factor."""
+TOO_EARLY: Mapping[Goal, str] = {
+    Goal.DECISION: "too early to decide",
+    Goal.PRECISION: "too early for the precision that is wanted",
+}
+"""What a planned end is."""
+_NEXT_DAYS = 12 * 3600.0
+"""Seconds from which the day of a moment is named."""
 ALIKE = 0.05
 """Difference of the gains of a sensor's channels up to which they are one gain."""
 
@@ -93,8 +101,8 @@ def what_to_do(found: TestVerdict) -> list[str]:
     """
     if found.verdict is not Verdict.NOT_DECIDED:
         return wrong_sensitivities(found.sensitivities)
-    lines = [_obstacle(each, found) for each in found.obstacles]
-    return lines + ([record_for(found.prediction)] if found.prediction is not None else [])
+    lines = [*(_obstacle(each, found) for each in found.obstacles), record_for(found)]
+    return [line for line in lines if line]
 
 
 def wrong_sensitivities(found: Sequence[WrongSensitivity]) -> list[str]:
@@ -144,13 +152,18 @@ def not_judged(found: TestVerdict) -> list[str]:
     return lines
 
 
-def record_for(prediction: Prediction) -> str:
-    """Return how long to record for a decision."""
+def record_for(found: TestVerdict) -> str:
+    """Return how long a recording has to be for a decision; empty if its length does not decide."""
+    prediction = found.prediction
+    if prediction is None:
+        return ""
     if prediction.seconds is not None:
-        return (
-            f"Record for {roughly(prediction.seconds)} in all: that decides with a probability of "
-            f"{LIKELY:.0%}."
+        long = (
+            roughly(prediction.seconds)
+            if prediction.is_close
+            else (f"about {roughly(prediction.seconds)}")
         )
+        return f"Record for {long} in all: that decides{_slowest(found)}."
     left = ""
     if math.isfinite(prediction.resolution_db):
         left = f", and even {roughly(prediction.longest)} leave ±{prediction.resolution_db:.2g} dB"
@@ -158,6 +171,58 @@ def record_for(prediction: Prediction) -> str:
         f"A recording of up to {roughly(prediction.longest)} is not likely to decide: the noise is "
         f"too close to the limit{left}."
     )
+
+
+def _slowest(found: TestVerdict | None) -> str:
+    """Return which channel decides last, or fails first, as the rest of a sentence."""
+    if found is None or found.prediction is None:
+        return ""
+    prediction = found.prediction
+    name = f"{found.limits[prediction.slowest].name} at {prediction.frequency:.2g} Hz"
+    return f"; {name} is the slowest" if prediction.is_pass else f", by {name}"
+
+
+def moment(seconds: float, ends: datetime | None, about: str = "") -> str:
+    """Return when a recording has gone on for so long: ``until 14:32 (12 min more)``.
+
+    `ends` is that moment, in the time zone of who reads it; None where the recording's clock is no
+    one's, as with sensors that are simulated faster than real time.
+    """
+    if ends is None:
+        return f"for {about}{roughly(seconds)} more"
+    day = "" if seconds < _NEXT_DAYS else f"{ends:%d %B} "
+    return f"until {about}{day}{ends:%H:%M} ({roughly(seconds)} more)"
+
+
+def how_long(left: Remaining, ends: datetime | None) -> str:
+    """Return how long a test still takes, in a sentence: the one duration on a screen.
+
+    `ends` as in `moment`.
+    """
+    found, seconds = left.verdict, left.seconds
+    if left.goal is None:
+        return "Records until it is stopped."
+    if seconds is None:
+        lines = _not_by_time(found) if found is not None and left.goal is Goal.DECISION else []
+        return next(iter(lines), "Not known yet how long to record.")
+    if left.goal is Goal.END:
+        why = "" if left.short_of is None else f": {TOO_EARLY[left.short_of]}"
+        return f"Records {moment(seconds, ends)}{why}{_slowest(found) if why else ''}."
+    known = "" if left.target is None else f" to {percent(left.target)}"
+    is_decision = left.goal is Goal.DECISION
+    if seconds == 0:
+        reached = "limits are decided" if is_decision else f"noise is known{known}"
+        return f"Enough is recorded: the {reached}."
+    is_close = found is None or found.prediction is None or found.prediction.is_close
+    about = "" if is_close or not is_decision else "about "
+    then = f"decides{_slowest(found)}" if is_decision else f"makes the noise known{known}"
+    return f"Record {moment(seconds, ends, about)}: that {then}."
+
+
+def _not_by_time(found: TestVerdict) -> list[str]:
+    """Return why a longer recording does not decide."""
+    lines = [_obstacle(each, found) for each in found.obstacles if each not in REMOVED_BY_TIME]
+    return [line for line in (*lines, record_for(found)) if line]
 
 
 def limit_line(result: LimitResult) -> str:

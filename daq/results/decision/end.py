@@ -1,7 +1,13 @@
-"""Whether a growing recording has what was wanted of it: a precision, or a decision."""
+"""When a growing recording has what was wanted of it: a precision, or a decision.
+
+`is_reached` ends a test, and `remaining` says how long it still takes: the one duration that all
+screens show.
+"""
 
 from __future__ import annotations
 
+import enum
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from daq.results.decision.limits import judge
@@ -13,10 +19,47 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
-    from daq.results.decision.verdict import LimitResult, TestVerdict
+    from daq.results.decision.verdict import TestVerdict
 
-INTERVAL_FACTOR = 1.25
-"""How much wider than the interval of a verdict the one is that ends a test."""
+NOT_KNOWN_FROM = 10.0
+"""C.o.v. from which it tells no duration."""
+
+
+class Goal(enum.StrEnum):
+    """What a recording goes on for."""
+
+    DECISION = "decision"
+    """The limits of its bench file are decided."""
+    PRECISION = "precision"
+    """The noise is known as well as was wanted."""
+    END = "end"
+    """Its planned end, which comes first, or is all that is wanted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Remaining:
+    """How long a recording still takes.
+
+    Attributes
+    ----------
+    goal : Goal or None
+        What is there then; None where nothing is wanted, and somebody stops it.
+    seconds : float or None
+        From now to the planned end, or from the end of the samples that are estimated; None where
+        it is not known, or something else than time is missing, which the verdict tells.
+    short_of : Goal or None
+        What the planned end comes too early for.
+    verdict : TestVerdict or None
+        On the limits so far.
+    target : float or None
+        Wanted c.o.v.
+    """
+
+    goal: Goal | None
+    seconds: float | None = None
+    short_of: Goal | None = None
+    verdict: TestVerdict | None = None
+    target: float | None = None
 
 
 def is_reached(
@@ -31,24 +74,52 @@ def is_reached(
     if not end.decided:
         return False
     verdict = judge(bench, snapshot, settings)
-    return verdict is not None and is_surely_decided(verdict)
+    return verdict is not None and verdict.is_sure
 
 
-def is_surely_decided(found: TestVerdict) -> bool:
-    """Return whether a verdict is decided with more than its own interval.
+def remaining(
+    end: EndCondition,
+    verdict: TestVerdict | None,
+    snapshot: Snapshot,
+    settings: Settings,
+    *,
+    elapsed: float,
+) -> Remaining:
+    """Return how long a test still takes by its live estimate.
 
-    A test that may end at any of many looks gets as many chances of a wrong verdict. Its intervals
-    therefore count as `INTERVAL_FACTOR` times as wide: at the three to four standard deviations of
-    a verdict on many bands this makes a single look ten times less likely to be wrong.
+    What ends it counts. If only its duration does, or nothing, the limits count, and without limits
+    the precision of the settings. A duration that is over before comes first.
+
+    Parameters
+    ----------
+    end : EndCondition
+        Of the recording.
+    verdict : TestVerdict or None
+        On the limits of its bench file, of this snapshot.
+    elapsed : float
+        Seconds since the start of the recording, which may have gone on since the snapshot.
     """
-    if found.verdict is Verdict.FAIL:
-        return any(each.verdict is Verdict.FAIL and _is_sure(each) for each in found.limits)
-    return found.verdict is Verdict.PASS and all(_is_sure(each) for each in found.limits)
+    known = precision(snapshot, settings, target=end.cov)
+    left: dict[Goal, float | None] = {}
+    if verdict is not None and (end.decided or end.cov is None):
+        left[Goal.DECISION] = _until_decided(verdict, snapshot, surely=end.decided)
+    if known.target is not None and (end.cov is not None or verdict is None):
+        is_known = known.cov <= NOT_KNOWN_FROM
+        left[Goal.PRECISION] = known.seconds_left if is_known else None
+    goal = min(
+        left, key=lambda each: float("inf") if (s := left[each]) is None else s, default=None
+    )
+    seconds, short_of = None if goal is None else left[goal], None
+    if end.duration is not None:
+        planned = max(0.0, end.duration - elapsed)
+        if seconds is None or elapsed + planned < snapshot.elapsed + seconds:
+            goal, short_of, seconds = Goal.END, goal, planned
+    return Remaining(goal, seconds, short_of, verdict, known.target)
 
 
-def _is_sure(result: LimitResult) -> bool:
-    if result.verdict is Verdict.PASS:
-        bound = result.noise_psd + INTERVAL_FACTOR * (result.high - result.noise_psd)
-        return bound < result.limit_psd
-    bound = result.noise_psd - INTERVAL_FACTOR * (result.noise_psd - result.low)
-    return bound > result.limit_psd
+def _until_decided(verdict: TestVerdict, snapshot: Snapshot, *, surely: bool) -> float | None:
+    if verdict.is_sure or (not surely and verdict.verdict is not Verdict.NOT_DECIDED):
+        return 0.0
+    if verdict.prediction is None or verdict.prediction.seconds is None:
+        return None
+    return max(0.0, verdict.prediction.seconds - snapshot.elapsed)

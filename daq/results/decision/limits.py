@@ -25,7 +25,7 @@ from estimator.decision.comparison import (
     whole,
 )
 from estimator.decision.mask_bands import mask_edges, mean_mask
-from estimator.decision.verdict import Obstacle, Verdict
+from estimator.decision.verdict import Obstacle
 from estimator.levels.contributions import Source
 
 if TYPE_CHECKING:
@@ -72,10 +72,12 @@ def judge(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> TestVe
     verdict, obstacles = whole(
         judged, _general_obstacles(snapshot), is_complete=not snapshot.not_estimated
     )
-    left = None
-    if verdict is Verdict.NOT_DECIDED:
-        left = prediction(found, obstacles, quantile=quantile, elapsed=snapshot.elapsed)
-    return TestVerdict(verdict, tuple(limits), obstacles, left, _named(snapshot, doubted.values()))
+    sensitivities = _named(snapshot, doubted.values())
+    so_far = TestVerdict(verdict, tuple(limits), obstacles, sensitivities=sensitivities)
+    if so_far.is_sure or snapshot.not_estimated:
+        return so_far
+    left = prediction(found, obstacles, quantile=quantile, elapsed=snapshot.elapsed)
+    return replace(so_far, prediction=left)
 
 
 def _doubted(bench: Bench, snapshot: Snapshot) -> dict[int, WrongGain]:

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from daq.bench.units import decibels
+from estimator.decision.decision_time import INTERVAL_FACTOR
+from estimator.decision.verdict import Verdict
 
 if TYPE_CHECKING:
     from estimator.checks.sensitivities import Cause
-    from estimator.decision.verdict import Obstacle, Prediction, Verdict
+    from estimator.decision.verdict import Obstacle, Prediction
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +60,15 @@ class LimitResult:
     def known(self) -> bool:
         """Whether there is an estimate in a band of the limit."""
         return math.isfinite(self.limit_psd)
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether the verdict holds with an interval `INTERVAL_FACTOR` times as wide."""
+        if self.verdict is Verdict.PASS:
+            bound = self.noise_psd + INTERVAL_FACTOR * (self.high - self.noise_psd)
+            return bound < self.limit_psd
+        bound = self.noise_psd - INTERVAL_FACTOR * (self.noise_psd - self.low)
+        return self.verdict is Verdict.FAIL and bound > self.limit_psd
 
     @property
     def margin_db(self) -> float:
@@ -117,8 +128,8 @@ class TestVerdict:
     obstacles : tuple of Obstacle
         What keeps the test from a decision, in the order of the enumeration.
     prediction : Prediction or None
-        Where a longer recording of the same kind would decide; None where something else is
-        missing.
+        When a longer recording of the same kind decides surely; None where something else is
+        missing, or the verdict is sure.
     sensitivities : tuple of WrongSensitivity
         Channels whose sensitivity the motion contradicts.
     """
@@ -130,6 +141,19 @@ class TestVerdict:
     sensitivities: tuple[WrongSensitivity, ...] = ()
 
     __test__ = False  # for pytest
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether the test is decided with more than its own interval.
+
+        A test that may end at any of many looks gets as many chances of a wrong verdict. Its
+        intervals therefore count as `INTERVAL_FACTOR` times as wide: at the three to four standard
+        deviations of a verdict on many bands this makes a single look ten times less likely to be
+        wrong.
+        """
+        if self.verdict is Verdict.FAIL:
+            return any(each.is_sure for each in self.having(Verdict.FAIL))
+        return self.verdict is Verdict.PASS and all(each.is_sure for each in self.limits)
 
     def having(self, verdict: Verdict) -> list[LimitResult]:
         """Return the channels and limits of one verdict."""

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
 
+from daq.bench.end_condition import EndCondition
 from daq.recording.monitor import RecordingMonitor, SensorStatus
 from daq.recording.reader import Recording
 from tests.daq.recording.sending_bench import Bench
@@ -91,10 +93,12 @@ def test_what_ends_by_itself_says_when(tmp_path: Path, duration: float | None) -
         Bench(writer).send("ABC", 8)
         recording.refresh()
         now = RecordingMonitor(recording).status()
-        assert now.ends_in == (None if duration is None else pytest.approx(60 - now.elapsed))
+        assert now.until == EndCondition(duration)
+        assert now.in_local_time(60.0) is None  # faster than real time: no clock shows it
+        at = replace(now, speed=1.0).in_local_time(60 - now.elapsed)
+        assert at is not None
+        assert at.timestamp() == pytest.approx(recording.created_at.utc_ns * 1e-9 + 60)
         writer.close()
-        recording.refresh()
-        assert RecordingMonitor(recording).status().ends_in is None
 
 
 def test_a_sensor_is_late_when_its_recorder_says_so(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ Textual parses them when an application starts, and when its colours change.
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING
 
 import pytest
@@ -12,6 +13,8 @@ from textual.css.parse import parse
 from textual.css.tokenize import tokenize_values
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from textual.css.model import RuleSet
     from textual.css.tokenizer import Token
     from textual.css.types import CSSLocation
@@ -50,6 +53,15 @@ def _parsed(
             )
         )
     return _rules[key]
+
+
+@pytest.fixture(autouse=True)
+def clocks_show_utc(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    with monkeypatch.context() as changed:
+        changed.setenv("TZ", "UTC")
+        time.tzset()
+        yield
+    time.tzset()
 
 
 @pytest.fixture(autouse=True)

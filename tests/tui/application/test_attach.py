@@ -60,7 +60,7 @@ async def test_closing_leaves_the_recorder_running_and_it_is_found_again(bench: 
         await pilot.press("s", "tab", "tab", *["backspace"] * 9, "enter")  # until x stops it
         await until(pilot, lambda: first.snapshot is not None and first.snapshot.n_segments > 2)
         assert first.now is not None
-        assert first.now.ends_in is None
+        assert first.now.until.duration is None
         await pilot.press("q")
     (recorder,) = controls.started
     assert not recorder.ended

@@ -33,7 +33,7 @@ def filled(since: dict[str, float]) -> int:
         ),
     )
     settings = replace(SETTINGS, target_cov=0.15)
-    return progress_line(now, snapshot, settings, width=150).plain.count("━")
+    return progress_line(now, snapshot, settings, None, width=150).plain.count("━")
 
 
 def test_the_bar_goes_on_while_all_sensors_send_and_stands_while_one_is_lost() -> None:

@@ -13,7 +13,7 @@ from daq.bench.end_condition import EndCondition
 from daq.bench.model import Limit
 from daq.errors import HuddleError
 from daq.recording.sensor_state import SensorState
-from daq.results.decision.end import is_reached, is_surely_decided
+from daq.results.decision.end import is_reached
 from daq.results.decision.limits import judge
 from estimator.decision.verdict import Verdict
 from tests.tui.application.screen_text import screen_text
@@ -92,18 +92,18 @@ def test_a_test_ends_on_a_verdict_only_if_it_is_surer_than_a_verdict_must_be() -
     found = judge(bench, snapshot, SETTINGS)
     assert found is not None
     assert found.verdict is Verdict.FAIL
-    assert is_surely_decided(found)
+    assert found.is_sure
     end = EndCondition(decided=True)
     assert end.is_estimated
     assert is_reached(end, bench, snapshot, SETTINGS)
     passed = [each for each in found.limits if each.verdict is Verdict.PASS]
-    assert is_surely_decided(replace(found, verdict=Verdict.PASS, limits=tuple(passed[:3])))
+    assert replace(found, verdict=Verdict.PASS, limits=tuple(passed[:3])).is_sure
     barely = replace(passed[0], limit_psd=passed[0].high * 1.001)
-    assert not is_surely_decided(replace(found, verdict=Verdict.PASS, limits=(barely,)))
+    assert not replace(found, verdict=Verdict.PASS, limits=(barely,)).is_sure
     failed = next(each for each in found.limits if each.verdict is Verdict.FAIL)
     barely = replace(failed, limit_psd=failed.low * 0.999)
-    assert not is_surely_decided(replace(found, limits=(barely,)))
-    assert not is_surely_decided(replace(found, verdict=Verdict.NOT_DECIDED))
+    assert not replace(found, limits=(barely,)).is_sure
+    assert not replace(found, verdict=Verdict.NOT_DECIDED).is_sure
 
 
 async def test_the_end_and_each_lost_sensor_are_announced_once(told: ProgressCallback) -> None:

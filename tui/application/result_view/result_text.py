@@ -11,7 +11,7 @@ from rich.text import Text
 
 from daq.results.band_summary import band_of, channel_means, data_means, judged_method
 from daq.results.comparison import compare
-from daq.results.facts import Rank
+from daq.results.facts import Rank, TargetMissed
 from daq.results.partners import without_partners
 from daq.results.precision import channel_covs, precision
 from tui.application.test_view.panels import alerts, known_to
@@ -59,7 +59,11 @@ def result(state: State, *, width: int) -> RenderableType:
     if snapshot.results:
         parts += [_channels(state, snapshot, settings, width=width)]
         parts += [*_notes(state, snapshot, settings), ""]
-    facts = known(snapshot, settings)
+    facts = [  # with limits, how long to record is said with the verdict
+        each
+        for each in known(snapshot, settings)
+        if state.verdict is None or not isinstance(each.fact, TargetMissed)
+    ]
     if not any(each.needs_action for each in facts):
         parts.append(item(NOTHING_TO_DO))
     parts += [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -13,14 +14,15 @@ from rich.text import Text
 from daq.bench.units import decibels
 from daq.recording.sensor_state import SensorState
 from daq.results.band_summary import band_of, channel_means
+from daq.results.decision.end import NOT_KNOWN_FROM, Goal, remaining
 from daq.results.facts import Rank, SensorsSimulated
 from daq.results.known_facts import WITHOUT_ESTIMATE
 from daq.results.partners import without_partners
 from daq.results.precision import precision
 from tui.wording.facts import known
-from tui.wording.formatting import clock_time, percent, roughly, several, signed, time_left
+from tui.wording.formatting import clock_time, percent, several, signed
 from tui.wording.verdict_text import STYLES as STYLES_OF_VERDICTS
-from tui.wording.verdict_text import headline, record_for
+from tui.wording.verdict_text import headline, how_long
 from tui.wording.vocabulary import FLAG_WORDS, PARTNER_WORDS, STATE_ALERTS
 
 if TYPE_CHECKING:
@@ -38,8 +40,6 @@ if TYPE_CHECKING:
 
 MUTED = "#9aa5b8"
 MIN_BAR = 6  # cells
-NOT_KNOWN_FROM = 10.0
-"""C.o.v. from which no number is given."""
 
 
 def noise_in_band(snapshot: Snapshot, settings: Settings, choice: Choice) -> tuple[BandMeans, ...]:
@@ -213,14 +213,14 @@ def _flagged(snapshot: Snapshot, column: int) -> str:
 
 
 def progress_line(
-    now: RecordingStatus, snapshot: Snapshot, settings: Settings, *, width: int
+    now: RecordingStatus,
+    snapshot: Snapshot,
+    settings: Settings,
+    verdict: TestVerdict | None,
+    *,
+    width: int,
 ) -> Text:
-    """Return how far the test is: a bar where its end is known, segments, c.o.v., time left."""
-    reached = precision(snapshot, settings)
-    cov, target = reached.cov, reached.target
-    waits = (
-        [sensor.name for sensor in now.sensors if sensor.state.is_overdue] if not now.closed else []
-    )
+    """Return how long the test takes, after a bar, segments and c.o.v. where there is room."""
     if snapshot.n_segments == 0:
         text = f"waits for the first {settings.segment:g} s segment"
         if snapshot.n_dropped:
@@ -229,28 +229,28 @@ def progress_line(
     parts = [several(snapshot.n_segments, "segment")]
     if snapshot.n_dropped:
         parts.append(f"{snapshot.n_dropped} excluded")
-    if not math.isnan(cov):
-        parts.append(known_to(reached))
-    left = reached.seconds_left if reached.cov <= NOT_KNOWN_FROM else None
-    if left is not None:
-        left = max(0.0, left - _gone_on(now, snapshot))
+    reached = precision(snapshot, settings, target=now.until.cov)
     if snapshot.closed:
-        if target is not None:
+        parts += [] if math.isnan(reached.cov) else [known_to(reached)]
+        if reached.target is not None:
             parts.append("target reached" if reached.is_reached else "target not reached")
-    elif waits:
-        parts.append(f"waits for {', '.join(waits)}")
-    elif target is not None:
-        parts.append("target reached" if reached.is_reached else _until_target(left, now))
-    if now.ends_in is not None:
-        parts.append(f"ends in {roughly(now.ends_in)}")
-    left = min((each for each in (left, now.ends_in) if each is not None), default=None)
-    text = " · ".join(parts)
-    if len(text) + MIN_BAR + 3 > width and len(parts) > 1 and left is not None:
-        text = " · ".join(parts[1:])  # the bar says more than the number of segments
-    line = Text()
+        return Text(" · ".join(parts))
+    if not math.isnan(reached.cov):
+        parts.append(known_to(replace(reached, target=None)))
+    left = remaining(now.until, verdict, snapshot, settings, elapsed=now.elapsed)
+    if left.seconds is not None and left.goal is not Goal.END:
+        left = replace(left, seconds=max(0.0, left.seconds - _gone_on(now, snapshot)))
+    lost = [sensor.name for sensor in now.sensors if sensor.state.is_overdue]
+    if lost and left.goal is not Goal.END:
+        parts.append(f"Waits for {', '.join(lost)}.")
+    else:
+        parts.append(how_long(left, now.in_local_time(left.seconds)))
+    while len(" · ".join(parts)) > width and len(parts) > 1:
+        del parts[0]  # the last says most
+    text, line = " · ".join(parts), Text()
     room = width - len(text) - 3
-    if left is not None and not snapshot.closed and room >= MIN_BAR:
-        done = snapshot.elapsed / max(snapshot.elapsed + left, 1e-9)
+    if left.seconds is not None and room >= MIN_BAR:
+        done = snapshot.elapsed / max(snapshot.elapsed + left.seconds, 1e-9)
         filled = round(done * room)
         line.append("━" * filled, "#4cc9f0")
         line.append("╌" * (room - filled), "#4a556b")
@@ -271,11 +271,6 @@ def _gone_on(now: RecordingStatus, snapshot: Snapshot) -> float:
     before = {sensor.name: sensor.n_samples for sensor in snapshot.sensors}
     new = ((s.n_samples - before[s.name]) / s.sampling_rate for s in now.sensors)
     return max(0.0, min(new))
-
-
-def _until_target(left: float | None, now: RecordingStatus) -> str:
-    """Return how long the target still takes; of a run that ends, what it is that takes so long."""
-    return f"target in {roughly(left)}" if left and now.ends_in is not None else time_left(left)
 
 
 def alerts(now: RecordingStatus, settings: Settings | None) -> list[Text]:
@@ -327,8 +322,7 @@ def findings(snapshot: Snapshot, *, width: int, besides: type[Fact] | None = Non
 def advice(snapshot: Snapshot, choice: Choice, verdict: TestVerdict | None = None) -> Text:
     """Return one line on what to know about what is shown: first the verdict so far."""
     if verdict is not None:
-        todo = "" if verdict.prediction is None else f" {record_for(verdict.prediction)}"
-        return Text(f"{headline(verdict)}{todo}", STYLES_OF_VERDICTS[verdict.verdict])
+        return Text(headline(verdict), STYLES_OF_VERDICTS[verdict.verdict])
     refused = [f"{method}: {why}" for method, why in snapshot.refused.items()]
     if refused:
         return Text(refused[0], "yellow")
