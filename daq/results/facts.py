@@ -7,6 +7,7 @@ The findings of the estimator (`estimator.checks.advice`) become facts as `Findi
 from __future__ import annotations
 
 import enum
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
@@ -16,8 +17,11 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from daq.protocols.block import Uncounted
+    from daq.recording.sensor_state import SensorState
     from estimator.checks.advice import Advice
     from estimator.checks.kinds import Untested
+    from estimator.checks.sensitivities import Cause
+    from estimator.decision.verdict import Obstacle
     from estimator.levels.contributions import Source
     from estimator.likelihood.dimension import BandDimension
     from estimator.self_noise.result import Flag
@@ -501,3 +505,94 @@ class TargetMissed(Fact):
     cov: float
     target: float
     total: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WrongSensitivity(Fact):
+    """Channels of a sensor read more or less of the common motion than the other sensors.
+
+    Attributes
+    ----------
+    gains, errors : tuple of float
+        Motion that each channel reads over that which the others read, and standard errors.
+    against : tuple of str
+        The sensors that agree; empty where no majority does.
+    cause : Cause or None
+        What is likely to be wrong.
+    """
+
+    name: ClassVar[str] = "wrong-sensitivity"
+    gains: tuple[float, ...]
+    errors: tuple[float, ...]
+    against: tuple[str, ...]
+    cause: Cause | None = None
+
+    @property
+    def gain(self) -> float:
+        """The geometric mean of the gains."""
+        return math.exp(math.fsum(map(math.log, self.gains)) / len(self.gains))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LimitUndecided(Fact):
+    """Something keeps `channels` (empty: all) from a decision on `limits`, by their names."""
+
+    name: ClassVar[str] = "limit-undecided"
+    obstacle: Obstacle
+    limits: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LimitNotJudged(Fact):
+    """A limit goes beyond the spectrum, and is not judged there.
+
+    Attributes
+    ----------
+    limit : str
+        Its name.
+    covers, judged : (float, float)
+        Lowest and highest frequency of the limit, and of its part that is judged, Hz.
+    """
+
+    name: ClassVar[str] = "limit-not-judged"
+    limit: str
+    covers: tuple[float, float]
+    judged: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorOverdue(Fact):
+    """A sensor of a running test is late or lost; of a closed one, it was lost before the end.
+
+    Attributes
+    ----------
+    state : SensorState
+    overdue : float
+        Seconds since its last block.
+    reason : str
+        The recorder's reason for the state; empty if it gave none.
+    is_closed : bool
+        Whether the recording has ended.
+    """
+
+    name: ClassVar[str] = "sensor-overdue"
+    state: SensorState
+    overdue: float
+    reason: str
+    is_closed: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChannelsStuck(Fact):
+    """Channels of a running test have a constant count, now or for some time earlier."""
+
+    name: ClassVar[str] = "channels-stuck"
+    is_now: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorClipping(Fact):
+    """A sensor of a running test reaches the end of its range; `are_kept`: segments with that."""
+
+    name: ClassVar[str] = "sensor-clipping"
+    are_kept: bool

@@ -15,6 +15,7 @@ from daq.results.facts import (
     BlocksDamaged,
     ChannelsClipped,
     ChannelsStoodStill,
+    ChannelsStuck,
     ClockNotUnderstood,
     ClocksFitted,
     ClocksMayExplain,
@@ -27,6 +28,8 @@ from daq.results.facts import (
     GapsBridged,
     IntervalsWidened,
     LikeChannelsAssumed,
+    LimitNotJudged,
+    LimitUndecided,
     MethodRefused,
     ModelPasses,
     ModelUntested,
@@ -39,7 +42,9 @@ from daq.results.facts import (
     SamplesMissing,
     SamplesUncounted,
     SegmentsExcluded,
+    SensorClipping,
     SensorLost,
+    SensorOverdue,
     SensorsSimulated,
     SharedNoiseNotSearched,
     StatedTimesDrift,
@@ -62,6 +67,7 @@ from estimator.checks.advice import (
 )
 from estimator.checks.kinds import Untested
 from estimator.checks.shared_noise import MAX_CHANNELS
+from estimator.decision.verdict import Obstacle, Verdict
 from estimator.errors import BandError
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
@@ -71,6 +77,8 @@ if TYPE_CHECKING:
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import SensorTotals, Snapshot
+    from daq.recording.monitor import RecordingStatus
+    from daq.results.decision.verdict import TestVerdict
     from estimator.checks.advice import Advice
     from estimator.levels.contributions import Source
 
@@ -91,7 +99,9 @@ _LIKE_A_CLOCK = Delay | Gain | ModelMisfit | NoSharedMotion
 _TURN = 0.3  # rad at the highest frequency: 9 % of the motion is taken for noise there
 
 
-def facts_of(snapshot: Snapshot, settings: Settings | None = None) -> tuple[Fact, ...]:
+def facts_of(
+    snapshot: Snapshot, settings: Settings | None = None, verdict: TestVerdict | None = None
+) -> tuple[Fact, ...]:
     """Return all facts of an estimate, the worst rank first.
 
     Parameters
@@ -99,6 +109,8 @@ def facts_of(snapshot: Snapshot, settings: Settings | None = None) -> tuple[Fact
     snapshot : Snapshot
     settings : Settings or None
         The snapshot was made with. Without, facts that depend on a band or a target are left out.
+    verdict : TestVerdict or None
+        On its limits, where facts of the verdict are wanted, too.
     """
     found = [
         *_findings(snapshot),
@@ -111,6 +123,8 @@ def facts_of(snapshot: Snapshot, settings: Settings | None = None) -> tuple[Fact
     ]
     if settings is not None:
         found += _precision(snapshot, settings)
+    if verdict is not None:
+        found += facts_of_verdict(verdict)
     ranks = list(Rank)
     return tuple(sorted(found, key=lambda fact: ranks.index(fact.rank)))
 
@@ -442,3 +456,52 @@ def widening(snapshot: Snapshot, settings: Settings, method: str) -> dict[Source
             if share >= LEAST_SHARE:
                 most[source] = max(most.get(source, 0.0), share)
     return most
+
+
+def facts_of_verdict(found: TestVerdict) -> Iterator[Fact]:
+    """Yield what is known of a verdict: wrong sensitivities, obstacles, what is not judged."""
+    yield from found.sensitivities
+    for obstacle in found.obstacles if found.verdict is Verdict.NOT_DECIDED else ():
+        if obstacle is Obstacle.SENSITIVITY:
+            continue  # those are facts
+        concerned = [each for each in found.limits if each.obstacle is obstacle]
+        yield LimitUndecided(
+            rank=Rank.DELAYS,
+            channels=tuple(dict.fromkeys(each.name for each in concerned)),
+            obstacle=obstacle,
+            limits=tuple(dict.fromkeys(each.limit for each in concerned)),
+        )
+    for limit, covers, judged in dict.fromkeys(
+        (each.limit, each.covers, each.judged) for each in found.limits
+    ):
+        if covers[0] < judged[0] or judged[1] < covers[1]:
+            yield LimitNotJudged(rank=Rank.TO_KNOW, limit=limit, covers=covers, judged=judged)
+
+
+def facts_of_sensors(now: RecordingStatus, settings: Settings | None) -> list[Fact]:
+    """Return the faults of the sensors of a running or closed recording, the worst first."""
+    found: list[Fact] = []
+    for sensor in now.sensors:
+        mine = (sensor.name,)
+        if sensor.state.is_overdue:
+            found.append(
+                SensorOverdue(
+                    rank=Rank.INVALIDATES if sensor.state.is_lost else Rank.DELAYS,
+                    sensors=mine,
+                    state=sensor.state,
+                    overdue=sensor.overdue_for,
+                    reason=sensor.reason,
+                    is_closed=now.closed,
+                )
+            )
+        elif sensor.stuck:
+            names = tuple(f"{sensor.name}.{name}" for name in sensor.stuck)
+            found.append(ChannelsStuck(rank=Rank.INVALIDATES, channels=names, is_now=True))
+        elif sensor.is_clipping:
+            kept = settings is not None and settings.reject is False
+            found.append(SensorClipping(rank=Rank.DELAYS, sensors=mine, are_kept=kept))
+        if sensor.was_stuck:
+            names = tuple(f"{sensor.name}.{name}" for name in sensor.was_stuck)
+            found.append(ChannelsStuck(rank=Rank.DELAYS, channels=names, is_now=False))
+    ranks, kinds = list(Rank), (SensorOverdue, ChannelsStuck, SensorClipping)
+    return sorted(found, key=lambda fact: (ranks.index(fact.rank), kinds.index(type(fact))))

@@ -9,7 +9,7 @@ from rich.text import Text
 from daq.preflight.findings import Check, Outcome, Problem
 from tui.output.json_values import plain
 from tui.wording.formatting import listed
-from tui.wording.verdict_text import CAUSES
+from tui.wording.vocabulary import CAUSES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

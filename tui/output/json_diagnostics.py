@@ -18,6 +18,7 @@ if TYPE_CHECKING:
         FrequencyDiagnosis,
         Synchronisation,
     )
+    from daq.protocols.block import Uncounted
     from estimator.checks.band import BandDiagnosis
     from estimator.checks.relative_response import RelativeResponse
     from estimator.checks.stability import Scatter, Stability
@@ -63,7 +64,7 @@ def diagnostics_document(snapshot: Snapshot) -> dict[str, Any]:
     if found.edge_leakage is not None:
         document["edge_leakage"] = _edge_leakage(found.edge_leakage)
     if found.dimensions:
-        document["dimensions"] = [_dimension(each) for each in found.dimensions]
+        document["dimensions"] = [dimension_document(each) for each in found.dimensions]
     if found.diagnosis is not None:
         document |= _diagnosis(found.diagnosis, snapshot)
     for key, by_column in (
@@ -116,11 +117,13 @@ def _clock(each: ClockState) -> dict[str, Any]:
         "drifts": each.drifts,
         "is_unchecked": each.unchecked,
         "is_understood": each.is_understood,
-        "slips": [
-            {"utc_ns": slip.utc_ns, "within_s": slip.within, "samples": slip.n_samples}
-            for slip in each.slips
-        ],
+        "slips": [slip_document(slip) for slip in each.slips],
     }
+
+
+def slip_document(slip: Uncounted) -> dict[str, Any]:
+    """Return samples that were lost without being counted as JSON."""
+    return {"utc_ns": slip.utc_ns, "within_s": slip.within, "samples": slip.n_samples}
 
 
 def _synchronisation(found: Synchronisation) -> dict[str, Any]:
@@ -145,7 +148,8 @@ def _edge_leakage(found: EdgeLeakage) -> dict[str, Any]:
     }
 
 
-def _dimension(each: BandDimension) -> dict[str, Any]:
+def dimension_document(each: BandDimension) -> dict[str, Any]:
+    """Return the dimensions of the motion in a band as JSON."""
     return {
         "low_hz": each.low,
         "high_hz": each.high,

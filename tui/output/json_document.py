@@ -17,13 +17,13 @@ from daq.results.clock_effect import relative_time
 from daq.results.facts import Fact, Finding
 from estimator.checks.advice import Advice
 from tui.output.calibration import channels_of
-from tui.output.json_diagnostics import diagnostics_document
+from tui.output.json_diagnostics import diagnostics_document, dimension_document, slip_document
 from tui.output.json_values import plain
 from tui.output.noise_parameters import noise_parameters_document
 from tui.wording.facts import known
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
@@ -99,7 +99,7 @@ def document(
     }
     whole |= documents[0] if len(documents) == 1 else {"results": documents}
     whole |= verdict_document(verdict)
-    whole["facts"] = facts_document(known(snapshot, settings))
+    whole["facts"] = facts_document(known(snapshot, settings, verdict))
     whole["band_means"] = _band_means(snapshot, settings)
     if noise_parameters is not None:
         whole["noise_parameters"] = plain(noise_parameters_document(noise_parameters))
@@ -247,7 +247,18 @@ def verdict_document(found: TestVerdict | None) -> dict[str, Any]:
     return {
         "verdict": found.verdict,
         "obstacles": list(found.obstacles),
-        "sensitivities": plain(found.sensitivities),
+        "sensitivities": [
+            {
+                "sensor": each.sensors[0],
+                "channel": name.removeprefix(f"{each.sensors[0]}."),
+                "gain": gain,
+                "error": error,
+                "against": list(each.against),
+                "cause": each.cause,
+            }
+            for each in found.sensitivities
+            for name, gain, error in zip(each.channels, each.gains, each.errors, strict=True)
+        ],
         "record_for": None
         if prediction is None
         else {
@@ -305,30 +316,67 @@ def facts_document(facts: Sequence[Known]) -> list[dict[str, Any]]:
     ]
 
 
+_IN_SECONDS = (
+    *("segment", "longest", "missing", "overdue", "total", "error", "left"),
+    *("corrected", "uncorrected", "delay", "times"),
+)
+_IN_HERTZ = ("below", "bands", "worst_band", "covers", "judged")
+_SHARES = (
+    *("lost", "leakage", "excess", "deviation", "expected", "unexplained", "largest_error"),
+    *("added_by_one_degree", "three_sensor", "maximum_likelihood"),
+)
+UNITS: Mapping[str, str] = (
+    {name: f"{name}_s" for name in _IN_SECONDS}
+    | {name: f"{name}_hz" for name in _IN_HERTZ}
+    | {name: f"{name}_share" for name in _SHARES}
+    | {"seconds": "constant_s", "amounts": "coherencies", "errors": "standard_errors"}
+)
+"""Names of the numbers of facts and findings in JSON, where those in the code have no unit."""
+
+
 def _numbers(fact: Fact) -> dict[str, Any]:
     """Return the fields of a fact beyond those of all; findings with theirs."""
     if isinstance(fact, Finding):
         return {"findings": [_finding(each) for each in fact.findings]}
-    common = {each.name for each in fields(Fact)}
-    return {
-        each.name: plain(getattr(fact, each.name))
-        for each in fields(fact)
-        if each.name not in common
+    return _with_units(fact, Fact) | {
+        name: [document(each) for each in getattr(fact, name)]
+        for name, document in _PARTS.items()
+        if hasattr(fact, name)
     }
 
 
+def _with_units(found: Fact | Advice, base: type) -> dict[str, Any]:
+    common = {each.name for each in fields(base)}
+    return {
+        UNITS.get(each.name, each.name): plain(getattr(found, each.name))
+        for each in fields(found)
+        if each.name not in common and each.name not in _PARTS
+    }
+
+
+def _transients(octave: tuple[float, float, int]) -> dict[str, Any]:
+    low, high, n_segments = octave
+    return {"low_hz": low, "high_hz": high, "segments": n_segments}
+
+
+_PARTS: Mapping[str, Callable[[Any], dict[str, Any]]] = {
+    "choices": dimension_document,
+    "slips": slip_document,
+    "transients_by_octave": _transients,
+}
+"""Fields of facts that hold lists of things with several numbers each."""
+
+
 def _finding(advice: Advice) -> dict[str, Any]:
-    common = {each.name for each in fields(Advice)}
+    numbers = _with_units(advice, Advice)
+    if "error_s" in numbers:  # of a finding, this is a share of the noise
+        numbers["error_share"] = numbers.pop("error_s")
     return {
         "kind": advice.kind,
         "level": advice.level,
         "sensors": list(advice.sensors),
         "band_hz": advice.band,
-        "numbers": {
-            each.name: plain(getattr(advice, each.name))
-            for each in fields(advice)
-            if each.name not in common
-        },
+        "numbers": numbers,
     }
 
 

@@ -16,6 +16,7 @@ from daq.results.facts import (
     BlocksDamaged,
     ChannelsClipped,
     ChannelsStoodStill,
+    ChannelsStuck,
     ClockNotUnderstood,
     ClocksFitted,
     ClocksMayExplain,
@@ -28,6 +29,8 @@ from daq.results.facts import (
     GapsBridged,
     IntervalsWidened,
     LikeChannelsAssumed,
+    LimitNotJudged,
+    LimitUndecided,
     MethodRefused,
     ModelPasses,
     ModelUntested,
@@ -40,7 +43,9 @@ from daq.results.facts import (
     SamplesMissing,
     SamplesUncounted,
     SegmentsExcluded,
+    SensorClipping,
     SensorLost,
+    SensorOverdue,
     SensorsSimulated,
     SharedNoiseNotSearched,
     StatedTimesDrift,
@@ -49,21 +54,26 @@ from daq.results.facts import (
     TargetMissed,
     ValuesBelowZero,
     WithoutEstimate,
+    WrongSensitivity,
 )
-from daq.results.known_facts import facts_of
+from daq.results.known_facts import facts_of, facts_of_sensors, facts_of_verdict
 from estimator.checks.kinds import Untested
+from estimator.decision.comparison import MIN_AVERAGES
+from estimator.decision.verdict import Obstacle
 from estimator.spectra.segment_rejection import Reason
 from tui.wording.alerts import alert
 from tui.wording.findings import Names, explain, model
 from tui.wording.formatting import clock_time, listed, percent, roughly, several, signed, span
 from tui.wording.grouped import together
-from tui.wording.vocabulary import FLAG_WORDS, REASONS, SOURCE_WORDS
+from tui.wording.vocabulary import CAUSES, FLAG_WORDS, REASONS, SOURCE_WORDS, STATE_ALERTS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from daq.recording.monitor import RecordingStatus
+    from daq.results.decision.verdict import TestVerdict
     from estimator.likelihood.dimension import BandDimension
 
 MARKS: Mapping[Rank, str] = {Rank.INVALIDATES: "✗", Rank.DELAYS: "▲", Rank.TO_KNOW: "·"}
@@ -76,6 +86,8 @@ MOST_LINES = 3
 """Below a table."""
 SIMULATED = "Simulated sensors: the noise is that of a model, not of instruments."
 NOTHING_TO_DO = "Nothing to do."
+_NO_NAMES = Names((), (), ())
+"""For facts that have names themselves."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,10 +144,22 @@ class Known(NamedTuple):
         return str(self.words)
 
 
-def known(snapshot: Snapshot, settings: Settings | None = None) -> tuple[Known, ...]:
+def known(
+    snapshot: Snapshot, settings: Settings | None = None, verdict: TestVerdict | None = None
+) -> tuple[Known, ...]:
     """Return all facts of an estimate with their words, the worst rank first."""
     names = Names.of(snapshot)
-    return tuple(Known(fact, word(fact, names)) for fact in facts_of(snapshot, settings))
+    return tuple(Known(fact, word(fact, names)) for fact in facts_of(snapshot, settings, verdict))
+
+
+def known_of_verdict(found: TestVerdict) -> list[Known]:
+    """Return what is known of a verdict."""
+    return [Known(fact, word(fact, _NO_NAMES)) for fact in facts_of_verdict(found)]
+
+
+def known_of_sensors(now: RecordingStatus, settings: Settings | None) -> list[Known]:
+    """Return the faults of the sensors of a running or closed recording, the worst first."""
+    return [Known(fact, word(fact, _NO_NAMES)) for fact in facts_of_sensors(now, settings)]
 
 
 def why_no_estimate(snapshot: Snapshot) -> str:
@@ -647,6 +671,123 @@ def _target(fact: TargetMissed, names: Names) -> Wording:
         return Wording(f"{text}: record longer", f"{text}.", "Record longer.")
     long = roughly(fact.total)
     return Wording(f"{text}: record for {long} in all", f"{text}.", f"Record for {long} in all.")
+
+
+@word.register(WrongSensitivity)
+def _sensitivity(fact: WrongSensitivity, names: Names) -> Wording:
+    del names
+    who = listed(fact.sensors if len(fact.channels) > 1 else fact.channels)
+    cause = "" if fact.cause is None else f" ({CAUSES[fact.cause]})"
+    if not fact.against:
+        text = f"{who} reads {fact.gain:.3g} of the other sensors{cause}"
+        return Wording(
+            f"{text}, and no two of them agree",
+            f"{text}, and no two of them agree.",
+            "Correct the sensitivities, or give their certificates.",
+        )
+    text = f"{who} reads {fact.gain:.3g} of {listed(fact.against)}{cause}"
+    do = "Correct its sensitivity, or give its certificate."
+    return Wording(f"{text}: correct its sensitivity", f"{text}.", do)
+
+
+_OBSTACLES: Mapping[Obstacle, tuple[str, str]] = {
+    Obstacle.SENSORS_LOST: (
+        "All sensors were lost before the end",
+        "Check power and cables, and record again.",
+    ),
+    Obstacle.NO_SEGMENTS: (
+        "There is no whole segment without a gap",
+        "Record longer, or choose a shorter segment.",
+    ),
+    Obstacle.NO_ESTIMATE: (
+        "{channels}: no noise estimate at some frequencies of the limit",
+        "See the advice on what is missing, and record again.",
+    ),
+    Obstacle.OUTSIDE_SPECTRUM: (
+        "The spectrum has no frequency of {limits}",
+        "Choose longer segments or another sampling rate.",
+    ),
+    Obstacle.NO_SHARED_MOTION: (
+        "A sensor records none of the motion that the others share",
+        "See the advice, and record again.",
+    ),
+    Obstacle.FAULTY_CHANNEL: (
+        "{channels}: clipped or temporarily dead, so the noise is lower than estimated",
+        "Remove the cause and record again.",
+    ),
+    Obstacle.MODEL_MISFIT: (
+        "{channels}: the model of one common motion fails, by more than the margin",
+        "Follow the advice and record again.",
+    ),
+    Obstacle.CLOCKS: (
+        "{channels}: errors of the clocks are too large to decide, or not known",
+        "Give the sensors one clock, or record longer (without --clocks nominal).",
+    ),
+    Obstacle.TOO_FEW_AVERAGES: (
+        "The uncertainty of fewer than {averages:g} averages is not reliable",
+        "Record longer.",
+    ),
+    Obstacle.SPANS_LIMIT: ("The uncertainty of {channels} spans the limit", ""),
+}
+"""What keeps a test from a decision, and what to do; sensitivities are facts of their own."""
+
+
+@word.register(LimitUndecided)
+def _undecided(fact: LimitUndecided, names: Names) -> Wording:
+    del names
+    text, do = _OBSTACLES[fact.obstacle]
+    line = text.format(
+        channels=listed(fact.channels) if fact.channels else "the channels",
+        limits=listed(fact.limits) if fact.limits else "the limits",
+        averages=MIN_AVERAGES,
+    )
+    return Wording(line, f"{line[0].upper()}{line[1:]}.", do)
+
+
+@word.register(LimitNotJudged)
+def _not_judged(fact: LimitNotJudged, names: Names) -> Wording:
+    del names
+    (low, high), (first, last) = fact.covers, fact.judged
+    parts = [f"below {first:.3g} Hz"] if low < first else []
+    parts += [f"above {last:.3g} Hz"] if last < high else []
+    text = (
+        f"Not judged: {fact.limit} {listed(parts)}, where there is no estimate (the limit goes "
+        f"from {low:.3g} to {high:.3g} Hz)"
+    )
+    return Wording(text, f"{text}.")
+
+
+@word.register(SensorOverdue)
+def _overdue(fact: SensorOverdue, names: Names) -> Wording:
+    del names
+    time, sensor = clock_time(fact.overdue), listed(fact.sensors)
+    if fact.is_closed:
+        text = f"{sensor} was lost {time} before the end: {fact.reason}"
+    else:
+        text = STATE_ALERTS[fact.state].format(sensor=sensor, time=time, reason=fact.reason)
+    return Wording(text, f"{text}.")
+
+
+@word.register(ChannelsStuck)
+def _stuck(fact: ChannelsStuck, names: Names) -> Wording:
+    del names
+    who = ", ".join(fact.channels)
+    if fact.is_now:
+        return Wording(
+            f"{who} is stuck: no signal; check the cable",
+            f"{who}: the count is constant: no signal.",
+            "Check the cable.",
+        )
+    text = f"{who} was stuck for a while: do not trust its noise"
+    return Wording(text, f"{text}.")
+
+
+@word.register(SensorClipping)
+def _clipping(fact: SensorClipping, names: Names) -> Wording:
+    del names
+    effect = "are kept: do not trust its noise" if fact.are_kept else "are excluded"
+    text = f"{listed(fact.sensors)} is clipping: segments with clipped samples {effect}"
+    return Wording(text, f"{text}.", "Choose a larger range, or reduce the motion.")
 
 
 def _us(seconds: float) -> str:

@@ -6,9 +6,9 @@ import math
 from typing import TYPE_CHECKING
 
 from daq.results.decision.end import Goal
-from estimator.checks.sensitivities import Cause
-from estimator.decision.comparison import MIN_AVERAGES
-from estimator.decision.verdict import REMOVED_BY_TIME, Obstacle, Verdict
+from daq.results.facts import LimitUndecided, WrongSensitivity
+from estimator.decision.verdict import REMOVED_BY_TIME, Verdict
+from tui.wording.facts import known_of_verdict
 from tui.wording.formatting import level, listed, percent, roughly, several, signed
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from datetime import datetime
 
     from daq.results.decision.end import Remaining
-    from daq.results.decision.verdict import LimitResult, TestVerdict, WrongSensitivity
+    from daq.results.decision.verdict import LimitResult, TestVerdict
 
 WORDS: Mapping[Verdict, str] = {
     Verdict.PASS: "PASS",
@@ -29,37 +29,6 @@ STYLES: Mapping[Verdict, str] = {
     Verdict.NOT_DECIDED: "bold yellow",
 }
 MARKS: Mapping[Verdict, str] = {Verdict.PASS: "✓", Verdict.FAIL: "✗", Verdict.NOT_DECIDED: "?"}
-OBSTACLES: Mapping[Obstacle, str] = {
-    Obstacle.SENSORS_LOST: "All sensors were lost before the end: check power and cables, and "
-    "record again.",
-    Obstacle.NO_SEGMENTS: "There is no whole segment without a gap: record longer, or choose a "
-    "shorter segment.",
-    Obstacle.NO_ESTIMATE: "{channels}: no noise estimate at some frequencies of the limit. See the "
-    "advice on what is missing, and record again.",
-    Obstacle.OUTSIDE_SPECTRUM: "The spectrum has no frequency of {limits}: choose longer segments "
-    "or another sampling rate.",
-    Obstacle.NO_SHARED_MOTION: "A sensor records none of the motion that the others share: see the "
-    "advice, and record again.",
-    Obstacle.FAULTY_CHANNEL: "{channels}: clipped or temporarily dead, so the noise is lower "
-    "than estimated. Remove the cause and record again.",
-    Obstacle.SENSITIVITY: "{sensitivities}",
-    Obstacle.MODEL_MISFIT: "{channels}: one common motion does not explain what the sensors have "
-    "in common, and the noise estimate may be wrong by more than the margin. Follow the advice and "
-    "record again.",
-    Obstacle.CLOCKS: "{channels}: errors of the clocks are too large to decide, or not known. Give "
-    "the sensors one clock, or record longer for their rates to be known (with --clocks nominal "
-    "they never are).",
-    Obstacle.TOO_FEW_AVERAGES: "The uncertainty of fewer than {averages:g} averages is not "
-    "reliable: record longer.",
-    Obstacle.SPANS_LIMIT: "The uncertainty of {channels} spans the limit.",
-}
-"""What keeps a test from a decision, and what to do."""
-CAUSES: Mapping[Cause, str] = {
-    Cause.GRAVITY: "g in place of m/s², or the reverse",
-    Cause.FACTOR_TWO: "a factor of 2, as between single-ended and differential inputs",
-    Cause.GAIN_SWITCH: "another position of a gain switch, or another multiple of the unit",
-}
-"""What makes a sensitivity wrong by a factor."""
 TOO_EARLY: Mapping[Goal, str] = {
     Goal.DECISION: "too early to decide",
     Goal.PRECISION: "too early for the precision that is wanted",
@@ -67,8 +36,6 @@ TOO_EARLY: Mapping[Goal, str] = {
 """What a planned end is."""
 _NEXT_DAYS = 12 * 3600.0
 """Seconds from which the day of a moment is named."""
-ALIKE = 0.05
-"""Difference of the gains of a sensor's channels up to which they are one gain."""
 
 
 def headline(found: TestVerdict) -> str:
@@ -99,57 +66,13 @@ def what_to_do(found: TestVerdict) -> list[str]:
 
     Where it is decided, only sensitivities that are wrong.
     """
-    if found.verdict is not Verdict.NOT_DECIDED:
-        return wrong_sensitivities(found.sensitivities)
-    lines = [*(_obstacle(each, found) for each in found.obstacles), record_for(found)]
-    return [line for line in lines if line]
-
-
-def wrong_sensitivities(found: Sequence[WrongSensitivity]) -> list[str]:
-    """Return a sentence for each sensor, or for each of its channels that differ."""
-    of_sensors: dict[str, list[WrongSensitivity]] = {}
-    for each in found:
-        of_sensors.setdefault(each.sensor, []).append(each)
-    lines = []
-    for sensor, channels in of_sensors.items():
-        gains = [each.gain for each in channels]
-        is_one = len(channels) > 1 and max(gains) <= (1 + ALIKE) * min(gains)
-        if is_one:
-            mean = math.exp(math.fsum(map(math.log, gains)) / len(gains))
-            lines.append(_sensitivity(sensor, mean, channels[0]))
-        else:
-            lines += [_sensitivity(each.name, each.gain, each) for each in channels]
-    return lines
-
-
-def _sensitivity(name: str, gain: float, about: WrongSensitivity) -> str:
-    cause = "" if about.cause is None else f" ({CAUSES[about.cause]})"
-    if not about.against:
-        return (
-            f"{name} reads {gain:.3g} of the other sensors{cause}, and no two of them agree: "
-            "correct the sensitivities, or give their certificates."
-        )
-    return (
-        f"{name} reads {gain:.3g} of {listed(about.against)}{cause}: correct its sensitivity, or "
-        "give its certificate."
-    )
+    lines = [str(each) for each in known_of_verdict(found) if each.needs_action]
+    return [line for line in (*lines, record_for(found)) if line]
 
 
 def not_judged(found: TestVerdict) -> list[str]:
     """Return where limits go beyond the spectrum and are not judged, a line a limit."""
-    lines = []
-    for name, covers, judged in dict.fromkeys(
-        (each.limit, each.covers, each.judged) for each in found.limits
-    ):
-        (low, high), (first, last) = covers, judged
-        parts = [f"below {first:.3g} Hz"] if low < first else []
-        parts += [f"above {last:.3g} Hz"] if last < high else []
-        if parts:
-            lines.append(
-                f"Not judged: {name} {listed(parts)}, where there is no estimate (the limit goes "
-                f"from {low:.3g} to {high:.3g} Hz)."
-            )
-    return lines
+    return [str(each) for each in known_of_verdict(found) if not each.needs_action]
 
 
 def record_for(found: TestVerdict) -> str:
@@ -221,7 +144,12 @@ def how_long(left: Remaining, ends: datetime | None) -> str:
 
 def _not_by_time(found: TestVerdict) -> list[str]:
     """Return why a longer recording does not decide."""
-    lines = [_obstacle(each, found) for each in found.obstacles if each not in REMOVED_BY_TIME]
+    lines = [
+        str(each)
+        for each in known_of_verdict(found)
+        if isinstance(each.fact, WrongSensitivity)
+        or (isinstance(each.fact, LimitUndecided) and each.fact.obstacle not in REMOVED_BY_TIME)
+    ]
     return [line for line in (*lines, record_for(found)) if line]
 
 
@@ -265,16 +193,6 @@ def worst_by_channel(found: TestVerdict | None) -> dict[tuple[str, str], LimitRe
         if before is None or rank > (order.index(before.verdict), -before.margin_low_db):
             worst[key] = each
     return worst
-
-
-def _obstacle(obstacle: Obstacle, found: TestVerdict) -> str:
-    concerned = [each for each in found.limits if each.obstacle is obstacle]
-    return OBSTACLES[obstacle].format(
-        channels=listed(_channels(concerned)) if concerned else "the channels",
-        limits=listed(list(dict.fromkeys(each.limit for each in concerned)) or ["the limits"]),
-        averages=MIN_AVERAGES,
-        sensitivities=" ".join(wrong_sensitivities(found.sensitivities)),
-    )
 
 
 def _channels(results: Sequence[LimitResult]) -> list[str]:

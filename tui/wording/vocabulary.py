@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from daq.clocks.clock_model import ClockSource
 from daq.recording.sensor_state import SensorState
 from daq.results.partners import WithoutPartner
+from estimator.checks.sensitivities import Cause
 from estimator.levels.contributions import Source
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
@@ -44,6 +45,13 @@ REASONS: Mapping[Reason, str] = {
     Reason.TRANSIENT: "with a transient",
 }
 """Why segments were excluded; the text follows their number."""
+
+CAUSES: Mapping[Cause, str] = {
+    Cause.GRAVITY: "g in place of m/s², or the reverse",
+    Cause.FACTOR_TWO: "a factor of 2, as between single-ended and differential inputs",
+    Cause.GAIN_SWITCH: "another position of a gain switch, or another multiple of the unit",
+}
+"""What makes a sensitivity wrong by a factor."""
 
 
 @dataclass(frozen=True, slots=True)

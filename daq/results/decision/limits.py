@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.results.band_summary import Spectrum, averages_at, highest_known, judged_method
-from daq.results.decision.verdict import LimitResult, TestVerdict, WrongSensitivity
+from daq.results.decision.verdict import LimitResult, TestVerdict
+from daq.results.facts import Rank, WrongSensitivity
 from daq.results.partners import without_partners
 from estimator.checks.sensitivities import TOLERANCE, wrong_gains
 from estimator.decision.comparison import (
@@ -39,6 +40,9 @@ if TYPE_CHECKING:
     from daq.results.band_summary import Levels
     from estimator.checks.sensitivities import WrongGain
     from estimator.types import FloatArray
+
+ALIKE = 0.05
+"""Difference of the gains of a sensor's channels up to which they are one gain."""
 
 
 def judge(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> TestVerdict | None:
@@ -108,18 +112,27 @@ def _certified(bench: Bench, labels: Sequence[ChannelLabel]) -> set[int]:
 
 
 def _named(snapshot: Snapshot, found: Iterable[WrongGain]) -> tuple[WrongSensitivity, ...]:
-    """Return wrong gains with the names of their channels, and of the sensors that agree."""
-    sensors = list(dict.fromkeys(label.sensor for label in snapshot.channels))
+    """Return wrong gains by name: one fact for a sensor whose channels are wrong alike."""
+    labels, sensors = snapshot.channels, snapshot.sensor_names
+    of_sensors: dict[str, list[WrongGain]] = {}
+    for each in found:
+        of_sensors.setdefault(labels[each.channel].sensor, []).append(each)
+    groups: list[list[WrongGain]] = []
+    for wrong in of_sensors.values():
+        gains = [each.gain for each in wrong]
+        is_one = max(gains) <= (1 + ALIKE) * min(gains)
+        groups += [wrong] if is_one else [[each] for each in wrong]
     return tuple(
         WrongSensitivity(
-            sensor=snapshot.channels[each.channel].sensor,
-            channel=snapshot.channels[each.channel].channel,
-            gain=each.gain,
-            error=each.error,
-            against=tuple(sensors[n] for n in each.against),
-            cause=each.cause,
+            rank=Rank.INVALIDATES,
+            sensors=(labels[group[0].channel].sensor,),
+            channels=tuple(labels[each.channel].name for each in group),
+            gains=tuple(each.gain for each in group),
+            errors=tuple(each.error for each in group),
+            against=tuple(sensors[n] for n in group[0].against),
+            cause=group[0].cause,
         )
-        for each in found
+        for group in groups
     )
 
 

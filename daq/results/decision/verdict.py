@@ -11,7 +11,7 @@ from estimator.decision.decision_time import INTERVAL_FACTOR
 from estimator.decision.verdict import Verdict
 
 if TYPE_CHECKING:
-    from estimator.checks.sensitivities import Cause
+    from daq.results.facts import WrongSensitivity
     from estimator.decision.verdict import Obstacle, Prediction
 
 
@@ -89,34 +89,6 @@ class LimitResult:
 
 
 @dataclass(frozen=True, slots=True)
-class WrongSensitivity:
-    """A channel that reads more or less of the common motion than the other sensors.
-
-    Attributes
-    ----------
-    sensor, channel : str
-    gain, error : float
-        Motion that the channel reads over that which the others read, and its standard error.
-    against : tuple of str
-        The sensors that agree; empty where no majority does.
-    cause : Cause or None
-        What is likely to be wrong.
-    """
-
-    sensor: str
-    channel: str
-    gain: float
-    error: float
-    against: tuple[str, ...]
-    cause: Cause | None = None
-
-    @property
-    def name(self) -> str:
-        """Sensor and channel, as in ``A.X``: to be read, not to be taken apart."""
-        return f"{self.sensor}.{self.channel}"
-
-
-@dataclass(frozen=True, slots=True)
 class TestVerdict:
     """What a huddle test says of the limits of its bench file.
 
@@ -131,7 +103,7 @@ class TestVerdict:
         When a longer recording of the same kind decides surely; None where something else is
         missing, or the verdict is sure.
     sensitivities : tuple of WrongSensitivity
-        Channels whose sensitivity the motion contradicts.
+        Sensors, or channels, whose sensitivity the motion contradicts.
     """
 
     verdict: Verdict

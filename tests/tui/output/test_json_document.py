@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 
+from daq.results.decision.verdict import LimitResult, TestVerdict
+from daq.results.facts import Fact, WrongSensitivity
+from estimator.checks import advice, misfit
+from estimator.checks.advice import Advice
 from estimator.checks.kinds import Untested
+from estimator.decision.verdict import Obstacle, Verdict
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
 from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot
+from tests.tui.wording.fact_examples import EXAMPLES, kinds
 from tui.output.console import finite
-from tui.output.json_document import document, result_document
+from tui.output.json_document import UNITS, document, result_document
+from tui.wording.verdict_text import what_to_do
 
 
 def test_advice_has_its_kind_its_numbers_and_its_words() -> None:
@@ -75,3 +82,46 @@ def test_what_is_not_known_is_left_out() -> None:
         "reference",
     }
     assert told["synchronisation"]["residual_s"]["C"] == 0.6e-6
+
+
+DIMENSIONLESS = {
+    *("cov", "target", "gains", "shares", "share", "statistic", "worst_statistic", "p_value"),
+    *("snr", "condition", "ratio", "coherencies", "standard_errors", "share_of_frequencies"),
+    *("n_dimensions", "n_effective", "share_of_partners", "share_without", "inflation"),
+    *("delay_samples", "ppm"),
+}
+"""Numbers without a unit; samples and ppm are their own."""
+
+
+def test_numbers_of_facts_have_their_units_in_their_names() -> None:
+    for kind in {*kinds(), *kinds(Advice, advice, misfit)}:
+        common = {each.name for each in fields(Fact if issubclass(kind, Fact) else Advice)}
+        for each in fields(kind):
+            if each.name in {*common, "transients_by_octave"} or "float" not in str(each.type):
+                continue
+            name = UNITS.get(each.name, each.name)
+            assert name in DIMENSIONLESS or name.endswith(("_s", "_hz", "_share", "_deg")), kind
+
+
+def test_a_verdict_has_its_facts_in_the_document() -> None:
+    wrong = next(each for each in EXAMPLES if isinstance(each, WrongSensitivity))
+    limit = LimitResult(
+        *("NLNM", "A", "X", "three-sensor", 1.0, 1e-12, 1e-13, 1e-11, 1e-12),
+        verdict=Verdict.NOT_DECIDED,
+        covers=(0.1, 100.0),
+        judged=(0.2, 90.0),
+        obstacle=Obstacle.SPANS_LIMIT,
+    )
+    found = TestVerdict(
+        Verdict.NOT_DECIDED,
+        (limit,),
+        obstacles=(Obstacle.SENSITIVITY, Obstacle.SPANS_LIMIT),
+        sensitivities=(wrong,),
+    )
+    written = document(diagnosed(), SETTINGS, verdict=found)
+    facts = {each["kind"]: each for each in written["facts"]}
+    assert facts["wrong-sensitivity"]["numbers"]["gains"] == [0.101, 0.103]
+    assert facts["limit-undecided"]["channels"] == ["A.X"]
+    assert facts["limit-not-judged"]["numbers"]["judged_hz"] == [0.2, 90.0]
+    assert [each["channel"] for each in written["sensitivities"]] == ["X", "Y"]
+    assert " ".join(what_to_do(found)).count("C reads 0.102 of A and B") == 1

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 from daq.protocols.block import Uncounted
+from daq.recording.sensor_state import SensorState
 from daq.results import facts
 from daq.results.facts import Fact, Rank
 from estimator.checks.kinds import Untested
+from estimator.checks.sensitivities import Cause
+from estimator.decision.verdict import Obstacle
 from estimator.levels.contributions import Source
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
 from tests.tui.wording.advice_examples import MISFIT
+
+if TYPE_CHECKING:
+    from types import ModuleType
 
 A, NOON = ("A",), 1_700_000_000_000_000_000
 
@@ -86,4 +94,38 @@ EXAMPLES: tuple[Fact, ...] = (
     facts.ValuesBelowZero(rank=Rank.TO_KNOW, method="three-sensor", n=5, n_values=900),
     facts.IntervalsWidened(rank=Rank.TO_KNOW, method="three-sensor", shares={Source.CLOCKS: 0.05}),
     facts.TargetMissed(rank=Rank.DELAYS, cov=0.2, target=0.1, total=7200.0),
+    facts.WrongSensitivity(
+        rank=Rank.INVALIDATES,
+        sensors=("C",),
+        channels=("C.X", "C.Y"),
+        gains=(0.101, 0.103),
+        errors=(0.001, 0.001),
+        against=("A", "B"),
+        cause=Cause.GRAVITY,
+    ),
+    facts.LimitUndecided(
+        rank=Rank.DELAYS, channels=("A.X",), obstacle=Obstacle.CLOCKS, limits=("NLNM",)
+    ),
+    facts.LimitNotJudged(rank=Rank.TO_KNOW, limit="NLNM", covers=(0.1, 100.0), judged=(0.2, 90.0)),
+    facts.SensorOverdue(
+        rank=Rank.INVALIDATES,
+        sensors=A,
+        state=SensorState.SILENT,
+        overdue=34.0,
+        reason="",
+        is_closed=False,
+    ),
+    facts.ChannelsStuck(rank=Rank.INVALIDATES, channels=("A.X",), is_now=True),
+    facts.SensorClipping(rank=Rank.DELAYS, sensors=A, are_kept=False),
 )
+
+
+def kinds(base: type[Any] = Fact, *modules: ModuleType) -> set[type[Any]]:
+    """Return all kinds; of a class with slots, not the one that it was made from."""
+    places = modules or (facts,)
+    children: set[type[Any]] = {
+        each
+        for each in base.__subclasses__()
+        if any(getattr(place, each.__name__, None) is each for place in places)
+    }
+    return children | {each for child in children for each in kinds(child, *modules)}

@@ -18,7 +18,7 @@ from daq.results.facts import BlocksDamaged, Fact, Finding, GapsBridged, Rank
 from daq.results.sources import sources
 from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot
 from tests.tui.night_recording import record
-from tests.tui.wording.fact_examples import EXAMPLES
+from tests.tui.wording.fact_examples import EXAMPLES, kinds
 from tui.application.result_view.result_text import result
 from tui.application.state import State
 from tui.application.test_view.panels import findings
@@ -35,12 +35,6 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
 
 NAMES = Names.of(made_snapshot())
-
-
-def kinds(base: type[Fact] = Fact) -> set[type[Fact]]:
-    """Return all kinds; of a class with slots, not the one that it was made from."""
-    children = {each for each in base.__subclasses__() if getattr(facts, each.__name__) is each}
-    return children | {each for child in children for each in kinds(child)}
 
 
 def test_every_kind_has_an_example_and_a_name_of_its_own() -> None:

@@ -19,11 +19,11 @@ from daq.results.facts import Rank, SensorsSimulated
 from daq.results.known_facts import WITHOUT_ESTIMATE
 from daq.results.partners import without_partners
 from daq.results.precision import precision
-from tui.wording.facts import known
+from tui.wording.facts import known, known_of_sensors
 from tui.wording.formatting import clock_time, percent, several, signed
 from tui.wording.verdict_text import STYLES as STYLES_OF_VERDICTS
 from tui.wording.verdict_text import headline, how_long
-from tui.wording.vocabulary import FLAG_WORDS, PARTNER_WORDS, STATE_ALERTS
+from tui.wording.vocabulary import FLAG_WORDS, PARTNER_WORDS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from tui.application.test_view.plotted import Choice
 
 MUTED = "#9aa5b8"
+_STYLES = {Rank.INVALIDATES: "bold #ff6b6b", Rank.DELAYS: "yellow", Rank.TO_KNOW: MUTED}
 MIN_BAR = 6  # cells
 
 
@@ -275,30 +276,10 @@ def _gone_on(now: RecordingStatus, snapshot: Snapshot) -> float:
 
 def alerts(now: RecordingStatus, settings: Settings | None) -> list[Text]:
     """Return faults of sensors with remedies, the worst first."""
-    found: list[tuple[int, str]] = []
-    for sensor in now.sensors:
-        if sensor.state.is_overdue:
-            found.append((1 if sensor.state.is_lost else 2, _overdue_alert(sensor, now)))
-        elif sensor.stuck:
-            channels = ", ".join(f"{sensor.name}.{name}" for name in sensor.stuck)
-            found.append((3, f"{channels} is stuck: no signal; check the cable"))
-        elif sensor.is_clipping:
-            kept = settings is not None and settings.reject is False
-            effect = "are kept: do not trust its noise" if kept else "are excluded"
-            found.append((4, f"{sensor.name} is clipping: segments with clipped samples {effect}"))
-        if sensor.was_stuck:
-            channels = ", ".join(f"{sensor.name}.{name}" for name in sensor.was_stuck)
-            found.append((5, f"{channels} was stuck for a while: do not trust its noise"))
-    styles = {2: "yellow", 4: "yellow", 5: "yellow"}
-    return [Text(f"▲ {text}", styles.get(rank, "bold #ff6b6b")) for rank, text in sorted(found)]
-
-
-def _overdue_alert(sensor: SensorStatus, now: RecordingStatus) -> str:
-    time = clock_time(sensor.overdue_for)
-    if now.closed:
-        return f"{sensor.name} was lost {time} before the end: {sensor.reason}"
-    alert = STATE_ALERTS[sensor.state]
-    return alert.format(sensor=sensor.name, time=time, reason=sensor.reason)
+    return [
+        Text(f"▲ {each.words.line}", _STYLES[each.fact.rank])
+        for each in known_of_sensors(now, settings)
+    ]
 
 
 def findings(snapshot: Snapshot, *, width: int, besides: type[Fact] | None = None) -> list[Text]:
@@ -306,14 +287,13 @@ def findings(snapshot: Snapshot, *, width: int, besides: type[Fact] | None = Non
 
     Those of the kind `besides` are left out: they are shown elsewhere.
     """
-    styles = {Rank.INVALIDATES: "bold #ff6b6b", Rank.DELAYS: "yellow", Rank.TO_KNOW: MUTED}
     needed = [
         each
         for each in known(snapshot)
         if (each.needs_action or isinstance(each.fact, SensorsSimulated))
         and (besides is None or not isinstance(each.fact, besides))
     ]
-    lines = [Text(each.line, styles[each.fact.rank]) for each in needed]
+    lines = [Text(each.line, _STYLES[each.fact.rank]) for each in needed]
     for line in lines:
         line.truncate(width, overflow="ellipsis")
     return lines

@@ -101,7 +101,7 @@ def test_the_verdict_names_sensor_factor_and_cause() -> None:
     found = verdict_of(snapshot, NOISE / 2)  # C reads 0.09 of its noise
     assert {each.verdict for each in found.limits if each.sensor == "C"} == {Verdict.NOT_DECIDED}
     assert {each.obstacle for each in found.limits if each.sensor == "C"} == {Obstacle.SENSITIVITY}
-    assert [each.name for each in found.sensitivities] == ["C.X", "C.Y", "C.Z"]
+    assert [each.channels for each in found.sensitivities] == [("C.X", "C.Y", "C.Z")]
     assert found.sensitivities[0].gain == pytest.approx(0.3, rel=0.02)
     assert found.sensitivities[0].against == ("A", "B")
     # Neither of both sensitivities passes here, or fails there: the verdict does not depend on it.
