@@ -13,13 +13,14 @@ from pydantic import BaseModel
 from daq.bench.channel import Channel
 from daq.bench.model import Bench, Sensor
 from daq.devices.interface import DEFAULT_PATIENCE, DeviceInformation
-from daq.protocols.block import Block, Event, HostTime
+from daq.protocols.block import Block, HostTime
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
 
     from daq.devices.interface import DriverType
     from daq.host_clock import HostClock
+    from daq.protocols.block import DeviceItem
 
 RATE = 100.0
 
@@ -52,7 +53,7 @@ class PlayedDevice:
     serial_number: str = "1"
     failure: Exception | None = None
     n_sessions: int = 0
-    items: asyncio.Queue[Block | Event | Exception] = field(default_factory=asyncio.Queue)
+    items: asyncio.Queue[DeviceItem | Exception] = field(default_factory=asyncio.Queue)
     opened: asyncio.Event = field(default_factory=asyncio.Event)
     left_quiet: bool = True
     hangs: bool = False
@@ -70,7 +71,7 @@ class PlayedSession:
     information: tuple[DeviceInformation, ...]
     patience: float = DEFAULT_PATIENCE
 
-    async def read(self) -> AsyncIterator[Block | Event]:
+    async def read(self) -> AsyncIterator[DeviceItem]:
         """Yield what the test put there; raise where it put an exception."""
         while True:
             item = await self.device.items.get()

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Sensor
     from daq.devices.interface import DriverType
-    from daq.protocols.block import Block, Event
+    from daq.protocols.block import DeviceItem
 
 LIMIT = 60.0
 """Seconds for which a driver may wait for what it does not ask for."""
@@ -23,7 +23,7 @@ LIMIT = 60.0
 
 async def replay(
     path: str | Path, driver: DriverType, sensors: Sequence[Sensor], *, limit: float = LIMIT
-) -> list[Block | Event]:
+) -> list[DeviceItem]:
     """Return the blocks and events of the first session on the port of some sensors.
 
     Parameters
@@ -41,12 +41,12 @@ async def replay(
         If the driver sends other bytes than the log has, or waits for others.
     """
     log = Replay(path)
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     try:
         async with asyncio.timeout(limit):
             with using(log):
                 async with driver.open(sensors, log.clock) as session:
-                    items = cast("AsyncGenerator[Block | Event]", session.read())
+                    items = cast("AsyncGenerator[DeviceItem]", session.read())
                     async with contextlib.aclosing(items):
                         async for item in items:
                             found.append(item)  # noqa: PERF401 -- kept if the driver raises

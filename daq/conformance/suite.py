@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Sensor
     from daq.devices.interface import DriverType
-    from daq.protocols.block import HostTime
+    from daq.protocols.block import DeviceItem, HostTime
 
 LIMIT = 60.0
 """Seconds that any test may take."""
@@ -223,7 +223,7 @@ class DriverConformance:
                     vanish()
 
                 clock = _CuttingClock(cut)
-                found: list[Block | Event] = []
+                found: list[DeviceItem] = []
                 with pytest.raises((NotConnectedError, NoAnswerError)):
                     await self._read(
                         served.sensors, first=clock.arm, seconds=1e6, clock=clock, into=found
@@ -283,11 +283,11 @@ class DriverConformance:
         first: Callable[[], object] | None = None,
         seconds: float | None = None,
         clock: SystemClock | None = None,
-        into: list[Block | Event] | None = None,
-    ) -> list[Block | Event]:
+        into: list[DeviceItem] | None = None,
+    ) -> list[DeviceItem]:
         """Read until every sensor has enough; ``first`` and ``pauses`` are called once, early."""
         wanted = {s.name: (seconds or self.seconds) * s.sampling_rate for s in sensors}
-        found: list[Block | Event] = [] if into is None else into
+        found: list[DeviceItem] = [] if into is None else into
         ends = dict.fromkeys(wanted, 0)
         validator = BlockValidator(self.driver, sensors)
         async with self.driver.open(sensors, clock or SystemClock()) as session:
@@ -296,7 +296,7 @@ class DriverConformance:
                 check_rate(sensor, one.sampling_rate)
             patience = patience_of(session)
             assert patience > 0
-            items = cast("AsyncGenerator[Block | Event]", session.read())
+            items = cast("AsyncGenerator[DeviceItem]", session.read())
             async with contextlib.aclosing(items):
                 while any(ends[name] < n for name, n in wanted.items()):
                     try:
@@ -317,7 +317,7 @@ class DriverConformance:
 
 
 def check_blocks(
-    driver: DriverType, sensors: Sequence[Sensor], found: Sequence[Block | Event]
+    driver: DriverType, sensors: Sequence[Sensor], found: Sequence[DeviceItem]
 ) -> None:
     """See that the blocks of a session follow one another, and that nothing was wrong."""
     wrong = [item for item in found if isinstance(item, Event) and item.kind not in NORMAL_EVENTS]
@@ -339,7 +339,7 @@ def check_blocks(
             end, at = block.end_sample, block.received.monotonic_ns
 
 
-def check_counters(found: Sequence[Block | Event]) -> None:
+def check_counters(found: Sequence[DeviceItem]) -> None:
     """See that the device's counter of each sensor grows with the index of the samples."""
     counted = [b for b in found if isinstance(b, Block) and b.device_counter is not None]
     for name in {block.sensor for block in counted}:
@@ -362,7 +362,7 @@ def check_rate(sensor: Sensor, rate: float | None, *, source: str = "stated") ->
 
 def check_truth(
     sensor: Sensor,
-    found: Sequence[Block | Event],
+    found: Sequence[DeviceItem],
     sent: Sent,
     *,
     gaps: bool = False,

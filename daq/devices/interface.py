@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Sensor
     from daq.host_clock import HostClock
-    from daq.protocols.block import Block, Event
+    from daq.protocols.block import DeviceItem
 
 
 DEFAULT_PATIENCE = 10.0
@@ -57,8 +57,8 @@ class Session(Protocol):
         """One entry per sensor, read when the session was opened."""
         ...
 
-    def read(self) -> AsyncIterator[Block | Event]:
-        """Start sampling and yield blocks and events, until closed.
+    def read(self) -> AsyncIterator[DeviceItem]:
+        """Start sampling and yield blocks, events and readings, until closed.
 
         Raises
         ------
@@ -73,7 +73,11 @@ class Session(Protocol):
 
 
 class DriverType(DriverRules, Protocol):
-    """A driver, the target of an entry point in ``huddle.drivers``."""
+    """A driver, the target of an entry point in ``huddle.drivers``.
+
+    A driver whose sessions yield the temperature as readings has ``states_temperature = True``. Of
+    other drivers, an auxiliary channel in °C is recorded as the temperature of its sensor.
+    """
 
     @property
     def name(self) -> str:

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench, Sensor
     from daq.devices.interface import DeviceInformation
     from daq.host_clock import HostClock
+    from daq.protocols.block import DeviceItem
 
 MIN_SAMPLES = 4
 TEXT_BAUD_RATES = (115200, 9600, 57600, 38400, 19200, 230400)
@@ -141,7 +142,7 @@ async def _probe(
         troubles = dict(_identity_errors(sensors, information))
         awaited = {name: n for name, n in wanted.items() if not information[name].trouble}
         async with contextlib.aclosing(
-            cast("AsyncGenerator[Block | Event]", session.read())  # other iterators need no closing
+            cast("AsyncGenerator[DeviceItem]", session.read())  # other iterators need no closing
         ) as stream:
             try:
                 async with asyncio.timeout(patience + 3 * longest):
@@ -149,6 +150,7 @@ async def _probe(
                         if isinstance(item, Event):
                             name = item.sensor if item.sensor in events else sensors[0].name
                             events[name].append(item)
+                        if not isinstance(item, Block):
                             continue
                         blocks[item.sensor].append(item)
                         if all(_n_samples(blocks[name]) >= n for name, n in awaited.items()):

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench, Sensor
     from daq.devices.interface import DeviceInformation
     from daq.host_clock import HostClock
-    from daq.protocols.block import Event
+    from daq.protocols.block import DeviceItem
 
 LENGTH = 10.0
 """Seconds of samples that are kept."""
@@ -201,7 +201,7 @@ async def _read_once(
                 except WrongDeviceError as error:
                     buffer.trouble = str(with_owner(error, bench.sensors))
         async with contextlib.aclosing(
-            cast("AsyncGenerator[Block | Event]", session.read())  # others have nothing to close
+            cast("AsyncGenerator[DeviceItem]", session.read())  # others have nothing to close
         ) as stream:
             async for item in stream:
                 if isinstance(item, Block):

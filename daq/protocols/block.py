@@ -1,9 +1,10 @@
-"""Blocks of samples and events: the output of every protocol.
+"""Blocks of samples, events and readings: the output of every protocol.
 
 Theory of operation
 -------------------
 A protocol takes received bytes and the host time at which they arrived, and returns complete
-:class:`Block` and :class:`Event` objects in order. It reads no clock and opens no port.
+:class:`Block`, :class:`Event` and :class:`Reading` objects in order. It reads no clock and opens no
+port.
 
 ``first_sample`` counts the device's own samples, from 0 at the start of a *session* (one
 connection). A **gap** separates two blocks if the second does not begin at the end of the first:
@@ -198,3 +199,68 @@ class Event:
     kind: EventKind | str
     text: str
     received: HostTime
+
+
+class Quantity(StrEnum):
+    """What a reading measures; recordings store these strings."""
+
+    TEMPERATURE = "temperature"
+    """In °C."""
+    SUPPLY = "supply"
+    """Supply voltage in V."""
+
+    @property
+    def unit(self) -> str:
+        """Unit of the values."""
+        return "°C" if self is Quantity.TEMPERATURE else "V"
+
+    @classmethod
+    def of(cls, text: str) -> Quantity | str:
+        """Return the quantity with this value, or the text itself if none has it."""
+        try:
+            return cls(text)
+        except ValueError:
+            return text
+
+
+READING_INTERVAL_NS = 60_000_000_000
+"""Time in ns between the recorded readings of one quantity of one sensor."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """A slow quantity that a device (or, with an empty name, the host) states of itself.
+
+    Attributes
+    ----------
+    sensor : str
+    quantity : Quantity or str
+        A str only if it is none of `Quantity`.
+    value : float
+    received : HostTime
+    """
+
+    sensor: str
+    quantity: Quantity | str
+    value: float
+    received: HostTime
+
+
+DeviceItem: TypeAlias = Block | Event | Reading
+"""What a driver yields."""
+
+
+class ReadingTimes:
+    """Tells when to read, or to record, a quantity again: once in each minute of the host's clock.
+
+    Drivers and the recorder take the same minutes, so what a driver reads is recorded.
+    """
+
+    def __init__(self) -> None:
+        self._last: int | None = None
+
+    def is_due(self, at: HostTime) -> bool:
+        """Whether this is the first call in its minute."""
+        minute = at.monotonic_ns // READING_INTERVAL_NS
+        due, self._last = minute != self._last, minute
+        return due

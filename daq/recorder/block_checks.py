@@ -6,19 +6,20 @@ Validation ends only the session of its port, with an error that names the fault
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from daq.errors import DeviceError
-from daq.protocols.block import Block, Event
+from daq.protocols.block import Block, Event, Reading
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from daq.bench.model import Sensor
     from daq.devices.interface import DriverType
-    from daq.protocols.block import HostTime
+    from daq.protocols.block import DeviceItem, HostTime
 
 _MIN_INT64, _MAX_INT64 = -(1 << 63), (1 << 63) - 1
 _MAX_FLAGS = (1 << 31) - 1
@@ -27,7 +28,7 @@ _TIMES = "expected a HostTime with two integers of 64 bits"
 
 
 class FaultyDriverError(DeviceError, TypeError):
-    """A driver yielded something other than a valid block or event of its sensors."""
+    """A driver yielded something other than a valid block, event or reading of its sensors."""
 
 
 class BlockValidator:
@@ -47,7 +48,7 @@ class BlockValidator:
         self._dtypes = {sensor.name: driver.counts_dtype(sensor) for sensor in sensors}
         self._polled: dict[str, bool] = {}
 
-    def validated(self, item: object) -> Block | Event:
+    def validated(self, item: object) -> DeviceItem:
         """Return the item if it is valid.
 
         Raises
@@ -59,9 +60,11 @@ class BlockValidator:
             problem = self._block_problem(item)
         elif isinstance(item, Event):
             problem = self._event_problem(item)
+        elif isinstance(item, Reading):
+            problem = self._reading_problem(item)
         else:
-            problem = f"{type(item).__name__}; expected a Block or an Event"
-        if not problem and isinstance(item, (Block, Event)):
+            problem = f"{type(item).__name__}; expected a Block, an Event or a Reading"
+        if not problem and isinstance(item, (Block, Event, Reading)):
             return item
         raise FaultyDriverError(f"{self._port}: driver {self._driver!r} yielded {problem}")
 
@@ -108,6 +111,17 @@ class BlockValidator:
             else f"an event received at {event.received!r}; {_TIMES}"
         )
 
+    def _reading_problem(self, reading: Reading) -> str:
+        if reading.sensor not in self._n_channels:
+            return f"a reading of {reading.sensor!r}; expected {self._expected_names()}"
+        if not _are_texts(reading.quantity) or not _is_finite(reading.value):
+            return f"a reading {reading.quantity!r}, {reading.value!r}; expected text and a number"
+        return (
+            ""
+            if _are_times(reading.received)
+            else f"a reading received at {reading.received!r}; {_TIMES}"
+        )
+
     def _expected_names(self) -> str:
         return " or ".join(map(repr, self._n_channels))
 
@@ -136,6 +150,10 @@ def _are_texts(*values: object) -> bool:
 
 def _are_times(at: HostTime) -> bool:
     return all(_is_int64(getattr(at, name, None)) for name in ("monotonic_ns", "utc_ns"))
+
+
+def _is_finite(value: object) -> bool:
+    return isinstance(value, (int, float, np.integer, np.floating)) and math.isfinite(value)
 
 
 def _is_int64(value: Any) -> bool:  # noqa: ANN401 -- a driver may yield anything

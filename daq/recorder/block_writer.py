@@ -6,11 +6,13 @@ It has no clock and no event loop; the recorder calls it from its writing thread
 from __future__ import annotations
 
 import logging
+import math
 from collections import defaultdict, deque
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from daq.protocols.block import Block, Event, EventKind
+from daq.protocols.block import Block, Event, EventKind, Quantity, Reading, ReadingTimes
 from daq.recorder.connection import SensorLate, SensorLost
 from daq.recorder.sample_index import Gap, SampleIndexer
 from daq.recording.sensor_state import SensorState
@@ -51,8 +53,9 @@ class SensorProgress:
 
 
 class _Sensor:
-    def __init__(self, sampling_rate: float) -> None:
+    def __init__(self, sampling_rate: float, thermometer: tuple[int, float] | None) -> None:
         self.rate = sampling_rate
+        self.thermometer = thermometer
         self.indexer = SampleIndexer(sampling_rate)
         self.state = SensorState.WAITING
         self.late_event: Event | None = None  # written only if the sensor is lost afterwards
@@ -134,14 +137,31 @@ class _RateLimit:
 
 
 class BlockWriter:
-    """Writes the rows of a recording."""
+    """Writes the rows of a recording.
 
-    def __init__(self, writer: RecordingWriter, sampling_rates: Mapping[str, float]) -> None:
+    Parameters
+    ----------
+    writer : RecordingWriter
+    sampling_rates : mapping
+        In Hz, by sensor.
+    thermometers : mapping
+        Column and sensitivity of the channel that measures the temperature, by sensor.
+    """
+
+    def __init__(
+        self,
+        writer: RecordingWriter,
+        sampling_rates: Mapping[str, float],
+        thermometers: Mapping[str, tuple[int, float]] = MappingProxyType({}),
+    ) -> None:
         self._writer = writer
-        self._sensors = {name: _Sensor(rate) for name, rate in sampling_rates.items()}
+        self._sensors = {
+            name: _Sensor(rate, thermometers.get(name)) for name, rate in sampling_rates.items()
+        }
         self._limits: defaultdict[tuple[str, str], _RateLimit] = defaultdict(_RateLimit)
         self._items: deque[Item] = deque()
-        self._unsafe_events: list[Event] = []
+        self._reading_times: defaultdict[tuple[str, str], ReadingTimes] = defaultdict(ReadingTimes)
+        self._unsafe_events: list[Event | Reading] = []
         self._ended = False
 
     def write(self, items: Iterable[Item]) -> None:
@@ -159,6 +179,8 @@ class BlockWriter:
                 self._write_block(item)
             elif isinstance(item, Event):
                 self._write_event(item)
+            elif isinstance(item, Reading):
+                self._write_reading(item)
             elif isinstance(item, SensorLate):
                 self._set_late(item)
             elif isinstance(item, SensorLost):
@@ -191,7 +213,10 @@ class BlockWriter:
         events, self._unsafe_events = self._unsafe_events, []
         for event in events:
             self._unsafe_events.append(event)
-            writer.event(event)
+            if isinstance(event, Event):
+                writer.event(event)
+            else:
+                writer.reading(event)
         for name, sensor in self._sensors.items():
             sensor.rows_before += sensor.unsafe.safe.rows
             sensor.gaps_before += sensor.unsafe.safe.gaps
@@ -256,6 +281,12 @@ class BlockWriter:
         for passed in self._limits[event.sensor, event.kind].passed(event):
             self._record(passed)
 
+    def _write_reading(self, reading: Reading) -> None:
+        """Write the first reading of each minute."""
+        if self._reading_times[reading.sensor, reading.quantity].is_due(reading.received):
+            self._unsafe_events.append(reading)
+            self._writer.reading(reading)
+
     def _set_late(self, item: SensorLate) -> None:
         """Keep the event of a late sensor until it is lost.
 
@@ -292,6 +323,16 @@ class BlockWriter:
         if placed.block is not None:
             sensor.state, sensor.late_event = SensorState.LIVE, None
             self._append(block.sensor, placed.block)
+            self._write_thermometer(sensor, placed.block)
+
+    def _write_thermometer(self, sensor: _Sensor, block: Block) -> None:
+        """Write the newest sample of an auxiliary channel in °C as a reading."""
+        if sensor.thermometer is not None:
+            column, sensitivity = sensor.thermometer
+            value = float(block.counts[-1, column]) / sensitivity
+            if math.isfinite(value):
+                kind = Quantity.TEMPERATURE
+                self._write_reading(Reading(block.sensor, kind, value, block.received))
 
     def _append(self, name: str, block: Block) -> None:
         sensor = self._sensors[name]

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from daq.devices.interface import DEFAULT_PATIENCE, Resuming
 from daq.errors import DeviceError, NoAnswerError, NotConnectedError, WrongDeviceError
-from daq.protocols.block import Block, Event, EventKind
+from daq.protocols.block import Block, DeviceItem, Event, EventKind
 from daq.recorder.block_checks import BlockValidator
 from daq.recorder.device_identity import check_identity
 from daq.recorder.stall_detector import StallDetector
@@ -123,7 +123,7 @@ class SensorLost:
         return STATE_AFTER[self.event.kind]
 
 
-Item = Block | Event | Connected | SensorLate | SensorLost
+Item = DeviceItem | Connected | SensorLate | SensorLost
 
 
 @dataclass(slots=True)
@@ -384,7 +384,7 @@ def patience_of(session: Session) -> float:
     return float(getattr(session, "patience", DEFAULT_PATIENCE))
 
 
-async def _generator(session: Session) -> AsyncGenerator[Block | Event, None]:
+async def _generator(session: Session) -> AsyncGenerator[DeviceItem, None]:
     """Return the items of a session as a generator that can be closed."""
     items = session.read()
     try:

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from daq.devices.registry import driver_type
 from daq.errors import DeviceError, DiskError, RecordingError
 from daq.host_clock import SystemClock
-from daq.protocols.block import Event, EventKind, Uncounted
+from daq.protocols.block import Event, EventKind, Quantity, Reading, ReadingTimes, Uncounted
 from daq.protocols.errors import RemoteProtocolError
 from daq.recorder.block_writer import BlockWriter, SensorProgress
 from daq.recorder.clock_trust import ClockWatch
@@ -43,7 +43,7 @@ from daq.transport.ports import is_simulated
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from daq.bench.model import Bench
+    from daq.bench.model import Bench, Sensor
     from daq.devices.interface import DriverType
     from daq.host_clock import HostClock
     from daq.recorder.connection import Item
@@ -60,6 +60,8 @@ MIN_CONTINUATION = 60.0
 """Seconds that a continuation file must last; a disk that fails sooner ends the run."""
 _LAST_BLOCKS = 1.0
 """Seconds after the end of a run in which its last blocks may arrive."""
+CELSIUS = "°C"
+"""Unit of an auxiliary channel that is recorded as the temperature of its sensor."""
 _Result = TypeVar("_Result")
 
 
@@ -270,6 +272,7 @@ class _Recorder:
         self, connections: list[Connection], address: tuple[int, str], duration: float | None
     ) -> BlockWriter:
         layouts: dict[str, SensorLayout] = {}
+        thermometers: dict[str, tuple[int, float]] = {}
         for connection in connections:
             information = {i.sensor: i for i in connection.information}
             for sensor in connection.sensors:
@@ -284,6 +287,9 @@ class _Recorder:
                         temperature=found.temperature,
                     )
                 layouts[sensor.name] = layout
+                states = getattr(connection.driver, "states_temperature", False)
+                if layout.temperature is None and not states:
+                    thermometers |= _thermometer(sensor)
         ordered = [layouts[sensor.name] for sensor in self._bench.sensors]
         self._started = self._file_started = self._clock.now()
         self._new_file = partial(
@@ -296,7 +302,14 @@ class _Recorder:
         writer = self._new_file(self._path, created=self._started, attributes=attributes)
         writer.event(Event("", EventKind.STARTED, f"{len(ordered)} sensors", self._started))
         _LOGGER.info("recording to %s", self._path, extra={"recording": str(self._path)})
-        return BlockWriter(writer, {layout.name: layout.sampling_rate for layout in ordered})
+        rates = {layout.name: layout.sampling_rate for layout in ordered}
+        rows = BlockWriter(writer, rates, thermometers)
+        rows.write(
+            Reading(layout.name, Quantity.TEMPERATURE, layout.temperature, self._started)
+            for layout in ordered
+            if layout.temperature is not None
+        )
+        return rows
 
     async def _write_until_end(
         self,
@@ -308,11 +321,14 @@ class _Recorder:
         """Write and commit the items of the connections until the run ends."""
         loop = asyncio.get_running_loop()
         last_commit, n_committed = -math.inf, 0
-        watch = ClockWatch(self._clock)
+        watch, host_times = ClockWatch(self._clock), ReadingTimes()
         while not self._stop.is_set():
             batch = await self._batch()
             if (report := watch.look()) is not None:
                 batch.append(report)
+            now = self._clock.now()
+            if host_times.is_due(now) and (celsius := host_temperature()) is not None:
+                batch.append(Reading("", Quantity.TEMPERATURE, celsius, now))
             await self._done(
                 writer, thread, partial(writer.write, batch), partial(writer.write, ())
             )
@@ -432,3 +448,20 @@ class _Recorder:
                 known.append(found)
                 await self._queue.put(event)
         return self._status.to_dict()
+
+
+def _thermometer(sensor: Sensor) -> dict[str, tuple[int, float]]:
+    """Return column and sensitivity of the first auxiliary channel in °C, by the sensor's name."""
+    for column, channel in enumerate(sensor.channels):
+        if channel.auxiliary and channel.unit == CELSIUS:
+            return {sensor.name: (column, channel.sensitivity)}
+    return {}
+
+
+def host_temperature(zones: Path = Path("/sys/class/thermal")) -> float | None:
+    """Return the highest temperature of the computer in °C; None if the system states none."""
+    found = []
+    for zone in zones.glob("thermal_zone*/temp"):
+        with contextlib.suppress(OSError, ValueError):
+            found.append(int(zone.read_text()) / 1000)
+    return max(found, default=None)

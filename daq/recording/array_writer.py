@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Self, TypeAlias
 
 import numpy as np
 
-from daq.protocols.block import Block, BlockFlag, Event, HostTime
+from daq.protocols.block import Block, BlockFlag, Event, HostTime, Reading
 from daq.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.model import Bench
-    from daq.protocols.block import CountsArray, EventKind
+    from daq.protocols.block import CountsArray, EventKind, Quantity
     from daq.recording.file_format import SensorLayout
 
     Times: TypeAlias = Sequence[int] | NDArray[np.int64]
@@ -168,6 +168,12 @@ class ArrayWriter:
     def event(self, kind: EventKind | str, text: str, *, at_ns: int = 0, sensor: str = "") -> None:
         """Record an event."""
         self._writer.event(Event(sensor, kind, text, self._at(at_ns)))
+
+    def reading(
+        self, quantity: Quantity | str, value: float, *, at_ns: int = 0, sensor: str = ""
+    ) -> None:
+        """Record a reading."""
+        self._writer.reading(Reading(sensor, quantity, value, self._at(at_ns)))
 
     def _at(self, ns: int) -> HostTime:
         return HostTime(self.created.monotonic_ns + ns, self.created.utc_ns + ns)

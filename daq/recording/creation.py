@@ -70,7 +70,7 @@ def recorded_text(bench: Bench) -> str:
 
 
 def make_datasets(file: h5py.File, sensors: Sequence[SensorLayout], chunk_seconds: float) -> None:
-    """Create the empty datasets of all sensors, events, and ``/committed``."""
+    """Create the empty datasets of all sensors, events, readings, and ``/committed``."""
     groups = file.create_group("sensors")
     for sensor in sensors:
         group = groups.create_group(sensor.name)
@@ -107,12 +107,13 @@ def make_datasets(file: h5py.File, sensors: Sequence[SensorLayout], chunk_second
         _make_table(group, "blocks", file_format.BLOCK_DTYPE, file_format.BLOCKS_PER_CHUNK)
         _make_table(group, "gaps", file_format.GAP_DTYPE, file_format.GAPS_PER_CHUNK)
     _make_table(file, "events", file_format.EVENT_DTYPE, file_format.EVENTS_PER_CHUNK)
+    _make_table(file, "readings", file_format.READING_DTYPE, file_format.READINGS_PER_CHUNK)
     make_checksums(file, len(sensors))
     committed = file.create_dataset("committed", data=np.zeros((len(sensors) + 1, 3), "<i8"))
     fixed = file_format.fixed
     committed.attrs["sensors"] = fixed([sensor.name for sensor in sensors])
     committed.attrs["columns"] = fixed(["rows", "blocks", "gaps"])
-    committed.attrs["last_row"] = fixed(["events", "closed", "unused"])
+    committed.attrs["last_row"] = fixed(["events", "closed", "readings"])
     make_manifest(file)
 
 

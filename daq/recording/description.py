@@ -1,9 +1,9 @@
-"""Checksums of attributes, gaps, events, and ``/committed``, for which HDF5 has none.
+"""Checksums of attributes, gaps, events, readings, and ``/committed``, for which HDF5 has none.
 
 ``/checksums`` has the same rows as ``/committed``. A sensor's row has the CRC-32 of its description
 (attributes), of its gaps, and of its row of ``/committed``; the last row has those of the file's
-attributes, of the events, and of the last row of ``/committed``. It is written when the recording
-is closed; zeros mean that it was not closed. Older recordings have no such dataset.
+attributes, of the events and readings, and of the last row of ``/committed``. It is written when
+the recording is closed; zeros mean that it was not closed. Older recordings have no such dataset.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from daq.recording.file_format import fixed, texts
 from daq.recording.storage.refusals import dataset
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     import h5py
@@ -42,11 +42,12 @@ def write_checksums(file: h5py.File) -> None:
     if CHECKSUMS in file:
         names = texts(file["committed"].attrs["sensors"])
         tables = [file["sensors"][name]["gaps"][...].tobytes() for name in names]
-        file[CHECKSUMS][...] = _checksums(file, [*tables, file["events"][...].tobytes()])
+        of_run = [file[name][...].tobytes() for name in ("events", "readings") if name in file]
+        file[CHECKSUMS][...] = _checksums(file, [*tables, b"".join(of_run)])
 
 
 def damaged_tables(
-    path: Path, file: h5py.File, gaps: dict[str, CommittedRows], events: CommittedRows
+    path: Path, file: h5py.File, gaps: dict[str, CommittedRows], of_run: Sequence[CommittedRows]
 ) -> Iterator[str]:
     """Yield the names of tables with wrong checksums.
 
@@ -57,7 +58,8 @@ def damaged_tables(
         The recording.
     gaps : dict
         Gaps by name of the sensor.
-    events : CommittedRows
+    of_run : sequence of CommittedRows
+        Events, and readings if the file has them.
 
     Raises
     ------
@@ -69,7 +71,8 @@ def damaged_tables(
     stored = dataset(file, CHECKSUMS, np.dtype("<u4"))[...]
     if not stored.any():
         return
-    tables = [rows.rows().tobytes() for rows in (*gaps.values(), events)]
+    tables = [rows.rows().tobytes() for rows in gaps.values()]
+    tables.append(b"".join(rows.rows().tobytes() for rows in of_run))
     found = _checksums(file, tables)
     if found.shape != stored.shape:
         raise NotARecordingError(f"{path}: damaged: /{CHECKSUMS} of shape {stored.shape}")
@@ -81,7 +84,7 @@ def damaged_tables(
                     f"{path}: damaged: the {what} of {name} has a wrong checksum"
                 )
         if own[_TABLE] != expected[_TABLE]:
-            yield "events" if name == names[-1] else f"gaps of {name}"
+            yield "events and readings" if name == names[-1] else f"gaps of {name}"
 
 
 def result_crc32(arrays: Mapping[str, Any], attributes: Mapping[str, Any]) -> int:

@@ -60,14 +60,25 @@ EVENT_DTYPE = np.dtype(
         ("text", "S200"),
     ]
 )
+READING_DTYPE = np.dtype(
+    [
+        ("monotonic_ns", "<i8"),
+        ("utc_ns", "<i8"),
+        ("sensor", "S64"),
+        ("quantity", "S32"),
+        ("value", "<f8"),
+    ]
+)
 
-# Columns of ``/committed``. The last row has the number of events, and whether the file is closed.
+# Columns of ``/committed``. The last row has the number of events, whether the file is closed, and
+# the number of readings.
 ROWS, BLOCKS, GAPS = range(3)
-EVENTS, CLOSED = range(2)
+EVENTS, CLOSED, READINGS = range(3)
 
 BLOCKS_PER_CHUNK = 256
 GAPS_PER_CHUNK = 32
 EVENTS_PER_CHUNK = 64
+READINGS_PER_CHUNK = 64
 
 
 @dataclass(frozen=True, slots=True)

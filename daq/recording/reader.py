@@ -19,7 +19,7 @@ import numpy as np
 from daq.bench.end_condition import EndCondition
 from daq.bench.outline import BenchOutline
 from daq.errors import BenchFileError, NotARecordingError
-from daq.protocols.block import Event, EventKind, HostTime
+from daq.protocols.block import Event, EventKind, HostTime, Quantity, Reading
 from daq.recording import file_format
 from daq.recording.description import damaged_tables, result_crc32
 from daq.recording.file_format import SIMULATED
@@ -85,12 +85,18 @@ class Recording:
         self.sensors = tuple(SensorRecord(member(groups, name)) for name in names)
         """In the order of the bench."""
         self._events = CommittedRows(dataset(file, "events", file_format.EVENT_DTYPE))
+        self._readings = (  # not in recordings of earlier versions
+            CommittedRows(dataset(file, "readings", file_format.READING_DTYPE))
+            if "readings" in file
+            else None
+        )
         self.closed = False
         """Whether the recording was closed properly and is complete."""
         self.refresh()
         gaps = {sensor.name: sensor.gap_rows for sensor in self.sensors}
-        self.damaged_tables = tuple(damaged_tables(path, file, gaps, self._events))
-        """Tables of gaps or events with a wrong checksum."""
+        of_run = [self._events] + ([] if self._readings is None else [self._readings])
+        self.damaged_tables = tuple(damaged_tables(path, file, gaps, of_run))
+        """Tables of gaps, events or readings with a wrong checksum."""
         for name in self.damaged_tables:
             _LOGGER.warning("%s: damaged: wrong checksum of the %s", path, name)
 
@@ -183,6 +189,20 @@ class Recording:
             for row in self._events.rows()[first:]
         )
 
+    @property
+    def readings(self) -> tuple[Reading, ...]:
+        """What devices and the host stated of themselves so far; none in older recordings."""
+        rows = () if self._readings is None else self._readings.rows()
+        return tuple(
+            Reading(
+                sensor=row["sensor"].decode(errors="replace"),
+                quantity=Quantity.of(row["quantity"].decode(errors="replace")),
+                value=float(row["value"]),
+                received=HostTime(int(row["monotonic_ns"]), int(row["utc_ns"])),
+            )
+            for row in rows
+        )
+
     def sensor(self, name: str) -> SensorRecord:
         """Return the sensor with this name."""
         for sensor in self.sensors:
@@ -249,6 +269,8 @@ class Recording:
             ]
             n_events = self._events.n_rows
             self._events.extend(int(counts[-1, file_format.EVENTS]))
+            if self._readings is not None:
+                self._readings.extend(int(counts[-1, file_format.READINGS]))
         self.closed = closed
         return any(is_new) or self._events.n_rows > n_events or self.closed
 

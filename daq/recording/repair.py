@@ -94,6 +94,7 @@ class Verification:
     being_written: bool
     sensors: tuple[SensorVerification, ...]
     n_events: int
+    n_readings: int = 0
     damaged_tables: tuple[str, ...] = ()
     changed: tuple[str, ...] = ()
     """Datasets and attributes of a closed recording that differ from its manifest."""
@@ -136,6 +137,7 @@ def verify(
             being_written,
             sensors,
             len(recording.events),
+            len(recording.readings),
             recording.damaged_tables,
             run_id=recording.run_id,
         )
@@ -309,6 +311,8 @@ def _cut_to_committed(file: h5py.File, report: Verification) -> None:
         instants.resize(min(sensor.n_samples, len(instants)), axis=0)
         group["blocks"].resize(sensor.n_blocks, axis=0)
         group["gaps"].resize(sensor.n_gaps, axis=0)
+    if "readings" in file:
+        file["readings"].resize(report.n_readings, axis=0)
 
 
 def _add_last_events(file: h5py.File, report: Verification, now: HostTime) -> None:
@@ -332,7 +336,7 @@ def _add_last_events(file: h5py.File, report: Verification, now: HostTime) -> No
     events.resize(n_events, axis=0)
     events[report.n_events :] = np.array(rows, file_format.EVENT_DTYPE)
     counts = [[s.n_samples, s.n_blocks, s.n_gaps] for s in report.sensors]
-    file["committed"][...] = [*counts, [n_events, 1, 0]]
+    file["committed"][...] = [*counts, [n_events, 1, report.n_readings]]
 
 
 @contextlib.contextmanager

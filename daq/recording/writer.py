@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from daq.bench.model import Bench
-    from daq.protocols.block import Block, Event, HostTime
+    from daq.protocols.block import Block, Event, HostTime, Reading
     from daq.recording.file_format import SensorLayout
 
 BROKEN: list[RecordingWriter] = []
@@ -103,6 +103,7 @@ class RecordingWriter:
             s.name: SensorRows(file["sensors"][s.name], s, packs=packs) for s in sensors
         }
         self._events = TableBuffer(file["events"])
+        self._readings = TableBuffer(file["readings"])
         self._committed = file["committed"]
         self._run_id = text(file.attrs, "run_id")
         self._failed = False
@@ -220,6 +221,17 @@ class RecordingWriter:
         )
         self._events.add(np.array([row], file_format.EVENT_DTYPE))
 
+    def reading(self, reading: Reading) -> None:
+        """Record a reading."""
+        row = (
+            reading.received.monotonic_ns,
+            reading.received.utc_ns,
+            _field(reading.sensor, 64),
+            _field(reading.quantity, 32),
+            reading.value,
+        )
+        self._readings.add(np.array([row], file_format.READING_DTYPE))
+
     def commit(self) -> Committed:
         """Make all complete chunks safe on disk, and return the numbers of safe rows.
 
@@ -299,7 +311,8 @@ class RecordingWriter:
                 sensor.gaps.write()
                 counts[number] = sensor.committable_rows, sensor.blocks.n_rows, sensor.gaps.n_rows
             self._events.write()
-            counts[-1, : file_format.CLOSED + 1] = self._events.n_rows, closed
+            self._readings.write()
+            counts[-1] = self._events.n_rows, closed, self._readings.n_rows
             self._sync()
             self._check_place()
             for sensor in self._sensors.values():
@@ -321,7 +334,7 @@ class RecordingWriter:
         )
 
     def _contents_sha256(self) -> dict[str, bytes]:
-        found = {self._events.name: self._events.sha256.digest()}
+        found = {each.name: each.sha256.digest() for each in (self._events, self._readings)}
         for sensor in self._sensors.values():
             found |= sensor.contents_sha256()
         return found
@@ -337,7 +350,7 @@ class RecordingWriter:
             name: (sensor.blocks.written, sensor.gaps.written)
             for name, sensor in self._sensors.items()
         }
-        return {**rows, "": (self._events.written,)}
+        return {**rows, "": (self._events.written, self._readings.written)}
 
     def _check_place(self) -> None:
         """Check that the file still has its name, so that users can find it."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 
 from daq.estimation.recording_set import continuations
-from daq.protocols.block import EventKind
+from daq.protocols.block import READING_INTERVAL_NS, EventKind, Quantity, Reading
 from daq.recording.reader import Recording
 from daq.recording.signing import signed_by
 from daq.recording.storage.locking import is_being_written
@@ -99,6 +99,9 @@ class Source:
         Whether a sensor was simulated.
     logged_events : tuple of LoggedEvent
         In time order.
+    readings : tuple of Reading
+        What devices and the host stated of themselves, in time order; of a recording of an earlier
+        version what the devices stated at its start.
     signed_by : str
         Id of the key of the signature beside the recording; empty if there is none, or it does not
         fit. The contents are compared by ``huddle verify`` only.
@@ -118,6 +121,7 @@ class Source:
     sensors: tuple[RecordedSensor, ...]
     simulated: bool
     logged_events: tuple[LoggedEvent, ...]
+    readings: tuple[Reading, ...] = ()
     signed_by: str = ""
 
     @property
@@ -188,8 +192,99 @@ def _source(recording: Recording, *, continued: bool) -> Source:
         ),
         simulated=recording.simulated,
         logged_events=tuple(logged_events),
+        readings=recording.readings or _stated_at_start(recording),
         signed_by=signed_by(path) if state == "closed" else "",
     )
+
+
+def _stated_at_start(recording: Recording) -> tuple[Reading, ...]:
+    return tuple(
+        Reading(sensor.name, Quantity.TEMPERATURE, sensor.temperature, recording.created_at)
+        for sensor in recording.sensors
+        if sensor.temperature is not None
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """Lowest and highest value of a quantity during a test.
+
+    Attributes
+    ----------
+    sensor : str
+        Empty for the computer that recorded.
+    quantity : Quantity or str
+    lowest, highest : float
+    n_readings : int
+        One a minute.
+    limits : (float, float) or None
+        Range of the data sheet.
+    """
+
+    sensor: str
+    quantity: Quantity | str
+    lowest: float
+    highest: float
+    n_readings: int
+    limits: tuple[float, float] | None = None
+
+    @property
+    def is_outside(self) -> bool:
+        """Whether a value was outside of the data sheet's range."""
+        return self.limits is not None and not (
+            self.limits[0] <= self.lowest and self.highest <= self.limits[1]
+        )
+
+
+def conditions(
+    found: Sequence[Source],
+    about: Bench | None = None,
+    *,
+    start: datetime | None = None,
+    end: datetime | None = None,
+) -> tuple[Condition, ...]:
+    """Return the conditions of a test, sensor by sensor, then those of the computer.
+
+    Parameters
+    ----------
+    found : sequence of Source
+    about : Bench, optional
+        With the data sheets of the sensors.
+    start, end : datetime, optional
+        Of the test, if it is a part of the recordings. Readings up to a minute before and after
+        belong to it.
+    """
+    values: dict[tuple[str, Quantity | str], list[float]] = {}
+    for source in found:
+        for reading in source.readings:
+            at = reading.received.utc_ns
+            if (start is None or at >= _ns(start) - READING_INTERVAL_NS) and (
+                end is None or at <= _ns(end) + READING_INTERVAL_NS
+            ):
+                values.setdefault((reading.sensor, reading.quantity), []).append(reading.value)
+    limits = {
+        sensor.name: sensor.data_sheet.temperature
+        for sensor in (() if about is None else about.sensors)
+        if sensor.data_sheet is not None
+    }
+    names = [*(sensor.name for sensor in found[0].sensors), ""]
+    return tuple(
+        Condition(
+            sensor,
+            quantity,
+            min(several),
+            max(several),
+            len(several),
+            limits.get(sensor) if quantity == Quantity.TEMPERATURE else None,
+        )
+        for sensor in names
+        for (owner, quantity), several in values.items()
+        if owner == sensor
+    )
+
+
+def _ns(at: datetime) -> int:
+    return round(at.timestamp() * _SECOND_NS)
 
 
 def _gaps(sensor: SensorRecord, created_ns: int) -> list[LoggedEvent]:

@@ -54,9 +54,8 @@ _DEFAULTS = {
 _PENDING = {commands.FLASH_BACKUP: 0x0008, commands.FACTORY: 0x0010}
 
 
-def temperature_counts(times: NDArray[np.float64] | float) -> NDArray[np.int64]:
-    """Return temperature counts at world times in s: 25 °C ± 0.5 °C with a period of one hour."""
-    celsius = 25.0 + 0.5 * np.sin(2 * np.pi * np.asarray(times) / 3600.0)
+def temperature_counts(celsius: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return temperature counts."""
     return np.rint((celsius - commands.TEMPERATURE_OFFSET) / commands.TEMPERATURE_SLOPE).astype(
         np.int64
     )
@@ -201,7 +200,7 @@ class EpsonDevice:
         )
         value = 0
         if high == commands.TEMP_HIGH:
-            value = int(temperature_counts(now))
+            value = int(temperature_counts(self._source.temperature(self._sensor, now)))
         elif high in (*commands.ACCELERATION_HIGH, *commands.TILT_HIGH):
             axis = [*commands.ACCELERATION_HIGH, *commands.TILT_HIGH].index(high) % 3
             index = self._sampled.first_sample_after(self._sensor, now)
@@ -291,7 +290,7 @@ class EpsonDevice:
         self._frames = commands.encode_bursts(
             self._burst,
             flag=0x8E00,
-            temperature=temperature_counts(self._times),
+            temperature=temperature_counts(self._source.temperature(self._sensor, self._times)),
             count=self._count(np.arange(first, first + n)),
             **self._axis_counts(first, n),
         )

@@ -41,6 +41,7 @@ MAX_BLOCK = 10
 """Maximum duration of a block, in s, at low sampling rates."""
 REPLY_TIME = 0.15
 STATUS_INTERVAL = 60.0
+SUPPLY = 13.0
 CLIENT_PATIENCE = 60.0
 HISTORY = 256
 _NS = 1_000_000_000
@@ -71,6 +72,7 @@ class Digitizer:
             )
         self._utc_ns = -(-device.utc_ns // _NS) * _NS  # UTC of sample 0: a full second
         offset = (self._utc_ns - device.utc_ns) / _NS
+        self._source, self._sensor = source, device.sensors[0]
         self._samples = Samples(source.disciplined(offset), device.sensors)
         self._streams = [s for sensor in device.sensors for s in stream_ids(device, sensor)]
         self._system = SystemId(str(device.settings.get("system_id", "SIM")))
@@ -123,7 +125,12 @@ class Digitizer:
     def _status(self) -> StatusBlock:
         stream = self._streams[0][:-2] + "00"
         start_ns = self._utc_ns + round(self._next * _NS / self._rate) // _NS * _NS
-        text = "GPS: 3D fix\r\nClock: locked\r\nMass positions: 0 0 0\r\n"
+        celsius = float(self._source.temperature(self._sensor, self.next_due()))
+        text = (
+            "GPS: 3D fix\r\nClock: locked\r\n"
+            f"External supply : {SUPPLY:.1f}V Temperature {celsius:.2f}'C\r\n"
+            "Mass positions: 0 0 0\r\n"
+        )
         return StatusBlock(self._system, stream, start_ns, text)
 
 

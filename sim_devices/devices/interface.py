@@ -184,6 +184,10 @@ class Source:
         at: FloatArray = times[index - first]
         return at
 
+    def temperature(self, sensor: str, times: FloatArray | float) -> FloatArray:
+        """Return the temperature of a sensor's device in °C at world times in s."""
+        return self._simulated.sensors[sensor].temperature.at(times)
+
     def stated_ns(self, sensor: str, utc_ns: int) -> int:
         """Return what the device states where UTC is ``utc_ns``."""
         return utc_ns if self._faults is None else self._faults.stated_ns(sensor, utc_ns)

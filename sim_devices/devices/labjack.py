@@ -96,7 +96,7 @@ class LabJack:
         for address, value in {
             reg.PRODUCT_ID: product,
             reg.FIRMWARE_VERSION: 1.0292,
-            reg.TEMPERATURE_DEVICE_K: 298.15,
+            reg.TEMPERATURE_DEVICE_K: 0.0,  # as `_read` returns it
             **_FLOATS,
         }.items():
             self._store(address, struct.pack(">f", value))
@@ -170,6 +170,9 @@ class LabJack:
         return float(struct.unpack(">f", self._value(address).to_bytes(4, "big"))[0])
 
     def _read(self, address: int, n_registers: int, now: float) -> bytes:
+        if address == reg.TEMPERATURE_DEVICE_K:
+            celsius = float(self._source.temperature(self._sensors[0], now))
+            self._store(address, struct.pack(">f", celsius + 273.15))
         if address == reg.STREAM_DATA_CR:
             return self._read_stream(n_registers, now)
         if address == reg.FLASH_READ:

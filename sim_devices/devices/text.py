@@ -30,7 +30,9 @@ if TYPE_CHECKING:
 
 PRESETS = {"raspberry-shake": RASPBERRY_SHAKE, "lily": LILY, "none": TextFormat()}
 PACKET_SAMPLES = 25
-LILY_TAIL = ("194.25", " 26.01", "11.96", "N9655")
+LILY_TAIL = ("194.25", "", "", "N9655")
+"""Azimuth, temperature, supply, serial number."""
+SUPPLY = 11.96
 _NS = 1_000_000_000
 
 
@@ -156,6 +158,13 @@ class TextDevice:
                 (self._next - self._counted_from) % format_.counter_modulus
             )
         filled |= dict(enumerate(self._tail, 1 + max(format_.columns, default=0)))
+        celsius = self._source.temperature(self._sensor, self._samples.time(self._next))
+        for key, value in (
+            (format_.temperature_column, float(celsius)),
+            (format_.supply_column, SUPPLY),
+        ):
+            if key is not None:
+                filled[key] = f"{value:6.2f}"
         return encode_row(filled, format_)
 
 

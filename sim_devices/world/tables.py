@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
 
+import numpy as np
 from pydantic import (
     BaseModel,
     ConfigDict,
@@ -19,6 +20,8 @@ from sim_devices.world.spectrum import Spectrum, White
 
 if TYPE_CHECKING:
     from typing import Self
+
+    from sim_devices.arrays import FloatArray
 
 USABLE = 0.9
 """The motion ends at this fraction of the lowest Nyquist frequency."""
@@ -79,8 +82,28 @@ class Response(Table):
     normalised_at: PositiveFloat = 1.0
 
 
+class DeviceTemperature(Table):
+    """Temperature in °C that a device states of itself.
+
+    `mean` plus the sine of a cycle of `period` (s) with `amplitude`, plus `drift` (K/h). Neither
+    noise nor clock follow it.
+    """
+
+    mean: float = 25.0
+    amplitude: float = 0.5
+    period: PositiveFloat = 3600.0
+    drift: float = 0.0
+
+    def at(self, times: FloatArray | float) -> FloatArray:
+        """Return the temperature at world times in s."""
+        hours = np.asarray(times) / 3600.0
+        cycle = np.sin(2 * np.pi * np.asarray(times) / self.period)
+        found: FloatArray = self.mean + self.amplitude * cycle + self.drift * hours
+        return found
+
+
 class SensorModel(Table):
-    """One sensor: orientation, gain, delay, response, noise and clock.
+    """One sensor: orientation, gain, delay, response, noise, clock and temperature.
 
     Channel r reads ``gain[r] · direction[r] · motion(t − delay, position) + noise[r]`` in m/s².
     """
@@ -95,6 +118,7 @@ class SensorModel(Table):
     seed: NonNegativeInt | None = None
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     clock: SensorClock = SensorClock()
+    temperature: DeviceTemperature = DeviceTemperature()
 
 
 class CommonMotion(Table):

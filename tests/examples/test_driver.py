@@ -26,6 +26,8 @@ from tests.waiting import limit
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from daq.protocols.block import DeviceItem
+
 EXAMPLE = Path(__file__).parents[2] / "examples" / "driver"
 RATE = 100.0
 
@@ -167,7 +169,7 @@ def test_frames_are_decoded_however_they_are_divided(
     counts, stream = sent(example, 65530, 40)
     decoder = example("protocol").Decoder("A", RATE)
     stream = b"\xa5\x5a\x00" + stream + b"\xa5"  # half a frame before and behind
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for start in range(0, len(stream), size):
         found += decoder.receive(stream[start : start + size], AT)
     blocks = [item for item in found if isinstance(item, Block)]

@@ -282,7 +282,7 @@ async def test_every_received_sample_has_its_index(
             async for item in session.read():
                 if isinstance(item, Block):
                     blocks.append(item)
-                else:
+                elif isinstance(item, Event):
                     events.append(item)
                 if blocks and blocks[-1].end_sample > 3500:
                     break

@@ -82,6 +82,7 @@ async def test_a_digitizer_counts_what_it_lost(
         async for item in items:
             if isinstance(item, Event):
                 events.append(item)
+            if not isinstance(item, Block):
                 continue
             blocks.append(item)
             # an overflow in which the stream began lies before its first block

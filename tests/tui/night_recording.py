@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.bench.loading import parse
-from daq.protocols.block import Event, HostTime
+from daq.protocols.block import Event, HostTime, Quantity, Reading
 from daq.recording.file_format import SensorLayout
 from daq.recording.writer import RecordingWriter
 from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks
@@ -79,6 +79,13 @@ def record(
         for second in range(60):
             at = HostTime(ORIGIN.monotonic_ns + second * 10**9, ORIGIN.utc_ns + second * 10**9)
             writer.event(Event(name, "checksum", "a frame was damaged", at))
+    for minute, celsius in enumerate((24.0, 26.5)):
+        at = HostTime(
+            ORIGIN.monotonic_ns + minute * 60 * 10**9, ORIGIN.utc_ns + minute * 60 * 10**9
+        )
+        writer.reading(Reading("A", Quantity.TEMPERATURE, celsius, at))
+        writer.reading(Reading("", Quantity.TEMPERATURE, celsius + 20, at))
+    writer.reading(Reading("A", Quantity.SUPPLY, 12.25, ORIGIN))
     writer.gap("B", 1000, 130, reason="cable pulled", estimated=True)
     writer.gap("B", 4000, 1, reason="lost")
     writer.commit()

@@ -14,10 +14,12 @@ from typing import TYPE_CHECKING
 
 from daq.bench.tables.certificate import CertificateTable, Customer, Laboratory
 from daq.bench.units import in_si
+from daq.protocols.block import Quantity
 from daq.results.band_summary import band_of, judged_method
 from daq.results.decision.conformity import Statement, conformity, with_rule
+from daq.results.sources import conditions
 from estimator.levels.interval import NORMAL_95
-from tui.report.certificate import PROCEDURE, SCOPE, manufacturers
+from tui.report.certificate import PROCEDURE, QUANTITIES, SCOPE, manufacturers, outside_range
 from tui.report.noise import decision_rule
 from tui.report.uncertainty import thirds, uncertainties
 from tui.wording.formatting import span
@@ -29,7 +31,7 @@ if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.results.decision.conformity import Conformity
-    from daq.results.sources import Source
+    from daq.results.sources import Condition, Source
     from tui.report.certificate import Issue
     from tui.report.uncertainty import Thirds, Uncertainty
 
@@ -45,6 +47,7 @@ _STATED = {
     Statement.CONDITIONAL_FAIL: "conditionalFail",
     Statement.FAIL: "fail",
 }
+_STATED_IN = {Quantity.TEMPERATURE: r"\degreecelsius", Quantity.SUPPLY: r"\volt"}
 _UNITS = {
     "m/s²": r"\metre\tothe{2}\second\tothe{-4}\hertz\tothe{-1}",
     "m/s": r"\metre\tothe{2}\second\tothe{-2}\hertz\tothe{-1}",
@@ -206,7 +209,8 @@ def _results(
         _content(_add(method, "description"), decision_rule(table))
         _add(method, "norm", "ILAC-G8:09/2019")
         _add(method, "norm", "JCGM 106:2012")
-    _conditions(_add(_add(one, "influenceConditions"), "influenceCondition"), found)
+    found_conditions = conditions(found, about, start=settings.start, end=settings.end)
+    _conditions(_add(_add(one, "influenceConditions"), "influenceCondition"), found_conditions)
     results = _add(one, "results")
     whole, spectra = uncertainties(snapshot, settings), thirds(snapshot, settings)
     if not whole:
@@ -230,19 +234,24 @@ def _results(
             _conformity(_add(data, "list"), concerned)
 
 
-def _conditions(condition: ET.Element, found: Sequence[Source]) -> None:
-    """Add the temperatures that the devices stated."""
-    _text(condition, "name", "Temperature of the sensors")
+def _conditions(condition: ET.Element, stated: Sequence[Condition]) -> None:
+    """Add the lowest and the highest of what devices and computer stated."""
+    _text(condition, "name", "Conditions during the test")
     data = _add(condition, "data")
-    known = [(e.name, e.temperature) for source in found for e in source.sensors]
-    for name, temperature in known:
-        if temperature is not None:
+    for each in stated:
+        if not isinstance(each.quantity, Quantity):
+            continue
+        name, unit = QUANTITIES[each.quantity], _STATED_IN[each.quantity]
+        of = each.sensor or "the computer that recorded"
+        for which, value in (("Lowest", each.lowest), ("Highest", each.highest)):
             quantity = _add(data, "quantity")
-            _text(quantity, "name", f"Temperature of {name} at the start of the recording")
+            _text(quantity, "name", f"{which} {name} of {of}")
             real = _si(quantity, "real")
-            _si(real, "value", _number(temperature))
-            _si(real, "unit", r"\degreecelsius")
-    if all(temperature is None for _, temperature in known):
+            _si(real, "value", _number(value))
+            _si(real, "unit", unit)
+    for text in outside_range(stated):
+        _content(_add(data, "text"), text)
+    if not any(each.sensor and each.quantity == Quantity.TEMPERATURE for each in stated):
         _content(_add(data, "text"), "Temperature: not stated by the devices.")
 
 

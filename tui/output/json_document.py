@@ -12,9 +12,11 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from daq.bench.estimate_settings import table_keys
+from daq.protocols.block import Quantity
 from daq.results.band_summary import band_of, channel_means, data_means
 from daq.results.clock_effect import relative_time
 from daq.results.facts import Fact, Finding
+from daq.results.sources import conditions
 from estimator.checks.advice import Advice
 from tui.output.calibration import channels_of
 from tui.output.json_diagnostics import diagnostics_document, dimension_document, slip_document
@@ -154,6 +156,17 @@ def _recording(source: Source) -> dict[str, Any]:
         "location": source.location or None,
         "simulated": source.simulated,
         "bench": None if bench is None else bench.name,
+        "conditions": [
+            {
+                "sensor": each.sensor or None,
+                "quantity": each.quantity,
+                "unit": each.quantity.unit if isinstance(each.quantity, Quantity) else None,
+                "lowest": each.lowest,
+                "highest": each.highest,
+                "readings": each.n_readings,
+            }
+            for each in conditions([source])
+        ],
         "started": source.started.isoformat(),
         "last_block": source.last.isoformat(),
         "sensors": [

@@ -6,7 +6,6 @@ people.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -14,6 +13,8 @@ from daq.bench.durations import format_duration
 from daq.bench.estimate_settings import to_table
 from daq.bench.tables.certificate import CertificateTable, Customer, Laboratory
 from daq.estimation.settings import Settings
+from daq.protocols.block import Quantity
+from daq.results.sources import conditions
 from tui.report.parts import Facts, Paragraph, Section, Table
 from tui.report.wording import plain_number, utc_time
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Bench
     from daq.estimation.snapshot import Snapshot
-    from daq.results.sources import Source
+    from daq.results.sources import Condition, Source
     from tui.report.parts import Part
 
 _NONE = "not given"
@@ -245,6 +246,8 @@ def notices(
             text = "; ".join(each.what for each in left)
             lines.append(Paragraph(f"Issued incomplete. Not given: {text}.", "doubtful"))
     lines += [Paragraph(text, "bad") for text in without_samples(found[-1], snapshot)]
+    stated = conditions(found, bench, start=settings.start, end=settings.end)
+    lines += [Paragraph(text, "bad") for text in outside_range(stated)]
     lines.append(settings_line(settings, bench))
     return tuple(lines)
 
@@ -308,36 +311,47 @@ def parties_section(found: Sequence[Source], bench: Bench | None, issue: Issue |
     return Section("Laboratory, customer and procedure", parts)
 
 
-def conditions_section(found: Sequence[Source], about: Bench | None) -> Section:
-    """Return the temperature of every sensor, and what lies outside the data sheet's range."""
-    ranges = {
-        sensor.name: sensor.data_sheet.temperature
-        for sensor in (() if about is None else about.sensors)
-        if sensor.data_sheet is not None and sensor.data_sheet.temperature is not None
-    }
-    parts: list[Part] = []
-    rows = []
-    for sensor in found[0].sensors:
-        known = [
-            each.temperature
-            for source in found
-            for each in source.sensors
-            if each.name == sensor.name and each.temperature is not None
-        ]
-        least, most = (min(known), max(known)) if known else (math.nan, math.nan)
-        limits = ranges.get(sensor.name)
-        shown = "not given" if limits is None else f"{limits[0]:g} … {limits[1]:g}"
-        low, high = (plain_number(end, ".1f") for end in (least, most))
-        rows.append((sensor.name, low, high, shown))
-        if limits is not None and known and (least < limits[0] or most > limits[1]):
-            parts.append(
-                Paragraph(f"Sensor {sensor.name} was outside of its data sheet's range.", "bad")
-            )
-    table = Table(("sensor", "lowest (°C)", "highest (°C)", "range of the data sheet"), tuple(rows))
-    note = (
-        "Temperature as the devices state it when a recording starts; ? where a device states none."
-    )
-    return Section("Conditions", (table, *parts, Paragraph(note, "quiet")))
+QUANTITIES = {Quantity.TEMPERATURE: "temperature", Quantity.SUPPLY: "supply voltage"}
+
+
+def outside_range(stated: Sequence[Condition]) -> list[str]:
+    """Return the sensors whose temperature left the range of their data sheet, in words."""
+    return [
+        f"Sensor {each.sensor} was outside of its data sheet's range: {each.lowest:.1f} to"
+        f" {each.highest:.1f} °C; {each.limits[0]:g} to {each.limits[1]:g} °C are permitted."
+        for each in stated
+        if each.limits is not None and each.is_outside
+    ]
+
+
+def conditions_section(found: Sequence[Source], about: Bench | None, settings: Settings) -> Section:
+    """Return what devices and computer stated, and what is outside the data sheet's range."""
+    stated = conditions(found, about, start=settings.start, end=settings.end)
+    rows = [
+        (
+            each.sensor or "computer",
+            *_quantity(each.quantity),
+            plain_number(each.lowest, ".2f"),
+            plain_number(each.highest, ".2f"),
+            str(each.n_readings),
+            "" if each.limits is None else f"{each.limits[0]:g} … {each.limits[1]:g}",
+        )
+        for each in stated
+    ]
+    titles = ("of", "quantity", "unit", "lowest", "highest", "readings", "range of the data sheet")
+    silent = {sensor.name for sensor in found[0].sensors} - {each.sensor for each in stated}
+    note = "Read from the devices once a minute."
+    if silent:
+        note += f" Nothing is stated by {', '.join(sorted(silent))}."
+    parts: list[Part] = [Table(titles, tuple(rows))] if rows else []
+    parts += [Paragraph(text, "bad") for text in outside_range(stated)]
+    return Section("Conditions", (*parts, Paragraph(note, "quiet")))
+
+
+def _quantity(quantity: Quantity | str) -> tuple[str, str]:
+    if isinstance(quantity, Quantity):
+        return QUANTITIES[quantity], quantity.unit
+    return quantity, ""
 
 
 def _joined(*parts: str) -> str:

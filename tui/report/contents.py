@@ -166,7 +166,7 @@ def report_of(
         _test_section(found),
         facts_section(facts),
         _sensors_section(snapshot, found, about),
-        conditions_section(found, about),
+        conditions_section(found, about, settings),
         limits_section(
             snapshot,
             judged,

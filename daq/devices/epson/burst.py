@@ -14,8 +14,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.devices.epson.commands import BURST_HEADER, DELIMITER, FLAG_ERROR, are_sums_right
-from daq.protocols.block import Block, BlockFlag, Event, EventKind
+from daq.devices.epson.commands import (
+    BURST_HEADER,
+    DELIMITER,
+    FLAG_ERROR,
+    are_sums_right,
+    temperature,
+)
+from daq.protocols.block import (
+    Block,
+    BlockFlag,
+    Event,
+    EventKind,
+    Quantity,
+    Reading,
+    ReadingTimes,
+)
 from daq.protocols.framing import BoolArray, OctetArray, find_frames
 from daq.protocols.plural import several
 from daq.protocols.sample_counter import Run, SampleCounter
@@ -26,7 +40,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.devices.epson.commands import BurstFormat
-    from daq.protocols.block import HostTime
+    from daq.protocols.block import DeviceItem, HostTime
 
 COUNT_MODULUS = 65536
 MIN_CONSECUTIVE = 3
@@ -73,6 +87,7 @@ class BurstDecoder:
         self._size = burst.size
         self._fields = tuple(fields)
         self._has_checksum, self._has_flag = "checksum" in burst, "flag" in burst
+        self._has_temperature, self._reading_times = "temperature" in burst, ReadingTimes()
         self._axes = [column for column, field in enumerate(fields) if field != "temperature"]
         self._full_scale = full_scale_counts
         self._counter = SampleCounter(COUNT_MODULUS, sampling_rate)
@@ -112,8 +127,8 @@ class BurstDecoder:
         self._left = b""
         self._counter.resume()
 
-    def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
-        """Return the blocks and events of all frames completed by ``data``."""
+    def receive(self, data: bytes, at: HostTime) -> list[DeviceItem]:
+        """Return the items of all frames completed by ``data``."""
         data = self._left + data
         octets = np.frombuffer(data, np.uint8)
         runs, consumed = find_frames(octets, self._size, self._valid)
@@ -124,11 +139,12 @@ class BurstDecoder:
         frames = [
             np.frombuffer(data, self._dtype, count=length, offset=offset) for offset, length in runs
         ]
-        found: list[Block | Event] = []
+        found: list[DeviceItem] = []
         if frames:
             together = frames[0] if len(frames) == 1 else np.concatenate(frames)
             found += self._blocks(together, at)
             found += self._error_flag(together, at)
+            found += self._temperature(together, at)
         return found + self._report(at)
 
     def _valid(self, windows: OctetArray) -> BoolArray:
@@ -191,6 +207,15 @@ class BurstDecoder:
             return []
         text = "the device reports an error" if error else "the device no longer reports an error"
         return [Event(self._sensor, EventKind.STATUS, text, at)]
+
+    def _temperature(self, frames: NDArray[np.void], at: HostTime) -> list[Reading]:
+        """Return the temperature once a minute."""
+        if not self._has_temperature:
+            return []
+        count = int(frames["temperature"][-1])
+        if not count or not self._reading_times.is_due(at):  # 0: not measured yet
+            return []
+        return [Reading(self._sensor, Quantity.TEMPERATURE, temperature(count), at)]
 
     def _report(self, at: HostTime) -> list[Event]:
         events: list[Event] = []

@@ -124,6 +124,10 @@ class Configuration:
             raise BenchFileError(FileFault("settings.fields", expected, list(fields), sensor.name))
         flags = ("flag",) if settings.flags else ()
         burst = BurstFormat.of(*flags, *fields, "count", "checksum")
+        # A streaming device answers no requests: its temperature comes with the samples, or not.
+        with_temperature = BurstFormat.of(*flags, *{*fields, "temperature"}, "count", "checksum")
+        if rate * with_temperature.size * 10 <= settings.baud_rate:
+            burst = with_temperature
         if (needed := rate * burst.size * 10) > settings.baud_rate:
             expected = (
                 f"expected at least {needed} for {rate} Hz of {burst.size} bytes (or fewer fields,"

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from daq.devices.epson.burst import BurstDecoder
     from daq.devices.interface import DeviceInformation, Session
     from daq.host_clock import HostClock
-    from daq.protocols.block import Block, Event
+    from daq.protocols.block import DeviceItem
     from daq.transport.byte_stream import ByteStream
 
 ASK_AFTER = 1.0
@@ -89,8 +89,8 @@ class EpsonSession:
         """Whether blocks continue the index of the session before."""
         return self._heard is not None
 
-    async def read(self) -> AsyncIterator[Block | Event]:
-        """Start sampling and yield blocks and events."""
+    async def read(self) -> AsyncIterator[DeviceItem]:
+        """Start sampling and yield blocks, events, and the temperature once a minute."""
         configuration = self._configuration
         if self._heard is None:
             self._stream.discard()
@@ -193,6 +193,7 @@ class EpsonDriver:
     summary = "Epson M-A352 or M-A370 quartz accelerometer on a UART"
     settings = EpsonSettings
     shares_clock = False
+    states_temperature = True
 
     def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:  # noqa: ARG002 -- interface
         """Return int32, for all fields including temperature."""

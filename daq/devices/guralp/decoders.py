@@ -26,7 +26,7 @@ from daq.devices.guralp.scream import (
     decode_packet,
 )
 from daq.devices.guralp.streams import Streams, cut, only
-from daq.protocols.block import Block, Event, EventKind, HostTime
+from daq.protocols.block import DeviceItem, Event, EventKind, HostTime
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.plural import several
 
@@ -53,9 +53,9 @@ class SerialDecoder:
         self._name = only(sensors)
         self._receiver = Receiver(replies=replies)
 
-    def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
+    def receive(self, data: bytes, at: HostTime) -> list[DeviceItem]:
         """Decode bytes of the line, cut anywhere. Then send :meth:`take_replies`."""
-        found: list[Block | Event] = []
+        found: list[DeviceItem] = []
         for item in self._receiver.receive(data):
             match item:
                 case Frame(_, block):
@@ -82,7 +82,7 @@ class SerialDecoder:
         """Return and remove the bytes to send to the digitizer."""
         return self._receiver.take_replies()
 
-    def _frame(self, data: bytes, at: HostTime) -> Iterator[Block | Event]:
+    def _frame(self, data: bytes, at: HostTime) -> Iterator[DeviceItem]:
         try:
             block = decode_block(data)
         except RemoteProtocolError as error:
@@ -125,9 +125,9 @@ class ScreamDecoder:
         """Sequence numbers of missing packets that may still arrive."""
         return tuple(self._missing)
 
-    def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
+    def receive(self, data: bytes, at: HostTime) -> list[DeviceItem]:
         """Decode bytes of the TCP connection, cut anywhere."""
-        found: list[Block | Event] = []
+        found: list[DeviceItem] = []
         for item in self._finder.receive(data):
             if isinstance(item, Packet):
                 found += self._packet(item, at)
@@ -139,7 +139,7 @@ class ScreamDecoder:
                 )
         return found
 
-    def receive_datagram(self, data: bytes, at: HostTime) -> list[Block | Event]:
+    def receive_datagram(self, data: bytes, at: HostTime) -> list[DeviceItem]:
         """Decode one UDP packet."""
         text = data[:16].rstrip(b"\0") + b"\0"
         if text == ACKNOWLEDGED:
@@ -155,7 +155,7 @@ class ScreamDecoder:
         """Stop waiting for a packet that the server no longer has."""
         self._missing.pop(sequence, None)
 
-    def _packet(self, packet: Packet, at: HostTime) -> Iterator[Block | Event]:
+    def _packet(self, packet: Packet, at: HostTime) -> Iterator[DeviceItem]:
         sequence = packet.sequence
         due = sequence if self._next is None else self._next
         ahead = (sequence - due) % 65536

@@ -37,7 +37,7 @@ from daq.errors import (
     NoAnswerError,
     WrongDeviceError,
 )
-from daq.protocols.block import Block, Event, EventKind
+from daq.protocols.block import Block, DeviceItem, Event, EventKind
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterator, Callable, Sequence
@@ -59,7 +59,7 @@ class GuralpSession:
         *,
         patience: float,
         information: tuple[DeviceInformation, ...],
-        buffered: list[Block | Event],
+        buffered: list[DeviceItem],
         identify: Callable[[str], DeviceInformation],
     ) -> None:
         self.information = information
@@ -72,7 +72,7 @@ class GuralpSession:
         self._absent = {one.sensor for one in information if one.trouble}
         self._refused: set[str] = set()
 
-    async def read(self) -> AsyncIterator[Block | Event]:
+    async def read(self) -> AsyncIterator[DeviceItem]:
         """Yield blocks and events."""
         async with contextlib.aclosing(self._received()) as received:
             async for item in received:
@@ -83,7 +83,7 @@ class GuralpSession:
                         continue
                 yield item
 
-    async def _received(self) -> AsyncGenerator[Block | Event]:
+    async def _received(self) -> AsyncGenerator[DeviceItem]:
         buffered, self._buffered = self._buffered, []
         for item in buffered:
             yield item
@@ -135,7 +135,7 @@ class GuralpDriver:
         label = port_label(sensors)
         ids = _configured(sensors)
         async with open_link(first.port, settings, clock, ids, label=label) as link:
-            buffered: list[Block | Event] = []
+            buffered: list[DeviceItem] = []
             if not ids[first.name]:
                 await _discover(link, first, settings, label, buffered)
             by_name = {sensor.name: sensor for sensor in sensors}
@@ -181,7 +181,7 @@ async def _discover(
     sensor: Sensor,
     settings: GuralpSettings,
     label: str,
-    buffered: list[Block | Event],
+    buffered: list[DeviceItem],
 ) -> None:
     """Listen until one digitizer has sent as many streams as the sensor has channels."""
     n_channels = len(sensor.channels)
@@ -219,7 +219,7 @@ async def _listen(
     sensors: Sequence[Sensor],
     settings: GuralpSettings,
     label: str,
-    buffered: list[Block | Event],
+    buffered: list[DeviceItem],
 ) -> tuple[DeviceInformation, ...]:
     """Listen until every stream has been received; return the information of each sensor.
 

@@ -14,7 +14,7 @@ from daq.devices.guralp import scream
 from daq.devices.guralp.decoders import ScreamDecoder, SerialDecoder
 from daq.devices.guralp.gcf import BLOCK_SIZE
 from daq.errors import NotConnectedError
-from daq.protocols.block import Block, Event, EventKind
+from daq.protocols.block import DeviceItem, Event, EventKind
 from daq.transport.address import host_and_port
 from daq.transport.ports import open_port
 from daq.transport.udp import open_datagrams
@@ -44,11 +44,11 @@ class Link(Protocol):
         """The received streams."""
         ...
 
-    async def receive(self) -> list[Block | Event]:
+    async def receive(self) -> list[DeviceItem]:
         """Wait for the next bytes and decode them."""
         ...
 
-    async def respond(self) -> list[Block | Event]:
+    async def respond(self) -> list[DeviceItem]:
         """Send what the other end needs, once the received blocks are handed on.
 
         Return the blocks that this recovers. A port that is lost meanwhile raises no error here:
@@ -68,11 +68,11 @@ class _SerialLink:
     def streams(self) -> Streams:
         return self._decoder.streams
 
-    async def receive(self) -> list[Block | Event]:
+    async def receive(self) -> list[DeviceItem]:
         received, at = await self._stream.read()
         return self._decoder.receive(received, at)
 
-    async def respond(self) -> list[Block | Event]:
+    async def respond(self) -> list[DeviceItem]:
         replies = self._decoder.take_replies()
         if replies:
             with contextlib.suppress(NotConnectedError):
@@ -89,11 +89,11 @@ class _TcpLink:
     def streams(self) -> Streams:
         return self._decoder.streams
 
-    async def receive(self) -> list[Block | Event]:
+    async def receive(self) -> list[DeviceItem]:
         received, at = await self._stream.read()
         return self._decoder.receive(received, at)
 
-    async def respond(self) -> list[Block | Event]:
+    async def respond(self) -> list[DeviceItem]:
         """Send nothing."""
         return []
 
@@ -112,7 +112,7 @@ class _UdpLink:
         self._delay = FIRST_RETRY
         self._retry_ns: int | None = None  # time of the next recovery, after a failed one
         self._at: HostTime | None = None  # arrival of the last datagram
-        self._recovered: list[Block | Event] = []  # not yet handed on
+        self._recovered: list[DeviceItem] = []  # not yet handed on
         self._name = next(iter(ids)) if len(ids) == 1 else ""
         self._decoder = ScreamDecoder(ids)
 
@@ -120,12 +120,12 @@ class _UdpLink:
     def streams(self) -> Streams:
         return self._decoder.streams
 
-    async def receive(self) -> list[Block | Event]:
+    async def receive(self) -> list[DeviceItem]:
         received, at = await self._stream.read()
         self._at = at
         return self._decoder.receive_datagram(received, at)
 
-    async def respond(self) -> list[Block | Event]:
+    async def respond(self) -> list[DeviceItem]:
         """Request missing packets over TCP; after a failure, wait before the next request."""
         at, where = self._at, self._recovery
         due = self._retry_ns is None or (at is not None and at.monotonic_ns >= self._retry_ns)

@@ -12,11 +12,12 @@ belong to no sensor are kept until :meth:`Streams.assign` assigns their streams.
 
 from __future__ import annotations
 
+import re
 from collections import Counter, deque
 from typing import TYPE_CHECKING
 
 from daq.devices.guralp.gcf import SampleBlock, StatusBlock, serial_number
-from daq.protocols.block import Block, Event, EventKind, HostTime
+from daq.protocols.block import Block, DeviceItem, Event, EventKind, HostTime, Quantity, Reading
 from daq.protocols.joined_streams import MAX_PENDING, JoinedStreams
 
 if TYPE_CHECKING:
@@ -24,6 +25,13 @@ if TYPE_CHECKING:
 
 MAX_KEPT = 1024
 """Maximum number of blocks kept for streams that are not assigned yet."""
+_STATED = {
+    Quantity.SUPPLY: re.compile(r"\bsupply\s*[:=]?\s*(\d{1,3}(?:\.\d{1,4})?)\s*V\b", re.IGNORECASE),
+    Quantity.TEMPERATURE: re.compile(
+        r"\btemp(?:erature)?\s*[:=]?\s*([-+]?\d{1,3}(?:\.\d{1,4})?)\s*['°]?\s*C\b", re.IGNORECASE
+    ),
+}
+"""As in ``External supply : 13.0V Temperature 24.68'C`` (Güralp MAN-D24-0004, 7.1.1)."""
 FULL_SCALE_COUNTS = (1 << 23) - 1
 """Full scale of a 24-bit digitizer, peak."""
 
@@ -83,7 +91,7 @@ class Streams:
 
     def receive(
         self, block: SampleBlock | StatusBlock, at: HostTime, *, awaiting: bool = False
-    ) -> Iterator[Block | Event]:
+    ) -> Iterator[DeviceItem]:
         """Add one block; yield the completed blocks and events.
 
         ``awaiting`` is whether missing blocks may still arrive.
@@ -110,7 +118,7 @@ class Streams:
             for sensor in self._sensors.values():
                 yield from sensor.take(self._at, awaiting=False, reason=self._lost)
 
-    def assign(self, sensor: str, stream_ids: Iterable[str]) -> Iterator[Block | Event]:
+    def assign(self, sensor: str, stream_ids: Iterable[str]) -> Iterator[DeviceItem]:
         """Assign streams to a sensor; yield the blocks received of them, up to the first hole."""
         ids = tuple(stream_ids)
         own = self._sensors[sensor] = _joined(sensor, ids)
@@ -130,14 +138,21 @@ class Streams:
         text = f"stream {stream_id} belongs to no sensor of this port"
         return Event(self._name, EventKind.REFUSED, text, at)
 
-    def _status(self, block: StatusBlock, at: HostTime) -> Iterator[Event]:
+    def _status(self, block: StatusBlock, at: HostTime) -> Iterator[Event | Reading]:
         serial = serial_number(block.stream_id)
         owners = {n for stream, n in self._owner.items() if serial_number(stream) == serial} or {""}
         for line in block.text.splitlines():
             text = "".join(c if c.isprintable() else "?" for c in line).strip()
             if text:
+                stated = [
+                    (quantity, float(found[1]))
+                    for quantity, pattern in _STATED.items()
+                    if (found := pattern.search(text))
+                ]
                 for name in sorted(owners):
                     yield Event(name, EventKind.STATUS, cut(text), at)
+                    for quantity, value in stated if name else ():
+                        yield Reading(name, quantity, value, at)
 
 
 def _joined(sensor: str, stream_ids: tuple[str, ...]) -> JoinedStreams:

@@ -214,7 +214,7 @@ async def identify(
         model=f"LabJack {product}",
         serial_number=str(serial),
         firmware=f"{firmware:.4f}",
-        temperature=round(kelvin - 273.15, 2),
+        temperature=celsius_of(kelvin),
     )
 
 
@@ -241,6 +241,18 @@ async def read_uptime(registers: Registers) -> Uptime | None:
         values, at = await registers.exchange(Read(reg.SYSTEM_TIMER_20HZ, 2))
         return Uptime(int.from_bytes(values, "big"), at)
     return None
+
+
+async def read_temperature(registers: Registers) -> tuple[float, HostTime]:
+    """Return the temperature of the device in °C, and when it was read."""
+    values, at = await registers.exchange(Read(reg.TEMPERATURE_DEVICE_K, 2))
+    (kelvin,) = struct.unpack(">f", values)
+    return celsius_of(kelvin), at
+
+
+def celsius_of(kelvin: float) -> float:
+    """Return a temperature in °C."""
+    return round(kelvin - 273.15, 2)
 
 
 async def set_inputs(

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -36,6 +37,7 @@ from daq.devices.labjack.settings import RANGES, LabJackSettings, lacking, range
 from daq.devices.labjack.stream import StreamDecoder
 from daq.devices.port_rules import port_label
 from daq.errors import BenchFileError, DeviceError, NoAnswerError
+from daq.protocols.block import Quantity, Reading, ReadingTimes
 from daq.protocols.errors import RemoteProtocolError
 from daq.transport.ports import open_port
 
@@ -46,7 +48,7 @@ if TYPE_CHECKING:
     from daq.bench.model import Sensor
     from daq.devices.interface import DeviceInformation, Session
     from daq.host_clock import HostClock
-    from daq.protocols.block import Block, Event
+    from daq.protocols.block import Block, DeviceItem, Event
 
 ASK_AFTER = 1.0
 """Silence in s, beyond two packets, after which the driver tests whether the device streams."""
@@ -95,8 +97,12 @@ class LabJackSession:
         """
         return self.decoder.recovers
 
-    async def read(self) -> AsyncIterator[Block | Event]:
-        """Start the stream and yield its blocks; restart the stream if it ends."""
+    async def read(self) -> AsyncIterator[DeviceItem]:
+        """Start the stream and yield its blocks; restart the stream if it ends.
+
+        The device's temperature is read once a minute, between two packets.
+        """
+        reading_times = ReadingTimes()
         if self._settings.mode == "command-response":
             received = self._by_command()
         else:
@@ -106,6 +112,9 @@ class LabJackSession:
             async for items in received:
                 for item in items:
                     yield item
+                if items and reading_times.is_due(items[-1].received):
+                    for reading in await self._temperature():
+                        yield reading
                 if self.decoder.fatal is None:
                     fruitless = 0 if items else fruitless
                     continue
@@ -116,6 +125,14 @@ class LabJackSession:
                 await self._registers.stop_stream()
                 self.decoder.restart()
                 await self._start()
+
+    async def _temperature(self) -> list[Reading]:
+        """Return the temperature of the device for all its sensors; none if it does not reply."""
+        with contextlib.suppress(NoAnswerError, RemoteProtocolError):
+            celsius, at = await setup.read_temperature(self._registers)
+            names = [one.sensor for one in self.information] if math.isfinite(celsius) else []
+            return [Reading(name, Quantity.TEMPERATURE, celsius, at) for name in names]
+        return []
 
     async def _start(self) -> None:
         await self._registers.do("starting the stream", setup.long(reg.STREAM_ENABLE, 1))
@@ -172,6 +189,7 @@ class LabJackDriver:
     summary = "LabJack T7 or T8: analog inputs streamed over Ethernet, several sensors on one"
     settings = LabJackSettings
     shares_clock = True
+    states_temperature = True
 
     def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:  # noqa: ARG002 -- interface
         """Return uint16."""

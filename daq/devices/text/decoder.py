@@ -29,8 +29,9 @@ sample, and lost bytes are not detected.
 
 from __future__ import annotations
 
+import contextlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -46,7 +47,16 @@ from daq.devices.text.format import (
     read_hexadecimal,
 )
 from daq.devices.text.packet_order import Group, Packets
-from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
+from daq.protocols.block import (
+    Block,
+    BlockFlag,
+    Event,
+    EventKind,
+    HostTime,
+    Quantity,
+    Reading,
+    ReadingTimes,
+)
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.sample_counter import SampleCounter
 from daq.protocols.sample_times import Place, SampleTimes
@@ -55,6 +65,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from numpy.typing import NDArray
+
+    from daq.protocols.block import DeviceItem
 
 _ANNOUNCED = 200
 _FIRST_ROWS = 5
@@ -109,15 +121,21 @@ class TextDecoder:
         self.first_rows: list[bytes] = []
         """The first messages, while none of them was readable."""
         self._has_read = False
+        keys = {
+            Quantity.TEMPERATURE: format_.temperature_column,
+            Quantity.SUPPLY: format_.supply_column,
+        }
+        self._stated_keys = {quantity: key for quantity, key in keys.items() if key is not None}
+        self._reading_times = ReadingTimes()
 
-    def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
+    def receive(self, data: bytes, at: HostTime) -> list[DeviceItem]:
         """Decode bytes of a line or connection, cut anywhere."""
         messages = self._finder.receive(data)
         if self._joins and messages:
             messages, self._joins = messages[1:], False
         return [*self._given_up(self._finder, at), *self._messages(messages, at)]
 
-    def receive_datagram(self, data: bytes, at: HostTime) -> list[Block | Event]:
+    def receive_datagram(self, data: bytes, at: HostTime) -> list[DeviceItem]:
         """Decode one datagram: complete messages, the last with or without a terminator."""
         finder = MessageFinder(self._format.terminator.encode())
         messages = finder.receive(data + self._format.terminator.encode())
@@ -134,8 +152,8 @@ class TextDecoder:
             )
             yield Event(self._sensor, EventKind.RESYNCHRONISED, _cut(text), at)
 
-    def _messages(self, messages: list[bytes], at: HostTime) -> list[Block | Event]:
-        found: list[Block | Event] = []
+    def _messages(self, messages: list[bytes], at: HostTime) -> list[DeviceItem]:
+        found: list[DeviceItem] = []
         rows: list[_Row] = []
         n_known = self._n_known
         for message in messages:
@@ -159,6 +177,8 @@ class TextDecoder:
                 found.append(Event(self._sensor, EventKind.CHECKSUM, _cut(text), at))
                 self._unreadable()
         found += self._rows(rows, at)
+        if rows and self._stated_keys and self._reading_times.is_due(at):
+            found += self._readings(rows[-1], at)
         if self._n_known > n_known:
             what = "packets" if self._format.layout == "channel" else "rows"
             text = f"dropped {self._n_known - n_known} {what} that were repeated or too late"
@@ -205,6 +225,14 @@ class TextDecoder:
             text = format_.delimiter.join(fields)[:80]
             raise RemoteProtocolError(f"not a row of this format: {text!r}") from error
         return _Row(values, message, counter, time_ns, resolution_ns)
+
+    def _readings(self, row: _Row, at: HostTime) -> Iterator[Reading]:
+        """Yield what a row states of the device; a field that is no number states nothing."""
+        by_key = _by_key(self._split(row.message) or [], self._format)
+        for quantity, key in self._stated_keys.items():
+            with contextlib.suppress(ValueError, LookupError):
+                (value,) = _numbers([by_key[key]], replace(self._format, whole=False))
+                yield Reading(self._sensor, quantity, float(value), at)
 
     def _time(self, text: str) -> tuple[int, int]:
         """Return a time and the resolution of the times: trailing zeros may be omitted."""

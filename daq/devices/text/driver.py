@@ -37,7 +37,7 @@ from daq.devices.text.format import (
 )
 from daq.devices.text.guess import guess_settings
 from daq.errors import BenchFileError, DeviceError, FileFault, toml_value
-from daq.protocols.block import Block, Event, EventKind
+from daq.protocols.block import Block, DeviceItem, Event, EventKind
 from daq.transport.ports import open_port
 from daq.transport.udp import open_datagrams
 
@@ -81,6 +81,10 @@ class TextSettings(BaseModel):
     since the start of the device."""
     counter_column: Annotated[int, Field(ge=0)] | str | None = None
     counter_modulus: PositiveInt | None = None
+    temperature_column: Annotated[int, Field(ge=0)] | str | None = None
+    """Field of the device's temperature in °C, recorded once a minute (not in layout "channel")."""
+    supply_column: Annotated[int, Field(ge=0)] | str | None = None
+    """Field of the supply voltage in V, likewise."""
     nmea_checksum: bool | None = None
     whole: bool | None = None
     """Whether samples are integers."""
@@ -187,7 +191,7 @@ def _check_format(format_: TextFormat, sensor: Sensor) -> None:
 class _Source(Protocol):
     """Source of the text."""
 
-    async def receive(self) -> list[Block | Event]: ...
+    async def receive(self) -> list[DeviceItem]: ...
     async def send(self, payload: bytes) -> None: ...
     def discard(self) -> None: ...
 
@@ -197,7 +201,7 @@ class _StreamSource:
         self._stream = stream
         self._decoder = decoder
 
-    async def receive(self) -> list[Block | Event]:
+    async def receive(self) -> list[DeviceItem]:
         received, at = await self._stream.read()
         return self._decoder.receive(received, at)
 
@@ -215,7 +219,7 @@ class _DatagramSource:
         self._sensor = sensor
         self._told: set[str] = set()
 
-    async def receive(self) -> list[Block | Event]:
+    async def receive(self) -> list[DeviceItem]:
         received, at = await self._stream.read()
         found = self._decoder.receive_datagram(received, at)
         if any(isinstance(item, Block) for item in found):
@@ -269,7 +273,7 @@ class TextSession:
         would = ", ".join(f"{key} = {toml_value(value)}" for key, value in guess.items())
         return f"received rows that settings do not match: {shown}; these would: {would}"
 
-    async def read(self) -> AsyncIterator[Block | Event]:
+    async def read(self) -> AsyncIterator[DeviceItem]:
         """Start the device and yield blocks and events."""
         self._source.discard()
         if self._settings.start:

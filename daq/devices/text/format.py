@@ -46,6 +46,9 @@ class TextFormat:
         Field of a counter that increases by one per row, modulo ``counter_modulus``.
     decimal_comma : bool
         Whether numbers are written ``1,5``.
+    temperature_column, supply_column : int, str or None
+        Fields of the device's temperature in °C and of its supply voltage in V (not in layout
+        "channel").
     hexadecimal_bits : int or None
         Number of bits of samples in hexadecimal, two's complement; None for decimal samples.
     tag : str
@@ -73,6 +76,8 @@ class TextFormat:
     device_time: bool = False
     decimal_comma: bool = False
     hexadecimal_bits: int | None = None
+    temperature_column: int | str | None = None
+    supply_column: int | str | None = None
 
     @property
     def channel_keys(self) -> tuple[int, ...] | tuple[str, ...]:
@@ -94,7 +99,13 @@ RASPBERRY_SHAKE = TextFormat(
 )
 """Its times are from NTP, rounded to 1 ms: precise enough for gaps, too coarse for the clock."""
 LILY = TextFormat(
-    tag="LILY", columns=(2, 3), time_column=1, time_format="%Y/%m/%d %H:%M:%S", terminator="\r\n"
+    tag="LILY",
+    columns=(2, 3),
+    time_column=1,
+    time_format="%Y/%m/%d %H:%M:%S",
+    terminator="\r\n",
+    temperature_column=5,
+    supply_column=6,
 )
 """Fields: tilt X and Y in µrad; then azimuth, temperature, supply voltage, serial number."""
 

@@ -44,6 +44,8 @@ _WINDOW = 1 << 20
 """Bytes before the previous end of a recording in which HDF5 may still place a chunk."""
 CHUNKED = ("samples", "instants")
 TABLES = ("blocks", "gaps")
+OF_RUN = ("events", "readings")
+"""Tables that are not of a sensor; a journal of an earlier version has no readings."""
 
 
 def journal_path(recording: Path) -> Path:
@@ -92,7 +94,7 @@ class Journal:
         chunked : mapping
             Datasets `CHUNKED` of each sensor.
         tables : mapping
-            New rows of the `TABLES` of each sensor; the key ``""`` has the new rows of the events.
+            New rows of the `TABLES` of each sensor; the key ``""`` has those of `OF_RUN`.
         counts : int64, shape (n_sensors + 1, 3)
             The new ``/committed``.
         """
@@ -189,7 +191,7 @@ class JournalContents:
         Offset, size, filter mask of each chunk, and its bytes if the offset is negative, by
         (sensor, dataset).
     tables : dict
-        All rows, by (sensor, dataset) or ("", "events").
+        All rows, by (sensor, dataset), or ("", dataset) for `OF_RUN`.
     """
 
     created: bytes
@@ -238,7 +240,7 @@ def _add(found: JournalContents, payload: bytes) -> None:
                 at += len(kept)
                 found.chunks[sensor, name].append((offset, size, mask, kept))
     for sensor, lengths in described["tables"].items():
-        names = TABLES if sensor else ("events",)
+        names = TABLES if sensor else OF_RUN[: len(lengths)]
         for name, length in zip(names, lengths, strict=True):
             found.tables[sensor, name] += rest[at : at + length]
             at += length
@@ -272,8 +274,10 @@ def rebuild(damaged: Path, contents: JournalContents, copy: Path) -> None:
                 _put_chunks(group[kind], stored, n_rows, source)
             for kind, n in zip(TABLES, row[[file_format.BLOCKS, file_format.GAPS]], strict=True):
                 _put_rows(group[kind], contents.tables.get((name, kind), b""), int(n))
-        events = contents.tables.get(("", "events"), b"")
-        _put_rows(file["events"], events, int(counts[-1, file_format.EVENTS]))
+        columns = counts[-1, [file_format.EVENTS, file_format.READINGS]]
+        for kind, n in zip(OF_RUN, columns, strict=True):
+            if kind in file:
+                _put_rows(file[kind], contents.tables.get(("", kind), b""), int(n))
         file["committed"][...] = counts
 
 

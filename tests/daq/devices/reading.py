@@ -16,12 +16,13 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Sensor
     from daq.devices.interface import DriverType, Session
+    from daq.protocols.block import DeviceItem
 
 
 @contextlib.asynccontextmanager
 async def reading(
     driver: DriverType, sensors: Sequence[Sensor], *, speed: float = 1.0
-) -> AsyncIterator[AsyncIterator[Block | Event]]:
+) -> AsyncIterator[AsyncIterator[DeviceItem]]:
     """Open a session and its reading; both are closed on exit."""
     async with (
         driver.open(sensors, host_clock(speed)) as session,
@@ -30,11 +31,11 @@ async def reading(
         yield items
 
 
-async def _patiently(session: Session, speed: float) -> AsyncGenerator[Block | Event]:
+async def _patiently(session: Session, speed: float) -> AsyncGenerator[DeviceItem]:
     """Yield what the session yields, until nothing has come for as long as it states."""
     patience = patience_of(session) / speed
     loop = asyncio.get_running_loop()
-    async with contextlib.aclosing(cast("AsyncGenerator[Block | Event]", session.read())) as items:
+    async with contextlib.aclosing(cast("AsyncGenerator[DeviceItem]", session.read())) as items:
         deadline = loop.time() + patience
         while True:
             try:
@@ -61,6 +62,7 @@ async def record(
         async for item in items:
             if isinstance(item, Event):
                 events.append(item)
+            if not isinstance(item, Block):
                 continue
             blocks.append(item)
             if item.end_sample >= n_samples:

@@ -22,7 +22,7 @@ from daq.devices.interface import PresentPort
 from daq.devices.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.host_clock import SystemClock
-from daq.protocols.block import Block, BlockFlag, Event, HostTime
+from daq.protocols.block import Block, BlockFlag, HostTime
 from sim_devices.devices.epson_can import SimulatedBus
 
 if TYPE_CHECKING:
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
+
+    from daq.protocols.block import DeviceItem
 
 RATE = 100.0
 DRIVER = driver_type("epson-can")
@@ -74,8 +76,8 @@ def sensors(channel: str, *names: str, **changes: object) -> list[Sensor]:
     ]
 
 
-async def read(bench: list[Sensor], n_samples: int) -> list[Block | Event]:
-    found: list[Block | Event] = []
+async def read(bench: list[Sensor], n_samples: int) -> list[DeviceItem]:
+    found: list[DeviceItem] = []
     ends = {one.name: 0 for one in bench}
     async with DRIVER.open(bench, SystemClock()) as session:
         assert [one.model for one in session.information] == ["M-A552AC10"] * len(bench)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from daq.devices.epson import commands
 from daq.devices.epson.burst import BurstDecoder
 from daq.devices.epson.commands import BurstFormat, CommandDecoder, Read, Register, Write
-from daq.protocols.block import Block, BlockFlag, Event, HostTime
+from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, HostTime, Reading
 
 RATE = 200.0
 ALL = BurstFormat.of("flag", "temperature", "x", "y", "z", "count", "checksum")
@@ -50,7 +50,7 @@ def frames(first: int, n: int) -> bytes:
     )
 
 
-def samples(found: list[Block | Event]) -> dict[int, tuple[int, ...]]:
+def samples(found: list[DeviceItem]) -> dict[int, tuple[int, ...]]:
     """Index → counts."""
     return {
         block.first_sample + row: tuple(counts)
@@ -93,8 +93,10 @@ def test_frame_lengths(burst: BurstFormat, size: int) -> None:
 def test_a_golden_burst_is_encoded_and_decoded() -> None:
     values = {"flag": 0x8E00, "temperature": 2637, "x": 2**24, "y": -(2**24), "z": 0x00800D80}
     assert commands.encode_bursts(ALL, **values, count=65534) == GOLDEN
-    (block,) = decoder().receive(GOLDEN, at(0))
+    block, reading = decoder().receive(GOLDEN, at(0))
     assert isinstance(block, Block)
+    assert isinstance(reading, Reading)
+    assert reading.value == pytest.approx(24.988, abs=1e-3)
     assert block.counts.tolist() == [[2**24, -(2**24), 0x00800D80, 2637]]
     assert (block.first_sample, block.device_counter) == (0, 65534)
     assert block.flags == BlockFlag.CLOCK_RESTART
@@ -133,7 +135,7 @@ def test_blocks_do_not_depend_on_the_division_of_bytes(data: st.DataObject) -> N
     stream = frames(0, 20) + garbage + frames(20, 20)[7:]
     cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=8)))
     split = decoder()
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for start, stop in zip([0, *cuts], [*cuts, len(stream)], strict=True):
         found += split.receive(stream[start:stop], at(0.2))
     assert samples(found) == samples(decoder().receive(stream, at(0.2)))
@@ -194,7 +196,7 @@ def test_a_wrap_of_count_is_no_gap() -> None:
 def test_a_gap_is_exact_for_any_number_of_wraps(missing: int) -> None:
     one = decoder()
     one.receive(frames(0, 200), at(1))
-    (block,) = one.receive(frames(200 + missing, 1), at(1 + (missing + 1) / RATE + 0.004))
+    block, *_ = one.receive(frames(200 + missing, 1), at(1 + (missing + 1) / RATE + 0.004))
     assert isinstance(block, Block)
     assert block.first_sample == 200 + missing
     assert not block.flags

@@ -75,6 +75,7 @@ async def record(
         async for item in items:
             if isinstance(item, Event):
                 events.append(item)
+            if not isinstance(item, Block):
                 continue
             blocks.append(item)
             if idle_after is not None and item.end_sample >= idle_after:

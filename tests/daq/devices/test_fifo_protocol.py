@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from daq.protocols.block import DeviceItem
+
 RATE = 7812.0
 
 
@@ -181,9 +183,9 @@ def run(
     n_reads: int,
     *,
     hurt: Callable[[int, bytes, bytes], bytes | None] | None = None,
-) -> list[Block | Event]:
+) -> list[DeviceItem]:
     """Read ``n_reads`` times, a millisecond each, 8 samples made in each."""
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for i in range(n_reads):
         device.advance(8)
         request = decoder.request()
@@ -197,7 +199,7 @@ def run(
     return found
 
 
-def numbered(found: list[Block | Event]) -> tuple[list[int], NDArray[Any]]:
+def numbered(found: list[DeviceItem]) -> tuple[list[int], NDArray[Any]]:
     blocks = [b for b in found if isinstance(b, Block)]
     index = [i for b in blocks for i in range(b.first_sample, b.end_sample)]
     return index, np.concatenate([b.counts for b in blocks])
@@ -271,7 +273,7 @@ def test_a_fifo_that_stays_full_loses_a_little_each_time(header: Header) -> None
     """100 samples are made between two reads of 41: each is where host time has it."""
     device = Device(header, capacity=3000)
     decoder = FifoDecoder("A", 100_000.0, header=header, capacity=3000)
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for i in range(200):
         device.advance(100 if i > 5 else 10)
         found += decoder.receive(device.answer(decoder.request()), at(i * 1e-3))

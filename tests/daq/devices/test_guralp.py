@@ -249,7 +249,7 @@ async def test_failed_recovery_is_repeated() -> None:
                 async for item in items:
                     if isinstance(item, Block):
                         blocks.append(item)
-                    elif "over TCP" in item.text:
+                    elif isinstance(item, Event) and "over TCP" in item.text:
                         said.append(item.text)
                         recovered_from = len(blocks)
                     if len(said) == 3 and len(blocks) > recovered_from + 4:

@@ -20,6 +20,7 @@ from tests.devices import serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
 
 if TYPE_CHECKING:
+    from daq.protocols.block import DeviceItem
     from sim_devices.server.launch import RunningDevice
 
 pytestmark = pytest.mark.devices
@@ -65,7 +66,7 @@ async def test_another_device_is_refused(settings: dict[str, Any], said: str) ->
         await record(DRIVER, of(running, **settings), 1)
 
 
-def decoded(*buffers: list[float], jitter: float = 0.0) -> list[Block | Event]:
+def decoded(*buffers: list[float], jitter: float = 0.0) -> list[DeviceItem]:
     """Return what becomes of scans at these numbers of a sample, their values."""
     channels = (Channel(name="x", sensitivity=1.0),)
     one = Sensor(name="A", driver="iio", port="iio://x", sampling_rate=RATE, channels=channels)
@@ -78,7 +79,7 @@ def decoded(*buffers: list[float], jitter: float = 0.0) -> list[Block | Event]:
         patience=1.0,
     )
     layout, rng = ScanLayout(ELEMENTS), np.random.default_rng(1)
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for numbers in buffers:
         late = rng.uniform(-jitter, jitter, len(numbers)) / RATE
         times = np.rint((np.array(numbers) / RATE + late + 1.8e9) * 1e9).astype(np.int64)

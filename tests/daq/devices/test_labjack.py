@@ -20,7 +20,7 @@ from daq.errors import (
     NotConnectedError,
     WrongDeviceError,
 )
-from daq.protocols.block import Block, BlockFlag, Event
+from daq.protocols.block import Block, BlockFlag, Event, Reading
 from sim_devices.world.world import World
 from tests.daq.devices.reading import reading
 from tests.devices import host_clock, serving
@@ -97,6 +97,7 @@ async def record(some: list[Sensor], n_samples: int) -> tuple[dict[str, list[Blo
         async for item in items:
             if isinstance(item, Event):
                 events.append(item)
+            if not isinstance(item, Block):
                 continue
             blocks[item.sensor].append(item)
             if item.sensor == some[-1].name and item.end_sample >= n_samples:
@@ -170,6 +171,23 @@ async def test_any_inputs_can_be_used(running: tuple[RunningDevice, ...]) -> Non
     assert np.corrcoef(a, b)[0, 1] > 0.999
 
 
+@pytest.mark.parametrize("mode", ["spontaneous", "command-response"])
+async def test_the_temperature_is_read_while_the_device_streams(
+    running: tuple[RunningDevice, ...], mode: str
+) -> None:
+    some = bench(running[0], settings={"mode": mode})
+    readings: list[Reading] = []
+    async with reading(DRIVER, some, speed=SPEED) as items:
+        async for item in items:
+            readings += [item] if isinstance(item, Reading) else []
+            if len(readings) >= 2 * len(NAMES):
+                break
+    assert [each.sensor for each in readings] == [*NAMES, *NAMES]
+    times = [each.received.monotonic_ns // 60_000_000_000 for each in readings]
+    assert times[-1] == times[0] + 1
+    assert all(abs(each.value - 25.0) <= 0.5 for each in readings)
+
+
 async def test_the_devices_information_is_reported(running: tuple[RunningDevice, ...]) -> None:
     some = bench(running[0], sampling_rate=333.0, serial_number="470001234")
     async with DRIVER.open(some, host_clock(SPEED)) as session:
@@ -178,7 +196,7 @@ async def test_the_devices_information_is_reported(running: tuple[RunningDevice,
     assert information[0].model == "LabJack T7"
     assert information[0].serial_number == "470001234"
     assert information[0].firmware == "1.0292"
-    assert information[0].temperature == pytest.approx(25.0)
+    assert information[0].temperature == pytest.approx(25.0, abs=0.6)
     assert information[0].sampling_rate == pytest.approx(actual_scan_rate(333.0), rel=1e-12)
     assert information[1].details == {
         "inputs": "AIN3, AIN4, AIN5",
@@ -269,7 +287,7 @@ async def test_a_buffer_that_overflows_is_a_gap_of_exact_length(
         async for item in items:
             if isinstance(item, Event):
                 events.append(item)
-            elif item.sensor == "A":
+            elif isinstance(item, Block) and item.sensor == "A":
                 blocks.append(item)
                 if len(blocks) == 5:
                     await asyncio.sleep(0.8)  # the test's own idleness is what is tested

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from daq.protocols.block import DeviceItem
+
 S = 1_000_000_000
 RATE = 1000.0
 TICKS = 40_000
@@ -64,9 +66,7 @@ def decoder(*, timed: bool = True) -> StreamDecoder:
     return StreamDecoder(SENSORS, scan_list=scan_list, scan_rate=RATE)
 
 
-def of(
-    sensor: str, found: Iterable[Block | Event]
-) -> tuple[NDArray[Any], list[Block], list[Event]]:
+def of(sensor: str, found: Iterable[DeviceItem]) -> tuple[NDArray[Any], list[Block], list[Event]]:
     found = list(found)
     blocks = [b for b in found if isinstance(b, Block) and b.sensor == sensor]
     counts = np.concatenate([b.counts for b in blocks]) if blocks else np.empty((0, 3))
@@ -115,7 +115,7 @@ def test_scans_become_blocks_of_every_sensor(timed: bool, step: int) -> None:
 def test_timer_is_unwrapped() -> None:
     """Four minutes at one packet a second: the timer wraps twice."""
     receiver = decoder()
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for second in range(240):
         rows = scans(second * 1000, 80, timer=4_000_000_000)[::]
         found += receiver.receive(
@@ -345,7 +345,7 @@ def test_stream_decoding_continues_after_any_bytes(pieces: list[bytes], timed: b
     receiver.receive(noise, at(1))
     rows = scans(0, 100, timed=timed)
     n_columns = rows.shape[1]
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for data in (*packets(rows, 10 * n_columns), bytes(1100)):
         found += receiver.receive(data, at(2))
     counts, _, _ = of("A", found)
@@ -368,7 +368,7 @@ def test_a_packet_number_that_contradicts_host_time_is_ignored(timed: bool) -> N
     wrong = bytearray(sent[20])
     wrong[0] ^= 0x80  # its transaction number
     one = decoder(timed=timed)
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for k, packet in enumerate([*sent[:10], sent[9], *sent[10:20], bytes(wrong), *sent[21:]]):
         found += one.receive(packet, at(k * 10 / RATE))
     blocks = [item for item in found if isinstance(item, Block) and item.sensor == "A"]
@@ -384,7 +384,7 @@ def test_a_packet_with_lost_bytes_does_not_shift_later_ones(timed: bool) -> None
     sent = packets(scans(0, 200, timed=timed), 10 * width)
     cut = sent[5][:50] + sent[5][52:]
     one = decoder(timed=timed)
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for k, packet in enumerate([*sent[:5], cut, *sent[6:]]):
         found += one.receive(packet, at(k * 10 / RATE))
     blocks = [item for item in found if isinstance(item, Block) and item.sensor == "A"]

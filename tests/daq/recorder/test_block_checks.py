@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
 
-from daq.protocols.block import Event, HostTime
+from daq.protocols.block import Event, HostTime, Reading
 from daq.recorder.block_checks import BlockValidator, FaultyDriverError
 from tests.scripted_driver import PlayedDriver, bench, block
 
@@ -53,11 +54,14 @@ def test_blocks_that_the_file_cannot_hold_are_refused(case: str) -> None:
 @pytest.mark.parametrize(
     ("item", "said"),
     [
-        (b"raw", "bytes; expected a Block or an Event"),
+        (b"raw", "bytes; expected a Block, an Event or a Reading"),
         (None, "NoneType"),
         (Event("c", "status", "", NOW), "an event of 'c'; expected 'a' or 'b'"),
         (Event("a", "status", cast("str", None), NOW), "'status', None; expected text"),
         (Event("a", "status", "", cast("HostTime", 5)), "an event received at 5"),
+        (Reading("c", "temperature", 20.0, NOW), "a reading of 'c'; expected 'a' or 'b'"),
+        (Reading("a", "temperature", math.nan, NOW), "'temperature', nan; expected text and a"),
+        (Reading("a", "temperature", 20.0, cast("HostTime", 5)), "a reading received at 5"),
     ],
 )
 def test_items_of_other_types_or_sensors_are_refused(item: object, said: str) -> None:

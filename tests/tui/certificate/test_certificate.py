@@ -104,7 +104,19 @@ CHECKLIST: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("Uncertainty budget (GUM)", "finite averages"),
         ("//si:coverageIntervalXMLList/si:intervalMinXMLList",),
     ),
-    "7.8.4.1 b": (("Place of the test",), ("//dcc:influenceCondition",)),
+    "7.8.4.1 b": (
+        (
+            "Place of the test",
+            "Atemperature°C24.0026.502",
+            "Sensor A was outside of its data sheet's range: 24.0 to 26.5 °C; -40 to 26",
+            "Asupply voltageV12.2512.251",
+            "computertemperature°C44.0046.502",
+        ),
+        (
+            "//dcc:quantity[contains(., 'Highest temperature of A')]//si:value[.='26.5']",
+            "//dcc:influenceCondition//dcc:text[contains(., 'Sensor A was outside')]",
+        ),
+    ),
     "7.8.4.1 c": (
         ("certificate 123 of the Example Institute",),
         ("//dcc:statement[contains(., 'certificate 123')]",),
@@ -171,6 +183,7 @@ def laboratory(folder: Path) -> Laboratory:
         SENSOR.format(name=name, number=number).replace(
             "serial_number", 'manufacturer = "Acme Sensors"\nserial_number'
         )
+        + "data_sheet = {temperature = [-40, 26]}\n"
         for number, name in enumerate(("A", "B", "C", HOSTILE))
     )
     bench = folder / "bench.toml"

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from daq.protocols.block import DeviceItem
+
 
 S = 1_000_000_000
 START_NS = 1_795_219_200 * S
@@ -44,7 +46,7 @@ def expected(first: int, n: int) -> NDArray[np.int64]:
     return np.column_stack([samples(i, first, n) for i in range(3)])
 
 
-def joined(found: Iterable[Block | Event]) -> tuple[NDArray[Any], list[Block], list[Event]]:
+def joined(found: Iterable[DeviceItem]) -> tuple[NDArray[Any], list[Block], list[Event]]:
     blocks = [item for item in found if isinstance(item, Block)]
     counts = np.concatenate([b.counts for b in blocks]) if blocks else np.empty((0, 3))
     return counts, blocks, [item for item in found if isinstance(item, Event)]

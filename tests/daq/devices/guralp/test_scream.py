@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from daq.devices.guralp import gcf, scream
 from daq.devices.guralp.decoders import ScreamDecoder
 from daq.devices.guralp.gcf import SampleBlock
-from daq.protocols.block import Block, Event
+from daq.protocols.block import Block, DeviceItem
 from daq.protocols.errors import RemoteProtocolError
 from tests.daq.devices.guralp.sample_blocks import (
     AT,
@@ -72,7 +72,7 @@ def test_little_endian_packets(width: gcf.Width) -> None:
 def test_tcp_bytes_cut_anywhere_and_with_garbage_are_decoded(version: int, step: int) -> None:
     stream = b"\x28garbage\x2d" + b"".join(packets(3, version=version))
     decoder = ScreamDecoder(SENSORS)
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for start in range(0, len(stream), step):
         found += decoder.receive(stream[start : start + step], AT)
     counts, _, events = joined(found)
@@ -98,7 +98,7 @@ def test_a_lost_packet_delays_less_than_one_block(lost: int, patience: int) -> N
     decoder = ScreamDecoder(SENSORS, patience=patience)
     seconds = []
     for second, sent in enumerate(np.array(packets(8), object).reshape(8, 3)):
-        found: list[Block | Event] = []
+        found: list[DeviceItem] = []
         for i, data in enumerate(sent):
             if 3 * second + i != lost:
                 found += decoder.receive(data, AT)
@@ -164,7 +164,7 @@ def test_a_restart_of_a_scream_server_is_detected(before: int) -> None:
     decoder = ScreamDecoder(SENSORS, patience=32)
     blocks = [scream.Packet(0, "", sample_block(i, s)) for s in range(30) for i in range(3)]
     numbers = [*range(before, before + 45), *range(20_000, 20_045)]
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for packet, number in zip(blocks, numbers, strict=True):
         if number != 20_009:
             data = scream.encode_packet(replace(packet, sequence=number))

@@ -15,7 +15,7 @@ from daq.devices.guralp import brp, gcf
 from daq.devices.guralp.decoders import SerialDecoder
 from daq.devices.guralp.gcf import SampleBlock, StatusBlock
 from daq.devices.guralp.streams import Streams
-from daq.protocols.block import Block, BlockFlag, Event
+from daq.protocols.block import Block, BlockFlag, Event, Reading
 from tests.daq.devices.guralp.sample_blocks import (
     AT,
     RATE,
@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from random import Random
 
     from numpy.typing import NDArray
+
+    from daq.protocols.block import DeviceItem
 
 
 def test_the_frame_of_the_specification_is_decoded() -> None:
@@ -59,7 +61,7 @@ def test_the_replies_of_the_specification_are_encoded() -> None:
 def test_streams_of_a_sensor_become_its_channels(step: int) -> None:
     line = b"".join(brp.encode_frame(i, raw) for i, raw in enumerate(raw_blocks(5)))
     decoder = SerialDecoder(SENSORS)
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for start in range(0, len(line), step):
         found += decoder.receive(line[start : start + step], AT)
     counts, blocks, events = joined(found)
@@ -79,7 +81,7 @@ def test_blocks_of_unequal_length_and_start_are_joined() -> None:
     """Only what all streams have is a sample of the sensor; the first such is sample 0."""
     sent = [(0, 0, 4), (1, 1, 2), (2, 2, 4), (1, 3, 3), (0, 4, 3), (2, 6, 1)]
     decoder = SerialDecoder(SENSORS)
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for number, (stream, second, n) in enumerate(sent):
         raw = gcf.encode_block(sample_block(stream, second, n))
         found += decoder.receive(brp.encode_frame(number, raw), AT)
@@ -97,7 +99,7 @@ def conversation(
     transmitter, decoder = brp.Transmitter(), SerialDecoder(SENSORS, replies=replies)
     for raw in raw_blocks(n_seconds):
         transmitter.queue(raw)
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     times_sent = 0
     while (frame := transmitter.take_frame()) is not None:
         found += decoder.receive(damage(times_sent, frame), AT)
@@ -134,7 +136,7 @@ def test_a_restart_of_the_digitizers_numbering_is_detected(due: int) -> None:
         first.queue(raw)
     for raw in blocks[due:]:
         transmitter.queue(raw)
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     while (frame := first.take_frame()) is not None:
         found += decoder.receive(frame, AT)
     decoder.take_replies()
@@ -191,6 +193,18 @@ def test_terminal_text_and_noise_between_frames_are_skipped() -> None:
         "skipped 72 bytes that are no block",
         "skipped 4 bytes: a block of 65535 bytes; expected at most 1024",
     ]
+
+
+def test_the_status_states_temperature_and_supply() -> None:
+    """The line of Güralp's manual MAN-D24-0004, 7.1.1."""
+    text = "2006 1 18 14:56:15 External supply : 13.0V Temperature 24.68'C"
+    streams = Streams({"A": ("DEMOZ2", "DEMON2", "DEMOE2")})
+    found = list(streams.receive(StatusBlock(SYSTEM, "DEMO00", START_NS, text), AT))
+    stated = [(f.sensor, f.quantity, f.value) for f in found if isinstance(f, Reading)]
+    assert stated == [("A", "supply", 13.0), ("A", "temperature", 24.68)]
+    for other in ("Temperature --.-'C", "Temperatures 3 C", "supply bad", "Temp 24.6 Counts"):
+        block = StatusBlock(SYSTEM, "DEMO00", START_NS, other)
+        assert not [f for f in streams.receive(block, AT) if isinstance(f, Reading)]
 
 
 def test_status_becomes_events_and_foreign_streams_are_named_once() -> None:
@@ -253,7 +267,7 @@ def test_clipping_is_flagged(extreme: int) -> None:
 
 def test_a_device_whose_clock_is_set_starts_a_new_grid() -> None:
     decoder = SerialDecoder(SENSORS)
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for number, (second, i) in enumerate(itertools.product((0, 1, 500_000, 500_001), range(3))):
         frame = brp.encode_frame(number, gcf.encode_block(sample_block(i, second)))
         found += decoder.receive(frame, AT)
@@ -267,7 +281,7 @@ def test_a_device_whose_clock_is_set_starts_a_new_grid() -> None:
 
 def test_a_silent_stream_does_not_fill_memory() -> None:
     decoder = SerialDecoder(SENSORS)
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for second in range(200):
         frame = brp.encode_frame(second, gcf.encode_block(sample_block(0, second)))
         found += decoder.receive(frame, AT)

@@ -8,7 +8,7 @@ from daq.devices.text.decoder import TextDecoder
 from daq.devices.text.format import (
     RASPBERRY_SHAKE,
 )
-from daq.protocols.block import Block, BlockFlag, Event
+from daq.protocols.block import Block, BlockFlag, DeviceItem
 from tests.daq.devices.text.text_formats import SHAKE, at, datacast, split
 
 
@@ -27,7 +27,7 @@ def test_raspberry_shake_packets_are_decoded() -> None:
 
 def test_packets_of_three_channels_belong_together() -> None:
     decoder = TextDecoder("A", SHAKE, sampling_rate=100.0)
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for packet in range(20):
         order = SHAKE.channel_names if packet % 2 else SHAKE.channel_names[::-1]
         for channel in order:
@@ -40,7 +40,7 @@ def test_packets_of_three_channels_belong_together() -> None:
 def test_a_lost_packet_of_one_channel_is_a_gap_of_all() -> None:
     """Packet 5 of one channel and packets 10 to 12 of all are lost on the way."""
     decoder = TextDecoder("A", SHAKE, sampling_rate=100.0)
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for packet in range(20):
         for channel in SHAKE.channel_names:
             if packet not in (10, 11, 12) and (packet, channel) != (5, "ENN"):
@@ -56,7 +56,7 @@ def test_a_lost_packet_of_one_channel_is_a_gap_of_all() -> None:
 def test_repeated_and_reordered_packets_are_sorted() -> None:
     """In pairs the wrong way round, and many again later; one time on the way is damaged."""
     decoder = TextDecoder("A", SHAKE, sampling_rate=100.0)
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     n_again = 0
     for packet in range(40):
         came = packet ^ 1 if packet >= 2 else packet
@@ -79,7 +79,7 @@ def test_repeated_and_reordered_packets_are_sorted() -> None:
 def test_packets_of_a_clock_that_is_set_back_leave_a_gap_where_they_were_dropped() -> None:
     """By 1 s: four packets seem to come again, and were no repetitions."""
     decoder = TextDecoder("A", SHAKE, sampling_rate=100.0)
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for packet in range(40):
         said = packet if packet < 20 else packet - 4
         for channel in SHAKE.channel_names:

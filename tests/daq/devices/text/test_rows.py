@@ -17,7 +17,7 @@ from daq.devices.text.format import (
     TextFormat,
     encode_fields,
 )
-from daq.protocols.block import Block, BlockFlag, Event
+from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, Reading
 from tests.daq.devices.text.text_formats import COUNTED, ROWS, SHAKE, at, datacast, split
 
 
@@ -53,6 +53,10 @@ def test_lily_rows_are_decoded() -> None:
     for second in (0, 1, 2, 6, 7):
         found += decoder.receive(line.format(second).encode(), at(second))
     found += decoder.receive(b"*9900XYC-OFF\r\n", at(8))
+    readings = [item for item in found if isinstance(item, Reading)]
+    stated = [(each.quantity, each.value) for each in readings]
+    assert stated == [("temperature", 26.01), ("supply", 11.96)]  # in one minute
+    found = [item for item in found if not isinstance(item, Reading)]
     index, rows, events = split(found)
     assert index == [0, 1, 2, 6, 7]
     assert rows == [[-236.026, 25.666]] * 5
@@ -65,7 +69,7 @@ def test_lily_rows_are_decoded() -> None:
 
 def test_a_counter_makes_gaps_exact() -> None:
     decoder = TextDecoder("A", COUNTED, sampling_rate=100.0)
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for i in range(600):
         if not 300 <= i < 400 and i != 7:
             found += decoder.receive(f"{i % 256},{i},{-i}\n".encode(), at(i / 100))
@@ -137,7 +141,7 @@ def test_decoding_continues_after_any_bytes(pieces: list[bytes], format_: TextFo
         id(SHAKE): [datacast(c, i) for i in range(20) for c in SHAKE.channel_names],
         id(LILY): [b"LILY,2013/06/24 23:22:%02d,1,%d\r\n" % (i, i) for i in range(50)],
     }[id(format_)]
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for i, line in enumerate(lines):
         found += decoder.receive(line, at(1 + i / 100))
     values: list[Any] = [row[-1] for row in split(found)[1]]

@@ -12,14 +12,14 @@ from daq.devices.text.format import (
     decode_time,
     encode_time,
 )
-from daq.protocols.block import Block, BlockFlag, Event
+from daq.protocols.block import Block, BlockFlag, DeviceItem
 from tests.daq.devices.text.text_formats import TIMED, at, split
 
 
-def rows_at(times: list[float], arrivals: list[float], rate: float) -> list[Block | Event]:
+def rows_at(times: list[float], arrivals: list[float], rate: float) -> list[DeviceItem]:
     """Return what rows come to that state these times, each with its own time as the sample."""
     decoder = TextDecoder("A", TIMED, sampling_rate=rate)
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for time, came in zip(times, arrivals, strict=True):
         found += decoder.receive(f"{time:.3f},{time:.3f}\n".encode(), at(came))
     return found
@@ -30,7 +30,7 @@ def test_rows_are_placed_by_their_time() -> None:
     decoder = TextDecoder("A", TIMED, sampling_rate=100.0)
     sent = [f"{1000 + i / 100:.3f},{i}\n".encode() for i in range(300)]
     came = [*range(10), 9, *range(7, 50), *range(57, 100), *([99] * 5), *range(200, 300)]
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for k in range(0, len(came), 7):
         rows = came[k : k + 7]
         found += decoder.receive(b"".join(sent[i] for i in rows), at(rows[-1] / 100))
@@ -61,7 +61,7 @@ def test_one_time_may_belong_to_many_rows(written: str) -> None:
     That 23 of them are lost is noticed at the next second.
     """
     decoder = TextDecoder("A", TIMED, sampling_rate=10.0)
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for i in range(103, 400):
         if not 215 <= i < 238:
             time = written.format(1000 + i // 10)
@@ -79,7 +79,7 @@ def test_a_leap_second_loses_nothing_of_a_tiltmeter() -> None:
     decoder = TextDecoder("A", LILY, sampling_rate=1.0)
     times = ["2016/12/31 23:59:58", "2016/12/31 23:59:59", "2016/12/31 23:59:60"]
     times += [f"2017/01/01 00:00:0{second}" for second in range(5)]
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for second, time in enumerate(times):
         found += decoder.receive(
             f"LILY,{time},{second},25,194,26,11,N9655\r\n".encode(), at(second)
@@ -95,7 +95,7 @@ def test_a_leap_second_of_many_rows_is_a_gap() -> None:
     format_ = TextFormat(columns=(1,), time_column=0, time_format="%Y-%m-%dT%H:%M:%S.%f")
     decoder = TextDecoder("A", format_, sampling_rate=10.0)
     seconds = ["23:59:59", "23:59:60", "00:00:00", "00:00:01", "00:00:02"]
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for second, time in enumerate(seconds):
         day = "2016-12-31T" if second < 2 else "2017-01-01T"
         for k in range(10):
@@ -111,7 +111,7 @@ def test_a_repeated_row_of_a_tiltmeter_is_dropped() -> None:
     decoder = TextDecoder("A", LILY, sampling_rate=1.0)
     line = "LILY,2013/06/24 23:22:{:02d},{},25,194,26,11,N9655\r\n"
     sent = [(0, 10), (1, 11), (1, 11), (2, 12), (2, 13), (4, 14)]
-    found: list[Block | Event] = []
+    found: list[DeviceItem] = []
     for k, (second, value) in enumerate(sent):
         found += decoder.receive(line.format(second, value).encode(), at(k - (k > 1)))
     index, rows, events = split(found)

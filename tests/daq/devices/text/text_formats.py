@@ -6,7 +6,7 @@ from daq.devices.text.format import (
     TextFormat,
     encode_fields,
 )
-from daq.protocols.block import Block, Event, HostTime
+from daq.protocols.block import Block, DeviceItem, Event, HostTime
 
 ROWS = TextFormat(columns=(0, 1, 2))
 TIMED = TextFormat(columns=(1,), time_column=0)
@@ -25,7 +25,7 @@ def at(seconds: float) -> HostTime:
     return HostTime(round(seconds * 1e9), 0)
 
 
-def split(found: list[Block | Event]) -> tuple[list[int], list[list[float]], list[Event]]:
+def split(found: list[DeviceItem]) -> tuple[list[int], list[list[float]], list[Event]]:
     blocks = [b for b in found if isinstance(b, Block)]
     index = [i for b in blocks for i in range(b.first_sample, b.end_sample)]
     rows = [row for b in blocks for row in b.counts.tolist()]
