@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from daq.bench import loading
 from daq.devices.interface import DriverType
 from daq.devices.registry import driver_names, driver_type
+from daq.transport.ports import is_simulated as is_simulated_port
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -32,6 +33,11 @@ class InstalledDrivers(Mapping[str, DriverType]):
 
     def __len__(self) -> int:
         return len(driver_names())
+
+
+def is_simulated(bench: Bench) -> bool:
+    """Whether simulated devices serve the ports of a bench, by its file or on this machine now."""
+    return bench.runs_simulated or any(map(is_simulated_port, bench.ports()))
 
 
 def load(path: str | Path) -> Bench:

@@ -96,7 +96,7 @@ def recording_of_arrays(
     given = _sensors(sensors, sampling_rate, channels)
     _check_together(given)
     in_memory = [_in_memory(each, unit, responses) for each in given]
-    return RecordingInMemory(in_memory, NAME)
+    return RecordingInMemory(in_memory, NAME, simulated=getattr(sensors, "simulated", False))
 
 
 def _sensors(sensors: object, rate: object, channels: Sequence[str] | None) -> list[_Sensor]:

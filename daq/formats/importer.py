@@ -22,12 +22,13 @@ from daq.bench.units import canonical
 from daq.errors import ImportFormatError, WrongSettingError
 from daq.formats.assembly import Columns
 from daq.formats.memory import RecordingInMemory, SensorInMemory
+from daq.formats.miniseed_export import SIMULATED_COMMENT
 from daq.formats.readers.fdsn import FDSN, fetch
 from daq.formats.readers.packed import is_packed, unpacked
 from daq.formats.sources import Selection, open_sources
 from daq.protocols.block import HostTime
 from daq.recording.array_writer import BLOCK_ROWS, ArrayWriter
-from daq.recording.file_format import SensorLayout
+from daq.recording.file_format import SIMULATED, SensorLayout
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
 _ROWS_AT_ONCE = 16 * BLOCK_ROWS
 _NAMES_KEPT = 100
+_MAX_STATION_XML = 1 << 24
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,7 +228,7 @@ def _import(
         written,
         sensors=[_layout(described[name], sensor) for name, sensor in found.items()],
         created=HostTime(start, start),
-        attributes={"origin": _origin(sources.given)},
+        attributes={"origin": _origin(sources.given), **_simulated(sources)},
         chunk_seconds=BLOCK_ROWS / max(sensor.sampling_rate for sensor in found.values()),
     ) as writer:
         _write(writer, tuple(found.values()))
@@ -269,7 +271,25 @@ def open_files(
     sensors = [SensorInMemory(each, described[name].channels) for name, each in found.items()]
     imported = tuple(_imported(each) for each in found.values())
     result = ImportResult(imported, opened.problems, opened.left_aside, taken)
-    return RecordingInMemory(sensors, _origin(sources)), result
+    simulated = bool(_simulated(fetched))
+    return RecordingInMemory(sensors, _origin(sources), simulated=simulated), result
+
+
+def _simulated(sources: _Sources) -> dict[str, str | float]:
+    """Return the mark of simulated sensors, if responses or StationXML beside the files have it."""
+    files = [Path(each) for each in (*sources.files, *sources.responses) if _is_path(each)]
+    for given in (*files, *(each.with_suffix(".xml") for each in files)):
+        inside = given.rglob("*.xml") if given.is_dir() else (given,)
+        for file in inside:
+            if file.suffix == ".xml" and file.is_file():
+                with file.open("rb") as content:
+                    if SIMULATED_COMMENT.encode() in content.read(_MAX_STATION_XML):
+                        return {SIMULATED: 1}
+    return {}
+
+
+def _is_path(given: object) -> bool:
+    return isinstance(given, (str, Path))
 
 
 def _responses(given: Sequence[Any], response_for: Sequence[tuple[str, Any]]) -> Responses | None:

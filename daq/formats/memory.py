@@ -112,17 +112,21 @@ class RecordingInMemory:
     sensors : sequence of SensorInMemory
     name : str
         What messages call it.
+    simulated : bool
+        Whether a sensor was simulated.
     """
 
     closed = True
     outline = None
     events: tuple[Event, ...] = ()
 
-    def __init__(self, sensors: Sequence[SensorInMemory], name: str) -> None:
+    def __init__(
+        self, sensors: Sequence[SensorInMemory], name: str, *, simulated: bool = False
+    ) -> None:
         self.sensors = tuple(sensors)
         self.path = Path(name)
         self.run_id = name
-        self.simulated = False
+        self.simulated = simulated
         start = min(int(sensor.blocks["device_counter"][0]) for sensor in sensors)
         self.created_at = HostTime(start, start)
 

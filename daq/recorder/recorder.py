@@ -23,6 +23,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from daq.devices.bench_file import is_simulated
 from daq.devices.registry import driver_type
 from daq.errors import DeviceError, DiskError, RecordingError
 from daq.host_clock import SystemClock
@@ -38,7 +39,6 @@ from daq.recording.file_format import SIMULATED, SensorLayout
 from daq.recording.storage.names import CONTINUES, continuation_names
 from daq.recording.storage.writing_thread import WritingThread
 from daq.recording.writer import RecordingWriter
-from daq.transport.ports import is_simulated
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -297,7 +297,7 @@ class _Recorder:
         )
         attributes: dict[str, str | float] = {} if duration is None else {"duration": duration}
         attributes |= self._attributes
-        if self._bench.runs_simulated or any(map(is_simulated, self._bench.ports())):
+        if is_simulated(self._bench):
             attributes[SIMULATED] = 1
         writer = self._new_file(self._path, created=self._started, attributes=attributes)
         writer.event(Event("", EventKind.STARTED, f"{len(ordered)} sensors", self._started))

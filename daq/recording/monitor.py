@@ -87,6 +87,8 @@ class RecordingStatus:
         When it ends by itself.
     speed : float
         Seconds of the recording that pass in one second; 1, unless sensors are simulated.
+    simulated : bool
+        Whether a sensor is simulated.
     """
 
     elapsed: float
@@ -96,6 +98,7 @@ class RecordingStatus:
     events: tuple[Event, ...]
     until: EndCondition = NEVER
     speed: float = 1.0
+    simulated: bool = False
 
     def in_local_time(self, seconds: float | None) -> datetime | None:
         """Return the moment so many seconds from now; None if the recording is not in real time."""
@@ -162,6 +165,7 @@ class RecordingMonitor:
             events=self._events,
             until=replace(self._first.until, duration=self._first.duration),
             speed=self._speed,
+            simulated=recording.simulated,
         )
 
     def _since_latest(self, latest_ns: int, sensors: tuple[SensorStatus, ...]) -> float:

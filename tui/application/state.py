@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from daq.devices.bench_file import is_simulated
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -79,6 +81,13 @@ class State:
     is_starting: bool = False
     reference: Reference | None = None
     models: tuple[Mask, ...] = ()
+
+    @property
+    def is_simulated(self) -> bool:
+        """Whether a sensor of the recording, or else of the bench, is simulated."""
+        if self.snapshot is not None or self.now is not None:
+            return any(each is not None and each.simulated for each in (self.snapshot, self.now))
+        return self.bench is not None and is_simulated(self.bench)
 
     @property
     def has_result(self) -> bool:

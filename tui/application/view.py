@@ -148,6 +148,9 @@ def status_line(state: State, view: str, *, width: int) -> Text:
             opens = Style(color=MUTED, meta={"@click": f"app.view('{name}')"})
             line.append(f" {number} {TITLES[name]} ", opens)
     line.append(" ")
+    if state.is_simulated:
+        line.append(" SIMULATED ", f"{BAD} reverse")
+        line.append(" ")
     now, path = state.now, state.path
     doing = _doing(state)
     if now is not None:

@@ -91,14 +91,18 @@ def check_bench(path: Path, *, devices: bool, write: bool = False, json: str | N
     ExceptionGroup
         With a DeviceError for every port that failed, after the others have been shown.
     """
-    from daq.devices.bench_file import load
+    from daq.devices.bench_file import is_simulated, load
     from daq.preflight.device_check import Examination
     from tui.output.console import for_people, write_json
     from tui.output.json_values import plain
+    from tui.wording.facts import SIMULATED
 
     bench = load(path)
     screen = for_people(json)
     screen.print(_summary(bench))
+    simulated = is_simulated(bench)
+    if simulated:
+        screen.print(SIMULATED)
     examined = examined_bench(bench) if devices else Examination((), (), ())
     found = examined.found
     if devices:
@@ -120,6 +124,7 @@ def check_bench(path: Path, *, devices: bool, write: bool = False, json: str | N
         json,
         {
             "bench": bench.name,
+            "simulated": simulated,
             "sensors": plain(found),
             "checks": check_list.document(examined.rows),
             "errors": [str(error) for error in examined.errors],

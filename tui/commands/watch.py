@@ -71,12 +71,15 @@ class _Lines:
 
     def status(self, status: RecordingStatus) -> None:
         from tui.output.console import console
+        from tui.wording.facts import SIMULATED
         from tui.wording.formatting import clock_time
 
         before, self._now = self._now, status
         events = status.events[self._n_events :]
         self._n_events = len(status.events)
         if before is None:  # events from before
+            if status.simulated and self._json is None:
+                console().print(SIMULATED, soft_wrap=True)
             return
         for event in events:
             at = (event.received.utc_ns - status.started_utc_ns) * 1e-9
@@ -172,6 +175,7 @@ def _update(
         "time_left_for": left.goal,
         "ends_too_early_for": left.short_of,
         "closed": snapshot.closed,
+        "simulated": snapshot.simulated,
         "sensors": {
             sensor.name: {
                 "state": sensor.state,

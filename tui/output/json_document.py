@@ -132,6 +132,7 @@ def provenance(
         "time_coverage_start": _instant(start_ns),
         "time_coverage_end": _instant(start_ns + round(snapshot.elapsed * 1e9)),
         "confidence_of_intervals": "0.95",
+        "simulated": str(snapshot.simulated).lower(),
         "settings": json.dumps(_settings(settings, snapshot), ensure_ascii=False),
         "recordings": json.dumps(recordings, ensure_ascii=False),
     }

@@ -1,17 +1,24 @@
-"""A simulated test says so everywhere: recording, JSON, page and console."""
+"""A simulated test says so everywhere: recording, JSON, page, screens, exports, imports."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import h5py
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import huddle
 from daq.recording.reader import Recording
+from tests.tui.example_snapshot import demo_bench, made_now, made_snapshot
 from tests.tui.report.written_report import Words
 from tui.commands.main import app
+from tui.application.state import VIEWS, State
+from tui.application.view import status_line
+from tui.report.figures.curves import noise_plots
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,6 +38,52 @@ def test_a_simulated_recording_says_so_wherever_it_is_shown(tmp_path: Path) -> N
     assert written.exit_code == 0, written.output
     text = Words(page.read_text(encoding="utf-8")).text
     assert "SIMULATED SENSORS" in text
+
+
+def test_exports_and_imports_of_simulated_recordings_keep_the_mark(tmp_path: Path) -> None:
+    pytest.importorskip("obspy")
+    recording, out = tmp_path / "s.h5", tmp_path / "s.mseed"
+    run = CliRunner()
+    run.invoke(app, ["simulate", "fig4", "--duration", "40s", "--out", str(recording)])
+    curves = run.invoke(app, ["export", str(recording), "--format", "npz", "--segment", "2s"])
+    assert curves.exit_code == 0, curves.output
+    with np.load(recording.with_suffix(".npz")) as file:
+        assert str(file["simulated"]) == "true"
+    written = run.invoke(app, ["export", str(recording), "--format", "mseed", "--out", str(out)])
+    assert written.exit_code == 0, written.output
+    back = tmp_path / "back.h5"
+    taken = run.invoke(app, ["import", str(out), "--out", str(back)])
+    assert taken.exit_code == 0, taken.output
+    with Recording.open(back) as imported:
+        assert imported.simulated
+    assert "simulated sensors" in repr(huddle.open(back))
+    assert "simulated sensors" in repr(huddle.read(out))
+    out.with_suffix(".xml").unlink()
+    assert "simulated" not in repr(huddle.read(out))  # miniSEED alone cannot say so
+
+
+def test_estimates_and_figures_of_simulated_samples_say_so() -> None:
+    simulation = huddle.simulate("fig4", duration="40s")
+    result = huddle.self_noise(simulation, fs=simulation.fs, sample_unit="m/s²", segment="2s")
+    assert result.snapshot.simulated
+    assert "simulated" in repr(result)
+    plots = noise_plots(result.snapshot, result.settings, None)
+    assert all("simulated" in plot.title for plot in plots)
+
+
+def test_the_status_line_of_every_view_says_simulated() -> None:
+    snapshot = made_snapshot()
+    for view in VIEWS:
+        for simulated in (True, False):
+            state = State("pier", now=replace(made_now(), simulated=simulated))
+            shown = status_line(state, view, width=100).plain
+            assert ("SIMULATED" in shown) == simulated
+        state = State("pier", snapshot=replace(snapshot, simulated=True))
+        assert "SIMULATED" in status_line(state, view, width=80).plain
+    bench = demo_bench().model_copy(update={"simulation": {}})
+    assert not State("pier", bench=bench).is_simulated
+    simulated_bench = bench.model_copy(update={"simulation": {"clock": "clock.json"}})
+    assert State("pier", bench=simulated_bench).is_simulated
 
 
 def test_a_measured_recording_is_not_simulated(tmp_path: Path) -> None:

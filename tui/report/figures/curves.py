@@ -184,7 +184,7 @@ def noise_plots(
             )
         plots.append(
             Plot(
-                title,
+                f"{title}, simulated".removeprefix(", ") if snapshot.simulated else title,
                 tuple(panels),
                 n_columns=max(widest, 2),
                 height=NOISE_HEIGHT,
