@@ -178,7 +178,7 @@ def uncertainty_section(
     method = judged_method(snapshot, settings)
     band = span(*band_of(settings, snapshot))
     unit = snapshot.unit
-    micro = _micro_g(unit)
+    of_g, in_si = _ratio(unit, "g"), _ratio(unit, "m/s²")
     rows = tuple(
         (
             name,
@@ -187,15 +187,18 @@ def uncertainty_section(
             _ends(each.total),
             plain_number(each.k, ".2f"),
             _root(each.level),
-            *((_root(each.level, micro),) if micro else ()),
+            *((_root(each.level, of_g), _root(each.level, 1e6 * of_g)) if of_g else ()),
+            *((decibel(each.level * in_si**2, 2),) if in_si and unit != "m/s²" else ()),
         )
         for name, each in zip(names, found, strict=True)
     )
     header: tuple[str, ...] = (
         "channel", "noise (dB)", "statistical (dB)", "total (dB)", "k", f"({unit})/√Hz",
     )  # fmt: skip
-    if micro:
-        header += ("µg/√Hz",)
+    if of_g:
+        header += ("g/√Hz", "µg/√Hz")
+    if in_si and unit != "m/s²":
+        header += ("dB re 1 (m/s²)²/Hz",)
     budget = tuple(
         (
             name, row.name, row.distribution, _percent(row.below), _percent(row.above),
@@ -288,9 +291,12 @@ def _half_octaves(
             )
     parts.append(
         Paragraph(
-            "Half octaves about powers of √2, as strong-motion users state noise and range (Evans "
-            "and others, USGS Open-File Report 2009–1055). Full scale as of the data sheet in the "
-            "bench file; without it no range is given.",
+            "Half octaves about powers of √2, as strong-motion users state noise and range: rms of "
+            "the noise in each, below the rms of a sine of full scale (Evans and others, 2010, "
+            "Seismol. Res. Lett. 81(4), with the erratum of 2012, 83(3), which corrects the "
+            "two- and three-instrument noise of their scripts; the noise here is not made by "
+            "them). Full scale as of the data sheet in the bench file; without it no range is "
+            "given.",
             "quiet",
         )
     )
@@ -377,9 +383,9 @@ def _full_scale(snapshot: Snapshot, column: int, about: Bench | None) -> float:
     return math.nan
 
 
-def _micro_g(unit: str) -> float | None:
-    """Return how many µg one of a unit of acceleration is; None of others."""
-    size, one = in_acceleration(unit), in_acceleration("µg")
+def _ratio(unit: str, wanted: str) -> float | None:
+    """Return one of a unit of acceleration in the wanted one; None of others."""
+    size, one = in_acceleration(unit), in_acceleration(wanted)
     return size / one if size and one else None
 
 

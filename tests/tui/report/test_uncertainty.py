@@ -47,13 +47,25 @@ def test_noise_is_stated_in_the_units_of_the_trade(reported: Reported) -> None:
     summary, budget, rms, *_ = tables(reported.report, "Uncertainty")
     row = next(row for row in summary.rows if row[0] == "A.X")
     assert number(row[5]) == pytest.approx(math.sqrt(2e-10), rel=0.05)
-    assert number(row[6]) == pytest.approx(math.sqrt(2e-10) / 9.80665e-6, rel=0.05)
+    assert summary.header[5:] == ("(m/s²)/√Hz", "g/√Hz", "µg/√Hz")
+    assert number(row[6]) == pytest.approx(math.sqrt(2e-10) / 9.80665, rel=0.05)
+    assert number(row[7]) == pytest.approx(math.sqrt(2e-10) / 9.80665e-6, rel=0.05)
     assert next(r[1] for r in budget.rows if r[0] == "A.X") == "finite averages"
     column = rms.header.index("A.X")
     for each in rms.rows:
         centre = float(each[0])
         expected = math.sqrt(2e-10 * centre * (2**0.25 - 2**-0.25))
         assert number(each[column]) == pytest.approx(expected, rel=0.25)
+
+
+def test_a_spectrum_in_g_has_its_level_in_si_too(reported: Reported) -> None:
+    snapshot = replace(reported.snapshot, unit="g")
+    section = uncertainty_section(snapshot, reported.settings, None)
+    assert section is not None
+    summary = next(part for part in section.parts if isinstance(part, Table))
+    assert summary.header[-1] == "dB re 1 (m/s²)²/Hz"
+    row = next(row for row in summary.rows if row[0] == "A.X")
+    assert number(row[-1]) - number(row[1]) == pytest.approx(20 * math.log10(9.80665), abs=0.02)
 
 
 def test_half_octaves_lie_within_the_spectrum_and_share_no_bin() -> None:
