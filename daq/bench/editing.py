@@ -72,6 +72,13 @@ def with_sensor(text: str, values: Mapping[str, Any], *, replaces: str = "") -> 
     return tomlkit.dumps(document)
 
 
+def with_values(text: str, values: Mapping[str, Any]) -> str:
+    """Return the text of a bench file with other values of keys and tables; None removes one."""
+    document = tomlkit.parse(text)
+    _change(document, values)
+    return tomlkit.dumps(document)
+
+
 def without_sensor(text: str, name: str) -> str:
     """Return the text of a bench file without a sensor, nor what is simulated of it."""
     document = tomlkit.parse(text)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import threading
 from dataclasses import dataclass, field, replace
+from datetime import date
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -195,6 +196,57 @@ async def test_a_sensor_is_found_named_checked_as_typed_changed_and_removed(
         await press("delete", "y")
     assert [sensor.name for sensor in told.bench.sensors] == ["A", "B", "C"]
     assert told.told == ["save bench"] * 3
+
+
+async def test_what_certificates_say_is_asked_for_checked_and_kept_in_the_bench_file(
+    told: ProgressCallback,
+) -> None:
+    app = HuddleApp(told)
+    given = {
+        "operator": "Ada",
+        "laboratory-name": "Pier Metrology",
+        "laboratory-address": "1 Quiet Lane",
+        "laboratory-country": "Germany",
+        "customer-name": "Slow Waves & Sons",
+        "customer-email": "buyer@waves.example",
+        "certificate-procedure": "QP-17, issue 3",
+        "certificate-received": "20.11.2026",
+        "certificate-condition": 'no damage, "as new"',
+        "certificate-decision_rule": "simple-acceptance",
+        "certificate-guard_band": "0.5",
+    }
+    async with app.run_test(size=NARROW) as pilot:
+
+        async def typed(**values: str) -> str:
+            for name, value in values.items():
+                app.screen.query_one(f"#{name}", Input).value = value
+            app.screen.query_one(f"#{next(iter(values))}", Input).focus()
+            await pilot.press("end", "enter")
+            await app.workers.wait_for_complete()
+            await shown(pilot, app)
+            return " ".join(screen_text(app).split())
+
+        await pilot.press("c")
+        assert "ISO 3166" in await typed(**given)
+        assert "date" in await typed(**{"laboratory-country": "DE"})
+        assert told.told == []
+        await typed(**{"certificate-received": "2026-11-20"})
+        assert told.told == ["save bench"]
+        await pilot.press("c")
+        assert app.screen.query_one("#laboratory-name", Input).value == "Pier Metrology"
+        assert app.screen.query_one("#certificate-received", Input).value == "2026-11-20"
+        await typed(**{"customer-email": ""})
+    bench = told.bench
+    assert bench is not None
+    assert bench.operator == "Ada"
+    assert (bench.laboratory.name, bench.laboratory.country) == ("Pier Metrology", "DE")
+    assert (bench.customer.name, bench.customer.email) == ("Slow Waves & Sons", "")
+    assert bench.certificate.received == date(2026, 11, 20)
+    assert bench.certificate.condition == 'no damage, "as new"'
+    assert (bench.certificate.decision_rule, bench.certificate.guard_band) == (
+        "simple-acceptance",
+        0.5,
+    )
 
 
 def test_why_a_test_did_not_start_is_on_the_row_of_the_sensor() -> None:

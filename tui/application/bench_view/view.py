@@ -20,6 +20,7 @@ from tui.application.bench_view.sensors import (
     sensors_of_bench,
 )
 from tui.application.dialogs import QuestionScreen
+from tui.application.forms.certificate import CertificateForm
 from tui.application.forms.sensor import PortForm, SensorForm, sensor_table
 from tui.application.messages import BenchEdited, ErrorReported, PreviewUpdated
 from tui.application.state import BENCH
@@ -53,6 +54,7 @@ class BenchView(View):
         Binding("up", "choose_next(-1)", "Choose", show=False),
         Binding("a", "add", "Add"),
         Binding("e", "edit", "Edit"),
+        Binding("c", "certificate", "Certificate", show=False),
         Binding("delete", "remove", "Remove", key_display="del", show=False),
         Binding("x", "app.stop", "Stop"),
         Binding("m", "app.mark", "Mark"),
@@ -64,6 +66,7 @@ class BenchView(View):
         ("a", "add a sensor: huddle looks what is on its port, if you do not name a driver"),
         ("e", "change the chosen sensor in the bench file; comments there stay"),
         ("del", "remove the chosen sensor from the bench file; asked before"),
+        ("c", "what certificates say of laboratory, customer and order; kept in the bench file"),
         ("s", "start a test: operator, note, and when it ends by itself"),
     )
 
@@ -128,7 +131,7 @@ class BenchView(View):
         del parameters
         state = self.state
         is_busy = state.is_recording or state.is_starting
-        if action in {"add", "edit", "remove"}:
+        if action in {"add", "edit", "remove", "certificate"}:
             return state.can_start and not is_busy and state.bench is not None
         if action == "preview":
             return self._controls.preview is not None and state.can_start and not is_busy
@@ -204,6 +207,16 @@ class BenchView(View):
             return
         known = sensor_table(text, replaces) if values is None else values
         self.app.push_screen(SensorForm(text, driver, known, replaces=replaces), self._save)
+
+    def action_certificate(self) -> None:
+        """Ask for what certificates say."""
+        try:
+            form = CertificateForm(self._controls.read_bench())
+        except (HuddleError, OSError, ValueError) as error:
+            self.app.post_message(ErrorReported(str(error)))
+            return
+        self.end_preview()
+        self.app.push_screen(form, self._save)
 
     def action_remove(self) -> None:
         """Remove the chosen sensor, once that has been confirmed."""

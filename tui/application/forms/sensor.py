@@ -28,6 +28,7 @@ SETTING = "setting-"
 OF_CHANNELS = ("sensitivity", "unit", "direction")
 HINTS = {
     "name": "The name of the sensor, unique on the bench.",
+    "manufacturer": "Its manufacturer, for certificates. May be empty.",
     "model": "Its model, for the report. May be empty.",
     "serial_number": "Checked when the device is opened. May be empty.",
     "port": "Where it is connected, such as /dev/ttyUSB0 or socket://192.168.0.5:4001.",
@@ -37,7 +38,7 @@ HINTS = {
     "unit": "Such as m/s², g or m/s: one for all channels, or one for each. Empty: m/s².",
     "direction": "Such as east north up: one for each channel. May be empty.",
 }
-KEPT_FIELDS = ("model", "serial_number", "port", "sampling_rate")
+KEPT_FIELDS = ("manufacturer", "model", "serial_number", "port", "sampling_rate")
 
 
 class PortForm(Form[tuple[str, dict[str, Any]]]):
