@@ -15,9 +15,9 @@ import huddle
 from daq.recording.reader import Recording
 from tests.tui.example_snapshot import demo_bench, made_now, made_snapshot
 from tests.tui.report.written_report import Words
-from tui.commands.main import app
 from tui.application.state import VIEWS, State
 from tui.application.view import status_line
+from tui.commands.main import app
 from tui.report.figures.curves import noise_plots
 
 if TYPE_CHECKING:
