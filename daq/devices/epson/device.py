@@ -314,9 +314,7 @@ class Device:
         if refusal := self._refusal(model, serial_number):
             raise WrongDeviceError(f"{self._stream.label}: {refusal}", found=(model, serial_number))
         version = await self.read(commands.VERSION)
-        high = await self.read(commands.TEMP_HIGH)
-        low = await self.read(Register(commands.TEMP_HIGH.window, commands.TEMP_HIGH.address + 2))
-        count = (high << 16 | low) - (1 << 32) * (high >> 15)
+        count = await self._temperature_count()
         diagnosis = await self.read(commands.DIAG_STAT)
         return DeviceInformation(
             sensor=self._sensor.name,
@@ -326,6 +324,20 @@ class Device:
             temperature=round(commands.temperature(count), 2) if count else None,
             details={"DIAG_STAT": f"{diagnosis:04X}"} if diagnosis else {},
         )
+
+    async def _temperature_count(self) -> int:
+        """Return the 32-bit count of the temperature; 0 if it is not measured yet.
+
+        Its halves are two registers, which may change in between: it passes 0 at 35 °C.
+        """
+        low_half = Register(commands.TEMP_HIGH.window, commands.TEMP_HIGH.address + 2)
+        high = await self.read(commands.TEMP_HIGH)
+        for _ in range(READ_ATTEMPTS):
+            before, low = high, await self.read(low_half)
+            high = await self.read(commands.TEMP_HIGH)
+            if high == before:
+                break
+        return (high << 16 | low) - (1 << 32) * (high >> 15)
 
     async def _identity(self) -> tuple[str, str]:
         """Return model and serial number.

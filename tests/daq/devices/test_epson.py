@@ -90,6 +90,31 @@ async def test_window_and_command_are_separate_writes_with_the_required_interval
     assert strict.n_ignored == 0
 
 
+class WarmingDevice(StrictDevice):
+    """Warms through 34.987 °C, where the count passes 0: one count for each read of a half."""
+
+    def __init__(self, first: int) -> None:
+        super().__init__()
+        self._count = first
+        self._registers[1, commands.PROD_ID[0].address] = 0x3341
+
+    def _do(self, command: Read | Write) -> None:
+        high = commands.TEMP_HIGH.address
+        if isinstance(command, Read) and self._window == 0 and command.address in {high, high + 2}:
+            self._count += 1
+            self._registers[0, high] = self._count >> 16 & 0xFFFF
+            self._registers[0, high + 2] = self._count & 0xFFFF
+        super()._do(command)
+
+
+@pytest.mark.parametrize("first", [*range(-8, 3), 65535 - 2, 65535 - 1, 65535])
+async def test_both_halves_of_the_temperature_are_of_one_moment(first: int) -> None:
+    device = Device(SENSOR, cast("ByteStream", WarmingDevice(first)))
+    temperature = (await device.information()).temperature
+    if temperature is not None:  # None at 0, which is no measured value
+        assert temperature == pytest.approx(commands.temperature(first), abs=0.05)
+
+
 class Restarted:
     """A device that sends 57 frames, is restarted, and then answers questions only."""
 
