@@ -335,7 +335,7 @@ class _Page:
                 else None,
             }
             if now is not None:
-                about["progress"] = progress_line(now, snapshot, settings, width=1)
+                about["progress"] = progress_line(now, snapshot, settings, state.verdict, width=1)
             if snapshot.n_segments:
                 about["noise"] = channel_table(
                     state, choice, means=band_means(snapshot, settings), width=WIDE
