@@ -45,6 +45,8 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
 
 __all__ = ["Recording", "SensorRecord", "check_format", "control_address"]
+_NAMED: set[str] = set()
+"""Run ids of recordings with private tables that this process has named."""
 _LOGGER = logging.getLogger(__name__)
 
 
@@ -99,6 +101,9 @@ class Recording:
         """Tables of gaps, events or readings with a wrong checksum."""
         for name in self.damaged_tables:
             _LOGGER.warning("%s: damaged: wrong checksum of the %s", path, name)
+        if self.warning and self.run_id not in _NAMED:
+            _NAMED.add(self.run_id)
+            _LOGGER.warning("%s: %s", path, self.warning)
 
     @classmethod
     def open(cls, path: str | Path, *, tried: bool = False) -> Recording:
@@ -145,6 +150,21 @@ class Recording:
         )
 
     @cached_property
+    def warning(self) -> str:
+        """Names the tables of the bench that may hold secrets; older versions recorded them."""
+        private = file_format.PRIVATE_TABLES
+        if not any(name in self.bench_text for name in private):
+            return ""
+        import tomllib  # noqa: PLC0415 - few recordings have such a word
+
+        with contextlib.suppress(tomllib.TOMLDecodeError):
+            found = tomllib.loads(self.bench_text)
+            names = ", ".join(f"[{name}]" for name in private if name in found)
+            if names:
+                return f"holds {names} of its bench file, which may have secrets; do not pass it on"
+        return ""
+
+    @cached_property
     def outline(self) -> BenchOutline | None:
         """The recorded bench in outline; None for recordings without a bench."""
         return BenchOutline.of_text(self.bench_text, self._estimate)
@@ -156,16 +176,9 @@ class Recording:
             return None
         from daq.bench.loading import parse  # noqa: PLC0415 - pydantic, as long as all of HDF5
         from daq.bench.model import estimate_settings  # noqa: PLC0415
-        from daq.bench.tables.unattended import Hooks  # noqa: PLC0415
 
         with contextlib.suppress(BenchFileError):
             bench = parse(self.bench_text, str(self.path))
-            if bench.hooks != Hooks():  # of a version that recorded them
-                _LOGGER.warning(
-                    "%s: holds the commands of [hooks], which may have secrets in them; do not pass"
-                    " it on",
-                    self.path,
-                )
             if self._estimate:
                 table = estimate_settings(json.loads(self._estimate))
                 bench = bench.model_copy(update={"estimate": table})

@@ -101,6 +101,8 @@ class Verification:
     root_sha256: str = ""
     """SHA-256 of the manifest; empty if there is none."""
     run_id: str = ""
+    warning: str = ""
+    """Of what is no damage, and must be known before the recording is passed on."""
 
     @property
     def intact(self) -> bool:
@@ -140,6 +142,7 @@ def verify(
             len(recording.readings),
             recording.damaged_tables,
             run_id=recording.run_id,
+            warning=recording.warning,
         )
     if not report.closed or being_written:
         return report
@@ -394,6 +397,7 @@ def _verified(path: Path) -> dict[str, Any]:
         "damaged": [*damaged, *report.damaged_tables, *report.changed],
         "root_sha256": report.root_sha256,
         "run_id": report.run_id,
+        "warning": report.warning,
     }
 
 

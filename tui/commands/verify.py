@@ -71,6 +71,8 @@ def verify(
             state = f"intact, signed with key {signer.key_id}"
         found.append((path, state, report.get("root_sha256") or None))
         for_people(json).print(f"{path}: {state.removeprefix(f'{path}: ')}", soft_wrap=True)
+        if warning := report.get("warning"):
+            for_people(json).print(f"{path}: {warning}", soft_wrap=True, markup=False)
     bad = [path.name for path, state, _ in found if not state.startswith("intact")]
     write_json(
         json,
