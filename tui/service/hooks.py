@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from tui.service.clock import Clock
     from tui.service.records.store import RunStore
 
+_SHORTEST_SECRET = 4
 _VARIABLE = re.compile(r"\$\{(\w+)\}")
 _LOGGER = logging.getLogger(__name__)
 _MOST_OUTPUT = 400
@@ -119,8 +120,21 @@ async def run_hook(command: Sequence[str], document: bytes, timeout: float) -> s
     """Run a command with a document on its standard input; return what went wrong, or nothing.
 
     ``${NAME}`` in its words is replaced by the variable of the environment, if there is one: so a
-    bench file names secrets and does not hold them.
+    bench file names secrets and does not hold them. What is returned does not hold them either.
     """
+    problem = await _problem_of_hook(command, document, timeout)
+    used = {name: os.environ.get(name, "") for word in command for name in _VARIABLE.findall(word)}
+    for name, value in sorted(used.items(), key=lambda item: -len(item[1])):
+        if len(value) >= _SHORTEST_SECRET:
+            problem = problem.replace(value, f"${{{name}}}")
+    return problem
+
+
+async def _problem_of_hook(
+    command: Sequence[str],
+    document: bytes,
+    timeout: float,  # noqa: ASYNC109
+) -> str:
     command = [_VARIABLE.sub(lambda m: os.environ.get(m[1], m[0]), word) for word in command]
     try:
         process = await asyncio.create_subprocess_exec(

@@ -44,6 +44,20 @@ def test_an_estimate_dies_before_a_recorder() -> None:
     assert int(said) == OOM_SCORE
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="of the Linux kernel")
+def test_an_estimate_has_a_share_of_the_memory() -> None:
+    program = (
+        "import os; from tui.service.processes.finish import limit_memory;"
+        " size = os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE');"
+        " limit_memory(0.1); bytearray(size // 5)"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", program], check=False, capture_output=True, text=True
+    )
+    assert ended.returncode == 1
+    assert ended.stderr.rstrip().endswith("MemoryError")
+
+
 async def test_points_are_no_outcome() -> None:
     process = await child(f"print('.\\n.'); print('.'); print({OUTCOME!r}, end='')")
     assert (await outcome_of(process)).verdict == "pass"

@@ -58,6 +58,13 @@ async def test_a_hook_names_its_secrets(tmp_path: Path, monkeypatch: pytest.Monk
     assert problem.startswith("${NO_SUCH_VARIABLE}: cannot be started")
 
 
+async def test_what_a_hook_says_holds_no_secret(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HUDDLE_TEST_TOKEN", "s3cret")
+    command = ("sh", "-c", 'echo "no host $0" >&2; exit 6', "http://a:${HUDDLE_TEST_TOKEN}@b")
+    said = await run_hook(command, b"", limit())
+    assert said == "sh: exit code 6: no host http://a:${HUDDLE_TEST_TOKEN}@b"
+
+
 async def test_a_hook_that_fails_is_tried_again_and_reads_the_run(tmp_path: Path) -> None:
     script = (
         f"echo x >> {tmp_path}/tries; test $(wc -l < {tmp_path}/tries) -ge 2 && cat > {tmp_path}/in"

@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
+import os
 import sys
 import time
 from dataclasses import asdict, dataclass, fields, replace
@@ -45,6 +46,9 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
 
 
+MEMORY_SHARE = 0.6
+"""Of the memory of the service that an estimate may take: the least of the computer's and of the
+limits of its control group."""
 OOM_SCORE = 800
 """Of 1000: an estimate can be made again, a recording cannot."""
 _OF_DISK = {
@@ -328,9 +332,27 @@ def die_first() -> None:
         Path("/proc/self/oom_score_adj").write_text(str(OOM_SCORE), encoding="ascii")
 
 
+def limit_memory(share: float = MEMORY_SHARE) -> None:
+    """Have this process fail with MemoryError beyond a share of the memory that the service has."""
+    if sys.platform != "linux":
+        return
+    import resource  # noqa: PLC0415 - Windows has none
+
+    sizes = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
+    with contextlib.suppress(OSError):
+        _, _, group = Path("/proc/self/cgroup").read_text(encoding="ascii").partition("0::/")
+        for name in ("memory.max", "memory.high"):
+            limit = Path("/sys/fs/cgroup", group.strip(), name)
+            with contextlib.suppress(OSError, ValueError):  # no such limit, or "max"
+                sizes.append(int(limit.read_text(encoding="ascii")))
+    n_bytes = round(share * min(sizes))
+    resource.setrlimit(resource.RLIMIT_DATA, (n_bytes, n_bytes))
+
+
 def main() -> None:
     """Finish what the argument says; print the outcome."""
     die_first()
+    limit_memory()
     configure(style=LogFormat.JSON)
     found = json.loads(sys.argv[1])
     request = Request(**found | {"bands": tuple((low, high) for low, high in found["bands"])})
