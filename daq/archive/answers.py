@@ -152,7 +152,7 @@ def answer(
     WrongSettingError
         If a unit or gain does not fit the sensors.
     """
-    known = [entry for entry in entries if entry.start_utc_ns]
+    known = [entry for entry in entries if entry.start_utc_ns is not None]
     if not known:
         raise ArchiveError(
             "the archive has no spectra yet: no recording holds one whole segment of"
@@ -234,7 +234,8 @@ class _Tally:
         problems = []
         described = entry.described
         response = self._one.responses(described.channels)
-        self._end_days(before=entry.start_utc_ns // DAY_NS * DAY_NS)
+        first = (entry.start_utc_ns or 0) // DAY_NS * DAY_NS
+        self._end_days(before=first)
         with SpectraFile(entry.path) as file:
             for row, (start, n_segments) in enumerate(file.stretches.tolist()):
                 try:
@@ -246,7 +247,7 @@ class _Tally:
                     )
                     continue
                 day = start // DAY_NS * DAY_NS
-                self._end_days(before=min(day, entry.start_utc_ns // DAY_NS * DAY_NS))
+                self._end_days(before=min(day, first))
                 averages = [pooled, self._open.setdefault(day, Average())]
                 if self._plan.stretch == "hour":
                     averages += self._times_of_day(start)

@@ -43,8 +43,14 @@ class Entry:
 
     path: Path
     described: Described
-    start_utc_ns: int
-    """Of its first stretch; 0 without one."""
+    start_utc_ns: int | None
+    """Of its first stretch; None without one."""
+
+    @property
+    def order(self) -> tuple[bool, int, str]:
+        """Sort key: by time, then by run; without a stretch first."""
+        start = self.start_utc_ns
+        return start is not None, start or 0, self.described.origin.run_id
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,16 +145,15 @@ class Store:
         for path in sorted(self.folder.glob("*.h5")):
             try:
                 with SpectraFile(path) as file:
-                    first = int(file.stretches["start_utc_ns"][0]) if len(file.stretches) else 0
+                    starts = file.stretches["start_utc_ns"]
+                    first = int(starts[0]) if len(starts) else None
                     self._check(file)
                     found.append(Entry(path, file.described, first))
             except WrongArchiveError:
                 raise
             except ArchiveError as error:
                 bad.append(str(error))
-        return tuple(sorted(found, key=lambda e: (e.start_utc_ns, e.described.origin.run_id))), (
-            *bad,
-        )
+        return tuple(sorted(found, key=lambda entry: entry.order)), tuple(bad)
 
     def _check(self, file: SpectraFile) -> None:
         """Refuse spectra of other sensors or settings than the archive's."""

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from daq.archive.answers import Answer
+    from daq.archive.plan import Plan
     from daq.archive.sources import Sorted
     from daq.archive.store import Entry, Store
     from daq.archive.task import Outcome
@@ -147,6 +148,13 @@ def archive(
     if scheduler is not None:
         require("distributed")
     masks = masks_named(models)
+
+    def checked(plan: Plan) -> Settings:
+        settings = plan.changed(wanted, stretch)
+        for mask in masks:
+            mask.check_unit(settings.unit or plan.sensors[0][1][0][1])
+        return settings
+
     folder = folder_for(sources) if store is None else store
     paths = recordings_in(sources, leave_out=folder)
     archive = Store.open(folder)
@@ -157,9 +165,9 @@ def archive(
         paths,
         stretch,
         lambda path: settings_for(path, **wanted)[0],
-        lambda plan: plan.changed(wanted, stretch),
+        checked,
     )
-    settings = archive.plan.changed(wanted, stretch)
+    settings = checked(archive.plan)
 
     failures = _take_new(archive, paths, jobs=jobs, scheduler=scheduler) if paths else []
     entries, bad = archive.entries()

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn
 
 STANDARD_OUTPUT = "-"
+_SPEED_PERIOD = 3600.0
+"""Seconds over which the time left is predicted: a step may take many minutes."""
 WIDTH_OF_FILES = 110
 """Columns of tables that go into a file or a pipe."""
 _for_json = False
@@ -100,6 +102,7 @@ def progress(*columns: str | ProgressColumn, per_second: float = 2) -> Progress:
         refresh_per_second=per_second,
         transient=True,
         disable=not shows_progress(),
+        speed_estimate_period=_SPEED_PERIOD,
     )
 
 

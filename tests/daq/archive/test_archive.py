@@ -353,3 +353,11 @@ def test_recordings_whose_clocks_are_not_understood_are_left_out(
     assert (left.origin.path, left.not_understood) == (str(bad), ("B",))
     only = answer(store.plan, [one for one in entries if one.described != left], settings)
     np.testing.assert_array_equal(found.levels.mean, only.levels.mean)
+
+
+def test_a_recording_from_1970_is_in_the_answer(tmp_path: Path) -> None:
+    path = record(tmp_path / "first.h5", begin_ns=0, hours=0.6)
+    store = store_for(tmp_path / "store", path)
+    assert fill(store, [path]) == []
+    found = answer(store.plan, store.entries()[0], SETTINGS)
+    assert list(found.days_utc_ns) == [0]

@@ -143,6 +143,16 @@ def test_wrong_options_are_refused(folder: Path, arguments: list[str], message: 
     assert content(Store.open(folder / "huddle-archive")) == before  # type: ignore[arg-type]
 
 
+def test_a_noise_model_that_has_no_unit_of_the_sensors_is_refused_before_work(
+    tmp_path: Path,
+) -> None:
+    path = record(tmp_path / "counts.h5", hours=0.05, unit="counts")
+    result = huddle(path, *OPTIONS, "--models", "nlnm", "--out", tmp_path / "figures")
+    assert result.exit_code == 2
+    assert "'m/s²' cannot be turned into 'counts'" in " ".join(result.stderr.split())
+    assert [each.name for each in tmp_path.iterdir()] == ["counts.h5"]
+
+
 def test_without_recordings_and_archive_there_is_nothing_to_do(tmp_path: Path) -> None:
     result = huddle("--store", tmp_path / "none")
     assert result.exit_code == 2

@@ -52,6 +52,17 @@ def test_trouble_that_cannot_be_told_is_trouble_all_the_same() -> None:
         assert subprocess.run(command, stderr=full, check=False).returncode == 3
 
 
+def test_the_time_left_is_shown_if_each_step_takes_minutes() -> None:
+    now = 0.0
+    with progress() as bar:
+        bar.get_time = lambda: now
+        task = bar.add_task("", total=4)
+        for _ in range(3):
+            now += 200.0
+            bar.advance(task)
+        assert bar.tasks[0].time_remaining == 200.0
+
+
 def test_files_and_pipes_get_no_progress_and_lines_of_their_width(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
