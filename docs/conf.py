@@ -35,7 +35,7 @@ html_show_copyright = False
 html_show_sourcelink = False
 html_extra_path = [
     "../tui/resources/result-2.schema.json",
-    "../tui/resources/archive-1.schema.json",
+    "../tui/resources/archive-2.schema.json",
 ]
 
 default_role = "py:obj"

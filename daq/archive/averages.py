@@ -198,14 +198,18 @@ class Average:
         self, described: Described, start_utc_ns: int, n_segments: int, csm: ComplexArray
     ) -> None:
         """Add a stretch of a recording, `csm` from `converted`."""
-        weighted = csm * n_segments
-        if self._sum is None:
-            self._sum = weighted
-            self.start_utc_ns = start_utc_ns
-        else:
-            self._sum += weighted
-        self.start_utc_ns = min(self.start_utc_ns, start_utc_ns)
+        self.add_sum(csm * n_segments, n_segments)
+        self.add_segments(described, start_utc_ns, n_segments)
+
+    def add_sum(self, total: ComplexArray, n_segments: int) -> None:
+        """Add a sum of matrices; whose they are, `add_segments` says."""
+        self._sum = total if self._sum is None else self._sum + total
         self.n_segments += n_segments
+
+    def add_segments(self, described: Described, start_utc_ns: int, n_segments: int) -> None:
+        """Count segments of a recording."""
+        first = not self._counts
+        self.start_utc_ns = start_utc_ns if first else min(self.start_utc_ns, start_utc_ns)
         self._counts[described.origin.run_id] += n_segments
         self.usable = min(self.usable, described.usable)
         for sensor, residual in described.residual.items():

@@ -8,14 +8,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from datetime import date
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import stdtrit
 
+from daq.archive.rollup import EARLY, LATE, WORK
 from estimator.levels.interval import CERTAIN
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     FloatArray = NDArray[np.float64]
@@ -24,6 +28,7 @@ if TYPE_CHECKING:
 MIN_DAYS = 8
 """With fewer, neither drift nor change is decided."""
 DAYS_PER_YEAR = 365.25
+SATURDAY = 5
 _AT_AN_END = 2  # days, at least, on either side of a change
 _EXCEEDING = 20  # simulated series, at least, beyond the critical value
 _MOST_SIMULATED, _LEAST_SIMULATED = 200_000, 5_000
@@ -233,3 +238,60 @@ def _critical(weight: FloatArray, probability: float) -> tuple[float, float]:
     both = (np.sort(np.concatenate([each[which] for each in found])) for which in (0, 1))
     z, ratio = (float(values[-rank]) for values in both)
     return z, ratio
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contrast:
+    """Noise in working hours against the nights of the same days.
+
+    Attributes
+    ----------
+    n_days : int
+        Days, Monday to Friday, with working hours and both nights.
+    difference, low, high : float64, shape (n_bands, n_channels)
+        Of working hours over nights in dB, with its 95 % interval; NaN where it has none.
+    """
+
+    n_days: int
+    difference: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+MIN_CONTRAST_DAYS = 3
+"""With fewer days the difference of working hours and nights has no interval."""
+
+
+def contrast(local: Mapping[int, tuple[FloatArray, FloatArray]]) -> Contrast | None:
+    """Compare the working hours of days with the nights of the same days.
+
+    Parameters
+    ----------
+    local : mapping of int to (array, array)
+        Of local days by ordinal: segments of the parts of the day, shape (3,), and the noise times
+        these, (3, n_bands, n_channels); `daq.archive.rollup` names the parts.
+
+    Notes
+    -----
+    What differs between days (changes, drift, weekends without nights) is in neither term of a
+    day's difference; drift within a day is not, as the mean of both nights has the middle of the
+    working hours. The interval is Student's, over days.
+    """
+    days = [
+        day
+        for day, (n_segments, _) in sorted(local.items())
+        if np.all(n_segments > 0) and date.fromordinal(day).weekday() < SATURDAY
+    ]
+    if len(days) < MIN_CONTRAST_DAYS:
+        return None
+    parts = np.stack([local[day][1] / local[day][0][:, None, None] for day in days])
+    night = (parts[:, EARLY] + parts[:, LATE]) / 2
+    n = len(days)
+    reference = night.mean(axis=0)
+    certain = reference > CERTAIN * night.std(axis=0, ddof=1) / math.sqrt(n)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = (parts[:, WORK] - night) / reference
+        half = float(stdtrit(n - 1, 0.975)) * share.std(axis=0, ddof=1) / math.sqrt(n)
+        middle = share.mean(axis=0)
+        found = 10 * np.log10(1 + np.stack([middle, middle - half, middle + half]))
+    return Contrast(n, *np.where(certain, found, np.nan))

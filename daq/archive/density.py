@@ -22,7 +22,7 @@ MIN_BINS = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Density:
-    """How often a stretch has a self-noise, as PQLX draws it.
+    """How often a stretch has a PSD, as PQLX draws it.
 
     Attributes
     ----------
@@ -42,6 +42,16 @@ class Density:
     n_stretches: int
     n_short: int
 
+    def __add__(self, other: Density) -> Density:
+        """Return the density of the stretches of both."""
+        return Density(
+            self.frequency,
+            self.counts + other.counts,
+            self.not_positive + other.not_positive,
+            self.n_stretches + other.n_stretches,
+            self.n_short + other.n_short,
+        )
+
     def percentile(self, share: float) -> FloatArray:
         """Return the level in dB below which this share of stretches lies, (n_points, n_channels).
 
@@ -60,63 +70,51 @@ class Density:
         return np.where((total > 0) & (self.not_positive < np.maximum(wanted, 1e-9)), found, np.nan)
 
 
-class DensityCounter:
-    """Counts the levels of stretches, one by one.
+def counted(
+    psd: FloatArray, frequency: FloatArray, edges: IntArray, *, n_short: int = 0
+) -> Density:
+    """Return the density of stretches.
 
     Parameters
     ----------
-    frequency : float64, shape (n_freqs,)
-        Of the estimates, in Hz.
-    n_channels : int
+    psd : float64, shape (n_stretches, n_fine, n_channels)
+        Means over the bands of a `daq.archive.rollup.Grid`; NaN where not known.
+    frequency, edges
+        Those of the grid.
+    n_short : int
+        Stretches that are left out of `psd`.
     """
-
-    def __init__(self, frequency: FloatArray, n_channels: int) -> None:
-        self._frequency = frequency
-        self._edges = _octaves(frequency)
-        n_points = len(self._edges)
-        self._counts = np.zeros((n_points, HIGHEST_DB - LOWEST_DB, n_channels), dtype=np.int64)
-        self._not_positive = np.zeros((n_points, n_channels), dtype=np.int64)
-        self._n_stretches = self._n_short = 0
-
-    def add(self, noise_psd: FloatArray | None) -> None:
-        """Count a stretch by its noise PSD, (n_freqs, n_channels); None if it is too short."""
-        if noise_psd is None:
-            self._n_short += 1
-            return
-        self._n_stretches += 1
-        known = np.isfinite(noise_psd)
-        none = np.zeros(noise_psd.shape[1])
-        total = np.cumsum(np.vstack([none, np.where(known, noise_psd, 0.0)]), 0)
-        number = np.cumsum(np.vstack([none, known]), 0)
-        low, high = self._edges.T
-        n_bins = number[high] - number[low]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            mean = (total[high] - total[low]) / n_bins
-            level = np.floor(10 * np.log10(mean)) - LOWEST_DB
-        self._not_positive += (n_bins > 0) & (mean <= 0)
-        point, channel = np.nonzero((n_bins > 0) & (mean > 0))
-        bins = np.clip(level[point, channel], 0, self._counts.shape[1] - 1).astype(np.int64)
-        np.add.at(self._counts, (point, bins, channel), 1)
-
-    def density(self) -> Density:
-        """Return the density of all stretches so far."""
-        low, high = self._frequency[self._edges[:, 0]], self._frequency[self._edges[:, 1] - 1]
-        return Density(
-            np.sqrt(low * high),
-            self._counts,
-            self._not_positive,
-            self._n_stretches,
-            self._n_short,
-        )
+    at, spans = _octaves(frequency, edges)
+    n_channels = psd.shape[-1]
+    known = np.isfinite(psd)
+    weight = np.where(known, np.diff(edges)[:, None], 0)
+    none = np.zeros((len(psd), 1, n_channels))
+    total = np.cumsum(np.concatenate([none, np.where(known, psd, 0.0) * weight], 1), 1)
+    number = np.cumsum(np.concatenate([none, weight], 1), 1)
+    low, high = spans.T
+    n_bins = number[:, high] - number[:, low]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = (total[:, high] - total[:, low]) / n_bins
+        level = np.floor(10 * np.log10(mean)) - LOWEST_DB
+    counts = np.zeros((len(at), HIGHEST_DB - LOWEST_DB, n_channels), dtype=np.int64)
+    row, point, channel = np.nonzero((n_bins > 0) & (mean > 0))
+    bins = np.clip(level[row, point, channel], 0, counts.shape[1] - 1).astype(np.int64)
+    np.add.at(counts, (point, bins, channel), 1)
+    not_positive = np.sum((n_bins > 0) & (mean <= 0), axis=0)
+    return Density(at, counts, not_positive, len(psd), n_short)
 
 
-def _octaves(frequency: FloatArray) -> IntArray:
-    """Return first and last + 1 bin of overlapping octaves, shape (n_points, 2)."""
-    edges = []
-    centre = frequency[1] * np.sqrt(2)
-    while centre * np.sqrt(2) <= frequency[-1] * (1 + 1e-9):
-        low, high = np.searchsorted(frequency, [centre / np.sqrt(2), centre * np.sqrt(2)])
-        if high - low >= MIN_BINS:
-            edges.append((int(low), int(high)))
-        centre *= 2 ** (1 / POINTS_PER_OCTAVE)
-    return np.array(edges, dtype=np.int64).reshape(-1, 2)
+def _octaves(frequency: FloatArray, edges: IntArray) -> tuple[FloatArray, IntArray]:
+    """Return centres of overlapping octaves in Hz, and first and last + 1 fine band of each."""
+    centres, spans = [], []
+    step = np.ceil(np.log2(frequency[1]) * POINTS_PER_OCTAVE - 1e-9)
+    low = 2.0 ** (step / POINTS_PER_OCTAVE)
+    while 2 * low <= frequency[-1] * (1 + 1e-9):
+        bins = np.searchsorted(frequency, [low, 2 * low])
+        if bins[1] - bins[0] >= MIN_BINS:
+            spans.append(np.searchsorted(edges, bins))
+            centres.append(low * np.sqrt(2))
+        step += 1
+        low = 2.0 ** (step / POINTS_PER_OCTAVE)
+    found = np.array(spans, dtype=np.int64).reshape(-1, 2)
+    return np.array(centres), np.minimum(found, len(edges) - 1)

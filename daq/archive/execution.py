@@ -24,6 +24,7 @@ from daq.recording.reader import Recording
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Sequence
+    from datetime import datetime
     from pathlib import Path
     from types import ModuleType
 
@@ -76,13 +77,15 @@ def begun(
     raise ArchiveError("\n".join(errors))
 
 
-def tasks_of(archive: Store, new: Sequence[tuple[str, Path]]) -> list[Task]:
+def tasks_of(archive: Store, new: Sequence[tuple[str, Path, datetime]]) -> list[Task]:
     """Return a task for each recording that is not in an archive yet."""
     plan, software = archive.plan.to_json(), software_version()
-    return [
-        Task(str(path.resolve()), str(archive.path_of(run_id).resolve()), plan, software)
-        for run_id, path in new
-    ]
+    tasks = []
+    for run_id, path, begin in new:
+        target = archive.path_of(run_id, begin).resolve()
+        target.parent.mkdir(exist_ok=True)
+        tasks.append(Task(str(path.resolve()), str(target), plan, software))
+    return tasks
 
 
 def failure_of(outcome: Outcome) -> str:

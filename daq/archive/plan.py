@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Self
 
 from daq.bench.estimate_settings import OPTIONS, EstimateSettings
+from daq.bench.units import canonical
 from daq.errors import WrongArchiveError, WrongSettingError
 from daq.estimation.settings import Settings
 
@@ -24,17 +25,8 @@ FORMAT_VERSION = 1
 STRETCHES = {"hour": 3600, "day": 86400}
 """Seconds; stretches begin at whole hours or days of UTC."""
 SHAPING = (
-    *(
-        "segment",
-        "overlap",
-        "window",
-        "detrend",
-        "clocks",
-        "reject",
-        "octaves",
-        "equalise",
-        "bridge",
-    ),
+    *("segment", "overlap", "window", "detrend", "clocks", "reject"),
+    *("octaves", "equalise", "bridge"),
 )
 """Settings that shape spectra."""
 
@@ -134,13 +126,20 @@ class Plan:
             )
         return replace(self.settings, **given)  # type: ignore[arg-type]  # of several types
 
+    def noise_settings(self, settings: Settings) -> Settings:
+        """Return what the noise of stretches and days depends on: one method, and one grid."""
+        methods = settings.methods[:1] if settings.methods[:1] != ("all",) else ("auto",)
+        return replace(
+            settings,
+            methods=methods,
+            unit=canonical(settings.unit or self.sensors[0][1][0][1]),
+            **{name: getattr(self.settings, name) for name in (*SHAPING, "band")},
+            target_cov=None,
+            target_cov_bin=None,
+        )
+
     def to_json(self) -> str:
         """Return the plan as text."""
-        settings = {}
-        for each in fields(EstimateSettings):
-            value = getattr(self.settings, each.name)
-            if value is not None:
-                settings[each.name] = OPTIONS[each.name].show(value)
         document = {
             "format": FORMAT,
             "format_version": FORMAT_VERSION,
@@ -150,7 +149,7 @@ class Plan:
                 {"name": name, "channels": [{"name": c, "unit": unit} for c, unit in channels]}
                 for name, channels in self.sensors
             ],
-            "settings": settings,
+            "settings": settings_document(self.settings),
         }
         return json.dumps(document, ensure_ascii=False, indent=1) + "\n"
 
@@ -194,6 +193,12 @@ class Plan:
                 f"{source}: not the description of an archive ({error!r}); restore the file, or"
                 " start another archive with --store"
             ) from error
+
+
+def settings_document(settings: Settings) -> dict[str, object]:
+    """Return settings as JSON has them."""
+    values = ((each.name, getattr(settings, each.name)) for each in fields(EstimateSettings))
+    return {name: OPTIONS[name].show(value) for name, value in values if value is not None}
 
 
 def described(each: Pass) -> tuple[tuple[str, tuple[tuple[str, str], ...]], ...]:

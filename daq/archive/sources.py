@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,7 @@ from daq.recording.reader import Recording
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from daq.archive.store import Entry
+    from daq.archive.index import Entry
 
 
 @dataclass(slots=True)
@@ -23,15 +24,15 @@ class Sorted:
 
     Attributes
     ----------
-    new : list of (str, Path)
-        Run and path of those to take: new ones, and those that have grown since.
+    new : list of (str, Path, datetime)
+        Run, path and begin of those to take: new ones, and those that have grown since.
     current : list of Path
         Those that the archive has.
     failures : list of str
         A message for each that cannot be read.
     """
 
-    new: list[tuple[str, Path]] = field(default_factory=list)
+    new: list[tuple[str, Path, datetime]] = field(default_factory=list)
     current: list[Path] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
 
@@ -59,12 +60,13 @@ def recordings_in(sources: Iterable[Path], *, leave_out: Path) -> list[Path]:
                 raise RecordingError(f"{source}: no such file or folder")
             found[source] = None
             continue
+        # without spectra of other archives
         inside = [
             path
             for path in sorted(source.rglob("*.h5"))
             if leave_out not in path.parents
             and not path.name.startswith(".")
-            and not (path.parent / PLAN_FILE).exists()  # spectra of another archive
+            and not any((place / PLAN_FILE).exists() for place in list(path.parents)[:2])
         ]
         if not inside:
             raise RecordingError(f"{source}: no recording (*.h5) in this folder")
@@ -86,6 +88,7 @@ def sort(paths: Sequence[Path], entries: Iterable[Entry]) -> Sorted:
                 continue
             with Recording.open(path) as recording:
                 origin = origin_of(recording)
+                begin = datetime.fromtimestamp(recording.created_at.utc_ns / 1e9, UTC)
         except (HuddleError, OSError) as error:
             found.failures.append(str(error))
             continue
@@ -97,6 +100,6 @@ def sort(paths: Sequence[Path], entries: Iterable[Entry]) -> Sorted:
         if same or origin.run_id in seen:
             found.current.append(path)
         else:
-            found.new.append((origin.run_id, path))
+            found.new.append((origin.run_id, path, begin))
         seen.add(origin.run_id)
     return found

@@ -1,17 +1,21 @@
-"""Spectra of one recording: an HDF5 file of an archive, one row a stretch.
+"""Spectra of one recording: an HDF5 file of an archive, one row a stretch, and its summaries.
 
 A file has its name when it is complete and on the disk; before, it is hidden and ends in ``.part``.
 Rows hold cross-spectral matrices in unit²/Hz, packed: real parts on and below the diagonal,
 imaginary parts of the elements above the diagonal. The matrices are Hermitian, so nothing is lost.
+`thin` replaces them by the means of days in single precision, and leaves summaries
+(`daq.archive.rollup`) as they are.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import itertools
 import json
 import os
 import uuid
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Self
 
 import h5py
@@ -24,7 +28,7 @@ from daq.recording.storage.refusals import dataset, member, number, text
 from estimator.spectra.segment_rejection import Reason
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -32,9 +36,15 @@ if TYPE_CHECKING:
     from daq.bench.channel import Channel
 
     ComplexArray = NDArray[np.complex128]
+    IntArray = NDArray[np.int64]
+    SmallArray = NDArray[np.float32]
 
 FORMAT = "huddle-archive-spectra"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+"""1: without summaries."""
+SUMMARY_VERSION = 1
+"""Summaries of another version are made again."""
+DAY_NS = 86400 * 10**9
 STRETCH_DTYPE = np.dtype([("start_utc_ns", "<i8"), ("n_segments", "<i8")])
 _DAMAGE = (AttributeError, IndexError, KeyError, MemoryError, OSError, RuntimeError, TypeError)
 
@@ -94,6 +104,52 @@ class Described:
     stood_still: Mapping[int, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Summary:
+    """Ingredients of answers, of one recording in one month of UTC (`daq.archive.rollup`).
+
+    Attributes
+    ----------
+    starts, n_segments : int64, shape (n_stretches,)
+        Beginning in ns of UTC.
+    noise, recorded : float32, shape (n_stretches, n_fine, n_channels)
+        NaN where a stretch gives no estimate.
+    days, day_segments : int64, shape (n_days,)
+    levels : float32, shape (N_FIELDS, n_days, n_fine, n_channels)
+    total : complex128, shape (n_freqs, n_channels, n_channels)
+        Sum of the matrices, in the units of the recording's channels.
+    """
+
+    starts: IntArray
+    n_segments: IntArray
+    noise: SmallArray
+    recorded: SmallArray
+    days: IntArray
+    day_segments: IntArray
+    levels: SmallArray
+    total: ComplexArray
+
+    @property
+    def of_days(self) -> Summary:
+        """Without stretches: where these are days, hours are not known."""
+        none = slice(0, 0)
+        return replace(
+            self,
+            starts=self.starts[none],
+            n_segments=self.n_segments[none],
+            noise=self.noise[none],
+            recorded=self.recorded[none],
+        )
+
+    @property
+    def sha256(self) -> str:
+        """Of all of it."""
+        digest = hashlib.sha256(str(SUMMARY_VERSION).encode())
+        for each in fields(self):
+            digest.update(np.ascontiguousarray(getattr(self, each.name)).tobytes())
+        return digest.hexdigest()
+
+
 class SpectraWriter:
     """Writes the file of one recording; a context manager.
 
@@ -103,9 +159,12 @@ class SpectraWriter:
     ----------
     path : Path
     n_freqs, n_channels : int
+    daily : bool
+        Whether stretches are days in single precision, of spectra that were finer.
     """
 
-    def __init__(self, path: Path, *, n_freqs: int, n_channels: int) -> None:
+    def __init__(self, path: Path, *, n_freqs: int, n_channels: int, daily: bool = False) -> None:
+        self._daily = daily
         self._path = path
         self._part = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
         self._file = h5py.File(self._part, "w")
@@ -115,7 +174,7 @@ class SpectraWriter:
             shape=(0, *shape),
             maxshape=(None, *shape),
             chunks=(1, *shape),
-            dtype="<f8",
+            dtype="<f4" if daily else "<f8",
             fletcher32=True,
         )
         self._stretches: list[tuple[int, int]] = []
@@ -136,12 +195,22 @@ class SpectraWriter:
         row = len(self._stretches)
         if row >= len(self._csm):
             self._csm.resize(row + 1, axis=0)
-        self._csm[row] = np.tril(csm.real) + np.triu(csm.imag, 1)
+        self._csm[row] = packed(csm)
         self._stretches.append((start_utc_ns, n_segments))
 
-    def commit(self, described: Described) -> None:
-        """Complete the file: it has its name, and is on the disk, when this returns."""
+    def rows(self) -> Iterator[tuple[int, int, ComplexArray]]:
+        """Yield beginning, segments and matrix of each stretch so far."""
+        for row, (start, n_segments) in enumerate(self._stretches):
+            yield start, n_segments, unpacked(self._csm[row])
+
+    def commit(self, described: Described, found: Iterable[tuple[str, Summary]]) -> None:
+        """Complete the file: it has its name, and is on the disk, when this returns.
+
+        `found` are the summaries with their months.
+        """
         file, origin = self._file, described.origin
+        for month, summary in found:
+            _write_summary(file.create_group(f"months/{month}"), summary, total=not self._daily)
         self._csm.resize(len(self._stretches), axis=0)
         file.create_dataset(
             "stretches", data=np.array(self._stretches, STRETCH_DTYPE), fletcher32=True, chunks=True
@@ -168,12 +237,13 @@ class SpectraWriter:
                 "not_understood": json.dumps(dict.fromkeys(described.not_understood, True)),
                 "clipped": json.dumps(dict(described.clipped)),
                 "stood_still": json.dumps(dict(described.stood_still)),
+                "daily": int(self._daily),
             }
         )
         file.close()
-        _to_disk(self._part)
+        to_disk(self._part)
         self._part.replace(self._path)
-        _to_disk(self._path.parent)
+        to_disk(self._path.parent)
 
 
 class SpectraFile:
@@ -236,7 +306,14 @@ class SpectraFile:
             stood_still={int(k): float(v) for k, v in _table(attributes, "stood_still").items()},
         )
         self.stretches: NDArray[np.void] = dataset(file, "stretches", STRETCH_DTYPE)[...]
-        self._csm = dataset(file, "csm", np.dtype("<f8"))
+        self.is_daily = bool(attributes.get("daily", 0))
+        """Whether the matrices of stretches have become those of days."""
+        self._csm = dataset(file, "csm", np.dtype("<f4" if self.is_daily else "<f8"))
+        self.months: dict[str, str] = {}
+        """SHA-256 of the summary of each month; empty in files of format version 1."""
+        if version > 1 and "months" in file:
+            months = member(file, "months")
+            self.months = {str(m): text(member(months, str(m)).attrs, "sha256") for m in months}
         n_channels = len(channels)
         shape = (len(self.stretches), self._csm.shape[1], n_channels, n_channels)
         if self._csm.shape != shape or np.any(self.stretches["n_segments"] < 1):
@@ -261,12 +338,31 @@ class SpectraFile:
             If it is damaged.
         """
         with _damage_named(self.path):
-            packed = self._csm[row]
-        lower, upper = np.tril(packed), np.triu(packed, 1)
-        csm = np.empty(packed.shape, dtype=np.complex128)
-        csm.real = lower + np.tril(packed, -1).swapaxes(1, 2)
-        csm.imag = upper - upper.swapaxes(1, 2)
-        return csm
+            found = self._csm[row]
+        return unpacked(found)
+
+    def rows(self) -> Iterator[tuple[int, int, ComplexArray]]:
+        """Yield beginning, segments and matrix of each stretch."""
+        for row, (start, n_segments) in enumerate(self.stretches.tolist()):
+            yield start, n_segments, self.csm(row)
+
+    def summary(self, month: str) -> Summary:
+        """Return what is kept of a month.
+
+        Raises
+        ------
+        ArchiveError
+            If it is damaged.
+        """
+        with _damage_named(self.path):
+            group = member(member(self._file, "months"), month)
+            names = (each.name for each in fields(Summary) if each.name != "total")
+            arrays = {name: member(group, name)[...] for name in names}
+            total = None if self.is_daily else unpacked(member(group, "total")[...])
+        if total is None:
+            days = set(arrays["days"].tolist())
+            total = np.sum([n * csm for day, n, csm in self.rows() if day in days], axis=0)
+        return Summary(**arrays, total=total)
 
     def close(self) -> None:
         """Close the file."""
@@ -277,6 +373,58 @@ class SpectraFile:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def thin(path: Path) -> bool:
+    """Replace the matrices of a file by the means of days, in single precision; whether it did.
+
+    The estimate of other settings than the archive's is then one of days. Files without summaries,
+    or of days already, stay as they are.
+
+    Raises
+    ------
+    ArchiveError
+        If the file is damaged: it stays as it is.
+    """
+    with SpectraFile(path) as file:
+        if file.is_daily or not file.months:
+            return False
+        n_channels = len(file.described.channels)
+        with SpectraWriter(path, n_freqs=file.n_freqs, n_channels=n_channels, daily=True) as writer:
+            for day, some in itertools.groupby(file.rows(), lambda row: row[0] // DAY_NS * DAY_NS):
+                total, count = np.zeros(1, np.complex128), 0
+                for _, n_segments, csm in some:
+                    total, count = total + n_segments * csm, count + n_segments
+                writer.append(day, count, total / count)
+            writer.commit(file.described, ((m, file.summary(m)) for m in file.months))
+    return True
+
+
+def packed(csm: ComplexArray) -> NDArray[np.float64]:
+    """Return Hermitian matrices as real ones."""
+    return np.asarray(np.tril(csm.real) + np.triu(csm.imag, 1))
+
+
+def unpacked(found: NDArray[np.floating[Any]]) -> ComplexArray:
+    """Return what was `packed`."""
+    upper = np.triu(found, 1)
+    csm = np.empty(found.shape, dtype=np.complex128)
+    csm.real = np.tril(found) + np.tril(found, -1).swapaxes(-1, -2)
+    csm.imag = upper - upper.swapaxes(-1, -2)
+    return csm
+
+
+def _write_summary(group: h5py.Group, summary: Summary, *, total: bool) -> None:
+    for each in fields(summary):
+        array = getattr(summary, each.name)
+        if each.name == "total" and not total:
+            continue
+        array = packed(array) if each.name == "total" else array
+        group.create_dataset(
+            each.name, data=array, compression="gzip", compression_opts=1, shuffle=True,
+            fletcher32=True, chunks=(1, *array.shape[1:]) if array.ndim > 2 else True,
+        )  # fmt: skip
+    group.attrs["sha256"] = summary.sha256
 
 
 @contextlib.contextmanager
@@ -302,7 +450,7 @@ def _table(
     return found
 
 
-def _to_disk(path: Path) -> None:
+def to_disk(path: Path) -> None:
     """Write a file, or the names in a folder, to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:

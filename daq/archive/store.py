@@ -4,9 +4,13 @@
 
     huddle-archive/
         archive.json        settings, sensors (`daq.archive.plan`)
-        RUN.h5              spectra of one recording, named by its run (`daq.archive.spectra_file`)
+        index.sqlite        what the files of recordings say of these
+        2026/RUN.h5         spectra and summaries of one recording (`daq.archive.spectra_file`),
+                            in the year in which it begins; without a year in older archives
+        2026/rollup-KEY.h5  months and year (`daq.archive.years`)
 
-A file is replaced whole. One command at a time writes; others may read.
+A file is replaced whole. One command at a time adds recordings; others may read. The index and the
+roll-ups can be deleted: they are made again.
 """
 
 from __future__ import annotations
@@ -20,8 +24,9 @@ import uuid
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from daq.archive.index import ROLLUP, Entry, Index
 from daq.archive.plan import Plan
-from daq.archive.spectra_file import Described, SpectraFile
+from daq.archive.spectra_file import DAY_NS, SpectraFile, thin
 from daq.errors import ArchiveError, WrongArchiveError
 
 if sys.platform != "win32":
@@ -29,28 +34,13 @@ if sys.platform != "win32":
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from datetime import datetime
     from pathlib import Path
 
 PLAN_FILE = "archive.json"
 FOLDER = "huddle-archive"
 """Default name, beside the recordings."""
 _FAMILIAR_RUN = re.compile(r"[0-9A-Za-z-]{1,64}")
-
-
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """One recording of an archive: its file, and what that says."""
-
-    path: Path
-    described: Described
-    start_utc_ns: int | None
-    """Of its first stretch; None without one."""
-
-    @property
-    def order(self) -> tuple[bool, int, str]:
-        """Sort key: by time, then by run; without a stretch first."""
-        start = self.start_utc_ns
-        return start is not None, start or 0, self.described.origin.run_id
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,18 +110,24 @@ class Store:
                     raise ArchiveError(
                         f"{self.folder}: another command is writing this archive; wait for its end"
                     ) from None
-            unfinished = list(self.folder.glob(".*.part"))
+            unfinished = [*self.folder.glob(".*.part"), *self.folder.glob("*/.*.part")]
             for path in unfinished:
                 path.unlink(missing_ok=True)
             yield len(unfinished)
         finally:
             os.close(handle)
 
-    def path_of(self, run_id: str) -> Path:
+    def path_of(self, run_id: str, begin: datetime) -> Path:
         """Return the file for the spectra of a recording."""
         familiar = _FAMILIAR_RUN.fullmatch(run_id)
         name = run_id if familiar else hashlib.sha256(run_id.encode()).hexdigest()
-        return self.folder / f"{name}.h5"
+        before = self.folder / f"{name}.h5"  # of older archives: one file of a run
+        return before if before.exists() else self.folder / f"{begin:%Y}" / f"{name}.h5"
+
+    def files(self) -> list[Path]:
+        """Return the files of recordings."""
+        found = [*self.folder.glob("*.h5"), *self.folder.glob("[0-9][0-9][0-9][0-9]/*.h5")]
+        return sorted(path for path in found if not path.name.startswith((".", ROLLUP)))
 
     def entries(self) -> tuple[tuple[Entry, ...], tuple[str, ...]]:
         """Return the recordings of the archive in order of time, and a message for each bad file.
@@ -142,18 +138,37 @@ class Store:
             If a file is of a newer format.
         """
         found, bad = [], []
-        for path in sorted(self.folder.glob("*.h5")):
-            try:
-                with SpectraFile(path) as file:
-                    starts = file.stretches["start_utc_ns"]
-                    first = int(starts[0]) if len(starts) else None
-                    self._check(file)
-                    found.append(Entry(path, file.described, first))
-            except WrongArchiveError:
-                raise
-            except ArchiveError as error:
-                bad.append(str(error))
+        with Index(self.folder) as index:
+            for path in self.files():
+                entry = index.get(path)
+                if entry is None:
+                    try:
+                        with SpectraFile(path) as file:
+                            self._check(file)
+                            entry = Entry.of(file)
+                    except WrongArchiveError:
+                        raise
+                    except ArchiveError as error:
+                        bad.append(str(error))
+                        continue
+                    index.put(entry)
+                found.append(entry)
         return tuple(sorted(found, key=lambda entry: entry.order)), tuple(bad)
+
+    def thin(self, days: int) -> int:
+        """Keep of recordings that begin so many days before the last one the matrices of days only.
+
+        Returns how many files have been made smaller.
+        """
+        entries, _ = self.entries()
+        starts = [entry.start_utc_ns for entry in entries if entry.start_utc_ns is not None]
+        last = max(starts, default=0) - days * DAY_NS
+        old = [
+            entry
+            for entry in entries
+            if entry.start_utc_ns is not None and entry.start_utc_ns < last and not entry.daily
+        ]
+        return sum(thin(entry.path) for entry in old)
 
     def _check(self, file: SpectraFile) -> None:
         """Refuse spectra of other sensors or settings than the archive's."""

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.archive.plan import Plan
+from daq.archive.rollup import summaries
 from daq.archive.spectra_file import Described, Origin, SpectraWriter
 from daq.errors import HuddleError
 from daq.estimation.blas_threads import one_blas_thread
@@ -120,20 +121,21 @@ def _archived(task: Task) -> Outcome:
             left_out = dict(each.left_out)
             left_out[Reason.TRANSIENT] = each.n_seen - each.n_written - sum(left_out.values())
             channels = each.aligned.channels
+            described = Described(
+                origin=origin,
+                channels=channels,
+                usable=each.aligned.usable,
+                elapsed=each.elapsed,
+                left_out={reason: left_out.get(reason, 0) for reason in Reason},
+                residual=synchronisation([each]).residual,
+                not_understood=tuple(
+                    clock.sensor for clock in each.aligned.clocks if not clock.is_understood
+                ),
+                clipped=clipped_columns([recording], channels),
+                stood_still=still_for_a_while([each], settings),
+            )
             writer.commit(
-                Described(
-                    origin=origin,
-                    channels=channels,
-                    usable=each.aligned.usable,
-                    elapsed=each.elapsed,
-                    left_out={reason: left_out.get(reason, 0) for reason in Reason},
-                    residual=synchronisation([each]).residual,
-                    not_understood=tuple(
-                        clock.sensor for clock in each.aligned.clocks if not clock.is_understood
-                    ),
-                    clipped=clipped_columns([recording], channels),
-                    stood_still=still_for_a_while([each], settings),
-                )
+                described, summaries(writer.rows(), described, plan, plan.noise_settings(settings))
             )
             return Outcome(task.source, each.n_stretches, each.n_written, origin.closed)
 

@@ -28,9 +28,10 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from daq.archive.answers import Answer
+    from daq.archive.index import Entry
     from daq.archive.plan import Plan
     from daq.archive.sources import Sorted
-    from daq.archive.store import Entry, Store
+    from daq.archive.store import Store
     from daq.archive.task import Outcome
     from daq.estimation.settings import Settings
 
@@ -78,6 +79,16 @@ def archive(
             metavar="ADDRESS",
             help="Use the workers of this Dask scheduler, such as tcp://host:8786. They must see"
             " recordings and archive under the same paths.",
+        ),
+    ] = None,
+    thin_after: Annotated[
+        int | None,
+        typer.Option(
+            "--thin-after",
+            metavar="DAYS",
+            min=0,
+            help="Keep the matrices of hours for so many days before the last recording; of older"
+            " ones those of days, in single precision.",
         ),
     ] = None,
     out: Annotated[
@@ -170,6 +181,7 @@ def archive(
     settings = checked(archive.plan)
 
     failures = _take_new(archive, paths, jobs=jobs, scheduler=scheduler) if paths else []
+    _thin(archive, thin_after)
     entries, bad = archive.entries()
     found = _answered(archive, entries, settings, zone=zone, false_alarm=false_alarm)
     screen = for_people(json, csv)
@@ -205,14 +217,14 @@ def _answered(
     from tui.output.console import progress
 
     with progress(
-        TextColumn("estimates"),
+        TextColumn("roll-ups"),
         BarColumn(),
         TextColumn("{task.completed} of {task.total} recordings"),
         TimeRemainingColumn(),
     ) as bar:
         task = bar.add_task("")
         return answer(
-            archive.plan,
+            archive,
             entries,
             settings,
             zone=zone,
@@ -271,6 +283,18 @@ def _take_new(
     return failures
 
 
+def _thin(archive: Store, days: int | None) -> None:
+    """Reduce the matrices of old recordings."""
+    from tui.output.console import notices
+    from tui.wording.formatting import several
+
+    if days is None:
+        return
+    with archive.writing():
+        n_thinned = archive.thin(days)
+    notices().print(f"matrices of {several(n_thinned, 'recording')} reduced to those of days")
+
+
 def _with_progress(
     archive: Store, found: Sorted, *, jobs: int, scheduler: str | None
 ) -> Iterator[Outcome]:
@@ -284,7 +308,8 @@ def _with_progress(
     if not tasks:
         return
     sizes = {
-        task.source: path.stat().st_size for task, (_, path) in zip(tasks, found.new, strict=True)
+        task.source: path.stat().st_size
+        for task, (_, path, _) in zip(tasks, found.new, strict=True)
     }
     outcomes = (
         carried_out(tasks, jobs=jobs)

@@ -270,7 +270,7 @@ def archive(
             tasks = tasks_of(kept, found.new)
             failures += filter(None, map(failure_of, carried_out(tasks, jobs=jobs)))
     entries, bad = kept.entries()
-    answered = answer(kept.plan, entries, settings, zone=zone, false_alarm=false_alarm)
+    answered = answer(kept, entries, settings, zone=zone, false_alarm=false_alarm)
     return replace(answered, problems=(*failures, *bad, *answered.problems))
 
 

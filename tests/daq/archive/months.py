@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 import h5py
 import numpy as np
 
-from daq.archive.execution import carried_out
+from daq.archive.execution import carried_out, tasks_of
+from daq.archive.index import FILE as INDEX
+from daq.archive.index import ROLLUP
 from daq.archive.plan import Plan
 from daq.archive.sources import sort
 from daq.archive.store import PLAN_FILE, Store
-from daq.archive.task import Task, software_version
 from daq.bench.channel import Channel
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
@@ -23,7 +24,10 @@ from daq.recording.reader import Recording
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from datetime import datetime
     from pathlib import Path
+
+    from daq.archive.task import Task
 
 RATE = 10.0
 START_NS = 1_788_134_400 * 10**9  # Monday 2026-08-31, 00:00 UTC
@@ -95,15 +99,18 @@ def fill(store: Store, paths: Sequence[Path], *, jobs: int = 1) -> list[str]:
     return found.failures + [each.failure for each in outcomes if each.failure]
 
 
-def tasks(store: Store, new: Sequence[tuple[str, Path]]) -> list[Task]:
+def tasks(store: Store, new: Sequence[tuple[str, Path, datetime]]) -> list[Task]:
     """Return tasks for recordings."""
-    plan = store.plan.to_json()
-    return [Task(str(path), str(store.path_of(run)), plan, software_version()) for run, path in new]
+    return tasks_of(store, new)
 
 
 def content(store: Store) -> dict[str, bytes]:
-    """Return all files of an archive."""
-    return {path.name: path.read_bytes() for path in store.folder.iterdir()}
+    """Return all files of an archive, but for what is made again of them."""
+    return {
+        str(path.relative_to(store.folder)): path.read_bytes()
+        for path in store.folder.rglob("*")
+        if path.is_file() and path.name != INDEX and not path.name.startswith(ROLLUP)
+    }
 
 
 def assert_same(one: Store, other: Store) -> None:
@@ -114,7 +121,7 @@ def assert_same(one: Store, other: Store) -> None:
 def values(store: Store) -> dict[str, bytes]:
     """Return every dataset and attribute of an archive: HDF5 may lay out equal values otherwise."""
     found: dict[str, bytes] = {PLAN_FILE: (store.folder / PLAN_FILE).read_bytes()}
-    for path in store.folder.glob("*.h5"):
+    for path in store.files():
 
         def take(name: str, item: h5py.Group, path: Path = path) -> None:
             for key, value in item.attrs.items():

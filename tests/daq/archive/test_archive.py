@@ -8,7 +8,7 @@ import pickle
 import shutil
 import signal
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
@@ -17,6 +17,8 @@ import pytest
 from daq.archive.answers import answer
 from daq.archive.density import LOWEST_DB, Density
 from daq.archive.execution import carried_out, is_exposed
+from daq.archive.index import FILE as INDEX
+from daq.archive.index import ROLLUP
 from daq.archive.sources import recordings_in, sort
 from daq.archive.spectra_file import SpectraFile, SpectraWriter
 from daq.archive.store import PLAN_FILE, Store
@@ -29,6 +31,7 @@ from tests.daq.archive.months import (
     HOUR_NS,
     SETTINGS,
     START_NS,
+    assert_same,
     content,
     fill,
     record,
@@ -40,6 +43,10 @@ from tests.daq.archive.months import (
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from daq.archive.answers import Answer
 
 SNR = 25.0**2
 """Of the recordings: rounding of the motion's spectra counts so many times in the noise's."""
@@ -79,7 +86,7 @@ def test_the_pooled_estimate_is_that_of_all_recordings(
     store = store_for(tmp_path / "store", paths[0], settings, stretch)
     assert fill(store, paths) == []
     entries, bad = store.entries()
-    pooled = answer(store.plan, entries, settings).pooled
+    pooled = answer(store, entries, settings).pooled
     direct = estimate(paths, replace(settings, equalise="off", bridge=0.0))
     assert not bad
     assert (pooled.n_segments, pooled.n_dropped) == (direct.n_segments, direct.n_dropped)
@@ -114,7 +121,7 @@ def test_processes_that_were_interrupted_and_resumed_write_the_same_bytes(
     outcomes.close()  # ends the processes, whatever they do
     with other.writing():
         assert fill(other, paths) == []
-    assert content(other) == content(store)
+    assert_same(other, store)
 
 
 def test_only_new_recordings_are_processed(paths: list[Path], copy: Store, tmp_path: Path) -> None:
@@ -122,7 +129,7 @@ def test_only_new_recordings_are_processed(paths: list[Path], copy: Store, tmp_p
     shutil.copyfile(paths[0], moved)  # another name and time, the same run
     longer = record(tmp_path / "four.h5", begin_ns=START_NS + 50 * HOUR_NS, seed=4)
     found = sort([moved, *paths, longer], copy.entries()[0])
-    assert [path for _, path in found.new] == [longer]
+    assert [path for _, path, _ in found.new] == [longer]
     assert found.current == [moved, *paths]
 
 
@@ -165,7 +172,7 @@ def test_a_failed_task_is_reported_and_the_others_are_completed(
     work.insert(1, Task("no.h5", "nowhere/no.h5", "[" * 10**5, work[0].software))
     outcomes = list(carried_out(work))
     assert [bool(each.failure) for each in outcomes].count(True) == 1
-    assert content(other) == content(store)
+    assert_same(other, store)
 
 
 def test_one_command_writes_at_a_time(copy: Store) -> None:
@@ -214,8 +221,8 @@ def test_recordings_of_other_sensors_are_reported_and_the_rest_processed(
 def test_newer_formats_are_refused_by_name(copy: Store) -> None:
     path = copy.entries()[0][1].path
     with h5py.File(path, "r+") as file:
-        file.attrs["format_version"] = 2
-    with pytest.raises(WrongArchiveError, match=rf"{path.name}: format version 2 is newer"):
+        file.attrs["format_version"] = 3
+    with pytest.raises(WrongArchiveError, match=rf"{path.name}: format version 3 is newer"):
         copy.entries()
     plan = copy.folder / PLAN_FILE
     plan.write_text(plan.read_text().replace('"format_version": 1', '"format_version": 7'))
@@ -252,19 +259,26 @@ def test_damaged_files_are_reported_excluded_and_rebuilt(
     assert not (copy.folder.parent / "executed").exists()
 
 
-def test_a_stretch_with_a_wrong_checksum_is_reported_and_excluded(copy: Store) -> None:
+@pytest.mark.parametrize(
+    ("dataset", "unit"), [("months/2026-08/noise", None), ("csm", "g")], ids=["own", "other"]
+)
+def test_what_has_a_wrong_checksum_is_reported_and_excluded(
+    copy: Store, dataset: str, unit: str | None
+) -> None:
+    """Of the archive's own settings the summary is read, of others the matrices."""
     entry = copy.entries()[0][0]
-    with SpectraFile(entry.path) as file:
-        n_segments = file.stretches["n_segments"]
     with h5py.File(entry.path) as found:
-        place = found["csm"].id.get_chunk_info(1).byte_offset
+        place = found[dataset].id.get_chunk_info(1).byte_offset
     content = bytearray(entry.path.read_bytes())
     content[place + 100] ^= 1
     entry.path.write_bytes(content)
-    whole = answer(copy.plan, copy.entries()[0], SETTINGS)
+    settings = replace(SETTINGS, unit=unit)
+    whole = answer(copy, copy.entries()[0], settings)
     assert len(whole.problems) == 1
-    assert "2026-08-31T01:00Z" in whole.problems[0]
-    assert whole.n_segments[0] == 3 * n_segments.sum() - n_segments[1] - whole.n_segments[1]
+    assert entry.path.name in whole.problems[0]
+    others = [each for each in copy.entries()[0] if each.path != entry.path]
+    assert whole.n_segments.sum() == sum(each.n_segments for each in others)
+    assert answer(copy, copy.entries()[0], settings).problems == whole.problems
 
 
 def test_folders_that_are_no_archive_are_not_written_into(tmp_path: Path, store: Store) -> None:
@@ -288,7 +302,7 @@ def test_recordings_in_folders_are_found(paths: list[Path], tmp_path: Path) -> N
 
 
 def test_days_and_density_have_the_true_noise(store: Store) -> None:
-    found = answer(store.plan, store.entries()[0], SETTINGS)
+    found = answer(store, store.entries()[0], SETTINGS)
     truth = (20.0**2 + 1 / 12) / 1e12 * 2 / 10.0  # noise and rounding, over half the rate
     assert list((found.days_utc_ns - START_NS) / HOUR_NS) == [0, 24]
     z = (found.levels.mean / truth - 1) / (found.levels.spread / truth)
@@ -346,12 +360,12 @@ def test_recordings_whose_clocks_are_not_understood_are_left_out(
     entries, _ = store.entries()
     if alone:
         with pytest.raises(ArchiveError, match="no recording in which all clocks are understood"):
-            answer(store.plan, entries, settings)
+            answer(store, entries, settings)
         return
-    found = answer(store.plan, entries, settings)
+    found = answer(store, entries, settings)
     (left,) = found.doubted
     assert (left.origin.path, left.not_understood) == (str(bad), ("B",))
-    only = answer(store.plan, [one for one in entries if one.described != left], settings)
+    only = answer(store, [one for one in entries if one.described != left], settings)
     np.testing.assert_array_equal(found.levels.mean, only.levels.mean)
 
 
@@ -359,5 +373,76 @@ def test_a_recording_from_1970_is_in_the_answer(tmp_path: Path) -> None:
     path = record(tmp_path / "first.h5", begin_ns=0, hours=0.6)
     store = store_for(tmp_path / "store", path)
     assert fill(store, [path]) == []
-    found = answer(store.plan, store.entries()[0], SETTINGS)
+    found = answer(store, store.entries()[0], SETTINGS)
     assert list(found.days_utc_ns) == [0]
+
+
+def levels_of(found: Answer) -> list[NDArray[np.number[Any]]]:
+    """Return the numbers of an answer that come from stretches and days."""
+    return [
+        found.levels.mean,
+        found.levels.low,
+        found.levels.high,
+        found.density.counts,
+        found.recorded.counts,
+        found.pooled.data_psd,
+    ]
+
+
+def test_archives_of_format_1_give_the_same_answer(copy: Store) -> None:
+    wanted = answer(copy, copy.entries()[0], SETTINGS)
+    for entry in copy.entries()[0]:
+        with h5py.File(entry.path, "r+") as file:
+            del file["months"]
+            del file.attrs["daily"]
+            file.attrs["format_version"] = 1
+        entry.path.rename(copy.folder / entry.path.name)
+    for again in range(2):  # the second from the roll-ups that the first has made
+        found = answer(copy, copy.entries()[0], SETTINGS)
+        assert not found.problems
+        for one, other in zip(levels_of(found), levels_of(wanted), strict=True):
+            np.testing.assert_array_equal(one, other, err_msg=str(again))
+
+
+def test_an_answer_opens_no_file_of_a_recording_twice(copy: Store) -> None:
+    wanted = answer(copy, copy.entries()[0], SETTINGS)
+    for entry in copy.entries()[0]:
+        about = entry.path.stat()
+        entry.path.write_bytes(b"x" * about.st_size)  # whoever reads it now, fails
+        os.utime(entry.path, ns=(about.st_atime_ns, about.st_mtime_ns))
+    entries, bad = copy.entries()
+    assert not bad
+    found = answer(copy, entries, SETTINGS)
+    for one, other in zip(levels_of(found), levels_of(wanted), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("damage", [b"", b"nothing", b"SQLite format 3\0" + b"\xff" * 4096])
+def test_damaged_indices_and_rollups_are_made_again(copy: Store, damage: bytes) -> None:
+    wanted = answer(copy, copy.entries()[0], SETTINGS)
+    derived = [copy.folder / INDEX, *copy.folder.glob(f"*/{ROLLUP}*")]
+    assert len(derived) == 2
+    for path in derived:
+        path.write_bytes(damage)
+    for one, other in zip(
+        levels_of(answer(copy, copy.entries()[0], SETTINGS)), levels_of(wanted), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_thinned_files_answer_as_before_and_other_settings_by_day(copy: Store) -> None:
+    wanted = answer(copy, copy.entries()[0], SETTINGS)
+    other = answer(copy, copy.entries()[0], replace(SETTINGS, unit="g"))
+    before = sum(path.stat().st_size for path in copy.files())
+    assert copy.thin(2) == 0
+    assert copy.thin(0) == len(copy.entries()[0]) - 1  # the last is not older than itself
+    assert copy.thin(0) == 0
+    assert sum(path.stat().st_size for path in copy.files()) < before
+    for path in copy.folder.glob(f"*/{ROLLUP}*"):
+        path.unlink()
+    found = answer(copy, copy.entries()[0], SETTINGS)
+    for one, two in zip(levels_of(found), levels_of(wanted), strict=True):
+        np.testing.assert_allclose(one, two, rtol=1e-6)
+    daily = answer(copy, copy.entries()[0], replace(SETTINGS, unit="g"))
+    np.testing.assert_allclose(daily.levels.mean, other.levels.mean, rtol=1e-2)  # at SNR 625
+    assert 0 < daily.density.n_stretches < other.density.n_stretches

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 SCHEMA: dict[str, Any] = json.loads(
-    (resources.files("tui.resources") / "archive-1.schema.json").read_text("utf-8")
+    (resources.files("tui.resources") / "archive-2.schema.json").read_text("utf-8")
 )
 OPTIONS = ("--segment", "10s", "--method", "three-sensor")
 PLAIN = ("--equalise", "off", "--bridge", "0")
@@ -165,7 +165,7 @@ def test_killed_and_started_again_it_goes_on(folder: Path, tmp_path: Path) -> No
     command = [*python_command("tui"), "archive", str(folder), "--store", str(store), *OPTIONS]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     with subprocess.Popen(command, **quiet) as process:  # type: ignore[call-overload]
-        wait_until(lambda: any(store.glob("*.h5")), "the first recording in the archive")
+        wait_until(lambda: any(store.glob("*/*.h5")), "the first recording in the archive")
         process.send_signal(signal.SIGKILL)
     result = huddle(folder, "--store", store)
     assert result.exit_code == 0
@@ -228,7 +228,7 @@ def test_figures_have_a_panel_a_channel_with_what_was_found(tmp_path: Path) -> N
         kept.append(sum(isinstance(each, Snapshot) for each in gc.get_objects()))
 
     gc.collect()
-    found = answer(store.plan, store.entries()[0], SETTINGS, progress=count)
+    found = answer(store, store.entries()[0], SETTINGS, progress=count)
     assert kept == [kept[0]] * 10
     assert found.changes.found[:6].all()
     assert set(found.changes.day[:6]) == {5}

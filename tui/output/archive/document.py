@@ -1,6 +1,6 @@
 """The answer of an archive as JSON and CSV; docs/archives.md describes both.
 
-``tui/resources/archive-1.schema.json`` describes the JSON for programs.
+``tui/resources/archive-2.schema.json`` describes the JSON for programs.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from tui.output.json_values import plain
 
 if TYPE_CHECKING:
     from daq.archive.answers import Answer, Levels
+    from daq.archive.density import Density
     from daq.archive.store import Store
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 """Rises when a key is removed or changes its meaning; new keys do not change it."""
 PERCENTILES = (10, 50, 90)
 
@@ -26,7 +27,7 @@ def archive_document(answer: Answer, store: Store, n_recordings: int) -> dict[st
     """Return the answer as JSON; arrays in the order that their names say."""
     pooled = answer.pooled
     shape = (len(answer.bands), len(pooled.channels))
-    density, changes = answer.density, answer.changes
+    changes = answer.changes
     return {
         "schema_version": SCHEMA_VERSION,
         "archive": {
@@ -65,22 +66,12 @@ def archive_document(answer: Answer, store: Store, n_recordings: int) -> dict[st
                 for name in ("amount", "low", "high")
             },
         },
-        "density": {
-            "stretches": density.n_stretches,
-            "short_stretches": density.n_short,
-            "frequency_hz": plain(density.frequency),
-            "lowest_db": LOWEST_DB,
-            "counts": plain(density.counts),
-            "not_positive": plain(density.not_positive),
-            "percentile_db": {str(p): plain(density.percentile(p / 100)) for p in PERCENTILES},
-        },
+        "density": _density(answer.density),
+        "recorded_density": _density(answer.recorded),
         "weekday_against_night": None
         if answer.contrast is None
         else {
-            "weekday_segments": answer.contrast.n_weekday,
-            "night_segments": answer.contrast.n_night,
-            "weekday": _levels(answer.contrast.weekday),
-            "night": _levels(answer.contrast.night),
+            "days": answer.contrast.n_days,
             "difference_db": plain(answer.contrast.difference),
             "difference_db_low": plain(answer.contrast.low),
             "difference_db_high": plain(answer.contrast.high),
@@ -119,6 +110,18 @@ def days_csv(answer: Answer) -> str:
             for column, label in enumerate(answer.pooled.channels)
         ),
     )
+
+
+def _density(density: Density) -> dict[str, Any]:
+    return {
+        "stretches": density.n_stretches,
+        "short_stretches": density.n_short,
+        "frequency_hz": plain(density.frequency),
+        "lowest_db": LOWEST_DB,
+        "counts": plain(density.counts),
+        "not_positive": plain(density.not_positive),
+        "percentile_db": {str(p): plain(density.percentile(p / 100)) for p in PERCENTILES},
+    }
 
 
 def _levels(levels: Levels) -> dict[str, Any]:

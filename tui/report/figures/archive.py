@@ -12,9 +12,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from daq.archive.answers import DAY_NS
 from daq.archive.changes import DAYS_PER_YEAR
 from daq.archive.density import HIGHEST_DB, LOWEST_DB
+from daq.archive.spectra_file import DAY_NS
 from daq.bench.units import levels_db
 from tui.output.archive.tables import day_text
 from tui.output.console import write_whole

@@ -1,0 +1,500 @@
+"""What answers are made of, in parts that add: of a stretch, a day, a month.
+
+Whoever has the cross-spectral matrices of a recording makes its summaries, one a month: the noise
+and the recorded PSD of every stretch on a `Grid` of 1/24 octaves; of every day also the cumulants
+of the noise, what widens its interval, and its bound; and the sum of the matrices. Summaries of one
+month make a roll-up: days in several recordings become one, and densities count stretches.
+
+Levels of independent spectra add: the mean by segments, the cumulant T_k with the k-th power of the
+shares (`estimator.levels.interval`). So do those of neighbouring bands, but for the correlation of
+neighbouring bins.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import reduce
+from operator import add
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+
+from daq.archive.averages import Average, Estimator
+from daq.archive.density import counted
+from daq.archive.spectra_file import DAY_NS, Summary
+from daq.results.band_summary import Levels, band_within, correlation_of, levels
+from estimator.errors import BandError
+from estimator.levels.bands import BandLevels, band_edges
+from estimator.levels.contributions import Contribution, Source
+from estimator.levels.interval import like_psd
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+    from datetime import tzinfo
+
+    from numpy.typing import NDArray
+
+    from daq.archive.density import Density
+    from daq.archive.plan import Plan
+    from daq.archive.spectra_file import Described
+    from daq.estimation.settings import Settings
+
+    FloatArray = NDArray[np.float64]
+    SmallArray = NDArray[np.float32]
+    IntArray = NDArray[np.int64]
+    ComplexArray = NDArray[np.complex128]
+
+PER_OCTAVE = 24
+WORK, EARLY, LATE = range(3)
+"""Parts of a local day: 8 to 18 h, 0 to 6 h, 22 to 24 h. The mean of the two nights has the middle
+of the working hours, so that a drift does not enter their difference."""
+_PART_OF_HOUR = dict.fromkeys(range(8, 18), WORK) | dict.fromkeys(range(6), EARLY) | {22: 2, 23: 2}
+(MEAN, DEVIATION, SKEWNESS, TAIL, BELOW, ABOVE, SHARE, BOUND, BOUND_DEVIATION, RECORDED) = range(10)
+"""Of a day: mean noise, √T₂, T₃/T₂^1.5 and T₄/T₂², what widens its interval, what the other sensors
+leave unpredicted, and the recorded PSD."""
+N_FIELDS = 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Grid:
+    """Bands of 1/24 octave, or of one bin where bins are wider; further edges where bands end.
+
+    Attributes
+    ----------
+    frequency : float64, shape (n_freqs,)
+    edges : int64, shape (n_fine + 1,)
+        Band b has bins ``edges[b]`` to ``edges[b + 1]``, excluded.
+    correlation : float64, shape (n_lags,)
+        Of bins.
+    """
+
+    frequency: FloatArray
+    edges: IntArray
+    correlation: FloatArray
+    _known: dict[tuple[int, int], list[FloatArray]] = field(default_factory=dict)
+    """Correlations of fine bands of each span that has been asked for."""
+
+    @classmethod
+    def of(cls, estimator: Estimator) -> Self:
+        """Return the grid of an estimator's spectra."""
+        frequency = estimator.welch.frequencies
+        first, last = np.log2(frequency[[1, -1]]) * PER_OCTAVE
+        nominal = 2.0 ** (np.arange(np.floor(first), np.ceil(last) + 1) / PER_OCTAVE)
+        edges = set(np.searchsorted(frequency, nominal).tolist())
+        for band in {band_within(estimator.settings, frequency, np.inf), _usual(frequency)}:
+            try:
+                edges |= set(band_edges(frequency, band).tolist())
+            except BandError:
+                continue
+        end = len(frequency) - 1
+        inside = sorted({1, end} | {edge for edge in edges if 1 < edge < end})
+        return cls(frequency, np.array(inside, np.int64), correlation_of(estimator.settings))
+
+    @property
+    def n_bins(self) -> IntArray:
+        """Bins of each band."""
+        return np.diff(self.edges)
+
+    @property
+    def middle(self) -> FloatArray:
+        """Geometric middle of each band in Hz."""
+        low, high = self.frequency[self.edges[:-1]], self.frequency[self.edges[1:] - 1]
+        return np.asarray(np.sqrt(low * high))
+
+    def mean(self, psd: FloatArray) -> FloatArray:
+        """Return means over the known bins of each band, of shape (n_freqs, n_channels)."""
+        known = np.isfinite(psd)
+        starts, inside = self.edges[:-1] - 1, slice(1, int(self.edges[-1]))
+        total = np.add.reduceat(np.where(known, psd, 0.0)[inside], starts, axis=0)
+        number = np.add.reduceat(known[inside].astype(float), starts, axis=0)
+        with np.errstate(invalid="ignore"):
+            return np.asarray(np.where(number > 0, total / number, np.nan))
+
+    def span(self, band: tuple[float, float]) -> slice:
+        """Return the bands within a band in Hz, whose ends move to the nearest edges.
+
+        Raises
+        ------
+        BandError
+            If the band has no frequency.
+        """
+        first, last = band_edges(self.frequency, band)
+        at = np.abs(self.edges[:, None] - np.array([first, last])).argmin(axis=0)
+        begin = min(int(at[0]), len(self.edges) - 2)
+        return slice(begin, max(int(at[1]), begin + 1))
+
+    def has(self, band: tuple[float, float]) -> bool:
+        """Return whether the ends of a band are edges."""
+        return bool(np.isin(band_edges(self.frequency, band), self.edges).all())
+
+    def average(self, psd: SmallArray, span: slice) -> FloatArray:
+        """Return the mean over the known bands of a `span`, of (…, n_fine, n_channels)."""
+        own = np.asarray(psd[..., span, :], np.float64)
+        weight = np.where(np.isfinite(own), self.n_bins[span, None], 0.0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            total = (np.where(weight > 0, own, 0.0) * weight).sum(axis=-2)
+            return np.asarray(total / weight.sum(axis=-2))
+
+    def ends(self, span: slice) -> tuple[float, float]:
+        """Return the first and the last frequency of a `span`, in Hz."""
+        first, last = int(self.edges[span.start]), int(self.edges[span.stop]) - 1
+        return float(self.frequency[first]), float(self.frequency[last])
+
+    def levels(self, days: FloatArray | SmallArray, span: slice) -> Levels:
+        """Return levels of a band from those of days, shape (N_FIELDS, …, n_fine, n_channels).
+
+        The band takes the place of the axis of fine bands, and has a length of 1.
+        """
+        own = np.asarray(days[..., span, :], np.float64)
+        known = np.isfinite(own[MEAN]) & np.isfinite(own[DEVIATION])
+        weight = np.where(known, self.n_bins[span, None], 0.0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            weight /= weight.sum(axis=-2, keepdims=True)
+            weighted = np.where(known, own, 0.0) * weight
+            deviation = weighted[DEVIATION]
+            t2 = deviation**2
+            shape = np.where(known, own, 0.0)
+            added = [
+                each.sum(axis=-2, keepdims=True)
+                for each in (t2, shape[SKEWNESS] * deviation**3, shape[TAIL] * t2**2)
+            ]
+            excess = 1 + self._pairs(deviation, span) / np.where(added[0] > 0, added[0], 1.0)
+            cumulants = np.stack([t * excess ** (k + 1) for k, t in enumerate(added)])
+            part = {
+                name: np.where(weight > 0, own[name] * weight, 0.0).sum(-2, keepdims=True)
+                for name in (MEAN, BELOW, ABOVE, BOUND)
+            }
+            size = np.where(known, np.abs(weighted[MEAN]), 0.0)
+            shares = np.where(size > 0, own[SHARE] * size, 0.0).sum(-2, keepdims=True)
+            share = shares / np.where(
+                size.sum(-2, keepdims=True) > 0, size.sum(-2, keepdims=True), 1
+            )
+            bound_deviation = np.where(weight > 0, own[BOUND_DEVIATION] * weight, 0.0)
+            spread = (bound_deviation**2).sum(-2, keepdims=True)
+            spread = np.sqrt(spread + self._pairs(bound_deviation, span))
+            bound = part[BOUND]
+        complete = known.all(axis=-2, keepdims=True)
+        nothing = ~known.any(axis=-2, keepdims=True)
+        mean = np.where(nothing, np.nan, part[MEAN])
+        widening = Contribution(Source.MISFIT, part[BELOW], part[ABOVE], share)
+        known_bound = np.isfinite(bound) & (bound > 0) & complete
+        bounded = like_psd(np.where(known_bound, bound, 1.0), np.where(known_bound, spread, 0.0))
+        return Levels(
+            BandLevels(mean, np.where(nothing, np.nan, cumulants), complete),
+            (widening,),
+            BandLevels(np.where(known_bound, bound, np.nan), bounded, known_bound),
+        )
+
+    def _pairs(self, deviation: FloatArray, span: slice) -> FloatArray:
+        """Return what the correlation of bins adds to the variance of a sum over fine bands."""
+        total = np.zeros((*deviation.shape[:-2], 1, deviation.shape[-1]))
+        for lag, factor in enumerate(self._factors(span), 1):
+            pairs = deviation[..., lag:, :] * deviation[..., :-lag, :] * factor[:, None]
+            total += pairs.sum(axis=-2, keepdims=True)
+        return total
+
+    def _factors(self, span: slice) -> list[FloatArray]:
+        """Return twice the correlation of fine bands 1, 2, … bands apart."""
+        key = (span.start, span.stop)
+        if key not in self._known:
+            begin, rho = self.edges[:-1][span].tolist(), self.correlation
+            n_bins = self.n_bins[span].tolist()
+            inner = np.array([_within(n, rho) for n in n_bins])
+            found = []
+            for lag in range(1, min(len(rho), len(n_bins))):
+                shared = np.array(
+                    [
+                        _between(begin[b + lag] - begin[b], n_bins[b], n_bins[b + lag], rho)
+                        for b in range(len(n_bins) - lag)
+                    ]
+                )
+                if not shared.any():
+                    break
+                found.append(2 * shared / np.sqrt(inner[lag:] * inner[:-lag]))
+            self._known[key] = found
+        return self._known[key]
+
+
+def _usual(frequency: FloatArray) -> tuple[float, float]:
+    return float(frequency[1]), 0.9 * float(frequency[-1])
+
+
+def _within(n: int, rho: FloatArray) -> float:
+    """Return the sum of the correlations of n neighbouring bins."""
+    lag = np.arange(1, min(n, len(rho)))
+    return float(n + 2 * np.sum((n - lag) * rho[lag]))
+
+
+def _between(apart: int, n: int, other: int, rho: FloatArray) -> float:
+    """Return the sum of the correlations of n bins with `other` bins that begin `apart` later."""
+    first = np.arange(max(0, n - len(rho)), n)
+    second = apart + np.arange(min(other, len(rho)))
+    lags = second[None, :] - first[:, None]
+    return float(np.sum(np.where(lags < len(rho), rho[np.minimum(lags, len(rho) - 1)], 0.0)))
+
+
+def month_of(utc_ns: int) -> str:
+    """Return the month of an instant, as in ``2026-07``."""
+    return f"{datetime.fromtimestamp(utc_ns / 1e9, UTC):%Y-%m}"
+
+
+def summaries(
+    rows: Iterable[tuple[int, int, ComplexArray]],
+    described: Described,
+    plan: Plan,
+    settings: Settings,
+) -> Iterator[tuple[str, Summary]]:
+    """Yield the summaries of a recording, each with its month.
+
+    Parameters
+    ----------
+    rows : iterable of (int, int, complex128 array)
+        Beginning, segments and mean matrix of each stretch, in order.
+    described : Described
+    plan : Plan
+    settings : Settings
+        Of the noise; its first method counts.
+    """
+    estimator = Estimator(plan, settings, described.channels)
+    making: tuple[str, _Making] | None = None
+    for start, n_segments, csm in rows:
+        month = month_of(start)
+        if making is None or making[0] != month:
+            if making is not None:
+                yield making[0], making[1].made()
+            making = month, _Making(estimator, described)
+        making[1].take(start, n_segments, csm)
+    if making is not None:
+        yield making[0], making[1].made()
+
+
+class _Making:
+    """A summary, while stretches come."""
+
+    def __init__(self, estimator: Estimator, described: Described) -> None:
+        self._estimator, self._described = estimator, described
+        self._grid = Grid.of(estimator)
+        self._stretches: list[tuple[int, int, FloatArray, FloatArray]] = []
+        self._days: list[tuple[int, int, FloatArray]] = []
+        self._day, self._begin = Average(), 0
+        self._total: ComplexArray = np.zeros(1, np.complex128)
+
+    def take(self, start: int, n_segments: int, csm: ComplexArray) -> None:
+        day = start // DAY_NS * DAY_NS
+        if self._day.n_segments and day != self._begin:
+            self._end_day()
+        self._begin = day
+        self._day.add(self._described, start, n_segments, csm)
+        self._total = self._total + csm * n_segments
+        alone = Average()
+        alone.add(self._described, start, n_segments, csm)
+        snapshot = self._estimator.snapshot(alone, curves_only=True)
+        result = next(iter(snapshot.results.values()), None)
+        recorded = self._grid.mean(snapshot.data_psd)
+        noise = np.full(recorded.shape, np.nan)
+        if result is not None:
+            noise = self._grid.mean(result.noise_psd)
+        self._stretches.append((start, n_segments, noise, recorded))
+
+    def _end_day(self) -> None:
+        snapshot = self._estimator.snapshot(self._day)
+        grid, shape = self._grid, (len(self._grid.n_bins), len(snapshot.channels))
+        row = np.full((N_FIELDS, *shape), np.nan)
+        row[RECORDED] = grid.mean(snapshot.data_psd)
+        result = next(iter(snapshot.results.values()), None)
+        if result is not None:
+            found = levels(result, snapshot, self._estimator.settings, grid.edges)
+            t2, t3, t4 = found.of_scatter.cumulants
+            with np.errstate(invalid="ignore", divide="ignore"):
+                row[DEVIATION] = np.sqrt(np.maximum(t2, 0.0))
+                row[SKEWNESS] = np.where(t2 > 0, t3 / t2**1.5, 0.0)
+                row[TAIL] = np.where(t2 > 0, t4 / t2**2, 0.0)
+            row[MEAN] = found.mean
+            row[BELOW] = sum((each.below for each in found.contributions), np.zeros(shape))
+            row[ABOVE] = sum((each.above for each in found.contributions), np.zeros(shape))
+            row[SHARE] = sum((each.share for each in found.contributions), np.zeros(shape))
+            row[BOUND] = np.where(found.bound.complete, found.bound.mean, np.nan)
+            row[BOUND_DEVIATION] = np.where(found.bound.complete, found.bound.spread, np.nan)
+        self._days.append((self._begin, self._day.n_segments, row))
+        self._day = Average()
+
+    def made(self) -> Summary:
+        """Return the summary."""
+        self._end_day()
+        starts, n_segments, noise, recorded = zip(*self._stretches, strict=True)
+        days, day_segments, rows = zip(*self._days, strict=True)
+        return Summary(
+            np.array(starts, np.int64),
+            np.array(n_segments, np.int64),
+            np.array(noise, np.float32),
+            np.array(recorded, np.float32),
+            np.array(days, np.int64),
+            np.array(day_segments, np.int64),
+            np.stack(rows, axis=1).astype(np.float32),
+            self._total,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rollup:
+    """Ingredients of all recordings in one month; arrays as in `Summary`.
+
+    Attributes
+    ----------
+    days, day_segments, levels
+        Each day once, in order.
+    local_days : int64, shape (n_local,)
+        Ordinals (`datetime.date.toordinal`) in the time zone of the answer.
+    part_segments : int64, shape (n_local, 3)
+        Segments of each part of the day (`WORK`, `EARLY`, `LATE`).
+    part_noise : float32, shape (n_local, 3, n_fine, n_channels)
+    noise, recorded : Density
+    total : complex128
+        In the units of the archive's first recording.
+    n_segments : int
+        In `total`.
+    """
+
+    days: IntArray
+    day_segments: IntArray
+    levels: SmallArray
+    local_days: IntArray
+    part_segments: IntArray
+    part_noise: SmallArray
+    noise: Density
+    recorded: Density
+    total: ComplexArray
+    n_segments: int
+
+
+def rolled_up(
+    found: Sequence[Summary], grid: Grid, *, zone: tzinfo, whole: float, hours: bool
+) -> Rollup:
+    """Return the roll-up of one month.
+
+    Parameters
+    ----------
+    found : sequence of Summary
+        In order of time; their totals in the units of the archive.
+    grid : Grid
+    zone : tzinfo
+        Of local days.
+    whole : float
+        Segments of a stretch without gaps: densities count stretches with half of them or more.
+    hours : bool
+        Whether stretches are hours, so that days have parts.
+    """
+    days, day_segments, rows = _merged_days(found)
+    local: dict[int, tuple[IntArray, FloatArray]] = {}
+    densities: list[tuple[Density, Density]] = []
+    for each in found:
+        enough = each.n_segments >= whole / 2
+        estimated = enough & np.isfinite(each.noise).any(axis=(1, 2))
+        densities.append(
+            tuple(  # type: ignore[arg-type]  # of two
+                counted(
+                    np.asarray(psd[some], np.float64),
+                    grid.frequency,
+                    grid.edges,
+                    n_short=int(np.sum(~some)),
+                )
+                for psd, some in ((each.noise, estimated), (each.recorded, enough))
+            )
+        )
+        if hours:
+            _count_parts(local, each, zone)
+    noise, recorded = (reduce(add, each) for each in zip(*densities, strict=True))
+    ordinals = sorted(local)
+    shape = (len(ordinals), 3, *rows.shape[2:])
+    parts = np.zeros(shape)
+    segments = np.zeros(shape[:2], np.int64)
+    for row, ordinal in enumerate(ordinals):
+        segments[row] = local[ordinal][0]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            parts[row] = local[ordinal][1] / segments[row][:, None, None]
+    return Rollup(
+        days=days,
+        day_segments=day_segments,
+        levels=rows,
+        local_days=np.array(ordinals, np.int64),
+        part_segments=segments,
+        part_noise=parts.astype(np.float32),
+        noise=noise,
+        recorded=recorded,
+        total=np.sum([each.total for each in found], axis=0),
+        n_segments=int(sum(each.day_segments.sum() for each in found)),
+    )
+
+
+def _count_parts(
+    local: dict[int, tuple[IntArray, FloatArray]], found: Summary, zone: tzinfo
+) -> None:
+    """Add the hours of a recording to the parts of local days."""
+    for start, n, noise in zip(found.starts, found.n_segments, found.noise, strict=True):
+        if not np.isfinite(noise).any():
+            continue
+        middle = datetime.fromtimestamp(int(start) // 10**9 + 1800, zone)
+        part = _PART_OF_HOUR.get(middle.hour)
+        if part is not None:
+            zeros = np.zeros(3, np.int64), np.zeros((3, *noise.shape))
+            segments, total = local.setdefault(middle.toordinal(), zeros)
+            segments[part] += n
+            total[part] += int(n) * noise.astype(np.float64)
+
+
+def _merged_days(found: Sequence[Summary]) -> tuple[IntArray, IntArray, SmallArray]:
+    """Return days, segments and levels; days that several recordings share become one."""
+    days = np.concatenate([each.days for each in found])
+    segments = np.concatenate([each.day_segments for each in found])
+    rows = np.concatenate([each.levels for each in found], axis=1)
+    unique, place = np.unique(days, return_inverse=True)
+    if len(unique) == len(days):
+        order = np.argsort(days)
+        return days[order], segments[order], rows[:, order]
+    merged = [merged_levels(rows[:, place == k], segments[place == k]) for k in range(len(unique))]
+    summed = np.bincount(place, weights=segments).astype(np.int64)
+    return unique, summed, np.stack(merged, axis=1).astype(np.float32)
+
+
+def merged_levels(rows: SmallArray, n_segments: IntArray) -> FloatArray:
+    """Return the levels of several spectra as one, shape (N_FIELDS, n_fine, n_channels).
+
+    Parameters
+    ----------
+    rows : float32, shape (N_FIELDS, n, n_fine, n_channels)
+    n_segments : int64, shape (n,)
+    """
+    own = np.asarray(rows, np.float64)
+    if own.shape[1] == 1:
+        return own[:, 0]
+    known = np.isfinite(own[MEAN]) & np.isfinite(own[DEVIATION])
+    count = np.broadcast_to(n_segments[:, None, None], known.shape)
+
+    def mean(name: int, some: NDArray[np.bool_]) -> FloatArray:
+        weight = np.where(some, count, 0.0)
+        with np.errstate(invalid="ignore"):
+            weighted = np.where(weight > 0, own[name] * weight, 0.0).sum(axis=0)
+            return np.asarray(weighted / weight.sum(axis=0))
+
+    found = np.full(own[:, 0].shape, np.nan)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = np.where(known, count, 0.0)
+        share /= share.sum(axis=0)
+        deviation = np.where(known, share * own[DEVIATION], 0.0)
+        t2 = (deviation**2).sum(axis=0)
+        found[DEVIATION] = np.where(known.any(axis=0), np.sqrt(t2), np.nan)
+        for name, power in ((SKEWNESS, 3), (TAIL, 4)):
+            total = np.where(known, own[name] * deviation**power, 0.0).sum(axis=0)
+            found[name] = np.where(t2 > 0, total / t2 ** (power / 2), 0.0)
+        for name in (MEAN, BELOW, ABOVE):
+            found[name] = mean(name, known)
+        size = np.where(known, share * np.abs(own[MEAN]), 0.0)
+        shares = np.where(size > 0, size * own[SHARE], 0.0).sum(axis=0)
+        found[SHARE] = np.where(size.sum(axis=0) > 0, shares / size.sum(axis=0), 0.0)
+        found[RECORDED] = mean(RECORDED, np.isfinite(own[RECORDED]))
+        bounded = np.isfinite(own[BOUND])
+        found[BOUND] = np.where(bounded.all(axis=0), mean(BOUND, bounded), np.nan)
+        part = np.where(bounded, share * own[BOUND_DEVIATION], 0.0)
+        found[BOUND_DEVIATION] = np.sqrt((part**2).sum(axis=0))
+    return found

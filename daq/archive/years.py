@@ -1,0 +1,239 @@
+"""The roll-ups of an archive, a file a year, and the totals of every year.
+
+A file is one of settings and a time zone, which are in its name. It is made again of what has
+changed: each month has the hash of what it was made of. So the file can be deleted at any time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import uuid
+from dataclasses import fields, replace
+from functools import reduce
+from operator import add
+from typing import TYPE_CHECKING
+
+import h5py
+import numpy as np
+
+from daq.archive.averages import Estimator, converted
+from daq.archive.density import Density
+from daq.archive.index import ROLLUP
+from daq.archive.plan import settings_document
+from daq.archive.rollup import Grid, Rollup, month_of, rolled_up, summaries
+from daq.archive.spectra_file import SUMMARY_VERSION, SpectraFile, packed, to_disk
+from daq.errors import ArchiveError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from datetime import tzinfo
+    from pathlib import Path
+
+    from daq.archive.index import Entry
+    from daq.archive.spectra_file import Summary
+    from daq.archive.store import Store
+    from daq.estimation.settings import Settings
+
+
+class Years:
+    """Roll-ups of an archive by one set of settings.
+
+    Parameters
+    ----------
+    store : Store
+    entries : sequence of Entry
+        In order of time; the units of the first are those of all totals.
+    settings : Settings
+        Of the noise.
+    zone : tzinfo
+        Of local days.
+    progress : callable or None
+        Receives how many recordings are read, and of how many.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        entries: Sequence[Entry],
+        settings: Settings,
+        *,
+        zone: tzinfo,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        plan = store.plan
+        settings = plan.noise_settings(settings)
+        self._folder, self._plan, self._settings, self._zone = store.folder, plan, settings, zone
+        self._own = settings == plan.noise_settings(plan.settings)
+        self._estimator = Estimator(plan, settings, entries[0].described.channels)
+        self.grid = Grid.of(self._estimator)
+        self._progress = progress or (lambda _, __: None)
+        self.problems: list[str] = []
+        self.damaged: set[str] = set()
+        """Runs of which a month is left out."""
+        self._months: dict[str, list[Entry]] = {}
+        for entry in entries:
+            for month in entry.months:
+                self._months.setdefault(month, []).append(entry)
+        about = json.dumps([settings_document(settings), str(zone)])
+        self._key = hashlib.sha256(about.encode()).hexdigest()[:12]
+        reference = repr(entries[0].described.channels)
+        self._reference = hashlib.sha256(reference.encode()).hexdigest()
+        self._n_read = self._n_all = 0
+
+    def each(self) -> Iterator[h5py.File]:
+        """Yield the open file of every year, in order."""
+        wanted = {month: self._digest(month) for month in sorted(self._months)}
+        years = sorted({month[:4] for month in wanted})
+        current = {year: self._current(year) for year in years}
+        missing = [month for month in wanted if current[month[:4]].get(month) != wanted[month]]
+        self._n_all = sum(len(self._months[month]) for month in missing)
+        for year in years:
+            own = {month: digest for month, digest in wanted.items() if month[:4] == year}
+            if current[year] != own:
+                with self._made(year, own, current[year]) as file:
+                    if file is not None:
+                        yield file
+            else:
+                with h5py.File(self._path(year)) as file:
+                    yield file
+
+    def _path(self, year: str) -> Path:
+        return self._folder / year / f"{ROLLUP}{self._key}.h5"
+
+    def _digest(self, month: str) -> str:
+        parts = [(e.described.origin.run_id, e.months[month]) for e in self._months[month]]
+        text = json.dumps([SUMMARY_VERSION, self._reference, parts])
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def _current(self, year: str) -> dict[str, str]:
+        """Return the months of a file, with what they were made of; none where it is damaged."""
+        with contextlib.suppress(OSError, RuntimeError, KeyError), h5py.File(self._path(year)) as f:
+            return {str(m): str(group.attrs["digest"]) for m, group in f["months"].items()}
+        return {}
+
+    @contextlib.contextmanager
+    def _made(
+        self, year: str, wanted: Mapping[str, str], current: Mapping[str, str]
+    ) -> Iterator[h5py.File | None]:
+        """Make the file of a year, of months that it has and of recordings; it is then kept.
+
+        In a folder that cannot be written, it is made in memory.
+        """
+        path = self._path(year)
+        part = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
+        try:
+            path.parent.mkdir(exist_ok=True)
+            file = h5py.File(part, "w")
+        except OSError:
+            file = h5py.File(part.name, "w", driver="core", backing_store=False)
+        try:
+            before = len(self.problems)
+            with file:
+                for month, digest in wanted.items():
+                    if current.get(month) == digest:
+                        with h5py.File(path) as old:
+                            old.copy(f"months/{month}", file.require_group("months"))
+                    else:
+                        rollup = self._rolled_up(month)
+                        if rollup is not None:
+                            group = file.create_group(f"months/{month}")
+                            _write(group, rollup)
+                            group.attrs["digest"] = digest
+                if file.require_group("months"):
+                    _write_totals(file)
+                    file.flush()
+                    yield file
+                else:
+                    yield None
+            if part.exists() and len(self.problems) == before:
+                to_disk(part)
+                part.replace(path)
+        finally:
+            with contextlib.suppress(OSError):
+                part.unlink(missing_ok=True)
+
+    def _rolled_up(self, month: str) -> Rollup | None:
+        found = []
+        for entry in self._months[month]:
+            try:
+                found.append(self._summary(entry, month))
+            except ArchiveError as error:
+                self.damaged.add(entry.described.origin.run_id)
+                self.problems.append(
+                    f"{error} ({month}): left out. Delete the file and run again with"
+                    f" {entry.described.origin.path}"
+                )
+            self._n_read += 1
+            self._progress(self._n_read, self._n_all)
+        welch, plan = self._estimator.welch, self._plan
+        if not found:
+            return None
+        return rolled_up(
+            found,
+            self.grid,
+            zone=self._zone,
+            whole=plan.stretch_s * welch.sampling_rate / welch.hop,
+            hours=plan.stretch == "hour",
+        )
+
+    def _summary(self, entry: Entry, month: str) -> Summary:
+        """Return the summary of a recording, its total in the units of the archive."""
+        described = entry.described
+        with SpectraFile(entry.path) as file:
+            if self._own and month in file.months:
+                found = file.summary(month)
+            else:
+                rows = (row for row in file.rows() if month_of(row[0]) == month)
+                made = summaries(rows, described, self._plan, self._settings)
+                found = next(summary for _, summary in made)
+                if file.is_daily:
+                    found = found.of_days
+        response = self._estimator.responses(described.channels)
+        return replace(found, total=converted(found.total, response))
+
+
+def density_of(group: h5py.Group) -> Density:
+    """Return a density that `Years` wrote."""
+    frequency, counts, below = (group[n][...] for n in ("frequency", "counts", "not_positive"))
+    n_stretches, n_short = (int(group.attrs[name]) for name in ("n_stretches", "n_short"))
+    return Density(frequency, counts.astype(np.int64), below.astype(np.int64), n_stretches, n_short)
+
+
+def _write(group: h5py.Group, rollup: Rollup) -> None:
+    for each in fields(rollup):
+        value = getattr(rollup, each.name)
+        if each.name in {"noise", "recorded"}:
+            _write_density(group.create_group(each.name), value)
+        elif each.name == "n_segments":
+            group.attrs["n_segments"] = value
+        elif each.name == "levels":
+            made = group.create_dataset(
+                "levels", value.shape, value.dtype, chunks=(1, *value.shape[1:]), fletcher32=True
+            )
+            for row, some in enumerate(value):
+                if some.any():  # what is zero everywhere takes no room
+                    made[row] = some
+        else:
+            value = packed(value) if each.name == "total" else value
+            group.create_dataset(each.name, data=value)
+
+
+def _write_density(group: h5py.Group, density: Density) -> None:
+    group.attrs.update(n_stretches=density.n_stretches, n_short=density.n_short)
+    group.create_dataset("frequency", data=density.frequency)
+    for name in ("counts", "not_positive"):
+        value = getattr(density, name).astype(np.int32)
+        group.create_dataset(name, data=value, compression="gzip", compression_opts=1, shuffle=True)
+
+
+def _write_totals(file: h5py.File) -> None:
+    """Add the months of a year up."""
+    months = [file["months"][month] for month in sorted(file["months"])]
+    for name in ("noise", "recorded"):
+        total = reduce(add, (density_of(month[name]) for month in months))
+        _write_density(file.create_group(name), total)
+    total = reduce(add, (month["total"][...] for month in months))
+    file.create_dataset("total", data=total)
+    file.attrs["n_segments"] = sum(int(month.attrs["n_segments"]) for month in months)
