@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from estimator.types import FloatArray
     from tui.report.parts import Part
 
-COLUMNS = 8
+COLUMNS = 9
 """Channels that one table is wide."""
 LEAST_SHARE = 1e-3
 """Of the level, from which a contribution has a row."""
@@ -263,8 +263,9 @@ def _half_octaves(
     parts: list[Part] = []
     if np.isfinite(full).any():
         parts += _diagrams(snapshot, centres, rms, full)
-    for first in range(0, len(names), COLUMNS):
-        some = slice(first, first + COLUMNS)
+    n_tables = math.ceil(len(names) / COLUMNS)
+    for columns in np.array_split(np.arange(len(names)), n_tables):
+        some = slice(int(columns[0]), int(columns[-1]) + 1)
         parts.append(
             Table(
                 ("Hz", *names[some]),
