@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 from daq.bench.estimate_settings import to_table
 from daq.errors import HuddleError
 from daq.recording.reader import Recording
+from daq.recording.repair import verify as verify_recording
+from daq.recording.signing import identity
 from daq.results.decision.conformity import conformity, with_rule
 from daq.results.decision.limits import judge
 from daq.results.sources import sources
@@ -145,6 +147,7 @@ def issue(
     refuse_unfit(found, about, by=by, complete=complete)
     prefix = "HT" if about is None else about.certificate.prefix
     runs = [(source.path.name, source.run_id, source.sha256) for source in found]
+    roots = dict(identity(source.path) for source in found)
     table = settings_table(settings, snapshot)
     if about is not None and about.certificate.guard_band != 1.0:
         table["guard_band"] = about.certificate.guard_band
@@ -158,7 +161,9 @@ def issue(
                 " revision of it"
             )
         at = datetime.now(UTC).replace(microsecond=0)
-        entry = ledger.allot(prefix, at=at, by=by, recordings=runs, settings=table, reason=reason)
+        entry = ledger.allot(
+            prefix, at=at, by=by, recordings=runs, settings=table, reason=reason, roots=roots
+        )
         try:
             made = Issue(
                 number=entry.number,
@@ -298,7 +303,13 @@ def _recordings(path: Path, entry: Entry, recordings: Sequence[Path], ledger: Le
         if run_id not in expected:
             raise VerificationError(f"{path}: {each} is another recording than the one certified")
         with each.open("rb") as file:
-            if hashlib.file_digest(file, "sha256").hexdigest() != expected[run_id][1]:
+            is_same = hashlib.file_digest(file, "sha256").hexdigest() == expected[run_id][1]
+        state = "unchanged"
+        if not is_same:
+            report = verify_recording(each)
+            root = entry.roots.get(run_id)
+            if not report.intact or root is None or report.root_sha256 != root:
                 raise VerificationError(f"{path}: {each} was changed since the certificate")
-        lines.append(f"recording {each}: the one certified, unchanged")
+            state = "its contents unchanged, its file not (such as results stored in it since)"
+        lines.append(f"recording {each}: the one certified, {state}")
     return lines

@@ -21,8 +21,9 @@ import json
 import os
 import sqlite3
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from daq.errors import HuddleError
@@ -64,6 +65,8 @@ class Entry:
         UTC.
     by : str
     recordings : tuple of (file, run_id, sha256)
+    roots : mapping
+        Root SHA-256 of the manifest of each recording, by run id; none in older ledgers.
     settings : mapping
         Those of the estimate that differ from the defaults.
     reason : str
@@ -86,6 +89,7 @@ class Entry:
     state: State
     file: str = ""
     sha256: str = ""
+    roots: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -171,6 +175,7 @@ class Ledger:
         recordings: Sequence[tuple[str, str, str]],
         settings: Mapping[str, Any],
         reason: str,
+        roots: Mapping[str, str] = MappingProxyType({}),
     ) -> Entry:
         """Give the next number; a further certificate of the same runs is a revision of theirs."""
         entries = self.entries()
@@ -191,6 +196,7 @@ class Ledger:
             "recordings": [list(each) for each in recordings],
             "settings": dict(settings),
             "reason": reason,
+            "roots": dict(roots),
         }
         return _entry(record, self._add(record), "being issued")
 
@@ -199,6 +205,34 @@ class Ledger:
         known = self.entries() if entries is None else entries
         found = [each for each in known if each.runs == runs and each.state != "void"]
         return found[-1] if found else None
+
+    def certified(self, path: Path, run_id: str, root: str) -> tuple[str, str]:
+        """Return the last certificate of a recording, and how the recording contradicts one.
+
+        Parameters
+        ----------
+        path : Path
+        run_id, root : str
+            Its run, and the root SHA-256 of its manifest.
+
+        Returns
+        -------
+        name, problem : str
+            Empty without a certificate, and if nothing is wrong.
+        """
+        last = ""
+        for entry in self.entries():
+            if entry.state == "void":
+                continue
+            if run_id in entry.runs:
+                last = entry.name
+                known = entry.roots.get(run_id, "")
+                sha256 = next(each for _, run, each in entry.recordings if run == run_id)
+                if root != known if known else _sha256(path) != sha256:
+                    return last, f"changed since certificate {entry.name} was issued"
+            elif path.name in {file for file, _, _ in entry.recordings}:
+                return "", f"exchanged: certificate {entry.name} is of another run of this name"
+        return last, ""
 
     def publish(self, entry: Entry, suffix: str, content: bytes) -> Path:
         """Add a certificate to the ledger and to the folder, in which it replaces nothing.
@@ -341,6 +375,7 @@ def _entry(record: Mapping[str, Any], own: str, state: State) -> Entry:
         recordings=tuple((file, run_id, sha256) for file, run_id, sha256 in record["recordings"]),
         settings=record["settings"],
         reason=record["reason"],
+        roots=record.get("roots", {}),
         hash=own,
         state=state,
     )

@@ -41,6 +41,9 @@ def verify(
 ) -> None:
     """Verify the checksums and signatures of recordings, or of all recordings of a service.
 
+    Recordings that were certified are compared with the ledger of the
+    certificates beside them.
+
     A certificate (.pdf) is compared with the ledger in its folder, and with
     the recordings named with it, or those beside that folder.
 
@@ -54,7 +57,7 @@ def verify(
         _verify_certificates(certificates, sources, json=json)
         return
     found = []
-    paths, known = _recordings(sources)
+    paths, known, folders = _recordings(sources)
     # In children: a file that hangs or crashes HDF5 is damaged, and the others are verified.
     for path, report in trials(paths, "verify"):
         damaged = ", ".join(report.get("damaged", ()))
@@ -64,11 +67,19 @@ def verify(
         own = report.get("run_id", ""), report.get("root_sha256", "")
         if state == "intact" and known.get(path, own) != own:
             state = "exchanged: not the recording that the service has made under this name"
+        names: list[str] = []
+        if state == "intact":
+            for ledger in _ledgers(path, folders):
+                name, wrong = ledger.certified(path, *own)
+                names += [name] if name else []
+                state = wrong or state
         if state == "intact":
             state = problem(path, *own, public=key) or state
         signer = signature_of(path) if state == "intact" else None
         if signer is not None:
             state = f"intact, signed with key {signer.key_id}"
+        if names and state.startswith("intact"):
+            state += f", certified by {'; '.join(names)}"
         found.append((path, state, report.get("root_sha256") or None))
         for_people(json).print(f"{path}: {state.removeprefix(f'{path}: ')}", soft_wrap=True)
         if warning := report.get("warning"):
@@ -117,11 +128,16 @@ def _verify_certificates(
 
 def _recordings(
     sources: Sequence[Path],
-) -> tuple[list[Path], dict[Path, tuple[str, str]]]:
-    """Return recordings, and run id and root SHA-256 of those that services know."""
+) -> tuple[list[Path], dict[Path, tuple[str, str]], set[Path]]:
+    """Return recordings, run id and root SHA-256 of those that services know.
+
+    And the folders of certificates that bench files name.
+    """
+    from daq.bench.tables.certificate import CertificateTable
     from tui.service.records.places import NoServiceError, Place
 
     found: list[Path] = []
+    folders = {CertificateTable().folder}
     known: dict[Path, tuple[str, str]] = {}
     for source in sources:
         if source.suffix.lower() in {".h5", ".hdf5"}:
@@ -134,7 +150,15 @@ def _recordings(
                 raise
             found += sorted(source.glob("*.h5"))
             continue
+        if place.bench is not None:
+            folders.add(place.bench.certificate.folder)
         runs = place.runs(kept=True)
         found += [place.folder / part for run in runs for part in run.parts]
         known |= {place.folder / part: own for part, own in place.store.identities().items()}
-    return list(dict.fromkeys(found)), known
+    return list(dict.fromkeys(found)), known, folders
+
+
+def _ledgers(path: Path, folders: set[Path]) -> list[Ledger]:
+    """Return the ledgers in the folders of a recording's certificates."""
+    found = [Ledger(path.absolute().parent / folder) for folder in sorted(folders)]
+    return [ledger for ledger in found if ledger.exists]

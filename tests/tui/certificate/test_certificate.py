@@ -12,6 +12,8 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import h5py
+import numpy as np
 import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
@@ -22,6 +24,9 @@ from lxml import etree
 from pypdf import PdfReader
 from typer.testing import CliRunner
 
+from daq.recording.chunks.manifest import write_manifest
+from daq.recording.description import write_checksums
+from daq.recording.repair import write_results
 from tests.tui.night_recording import BENCH, HOSTILE, SENSOR, record
 from tests.tui.report.written_report import ROOT
 from tui.certificate.dcc import NAME
@@ -313,6 +318,36 @@ def test_no_certificate_is_issued_of_simulated_sensors(tmp_path: Path) -> None:
     assert not (tmp_path / "certificates").exists()
 
 
+def test_recordings_are_compared_with_their_certificates(copied: Laboratory) -> None:
+    """Results may be stored later; nothing else may change, whatever checksums are rewritten."""
+    certificate, recording = copied.certificate(), copied.recording
+    code, said = copied.verify(recording)
+    assert code == 0
+    assert said.endswith(f"certified by {Ledger(copied.certificates).entries()[0].name}")
+    write_results(recording, {"three-sensor": ({"frequency": np.arange(3.0)}, {"unit": "m/s²"})})
+    code, said = copied.verify(copied.folder)
+    assert code == 0
+    assert "certified by PIER-" in said
+    code, said = copied.verify(certificate, recording)
+    assert code == 0
+    assert "the one certified, its contents unchanged, its file not" in said
+    with h5py.File(recording, "r+") as file:
+        file["sensors/A/samples"].attrs["sensitivity"] = [2e6, 2e6]
+        write_checksums(file)
+        write_manifest(file)
+    code, said = copied.verify(recording)
+    assert code == 3
+    assert "changed since certificate PIER-" in said
+    code, said = copied.verify(certificate, recording)
+    assert code != 0
+    assert "was changed since the certificate" in said
+    recording.unlink()
+    record(recording)  # another run, of the same name
+    code, said = copied.verify(recording)
+    assert code == 3
+    assert "exchanged: certificate PIER-" in said
+
+
 def key(file: Path, passphrase: bytes) -> Path:
     """Write a key with a certificate of its own."""
     private = ec.generate_private_key(ec.SECP256R1())
@@ -375,8 +410,8 @@ def other_recording(made: Laboratory) -> list[Path]:
 
 
 def changed_recording(made: Laboratory) -> list[Path]:
-    content = bytearray(made.recording.read_bytes())
-    made.recording.write_bytes(content + b"\0")
+    with h5py.File(made.recording, "r+") as file:
+        file["sensors/A/samples"][17] += 1
     return [made.certificate(), made.recording]
 
 
