@@ -226,7 +226,7 @@ async def test_an_item_that_is_no_block_ends_only_its_session(tmp_path: Path) ->
         await run.until("a", 100)
     with Recording.open(run.path) as recording:
         assert [e.text for e in recording.events if e.kind == "disconnected"] == [
-            "a: driver 'played' yielded bytes; expected a Block or an Event",
+            "a: driver 'played' yielded bytes; expected a Block, an Event or a Reading",
             "a: driver 'played' yielded an event of 'c'; expected 'a'",
         ]
 
