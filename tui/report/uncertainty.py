@@ -328,8 +328,8 @@ class _Range:
         clips = self.full_db[np.isfinite(self.full_db)]
         if clips.size:
             axes.axhline(
-                float(clips.min()), color=drawing.LIMIT, lw=1.0, ls="--", label="sine of full scale"
-            )
+                float(clips.min()), color=drawing.LIMIT, lw=1.0, ls="-.", label="sine of full scale"
+            )  # told apart from dashed channels in grey, too
         axes.set_ylim(self.scale)
         axes.set_ylabel(f"dB re 1 {self.unit} rms")
 

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 import re
+import shutil
 from html.parser import HTMLParser
+from typing import TYPE_CHECKING
 
 import pytest
 
 from tests.tui.night_recording import HOSTILE
 from tests.tui.report.written_report import Reported, Words
 from tui.report.parts import Table
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 def test_the_page_needs_nothing_else_and_runs_nothing(reported: Reported) -> None:
@@ -112,3 +118,27 @@ def test_foreign_names_are_text_and_nothing_else(reported: Reported) -> None:
     assert HOSTILE in Words(reported.page).text
     assert "<script" not in reported.page.lower()
     assert "&lt;script&gt;" in reported.page
+
+
+def test_axe_finds_nothing_in_the_page(reported: Reported, tmp_path: Path) -> None:
+    """On a wide screen and on a phone; and it finds what is wrong with a page that lacks it."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("Chromium is not installed (Debian: chromium)")
+    pages = {"sound": reported.page, "without": reported.page.replace(' lang="en"', "")}
+    found: dict[tuple[str, int], list[str]] = {}
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        for (name, content), width in itertools.product(pages.items(), (1280, 375)):
+            file = tmp_path / f"{name}.html"
+            file.write_text(content, encoding="utf-8")
+            page = browser.new_page(viewport={"width": width, "height": 900})
+            page.goto(file.as_uri())
+            violations = axe.run(page).response["violations"]
+            found[name, width] = [each["id"] for each in violations]
+        browser.close()
+    for width in (1280, 375):
+        assert found["sound", width] == []
+        assert found["without", width] == ["html-has-lang"]
