@@ -205,14 +205,24 @@ def settings_line(settings: Settings, bench: Bench | None) -> Paragraph:
 def changes(before: dict[str, object], after: dict[str, object]) -> list[str]:
     """Return what differs between two tables of settings, in words."""
     return [
-        f"{key} {before.get(key, 'default')} → {after.get(key, 'default')}"
+        f"{key} {_value(key, before)} → {_value(key, after)}"
         for key in dict.fromkeys([*before, *after])
         if before.get(key) != after.get(key)
     ]
 
 
 def _listed(table: dict[str, object]) -> str:
-    return ", ".join(f"{key} {value}" for key, value in table.items())
+    return ", ".join(f"{key} {_value(key, table)}" for key in table)
+
+
+def _value(key: str, table: dict[str, object]) -> str:
+    """Return a setting with its unit."""
+    value = table.get(key)
+    if isinstance(value, (list, tuple)) and key == "band":
+        return " to ".join(f"{end:g}" for end in value) + " Hz"
+    if isinstance(value, float):
+        return f"{value:g}{' s' if key == 'segment' else ''}"
+    return "default" if key not in table else str(value)
 
 
 def notices(

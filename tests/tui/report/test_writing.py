@@ -94,7 +94,7 @@ def test_a_draft_replaces_no_other_one_unless_forced(reported: Reported, tmp_pat
     assert out.read_bytes() == first
     assert run.invoke(app, [*arguments[:-1], "2s", "--force"]).exit_code == 4
     page = Words(out.read_text(encoding="utf-8")).text
-    assert "segment 1.0 → 2.0" in page
+    assert "segment 1 s → 2 s" in page
     _, beside = write(
         reported.snapshot, out, recordings=[reported.recording], settings=reported.settings,
         taken="beside",
