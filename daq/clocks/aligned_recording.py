@@ -425,7 +425,7 @@ class AlignedRecording:
         Returns
         -------
         samples : float64, shape (stop - start, n_channels)
-            In physical units. Arbitrary where not valid.
+            In physical units; NaN where a channel has no sample.
         valid : bool, shape (stop - start,)
             False if any sensor has a gap.
 
@@ -444,7 +444,10 @@ class AlignedRecording:
         valid = np.ones(stop - start, dtype=bool)
         edges = np.cumsum([0, *self.dims])
         for source, low, high in zip(self._sources, edges[:-1], edges[1:], strict=True):
-            valid &= grid.read(source, start, samples[:, low:high])
+            here = grid.read(source, start, samples[:, low:high])
+            if not here.all():
+                samples[~here, low:high] = np.nan
+                valid &= here
         return samples, valid
 
     def own_samples(self, begins: NDArray[np.int64], length: int) -> list[OwnSamples] | None:

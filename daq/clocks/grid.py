@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
     BoolArray = NDArray[np.bool_]
 
+_TOGETHER = 60.0  # s
 SNAP = 1e-3
 """Constant offset between exact clocks, in samples, up to which it is rounding of the times."""
 
@@ -45,8 +46,11 @@ class Grid:
     def laid(
         cls, sources: Sequence[SensorSource], sampling_rate: float, *, wanted: float | None
     ) -> Grid:
-        """Return the grid from the start of all sensors on, or from `wanted` (s) if later."""
-        start = max(source.known_clock.start for source in sources)
+        """Return the grid from the start of all sensors on, or from `wanted` (s) if later.
+
+        Channels of a sensor often begin some samples apart: it starts with the last of them.
+        """
+        start = max(map(_start, sources))
         grid = cls(sampling_rate, start)
         if not all(grid.has(source) and not source.doubted for source in sources):
             start += max(map(grid.reach, sources))
@@ -79,7 +83,7 @@ class Grid:
         Parameters
         ----------
         samples : float64, shape (n, n_channels)
-            Output, in physical units; arbitrary where not valid.
+            Output, in physical units; arbitrary where not valid, NaN where a channel has none.
 
         Returns
         -------
@@ -129,14 +133,28 @@ class Grid:
             inside = np.arange(low, high)
             present &= (inside >= epoch.first_sample) & (inside < epoch.end_sample)
             inputs[~present] = 0.0
+            lacking = np.isnan(inputs)
+            inputs[lacking] = 0.0
             usable = all_present(present, positions - low, ratio=ratio)
             if usable.any():
                 samples[usable] = resample(inputs, positions - low, ratio=ratio)[usable]
                 valid |= usable
+            for column in np.flatnonzero(lacking.any(axis=0)):
+                known = all_present(~lacking[:, column], positions - low, ratio=ratio)
+                samples[usable & ~known, column] = np.nan
         return samples, valid
 
     def _ratio(self, source: SensorSource) -> float:
         return max(1.0, source.record.sampling_rate / self.sampling_rate)
+
+
+def _start(source: SensorSource) -> float:
+    """Return when a sensor begins with all channels, unless that takes longer than a minute."""
+    clock, first = source.known_clock, source.whole_from
+    if first == source.runs[0].first_sample:
+        return clock.start
+    whole = float(clock.at(np.array([first], dtype=np.float64))[0])
+    return whole if clock.start <= whole <= clock.start + _TOGETHER else clock.start
 
 
 def grid_rate(records: list[ReadableSensor], wanted: float | None) -> float:

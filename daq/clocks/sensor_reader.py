@@ -25,9 +25,10 @@ from daq.clocks.slips import Slips
 from daq.clocks.utc_rate import UtcRate
 from daq.errors import CannotAlignError
 from daq.protocols.block import BlockFlag, Uncounted
+from daq.recording.interface import absences
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator
 
     from numpy.typing import NDArray
 
@@ -184,7 +185,10 @@ class SensorSource:
         self.n_blocks += len(blocks)
 
     def fill(self, samples: FloatArray, first: int) -> BoolArray:
-        """Write samples from `first` on in physical units; return whether each is present."""
+        """Write samples from `first` on in physical units; return whether each is present.
+
+        A sample is, where any channel has one; the others are NaN.
+        """
         last = first + len(samples)
         present = np.zeros(len(samples), dtype=bool)
         begin = bisect.bisect_right(self.runs, first, key=lambda run: run.first_sample) - 1
@@ -203,6 +207,8 @@ class SensorSource:
         if len(runs) == 1:
             place = slice(row + ahead[0], last_row + ahead[0])
             np.divide(counts, self.sensitivity, out=samples[place])
+            for column, lacking in self._lacking(row, last_row):
+                samples[place][lacking, column] = np.nan
             present[place] = True
             for begin, end in damaged:
                 present[place][begin:end] = False
@@ -210,10 +216,29 @@ class SensorSource:
         rows = [row, *(run.first_row for run in runs[1:]), last_row]
         places = np.arange(row, last_row) + np.repeat(ahead, np.diff(rows))
         samples[places] = counts / self.sensitivity
+        for column, lacking in self._lacking(row, last_row):
+            samples[places[lacking], column] = np.nan
         present[places] = True
         for begin, end in damaged:
             present[places[begin:end]] = False
         return present
+
+    def _lacking(self, first_row: int, last_row: int) -> Iterator[tuple[int, slice]]:
+        """Yield channels without samples, by their place in `columns`, and where."""
+        if len(self.record.absent):
+            for column, rows in absences(self.record, first_row, last_row):
+                if column in self.columns:
+                    yield self.columns.index(column), rows
+
+    @property
+    def whole_from(self) -> int:
+        """Index of the first sample that every channel has; that of the first one if none is."""
+        row = self.runs[0].first_row
+        absent = self.record.absent[np.isin(self.record.absent[:, 0], self.columns), 1:]
+        for begin, end in sorted(absent.tolist()):
+            row = end if begin <= row < end else row
+        run = next((run for run in self.runs if run.first_row <= row < run.last_row), self.runs[0])
+        return run.first_sample + max(0, row - run.first_row)
 
     @classmethod
     def of(cls, record: ReadableSensor, monotonic_ns: int, utc_ns: int) -> SensorSource:

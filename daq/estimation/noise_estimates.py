@@ -16,7 +16,7 @@ from estimator.likelihood.dimension import BandDimension, choose_dimension
 from estimator.likelihood.goodness_of_fit import neighbour_correlation
 from estimator.likelihood.gradients import Gradients, noise_by_gradients, with_gradients
 from estimator.methods import METHODS, self_noise
-from estimator.self_noise.result import SelfNoise
+from estimator.self_noise.result import Flag, SelfNoise, combined
 from estimator.spectra.multiresolution import Band, MultiResolution
 from estimator.spectra.welch import CrossSpectra, scale
 from estimator.spectra.windows import effective_averages, get_window
@@ -40,6 +40,10 @@ ALL_METHODS = tuple(sorted(METHODS, key=lambda name: name != "three-sensor"))
 """The first is what limits, c.o.v. and clocks are judged by: one that needs no alignment."""
 MIN_AVERAGES = 20
 """Of an octave with its own segments: with fewer it goes with the octave above."""
+
+
+_BY_MOTION = frozenset({"three-sensor", "maximum-likelihood"})
+_WHOLE = 3  # sensors with all channels
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +98,108 @@ def averages(passes: Sequence[Pass]) -> tuple[Band, ...]:
     )
     band = Band(first.welch, first.welch.frequencies, spectra.csm(), n_segments, n_effective)
     return (up_to(band, usable),)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChannelSet:
+    """Averages of the segments that only these channels have, by their columns."""
+
+    columns: tuple[int, ...]
+    band: Band
+
+    def whole(self, n_channels: int) -> Band:
+        """Return averages of all channels: zero for those that have no samples."""
+        csm = np.zeros((len(self.band.csm), n_channels, n_channels), np.complex128)
+        csm[:, np.array(self.columns)[:, None], np.array(self.columns)] = self.band.csm
+        return replace(self.band, csm=csm)
+
+
+def channel_sets(passes: Sequence[Pass]) -> tuple[ChannelSet, ...]:
+    """Return averages of segments in which channels have no samples; most channels first.
+
+    Sets with fewer averages than an octave needs are left out.
+    """
+    first = passes[0]
+    usable = min(each.aligned.usable for each in passes)
+    window = get_window(first.welch.window, first.welch.segment_length)
+    sums: dict[tuple[int, ...], tuple[CrossSpectra, float]] = {}
+    for each in passes:
+        for columns, spectra in each.sets.spectra.items() if each.sets is not None else ():
+            n_effective = effective_averages(window, each.welch.hop, spectra.n_segments)
+            before, n_before = sums.get(columns, (CrossSpectra(each.welch, len(columns)), 0.0))
+            sums[columns] = before + spectra, n_before + n_effective
+    found = []
+    for columns, (spectra, n_effective) in sums.items():
+        if n_effective >= max(MIN_AVERAGES, len(columns) + 2):
+            frequencies, n_segments = first.welch.frequencies, spectra.n_segments
+            band = Band(first.welch, frequencies, spectra.csm(), n_segments, n_effective)
+            found.append(ChannelSet(columns, up_to(band, usable)))
+    return tuple(sorted(found, key=lambda each: (-len(each.columns), each.columns)))
+
+
+def with_sets(
+    estimates: Estimates,
+    sets: Sequence[ChannelSet],
+    settings: Settings,
+    *,
+    dims: tuple[int, ...],
+    gains: FloatArray,
+) -> tuple[Estimates, tuple[ChannelSet, ...]]:
+    """Return estimates combined with those of sets of channels, and the sets that count.
+
+    Where fewer than three sensors have all channels, the others cannot take all motion out of one
+    (three-sensor). Maximum likelihood can, from all channels together, and stands in for it. Other
+    methods take channels by their number, and have complete segments only.
+
+    Parameters
+    ----------
+    estimates : Estimates
+        Of the segments that all channels have; without results if there are none.
+    sets : sequence of ChannelSet
+        In physical units.
+    settings : Settings
+    dims : tuple of int
+    gains : float64, shape (n_channels,)
+    """
+    settings = settings.for_sensors(dims)
+    wanted = ALL_METHODS if "all" in settings.methods else settings.methods
+    wanted = tuple(name for name in wanted if name in _BY_MOTION)
+    sensor_of, usual = np.repeat(np.arange(len(dims)), dims), max(dims)
+    parts = {name: [found] for name, found in estimates.results.items()}
+    refused, dimensions, counted = dict(estimates.refused), estimates.dimensions, []
+    for each in sets if wanted else ():
+        columns = list(each.columns)
+        left = np.bincount(sensor_of[columns], minlength=len(dims))
+        is_whole = np.count_nonzero(left == usual) >= _WHOLE
+        its = replace(settings, methods=wanted)
+        if not is_whole:
+            q = settings.dimension if isinstance(settings.dimension, int) else usual
+            its = replace(settings, methods=("maximum-likelihood",), dimension=q)
+        found = noise_estimates(
+            [each.band], its, dims=tuple(int(n) for n in left if n), gains=gains[columns]
+        )
+        refused = {**found.refused, **refused}
+        for name in wanted:
+            noise = found.results.get(name if is_whole else "maximum-likelihood")
+            if noise is not None and np.isfinite(noise.noise_psd).any():
+                whole = _spread(noise, columns, len(sensor_of), name)
+                parts.setdefault(name, []).append(whole)
+                counted += [] if each in counted else [each]
+        dimensions = dimensions or (found.dimensions if is_whole else None)
+    blocks = blocks_of(sets[0].band.frequencies)
+    results = {name: combined(found, blocks) for name, found in parts.items()}
+    refused = {name: why for name, why in refused.items() if name not in results}
+    return Estimates(results, refused, dimensions), tuple(counted)
+
+
+def _spread(noise: SelfNoise, columns: Sequence[int], n_channels: int, method: str) -> SelfNoise:
+    """Return a result of some channels as one of all: the others are dead."""
+    shape = (len(noise.noise_psd), n_channels)
+    psd, cumulants = np.full(shape, np.nan), np.full((3, *shape), np.nan)
+    flags = np.full(shape, int(Flag.DEAD_CHANNEL))
+    psd[:, columns], cumulants[:, :, columns] = noise.noise_psd, noise.cumulants
+    flags[:, columns] = noise.flags
+    return SelfNoise.of(method, psd, cumulants, flags)
 
 
 def up_to(band: Band, usable: float) -> Band:

@@ -200,6 +200,9 @@ class Snapshot:
         Angle by which axes of each sensor may be off, rms, in radians; empty: not at all.
     simulated : bool
         Whether a sensor was simulated: the noise is that of no real one.
+    channel_segments : tuple of int
+        Segments behind the noise of each channel, where some channels have no samples in some
+        segments; empty where all rest on the same ones.
     """
 
     frequency: FloatArray
@@ -227,6 +230,7 @@ class Snapshot:
     not_estimated: tuple[str, ...] = ()
     axis_tolerances: tuple[float, ...] = ()
     simulated: bool = False
+    channel_segments: tuple[int, ...] = ()
 
     @property
     def sensor_names(self) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,11 +23,13 @@ from daq.estimation.noise_estimates import (
     Dimensions,
     Estimates,
     averages,
+    channel_sets,
     in_units,
     known_gains,
     known_positions,
     noise_estimates,
     quantisation_psd,
+    with_sets,
 )
 from daq.estimation.recording_set import is_complete
 from daq.estimation.segment_course import segment_course
@@ -47,8 +50,10 @@ from estimator.spectra.segment_rejection import Reason
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from numpy.typing import NDArray
+
     from daq.estimation.equalisation import Equalisation
-    from daq.estimation.noise_estimates import Channels
+    from daq.estimation.noise_estimates import Channels, ChannelSet
     from daq.estimation.segments.segment_pass import Pass
     from daq.estimation.settings import Settings
     from daq.recording.interface import ReadableRecording
@@ -130,8 +135,17 @@ class SnapshotBuilder:
             shape = (len(frequency), first.n_channels, first.n_channels)
             csm = np.full(shape, np.nan, dtype=np.complex128)
         n_segments = sum(each.n_segments for each in passes)
-        n_effective = bands[-1].n_effective if bands else 0.0
         estimates = self._estimates(bands, raw, recordings[0], first, n_segments, final=final)
+        sets = self._sets(passes) if final else ()
+        if sets:
+            estimates, sets = with_sets(
+                estimates, sets, self._settings, dims=dims, gains=self._gains
+            )
+        if sets and not bands:
+            csm, bands = _largest(sets, first.n_channels)
+            n_segments = bands[0].n_segments
+        n_effective = bands[-1].n_effective if bands else 0.0
+        n_partial = sum(each.band.n_segments for each in sets) - (0 if raw else n_segments)
         latest = recordings[-1]
         events = latest.events
         diagnostics = SnapshotDiagnostics(
@@ -147,7 +161,8 @@ class SnapshotBuilder:
         left = _not_estimated(latest, channels)
         if final or (self._diagnoses.is_due and not left):
             with self._diagnoses:
-                self._findings = self._diagnose(recordings, passes, raw, bands, estimates)
+                bands_of_all = bands if raw else ()
+                self._findings = self._diagnose(recordings, passes, raw, bands_of_all, estimates)
         if self._findings.fits(frequency):
             diagnostics = self._findings.added_to(diagnostics)
         snapshot = Snapshot(
@@ -161,7 +176,7 @@ class SnapshotBuilder:
             dims=dims,
             unit=self._unit,
             n_segments=n_segments,
-            n_dropped=sum(each.n_seen for each in passes) - n_segments,
+            n_dropped=sum(each.n_seen for each in passes) - n_segments - n_partial,
             n_effective=n_effective,
             elapsed=sum(each.elapsed for each in passes),
             start_utc_ns=first.aligned.start_utc_ns,
@@ -169,10 +184,11 @@ class SnapshotBuilder:
             clocks=clock_states(passes),
             drift=last.drift(),
             closed=all(map(is_complete, recordings, (*recordings[1:], None))),
-            left_out=_left_out(passes),
+            left_out=_left_out(passes, sum(each.band.n_segments for each in sets)),
+            channel_segments=_segments_of(sets, n_segments if raw else 0, first.n_channels),
             octaves=tuple(map(Octave.of, bands)) if self._settings.octaves else (),
             diagnostics=diagnostics,
-            no_segment=_no_segment(passes, self._settings.segment),
+            no_segment=None if sets else _no_segment(passes, self._settings.segment),
             bridged=_bridged(passes, estimates.results),
             not_estimated=left,
             axis_tolerances=self._axes,
@@ -184,6 +200,22 @@ class SnapshotBuilder:
             ),
         )
         return with_contributions(snapshot)
+
+    def _sets(self, passes: Sequence[Pass]) -> tuple[ChannelSet, ...]:
+        """Return averages of segments in which channels have no samples, in physical units."""
+        channels = passes[0].aligned.channels
+        filters = self._equalisation.response(passes[0].welch.frequencies)
+        found = []
+        for each in channel_sets(passes):
+            columns = list(each.columns)
+            band = in_units(
+                each.band,
+                [channels[column] for column in columns],
+                self._unit,
+                None if filters is None else filters[:, columns],
+            )
+            found.append(replace(each, band=band))
+        return tuple(found)
 
     def _diagnose(
         self,
@@ -253,6 +285,32 @@ class SnapshotBuilder:
         return [len(n_factors) for n_factors in before] == [len(each.frequencies) for each in bands]
 
 
+def _largest(
+    sets: Sequence[ChannelSet], n_channels: int
+) -> tuple[NDArray[np.complex128], tuple[Band, ...]]:
+    """Return the averages of the set with the most channels and segments, as of all channels.
+
+    The PSD of other channels is that of their own segments; nothing is coherent with it.
+    """
+    main = max(sets, key=lambda each: len(each.columns) * each.band.n_segments)
+    whole = main.whole(n_channels)
+    for each in sets:
+        for place, column in enumerate(each.columns):
+            if column not in main.columns:
+                whole.csm[:, column, column] = each.band.csm[:, place, place]
+    return whole.csm, (whole,)
+
+
+def _segments_of(sets: Sequence[ChannelSet], n_complete: int, n_channels: int) -> tuple[int, ...]:
+    """Return the segments behind each channel, where these are not the same for all."""
+    if not sets:
+        return ()
+    return tuple(
+        n_complete + sum(each.band.n_segments for each in sets if column in each.columns)
+        for column in range(n_channels)
+    )
+
+
 def _bridged(passes: Sequence[Pass], results: Mapping[str, SelfNoise]) -> Bridged | None:
     """Return the number of bridged segments, and the leakage of their windows."""
     with_gaps = [(each, each.leakage) for each in passes if each.n_bridged]
@@ -286,12 +344,13 @@ def _counting_rates(recording: ReadableRecording) -> dict[str, float]:
     }
 
 
-def _left_out(passes: Sequence[Pass]) -> dict[Reason, int]:
-    counts: Counter[Reason] = Counter()
+def _left_out(passes: Sequence[Pass], n_partial: int = 0) -> dict[Reason, int]:
+    """Return how many segments were left out, by reason; `n_partial` count for some channels."""
+    counts: Counter[Reason] = Counter({Reason.GAP: -n_partial})
     for each in passes:
         counts.update(each.left_out)
         counts[Reason.GAP] -= each.n_bridged
-    dropped = sum(each.n_seen - each.n_segments for each in passes)
+    dropped = sum(each.n_seen - each.n_segments for each in passes) - n_partial
     counts[Reason.TRANSIENT] = dropped - counts.total()
     return {reason: counts[reason] for reason in Reason}
 

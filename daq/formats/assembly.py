@@ -1,14 +1,17 @@
-"""Channels become sensors: rows in which every channel has a sample.
+"""Channels become sensors: rows in which any channel has a sample.
 
-The rows are those of the first channel. A channel that is sampled at the same instants is shifted
-by whole rows. Another one, a fraction of a sample apart or with a clock of its own, is resampled
-(:mod:`daq.clocks.resampling`). Where a channel has no samples, the sensor has a gap.
+The rows are those of the first channel that has samples at a time. A channel that is sampled at the
+same instants is shifted by whole rows. Another one, a fraction of a sample apart or with a clock of
+its own, is resampled (:mod:`daq.clocks.resampling`). Where a channel has no sample, the sensor
+records that it is absent; where none has, the sensor has a gap.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from bisect import bisect_left, bisect_right
+from dataclasses import dataclass, replace
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +22,7 @@ from daq.formats.channel_runs import SAME_RATE, Run, runs_of, time_tolerance_ns
 from daq.formats.foreign_sensor import NS_PER_S, ForeignSensor, Stretch
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -27,6 +30,7 @@ if TYPE_CHECKING:
     from daq.formats.traces import PartCache, Piece
 
 _PIECES_NAMED = 3
+_CONTINUES = 0.5  # of a sample
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,15 +65,38 @@ class Column:
 
 
 class Columns:
-    """Samples of several channels, read when they are sliced; shape (n_samples, n_channels)."""
+    """Samples of several channels, read when they are sliced; shape (n_samples, n_channels).
+
+    Each channel has columns with the first and last row that they have samples for, counted from
+    `first`. In other rows stands 0, or NaN where samples are floating-point numbers.
+    """
 
     ndim = 2
 
-    def __init__(self, columns: Sequence[Column], first: int, end: int) -> None:
-        self.columns = columns
-        self.shape = (end - first, len(columns))
-        self.dtype = np.result_type(*(column.dtype for column in columns))
+    def __init__(
+        self, channels: Sequence[Sequence[tuple[int, int, Column]]], first: int, end: int
+    ) -> None:
+        self.channels = channels
+        self.shape = (end - first, len(channels))
+        self.dtype = np.result_type(*(column.dtype for _, _, column in chain(*channels)))
         self._first = first
+
+    @property
+    def columns(self) -> Iterator[tuple[int, Column]]:
+        """Every column, with the number of its channel."""
+        for number, columns in enumerate(self.channels):
+            for _, _, column in columns:
+                yield number, column
+
+    @property
+    def absent(self) -> list[tuple[int, int, int]]:
+        """Rows in which a channel has no sample: its number, the first, and one after the last."""
+        found = []
+        for number, columns in enumerate(self.channels):
+            edges = [0, *chain(*((begin, end) for begin, end, _ in columns)), len(self)]
+            gaps = zip(edges[::2], edges[1::2], strict=True)
+            found += [(number, begin, end) for begin, end in gaps if begin < end]
+        return found
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -79,10 +106,14 @@ class Columns:
         if not isinstance(rows, slice):
             return np.asarray(self[:][rows])
         first, end, _ = rows.indices(self.shape[0])
-        found = np.empty((max(0, end - first), len(self.columns)), self.dtype)
-        for number, column in enumerate(self.columns):
-            if len(found):
-                found[:, number] = column.read(first + self._first, end + self._first)
+        fill = np.nan if self.dtype.kind == "f" else 0
+        found = np.full((max(0, end - first), len(self.channels)), fill, self.dtype)
+        for number, columns in enumerate(self.channels):
+            for begin, beyond, column in columns:
+                low, high = max(first, begin), min(end, beyond)
+                if low < high:
+                    samples = column.read(low + self._first, high + self._first)
+                    found[low - first : high - first, number] = samples
         return found
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:  # noqa: ANN401 - as numpy has it
@@ -138,7 +169,7 @@ def assembled(
     Raises
     ------
     ImportFormatError
-        Several rates, pieces that overlap, or no samples in common.
+        Several rates, or pieces that overlap.
     """
     where = f"sensor {name!r}"
     rate = nominal_rate(where, channels)
@@ -146,67 +177,88 @@ def assembled(
         runs_of(f"{where}, channel {channel}", pieces, rate, overlap, cache)
         for channel, pieces in channels.items()
     ]
-    stretches = [
-        stretch for runs in _together(of_channel) if (stretch := _stretch(runs, rate)) is not None
-    ]
-    if not stretches:
-        raise ImportFormatError(
-            f"{where}: its channels {', '.join(channels)} have no samples in common"
-        )
+    stretches = tuple(_stretches(of_channel, rate))
     sources = list(dict.fromkeys(p.part.source for pieces in channels.values() for p in pieces))
     more = len(sources) - _PIECES_NAMED
     source = ", ".join(sources[:_PIECES_NAMED]) + (f" and {more} more" if more > 0 else "")
-    n_samples = sum(stretch.n_samples for stretch in stretches)
-    beyond = [sum(run.n_samples for run in runs) - n_samples for runs in of_channel]
-    unused = tuple((each, n) for each, n in zip(channels, beyond, strict=True) if n > 0)
-    return ForeignSensor(
-        name, tuple(channels), rate, tuple(stretches), source, tuple(units), unused=unused
-    )
+    return ForeignSensor(name, tuple(channels), rate, stretches, source, tuple(units))
 
 
-def _together(of_channel: Sequence[Sequence[Run]]) -> Iterable[tuple[Run, ...]]:
-    """Yield runs of all channels, one of each, that have time in common, in order."""
-    spans: list[tuple[int, int, tuple[Run, ...]]] = [
-        (run.pieces[0].start_ns, run.pieces[-1].end_ns, (run,)) for run in of_channel[0]
-    ]
-    for runs in of_channel[1:]:
-        common: list[tuple[int, int, tuple[Run, ...]]] = []
-        at = 0
-        for start, end, members in spans:
-            while at < len(runs) and runs[at].pieces[-1].end_ns < start - _slack_ns(runs[at]):
-                at += 1
-            for run in runs[at:]:
-                if run.pieces[0].start_ns > end + _slack_ns(run):
-                    break
-                first = max(start, run.pieces[0].start_ns)
-                last = min(end, run.pieces[-1].end_ns)
-                common.append((first, last, (*members, run)))
-        spans = common
-    for _, _, members in spans:
-        yield members
+def _stretches(of_channel: Sequence[Sequence[Run]], rate: float) -> Iterator[Stretch]:
+    """Yield the rows of a sensor: those of its first channel that has samples at a time."""
+    interval = NS_PER_S / rate
+    starts = [[run.start_ns for run in runs] for runs in of_channel]
+    at = min(each[0] for each in starts)
+    before: Stretch | None = None
+    while True:
+        # of each channel the run that has samples from `at` on, now or later
+        numbers = [_number(runs, at) for runs in of_channel]
+        ahead = [
+            runs[n].start_ns if n < len(runs) else None
+            for runs, n in zip(of_channel, numbers, strict=True)
+        ]
+        begins = [start for start in ahead if start is not None]
+        if not begins:
+            return
+        at = max(at, min(begins))
+        first = next(n for n, start in enumerate(ahead) if start is not None and start <= at)
+        reference = of_channel[first][numbers[first]]
+        (row,) = np.ceil(reference.rows_at(np.array([at - reference.start_ns], np.float64)) - 1e-3)
+        begin, end = max(0, int(row)), reference.n_samples
+        sooner = [start for start in ahead[:first] if start is not None]
+        if sooner:  # a channel that comes before this one gives the rows from there on
+            until = np.array([min(sooner) - reference.start_ns], np.float64)
+            end = min(end, math.ceil(reference.rows_at(until)[0] - _CONTINUES))
+        if end > begin:
+            stretch = _stretch(of_channel, starts, reference, rate, (begin, end))
+            yield stretch if before is None else _continued(before, stretch, rate)
+            before = stretch
+            last = reference.start_ns + reference.times_ns(np.array([end - 1.0]))[0]
+            at = max(at + 1, math.ceil(last + _CONTINUES * interval))
+        else:
+            at = min([reference.pieces[-1].end_ns + 1, *sooner])
 
 
-def _slack_ns(run: Run) -> float:
-    return time_tolerance_ns(run.sampling_rate)
+def _number(runs: Sequence[Run], at: float) -> int:
+    """Return the number of the first run that ends at a time or later."""
+    return bisect_left(runs, at, key=lambda run: run.pieces[-1].end_ns)
 
 
-def _stretch(runs: tuple[Run, ...], rate: float) -> Stretch | None:
-    """Return the rows of the first run in which all have samples, if there are any."""
-    reference = runs[0]
-    columns = [_column(run, reference, rate) for run in runs]
-    first, end = 0, reference.n_samples
-    for column in columns:
-        begin, last = _rows_with_samples(column)
-        first, end = max(first, begin), min(end, last)
-    if end <= first:
-        return None
-    offset = reference.times_ns(np.array([first], dtype=np.float64))[0]
-    start_ns = reference.start_ns + round(offset)
-    rows, times = (None, None) if reference.is_nominal else reference.knots
+def _continued(before: Stretch, stretch: Stretch, rate: float) -> Stretch:
+    """Return a stretch, and whether its samples follow those of the one before without a step."""
+    nominal = before.knot_rows is None and stretch.knot_rows is None
+    (expected,) = before.times_ns([before.n_samples], rate)
+    near = abs(stretch.start_utc_ns - expected) <= time_tolerance_ns(rate)
+    return replace(stretch, continues=nominal and near)
+
+
+def _stretch(
+    of_channel: Sequence[Sequence[Run]],
+    starts: Sequence[Sequence[int]],
+    reference: Run,
+    rate: float,
+    rows: tuple[int, int],
+) -> Stretch:
+    """Return rows of a run, with what samples the channels have there."""
+    first, end = rows
+    offset, last = reference.times_ns(np.array([first, end - 1], dtype=np.float64))
+    slack = time_tolerance_ns(rate) + NS_PER_S / rate
+    columns: list[list[tuple[int, int, Column]]] = []
+    for runs, begins in zip(of_channel, starts, strict=True):
+        low = _number(runs, reference.start_ns + offset - slack)
+        high = bisect_right(begins, reference.start_ns + last + slack)
+        columns.append([])
+        for run in runs[low:high]:
+            column = _column(run, reference, rate)
+            begin, beyond = _rows_with_samples(column)
+            begin, beyond = max(first, begin), min(end, beyond)
+            if begin < beyond:
+                columns[-1].append((begin - first, beyond - first, column))
+    row_knots, times = (None, None) if reference.is_nominal else reference.knots
     return Stretch(
-        start_ns,
+        reference.start_ns + round(offset),
         Columns(columns, first, end),
-        None if rows is None else rows - first,
+        None if row_knots is None else row_knots - first,
         None if times is None else times - offset,
     )
 

@@ -51,12 +51,15 @@ class Stretch:
     knot_rows, knot_times_ns : float64, shape (n_knots,), optional
         Rows and their times after the first row, where the clock runs off the nominal rate;
         linear between and beyond them.
+    continues : bool
+        Whether no sample is missing between the stretch before and this one.
     """
 
     start_utc_ns: int
     counts: CountsArray | RowSource
     knot_rows: NDArray[np.float64] | None = None
     knot_times_ns: NDArray[np.float64] | None = None
+    continues: bool = False
 
     @property
     def n_samples(self) -> int:
@@ -109,8 +112,6 @@ class ForeignSensor:
 
     ``units`` holds one unit per channel, in which its samples are, or is empty where the format
     does not say. ``calibrations`` holds one for each channel whose samples are counts, or is empty.
-    ``unused`` holds the channels with samples that are in no stretch, as others have none there,
-    and how many these are.
     """
 
     name: str
@@ -120,7 +121,17 @@ class ForeignSensor:
     source: str
     units: tuple[str, ...] = ()
     calibrations: tuple[Calibration | None, ...] = ()
-    unused: tuple[tuple[str, int], ...] = ()
+
+    @property
+    def absent(self) -> NDArray[np.int64]:
+        """Rows in which a channel has no sample: its number, the first, and one after the last."""
+        found, row = [np.empty((0, 3), np.int64)], 0
+        for stretch in self.stretches:
+            absent = getattr(stretch.counts, "absent", [])
+            if absent:
+                found.append(np.array(absent, np.int64) + np.array([0, row, row]))
+            row += stretch.n_samples
+        return np.concatenate(found)
 
     def check(self) -> None:
         """Refuse what no recording can hold.
@@ -166,8 +177,9 @@ class ForeignSensor:
         for stretch in self.stretches:
             elapsed_ns = stretch.start_utc_ns - begin
             first = round(elapsed_ns * self.sampling_rate / NS_PER_S) + moved
-            if found and first <= end:
-                moved, first = moved + end + 1 - first, end + 1
+            least = end if stretch.continues else end + 1
+            if found and (first < least or stretch.continues):
+                moved, first = moved + least - first, least
             found.append(first)
             end = first + stretch.n_samples
             if stretch.knot_rows is not None:
@@ -187,7 +199,7 @@ class ForeignSensor:
 def finite_stretches(
     counts: CountsArray, *, start_utc_ns: int, sampling_rate: float
 ) -> tuple[Stretch, ...]:
-    """Cut samples at every row that holds a value that is not a number.
+    """Cut samples at every row without any number; other values that are none become NaN.
 
     Parameters
     ----------
@@ -204,8 +216,11 @@ def finite_stretches(
     """
     if not np.issubdtype(counts.dtype, np.floating):
         return (Stretch(start_utc_ns, counts),) if counts.shape[0] else ()
-    whole = np.isfinite(counts).all(axis=1)
-    edges = np.flatnonzero(np.diff(whole, prepend=False, append=False))
+    finite = np.isfinite(counts)
+    if not finite.all():
+        counts = counts.copy()
+        counts[~finite] = np.nan
+    edges = np.flatnonzero(np.diff(finite.any(axis=1), prepend=False, append=False))
     return tuple(
         Stretch(start_utc_ns + round(int(first) * NS_PER_S / sampling_rate), counts[first:end])
         for first, end in edges.reshape(-1, 2)

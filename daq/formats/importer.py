@@ -46,9 +46,9 @@ _MAX_STATION_XML = 1 << 24
 class Imported:
     """What became of one sensor: ``missing`` samples lie in ``n_gaps`` gaps.
 
-    ``resampled`` channels were sampled at other instants than the first channel. ``unused`` are
-    channels with the number of their samples that are not in the recording, as other channels of
-    the sensor have none at these times.
+    ``resampled`` channels were sampled at other instants than the first channel. ``absent`` are
+    channels that have no samples where others of the sensor have some, with the number of these
+    rows and of the stretches that they make.
     """
 
     sensor: str
@@ -59,7 +59,7 @@ class Imported:
     n_gaps: int
     missing: int
     resampled: tuple[str, ...] = ()
-    unused: tuple[tuple[str, int], ...] = ()
+    absent: tuple[tuple[str, int, int], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -446,6 +446,7 @@ def _layout(described: Sensor, foreign: ForeignSensor) -> SensorLayout:
         serial_number=described.serial_number,
         driver=described.driver,
         port=described.port,
+        absent=foreign.absent,
     )
 
 
@@ -499,7 +500,7 @@ def _write_rows(writer: ArrayWriter, rows: _Rows) -> None:
         first_sample=rows.first_sample,
         received_ns=after[1:],
         utc_ns=after[:-1],
-        restart=rows.first == 0,
+        restart=rows.first == 0 and not stretch.continues,
     )
 
 
@@ -511,7 +512,7 @@ def _sharing_files(sensors: Iterable[ForeignSensor]) -> list[list[ForeignSensor]
             id(piece.part)
             for stretch in sensor.stretches
             if isinstance(stretch.counts, Columns)
-            for column in stretch.counts.columns
+            for _, column in stretch.counts.columns
             for piece in column.run.pieces
         }
         members = [sensor]
@@ -530,10 +531,10 @@ def _imported(sensor: ForeignSensor) -> Imported:
         for first, stretch in zip(first_samples, sensor.stretches, strict=True)
     ]
     resampled = {
-        channel
+        sensor.channels[number]
         for stretch in sensor.stretches
         if isinstance(stretch.counts, Columns)
-        for channel, column in zip(sensor.channels, stretch.counts.columns, strict=True)
+        for number, column in stretch.counts.columns
         if column.shift is None
     }
     return Imported(
@@ -542,8 +543,19 @@ def _imported(sensor: ForeignSensor) -> Imported:
         sampling_rate=sensor.sampling_rate,
         start_utc_ns=sensor.stretches[0].start_utc_ns,
         n_samples=sum(stretch.n_samples for stretch in sensor.stretches),
-        n_gaps=len(sensor.stretches) - 1,
+        n_gaps=sum(not stretch.continues for stretch in sensor.stretches[1:]),
         missing=sum(first - end for first, end in zip(first_samples[1:], ends[:-1], strict=True)),
         resampled=tuple(channel for channel in sensor.channels if channel in resampled),
-        unused=sensor.unused,
+        absent=_absent(sensor),
     )
+
+
+def _absent(sensor: ForeignSensor) -> tuple[tuple[str, int, int], ...]:
+    """Return channels with rows in which they have no sample, and how many stretches these are."""
+    absent, found = sensor.absent, []
+    for number, name in enumerate(sensor.channels):
+        rows = absent[absent[:, 0] == number, 1:]
+        if len(rows):
+            n_stretches = 1 + int(np.count_nonzero(rows[1:, 0] != rows[:-1, 1]))
+            found.append((name, int(np.diff(rows).sum()), n_stretches))
+    return tuple(found)

@@ -63,6 +63,7 @@ class SensorInMemory:
         lengths = [stretch.n_samples for stretch in foreign.stretches]
         self._first_rows = np.concatenate([[0], np.cumsum(lengths)])
         self.n_samples = int(self._first_rows[-1])
+        self.absent = foreign.absent
         first_samples = foreign.first_samples()
         self.blocks = BlocksInMemory(
             np.concatenate(
@@ -151,7 +152,8 @@ def _blocks(
     blocks["monotonic_ns"] = blocks["utc_ns"] = times[1:]
     blocks["device_counter"] = times[:-1]
     blocks["flags"] = int(BlockFlag.DEVICE_UTC)
-    blocks["flags"][0] |= int(BlockFlag.CLOCK_RESTART)
+    if not stretch.continues:
+        blocks["flags"][0] |= int(BlockFlag.CLOCK_RESTART)
     return blocks
 
 
@@ -159,5 +161,6 @@ def _gaps(first_samples: Sequence[int], lengths: Sequence[int], source: str) -> 
     rows = [
         (first + length, following - first - length, 0, f"not in {source}".encode()[:100])
         for (first, length), (following, _) in pairwise(zip(first_samples, lengths, strict=True))
+        if following > first + length
     ]
     return np.array(rows, GAP_DTYPE)

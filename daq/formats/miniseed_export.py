@@ -24,6 +24,7 @@ from daq.errors import RecordingError
 from daq.formats.foreign_sensor import NS_PER_S
 from daq.formats.readers.waveforms import load_obspy
 from daq.protocols.block import BlockFlag
+from daq.recording.interface import absences
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -260,9 +261,10 @@ def _write_rows(
             f"sensor {sensor.name!r}: rows {damaged[0][0] + rows[0]} to {damaged[0][1] + rows[0]}"
             " are damaged; expected sound samples: see huddle repair --check"
         )
-    for number, channel in enumerate(sensor.channels):
-        known = codes[sensor.name, channel.name]
-        samples, encoding = _encodable(counts[:, number], f"{sensor.name}.{channel.name}")
+    for number, first, end in _present(sensor, *rows):
+        name = sensor.channels[number].name
+        known = codes[sensor.name, name]
+        samples, encoding = _encodable(counts[first:end, number], f"{sensor.name}.{name}")
         trace = obspy.Trace(
             samples,
             {
@@ -271,16 +273,31 @@ def _write_rows(
                 "location": known.location,
                 "channel": known.channel,
                 "sampling_rate": sensor.sampling_rate,
-                "starttime": obspy.UTCDateTime(ns=start_ns),
+                "starttime": obspy.UTCDateTime(
+                    ns=start_ns + round(first * NS_PER_S / sensor.sampling_rate)
+                ),
             },
         )
         trace.write(
             file,
             format="MSEED",
             encoding=encoding,
-            reclen=_SHORT_RECORD if len(counts) <= _SHORT_ROWS else _RECORD,
+            reclen=_SHORT_RECORD if end - first <= _SHORT_ROWS else _RECORD,
         )
     return len(counts)
+
+
+def _present(sensor: SensorRecord, first_row: int, last_row: int) -> Iterator[tuple[int, int, int]]:
+    """Yield each channel's number with each piece of the rows, from `first_row`, that it has."""
+    absent = list(absences(sensor, first_row, last_row))
+    for number in range(len(sensor.channels)):
+        begin = 0
+        for lacking in sorted((rows.start, rows.stop) for n, rows in absent if n == number):
+            if lacking[0] > begin:
+                yield number, begin, lacking[0]
+            begin = max(begin, lacking[1])
+        if begin < last_row - first_row:
+            yield number, begin, last_row - first_row
 
 
 def _encodable(samples: NDArray[Any], name: str) -> tuple[NDArray[Any], str]:

@@ -32,6 +32,8 @@ def write_attributes(
     created: HostTime,
     control: tuple[int, str] | None,
     attributes: dict[str, str | float],
+    *,
+    sensors: Sequence[SensorLayout],
 ) -> None:
     """Write the attributes that are known at the start of the run."""
     utc = datetime.fromtimestamp(created.utc_ns / 1e9, tz=UTC)
@@ -41,7 +43,7 @@ def write_attributes(
         software = "huddle"
     known: dict[str, Any] = {
         "format": file_format.FORMAT,
-        "format_version": file_format.FORMAT_VERSION,
+        "format_version": max(sensor.format_version for sensor in sensors),
         "run_id": uuid.uuid4().hex,
         "created": utc.isoformat(timespec="microseconds"),
         "created_utc_ns": created.utc_ns,
@@ -93,6 +95,8 @@ def make_datasets(file: h5py.File, sensors: Sequence[SensorLayout], chunk_second
             **filters,
         )
         samples.attrs.update(file_format.channel_attributes(sensor.channels))
+        if sensor.absent is not None and len(sensor.absent):
+            samples.attrs["absent"] = sensor.absent
         # Remains empty unless the sensor is polled.
         instants = group.create_dataset(
             "instants",

@@ -34,7 +34,7 @@ _FILE = (
     "simulated",
 )
 _SENSOR = ("model", "serial_number", "driver", "port", "clock", "sampling_rate", "temperature")
-_SAMPLES = ("channels", "sensitivity", "unit", "direction", "auxiliary", "response")
+_SAMPLES = ("channels", "sensitivity", "unit", "direction", "auxiliary", "response", "absent")
 
 
 def write_checksums(file: h5py.File) -> None:

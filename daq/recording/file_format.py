@@ -21,8 +21,10 @@ if TYPE_CHECKING:
     from daq.bench.response import PolesZeros, Response
 
 FORMAT = "huddle-recording"
-FORMAT_VERSION = 2
-"""Version 2 has a manifest, and strings of fixed length; version 1 is read."""
+FORMAT_VERSION = 3
+"""Version 2 has a manifest, and strings of fixed length; version 1 is read. Files in which channels
+have no samples in some rows are of version 3, all others of version 2: earlier programs would take
+what stands there for samples."""
 LIBVER = ("v110", "v110")
 """HDF5 file format of recordings."""
 
@@ -99,6 +101,9 @@ class SensorLayout:
         Name of the sampling clock; sensors with one clock share the name.
     temperature : float or None
         In °C, as the device reported at the start; None if it reports none.
+    absent : int64, shape (n, 3), optional
+        Rows in which a channel has no sample: its column, the first row, and the one after the
+        last.
     """
 
     name: str
@@ -111,6 +116,12 @@ class SensorLayout:
     driver: str = ""
     port: str = ""
     temperature: float | None = None
+    absent: NDArray[np.int64] | None = None
+
+    @property
+    def format_version(self) -> int:
+        """The first version of the format that can hold it."""
+        return FORMAT_VERSION if self.absent is not None and len(self.absent) else 2
 
     @classmethod
     def of(cls, sensor: Sensor, driver: DriverRules) -> SensorLayout:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Protocol
 
+import numpy as np
+
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from daq.bench.channel import Channel
@@ -62,6 +64,10 @@ class ReadableSensor(Protocol):
     def gaps(self) -> NDArray[np.void]:
         """Gaps, dtype `daq.recording.file_format.GAP_DTYPE`."""
 
+    @property
+    def absent(self) -> NDArray[np.int64]:
+        """Rows in which a channel has no sample: column, first row, one after the last; (n, 3)."""
+
     def counts(self, first_row: int = 0, last_row: int | None = None) -> NDArray[Any]:
         """Return raw counts, shape (last_row - first_row, n_channels)."""
 
@@ -76,6 +82,14 @@ class ReadableSensor(Protocol):
 
     def instants_ns(self, first_row: int = 0, last_row: int | None = None) -> NDArray[np.int64]:
         """Return the host monotonic time of each sample of a polled sensor, in ns."""
+
+
+def absences(sensor: ReadableSensor, first_row: int, last_row: int) -> Iterator[tuple[int, slice]]:
+    """Yield columns without samples, with the rows, counted from `first_row`, that lack them."""
+    absent = sensor.absent
+    begins, ends = np.maximum(absent[:, 1], first_row), np.minimum(absent[:, 2], last_row)
+    for at in np.flatnonzero(begins < ends).tolist():
+        yield int(absent[at, 0]), slice(int(begins[at]) - first_row, int(ends[at]) - first_row)
 
 
 class ReadableRecording(Protocol):

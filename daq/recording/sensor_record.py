@@ -75,6 +75,10 @@ class SensorRecord:
         self._samples = dataset(group, "samples")
         self._instants = dataset(group, "instants", np.dtype("<i8"))
         self.channels: tuple[Channel, ...] = file_format.channels_of(self._samples.attrs)
+        self.absent: NDArray[np.int64] = np.array(
+            self._samples.attrs.get("absent", np.empty((0, 3))), np.int64
+        )
+        """Rows in which a channel has no sample: its column, first row, and one after the last."""
         self.dtype: np.dtype[Any] = self._samples.dtype
         self._check_shapes()
         self._sample_rows = ChunkedRows(self._samples)
@@ -92,6 +96,10 @@ class SensorRecord:
                 f"sensor {self.name!r}: samples of shape {self._samples.shape}; expected"
                 f" {n_channels} columns"
             )
+        if self.absent.ndim != 2 or self.absent.shape[1] != 3:
+            raise ValueError(f"sensor {self.name!r}: absent of shape {self.absent.shape}")
+        if not np.isin(self.absent[:, 0], np.arange(n_channels)).all():
+            raise ValueError(f"sensor {self.name!r}: absent of other columns than its own")
         if self._instants.ndim != 1 or not self._samples.chunks or not self._instants.chunks:
             raise ValueError(f"sensor {self.name!r}: samples or instants are not in chunks")
         if self.sampling_rate <= 0:

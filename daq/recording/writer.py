@@ -167,7 +167,7 @@ class RecordingWriter:
                     rdcc_nbytes=64 * 1024,
                     locking=False,
                 )
-                write_attributes(file, bench, created, control, attributes or {})
+                write_attributes(file, bench, created, control, attributes or {}, sensors=sensors)
                 make_datasets(file, sensors, chunk_seconds)
                 file.swmr_mode = True
                 writer = cls(path, file, sensors, lock, packs=hidden)

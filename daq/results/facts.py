@@ -227,6 +227,23 @@ class GapsBridged(Fact):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ChannelsAbsent(Fact):
+    """Channels have no samples in some segments; the others are estimated from these without them.
+
+    Attributes
+    ----------
+    n_segments : tuple of int
+        Segments behind the noise of each of `channels`.
+    most : int
+        Segments behind the channel with the most.
+    """
+
+    name: ClassVar[str] = "channels-absent"
+    n_segments: tuple[int, ...]
+    most: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class OctaveSegments(Fact):
     """Low octaves have longer segments; `only_one` where there are too few samples for them.
 

@@ -13,6 +13,7 @@ from daq.results.clock_effect import reference
 from daq.results.facts import (
     RANK_OF_LEVEL,
     BlocksDamaged,
+    ChannelsAbsent,
     ChannelsClipped,
     ChannelsStoodStill,
     ChannelsStuck,
@@ -217,6 +218,14 @@ def _segments(snapshot: Snapshot) -> Iterator[Fact]:
             n_segments=snapshot.bridged.n_segments,
             lost=snapshot.bridged.lost,
             leakage=float(np.nanmean(np.abs(snapshot.bridged.leakage[1:-1]))),
+        )
+    if counts := snapshot.channel_segments:
+        fewer = [n for n, count in enumerate(counts) if count < max(counts)]
+        yield ChannelsAbsent(
+            rank=Rank.TO_KNOW,
+            channels=tuple(snapshot.channels[n].name for n in fewer),
+            n_segments=tuple(counts[n] for n in fewer),
+            most=max(counts),
         )
     if snapshot.octaves:
         lowest = snapshot.octaves[0]

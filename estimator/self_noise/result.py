@@ -11,6 +11,8 @@ import numpy as np
 from estimator.levels.interval import interval
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from estimator.types import FloatArray, IntArray
 
 
@@ -81,3 +83,47 @@ class SelfNoise:
             cov = np.where(noise_psd == 0, np.nan, cov)
             low, high = interval(noise_psd, cumulants)
         return cls(method, noise_psd, cov, low, high, flags, cumulants)
+
+
+def combined(parts: Sequence[SelfNoise], blocks: IntArray) -> SelfNoise:
+    """Return the mean of independent estimates of the same noise, weighted by their precision.
+
+    Parameters
+    ----------
+    parts : sequence of SelfNoise
+        By one method, from different segments; NaN where a channel has no estimate.
+    blocks : int64, shape (n_freqs,)
+        Block of neighbours of every frequency (`estimator.levels.pooled.blocks_of`). The variances
+        behind the weights are means over a block: those of single frequencies are correlated with
+        the estimates, and would make the mean too low.
+
+    Returns
+    -------
+    SelfNoise
+        Flags of all estimates that count; of all, where none does.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    noise = np.stack([each.noise_psd for each in parts])
+    cumulants = np.stack([each.cumulants for each in parts])
+    known = np.isfinite(noise) & np.isfinite(cumulants).all(axis=1)
+    first = np.flatnonzero(np.diff(blocks, prepend=-1))
+
+    def mean(values: FloatArray) -> FloatArray:
+        total = np.add.reduceat(np.where(known, values, 0.0), first, axis=1)
+        number = np.add.reduceat(known.astype(np.float64), first, axis=1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.asarray((total / number)[:, blocks])
+
+    with np.errstate(invalid="ignore", divide="ignore"):
+        weight = np.where(known, 1 / mean(cumulants[:, 0]), 0.0)
+        weight /= weight.sum(axis=0)
+        found = np.where(known, weight * noise, 0.0).sum(axis=0)
+        power = np.arange(2, 5)[:, None, None]
+        scatter = np.where(known[:, None], weight[:, None] ** power * cumulants, 0.0).sum(axis=0)
+    nowhere = ~known.any(axis=0)
+    found[nowhere], scatter[:, nowhere] = np.nan, np.nan
+    flags = np.stack([each.flags for each in parts])
+    flags = np.bitwise_or.reduce(np.where(known | nowhere, flags, 0), axis=0)
+    negative = np.where(found <= 0, int(Flag.NEGATIVE), 0)
+    return SelfNoise.of(parts[0].method, found, scatter, (flags & ~Flag.NEGATIVE) | negative)

@@ -290,6 +290,7 @@ def _by_sensor(names: Sequence[str]) -> str:
 def _show(result: ImportResult, out: Path, json: str | None) -> None:
     from rich.table import Table
 
+    from daq.bench.durations import format_duration
     from tui.output.console import for_people, notices
     from tui.wording.formatting import several, utc
 
@@ -313,13 +314,14 @@ def _show(result: ImportResult, out: Path, json: str | None) -> None:
                 f"{entry.sensor}: resampled to the instants of {entry.channels[0]}:"
                 f" {' '.join(entry.resampled)}"
             )
-        if entry.unused:
-            lost = ", ".join(
-                f"{n / entry.sampling_rate:.6g} s of {name}" for name, n in entry.unused
+        if entry.absent:
+            lacking = ", ".join(
+                f"{name} {format_duration(round(n / entry.sampling_rate, 3))}"
+                + (f" in {n_stretches} pieces" if n_stretches > 1 else "")
+                for name, n, n_stretches in entry.absent
             )
             screen.print(
-                f"not imported: {lost}: other channels of {entry.sensor} have no samples there;"
-                " --channels chooses channels",
+                f"{entry.sensor}: missing where other channels have samples: {lacking}",
                 soft_wrap=True,
             )
     for line in _calibrations(result):

@@ -20,6 +20,7 @@ from daq.errors import WrongSettingError
 from daq.formats.importer import open_files
 from daq.formats.sources import Selection
 from daq.protocols.block import BlockFlag
+from daq.recording.interface import absences
 from daq.recording.reader import Recording
 from tui.notebook.estimates import PathLike, Response, estimate, response_sources, self_noise
 from tui.notebook.options import moment
@@ -167,9 +168,10 @@ class SampledSensors:
                 inside = (at >= 0) & (at < len(samples))
                 row, last = begin + int(np.argmax(inside)), begin + int(np.flatnonzero(inside)[-1])
                 sensitivity = np.array([channel.sensitivity for channel in channels])
-                samples[at[row - begin : last + 1 - begin]] = (
-                    record.counts(row, last + 1) / sensitivity
-                )
+                places = at[row - begin : last + 1 - begin]
+                samples[places] = record.counts(row, last + 1) / sensitivity
+                for column, rows in absences(record, row, last + 1):
+                    samples[places[rows], column] = np.nan
         return samples, clock.times(np.arange(low, max(low, high)))
 
     def _of(self, sensor: str) -> tuple[Channel, ...]:
@@ -316,9 +318,8 @@ class Waveforms(SampledSensors):
         lines += map(_line, self.recording.sensors)
         for each in self._imported:
             lines += [
-                f"  {each.sensor}.{channel}: {n} samples left out, as other channels of the sensor"
-                " have none at their times"
-                for channel, n in each.unused
+                f"  {each.sensor}.{channel}: no samples in {n} rows that other channels have"
+                for channel, n, _ in each.absent
             ]
         return "\n".join((*lines, *(f"  not used: {each}" for each in self.problems)))
 

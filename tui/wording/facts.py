@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from daq.protocols.block import UNCOUNTED_CHECK
 from daq.results.facts import (
     BlocksDamaged,
+    ChannelsAbsent,
     ChannelsClipped,
     ChannelsStoodStill,
     ChannelsStuck,
@@ -311,6 +312,22 @@ def _excluded(fact: SegmentsExcluded, names: Names) -> Wording:
         parts.append(f"segments with transients excluded: {each}")
     text = "; ".join(parts)
     return Wording(text, f"{text[0].upper()}{text[1:]}.")
+
+
+@word.register(ChannelsAbsent)
+def _absent(fact: ChannelsAbsent, names: Names) -> Wording:
+    del names
+    if not fact.channels:
+        text = "Every channel has no samples in some segments, which count for the others"
+        return Wording(text, f"{text}: {fact.most} for each.")
+    found = ", ".join(
+        f"{channel} {count}" for channel, count in zip(fact.channels, fact.n_segments, strict=True)
+    )
+    return Wording(
+        f"Channels without samples in some segments: {listed(fact.channels)}",
+        f"Segments behind channels that have no samples in some: {found}; behind the others"
+        f" {fact.most}. Segments that a channel lacks count for the other channels.",
+    )
 
 
 @word.register(GapsBridged)

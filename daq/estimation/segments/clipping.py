@@ -41,13 +41,13 @@ def clipped_shares(record: ReadableSensor) -> dict[str, float]:
     blocks = record.blocks
     begins = np.concatenate([[0], np.cumsum(blocks["n_samples"])])[:-1]
     flags = blocks["flags"][np.searchsorted(begins, which, side="right") - 1]
-    counts = counts[(flags & int(BlockFlag.CLIPPED)) == 0]
-    if len(counts) == 0:
-        return {}
+    used = np.repeat((flags & int(BlockFlag.CLIPPED))[:, None] == 0, counts.shape[1], axis=1)
+    for column, begin, end in record.absent:
+        used[(which >= begin) & (which < end), column] = False
     shares = {
-        channel.name: _share(counts[:, column])
+        channel.name: _share(counts[used[:, column], column])
         for column, channel in enumerate(record.channels)
-        if not channel.auxiliary
+        if not channel.auxiliary and used[:, column].any()
     }
     return {name: share for name, share in shares.items() if share}
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from daq.clocks.aligned_recording import AlignedRecording
 from daq.clocks.growing_rows import GrowingRows
+from daq.estimation.segments.channel_sets import ChannelSets
 from daq.estimation.segments.clipping import in_clipped_blocks
 from daq.estimation.segments.delay_measurement import DelayMeasurement
 from daq.estimation.segments.flatline import FlatlineDetector, stands_still
@@ -224,6 +225,9 @@ class Pass:
         self._bridge: GapBridge | None = None
         if wanted.bridge > 0 and self._undisturbed is None and self.octaves is None:
             self._bridge = GapBridge(self.welch, self.n_channels, most=wanted.bridge)
+        self.sets: ChannelSets | None = None
+        if self._undisturbed is None and self.octaves is None:
+            self.sets = ChannelSets(self.welch, short=wanted.bridge)
         self.n_seen = self._n_taken = 0
         self._fed = 0  # grid samples that the octaves have had
         self.left_out: Counter[Reason] = Counter()
@@ -267,8 +271,9 @@ class Pass:
 
     @property
     def n_bridged(self) -> int:
-        """Segments that count though they have gaps: none where half of all have none."""
-        if self._bridge is None or 2 * self._n_taken >= self.n_seen:
+        """Segments that count though they have gaps: none where half of all need not."""
+        partial = 0 if self.sets is None else self.sets.n_segments
+        if self._bridge is None or 2 * (self._n_taken + partial) >= self.n_seen:
             return 0
         return self._bridge.spectra.n_segments
 
@@ -393,14 +398,20 @@ class Pass:
         length = n_hops - self.welch.hop + self.welch.segment_length + 2 * reach
         samples, valid = source.read(begin, begin + length)
         usable = valid & self._finite(samples)
+        present: BoolArray | None = None
+        if not usable.all():
+            present = np.isfinite(samples)
+            samples = np.where(present, samples, 0.0)
         self._silence(samples)
         clipped = self._clipped(begin, len(samples))
         raw, flat = samples[reach : reach + n_hops], usable[reach : reach + n_hops]
         if filters is not None:
-            samples = filters.apply(np.where(usable[:, None], samples, 0.0))
+            samples = filters.apply(samples)
             usable = surrounded(usable, reach)
+            if present is not None:
+                present = np.column_stack([surrounded(column, reach) for column in present.T])
             clipped = None if clipped is None else ~surrounded(~clipped, reach)
-        return _Samples(samples, usable, clipped, raw, flat)
+        return _Samples(samples, usable, present, clipped, raw, flat)
 
     def _survey(self) -> None:
         """Set free clocks from a few segments, before all are taken.
@@ -485,8 +496,11 @@ class Pass:
         self._n_taken += len(starts)
         self._taken_at.add(self._positions(np.arange(first, first + count)))
         self._delays.measure(samples, starts, begin + reach + starts, together=together)
-        if self._bridge is not None and not whole.all():
-            touched = np.flatnonzero(~whole) * hop
+        touched = np.flatnonzero(~whole) * hop
+        if self.sets is not None and part.present is not None and len(touched):
+            taken = self.sets.take(samples, part.present, clipped, touched)
+            touched = np.setdiff1d(touched, taken)
+        if self._bridge is not None and len(touched):
             taken = self._bridge.take(samples, usable, clipped, touched)
             begins = begin + reach + taken
             self._delays.measure_with_gaps(
@@ -613,6 +627,8 @@ class _Samples:
 
     samples: FloatArray
     usable: NDArray[np.bool_]
+    present: NDArray[np.bool_] | None
+    """Which channel has each sample, shape (n_samples, n_channels); None where all have all."""
     clipped: NDArray[np.bool_] | None
     raw: FloatArray
     raw_usable: NDArray[np.bool_]

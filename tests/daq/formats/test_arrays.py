@@ -62,15 +62,17 @@ def test_lists_of_numbers_are_arrays() -> None:
     np.testing.assert_array_equal(recording.sensors[0].counts(), [[1, 2], [3, 4]])
 
 
-def test_samples_that_are_masked_or_not_finite_are_gaps() -> None:
+def test_rows_that_are_masked_are_gaps_and_numbers_that_are_not_finite_absent() -> None:
     given = samples()
     given[3, 1] = np.nan
     given[7, 0] = np.inf
     mask = np.zeros_like(given, dtype=bool)
     mask[5] = True
     recording = recording_of_arrays({"A": np.ma.MaskedArray(given, mask)}, RATE)
-    assert recording.sensors[0].gaps["first_sample"].tolist() == [3, 5, 7]
-    assert recording.sensors[0].n_samples == N - 3
+    assert recording.sensors[0].gaps["first_sample"].tolist() == [5]
+    counts = recording.sensors[0].counts()
+    assert np.argwhere(np.isnan(counts)).tolist() == [[3, 1], [6, 0]]
+    assert recording.sensors[0].n_samples == N - 1
 
 
 def test_labels_of_a_data_array_are_taken() -> None:
@@ -114,8 +116,10 @@ def test_a_sensor_can_be_a_stream_a_trace_or_a_list_of_traces() -> None:
     )
     assert [len(sensor.channels) for sensor in recording.sensors] == [2, 1, 2, 2, 2]
     assert [len(sensor.gaps) for sensor in recording.sensors][:3] == [0, 0, 0]
-    assert recording.sensors[3].n_samples == N - n_masked
-    assert recording.sensors[4].gaps["first_sample"].tolist() == [17]
+    absent = [sensor.absent.tolist() for sensor in recording.sensors]
+    assert {column for column, _, _ in absent[3]} == {0}
+    assert sum(end - begin for _, begin, end in absent[3]) == n_masked
+    assert (absent[:3], absent[4]) == ([[], [], []], [[1, 17, 18]])
     named = recording_of_arrays({"A": given}, channels="XY")
     assert [channel.name for channel in named.sensors[0].channels] == ["X", "Y"]
 

@@ -91,10 +91,9 @@ def test_dialects_give_the_same_samples(tmp_path: Path, text: str, unit: str, da
     np.testing.assert_array_equal(first.counts[:1], [[0.5, -1.25]])
     last = sensor.stretches[-1]
     if text == GERMAN:  # an empty cell
-        assert [s.n_samples for s in sensor.stretches] == [1, 1]
-        np.testing.assert_array_equal(last.counts, [[1, 2.5]])
+        np.testing.assert_array_equal(last.counts, [[0.5, -1.25], [0.75, np.nan], [1, 2.5]])
     elif text == CAMPBELL:
-        assert [s.n_samples for s in sensor.stretches] == [2]
+        np.testing.assert_array_equal(last.counts, [[0.5, -1.25], [0.75, 2], [1, np.nan]])
     else:
         np.testing.assert_array_equal(last.counts, [[0.5, -1.25], [0.75, 2], [1, 2.5]])
 

@@ -100,7 +100,7 @@ def test_sensors_that_begin_apart_and_at_other_rates_are_brought_onto_one_grid(
 
 def test_rows_are_read_across_gaps() -> None:
     counts = np.arange(24.0).reshape(12, 2)
-    counts[[3, 8], 0] = np.nan
+    counts[[3, 8]] = np.nan
     stretches = finite_stretches(counts, start_utc_ns=0, sampling_rate=10.0)
     sensor = SensorInMemory(ForeignSensor("A", ("X", "Y"), 10.0, stretches, "arrays"), ())
     whole = counts[np.isfinite(counts).all(axis=1)]

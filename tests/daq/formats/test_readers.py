@@ -68,7 +68,7 @@ def test_miniseed_sensor_is_network_station_location_and_times_are_exact(tmp_pat
     np.testing.assert_array_equal(stretch.counts, np.stack([x, y], axis=1))
 
 
-def test_miniseed_a_gap_in_one_channel_is_a_gap_of_the_sensor(tmp_path: Path) -> None:
+def test_miniseed_channels_are_absent_where_others_have_samples(tmp_path: Path) -> None:
     x, y = counts(1000, 1), counts(1000, 2)
     step = 5_000_000
     path = write_mseed(
@@ -80,20 +80,22 @@ def test_miniseed_a_gap_in_one_channel_is_a_gap_of_the_sensor(tmp_path: Path) ->
         ],
     )
     (sensor,) = read_waveforms([path])
-    first, second = sensor.stretches
-    assert first.start_utc_ns == START_NS + 10 * step
-    np.testing.assert_array_equal(first.counts, np.stack([x, y], axis=1)[10:400])
-    assert sensor.first_samples() == [0, 440]
-    np.testing.assert_array_equal(second.counts, np.stack([x, y], axis=1)[450:])
+    assert sensor.stretches[0].start_utc_ns == START_NS
+    assert sensor.first_samples() == [0, 400, 450]
+    assert sensor.absent.tolist() == [[1, 0, 10], [0, 400, 450]]
+    found = np.concatenate([stretch.counts[:] for stretch in sensor.stretches])
+    x[400:450] = y[:10] = 0
+    np.testing.assert_array_equal(found, np.stack([x, y], axis=1))
 
 
-def test_miniseed_channels_without_samples_in_common_are_refused(tmp_path: Path) -> None:
+def test_miniseed_channels_need_no_samples_in_common(tmp_path: Path) -> None:
     pieces = [
         ("00", "HNX", START_NS, counts(100)),
         ("00", "HNY", START_NS + 10_000_000_000, counts(100)),
     ]
-    with pytest.raises(ImportFormatError, match="no samples in common"):
-        read_waveforms([write_mseed(tmp_path / "a.mseed", pieces)])
+    (sensor,) = read_waveforms([write_mseed(tmp_path / "a.mseed", pieces)])
+    assert sensor.first_samples() == [0, 2000]
+    assert sensor.absent.tolist() == [[1, 0, 100], [0, 100, 200]]
 
 
 def test_miniseed_overlap_with_other_samples_is_refused(tmp_path: Path) -> None:
@@ -148,7 +150,7 @@ def test_npz_one_array_a_sensor(tmp_path: Path) -> None:
 
 def test_npz_rows_that_are_not_numbers_are_gaps(tmp_path: Path) -> None:
     values = np.arange(20.0).reshape(10, 2)
-    values[4, 1] = np.nan
+    values[4] = np.nan
     np.savez(tmp_path / "a.npz", sampling_rate=2.0, A=values)
     (sensor,) = read_npz(tmp_path / "a.npz")
     assert [s.n_samples for s in sensor.stretches] == [4, 5]
@@ -226,14 +228,15 @@ def test_delimited_times_since_1970_keep_their_last_decimal(tmp_path: Path) -> N
     assert sensor.stretches[0].start_utc_ns == 1_700_000_000_123_456_789
 
 
-def test_delimited_written_times_and_missing_cells_make_gaps(tmp_path: Path) -> None:
+def test_delimited_missing_rows_make_gaps_and_missing_cells_none(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     rows = [f"2026-11-21T03:00:{s:02d}Z,{s},{'' if s == 4 else s}" for s in range(10) if s != 7]
     path.write_text("time,A.X,A.Y\n" + "\n".join(rows) + "\n")
     (sensor,) = read_delimited(path)
     assert sensor.sampling_rate == 1.0
-    assert sensor.first_samples() == [0, 5, 8]
-    assert [s.n_samples for s in sensor.stretches] == [4, 2, 2]
+    assert sensor.first_samples() == [0, 8]
+    assert [s.n_samples for s in sensor.stretches] == [7, 2]
+    assert np.argwhere(np.isnan(sensor.stretches[0].counts[:])).tolist() == [[4, 1]]
 
 
 def test_delimited_a_clock_that_is_off_keeps_its_rate(tmp_path: Path) -> None:

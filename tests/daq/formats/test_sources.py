@@ -247,8 +247,9 @@ def test_channels_sampled_between_each_other_are_resampled() -> None:
     found = whole(stretch)
     np.testing.assert_array_equal(found[:, 0], wave(rows))
     for column in (1, 2):  # the interpolation errs by less than -100 dB below 0.45 of the rate
-        assert np.max(np.abs(found[:, column] - wave(rows))) < 1.5e-5
-    assert stretch.n_samples > 3900
+        known = np.isfinite(found[:, column])
+        assert np.max(np.abs(found[known, column] - wave(rows[known]))) < 1.5e-5
+        assert np.count_nonzero(known) > 3900
 
 
 def test_a_span_of_time_is_cut_to_the_sample(tmp_path: Path) -> None:

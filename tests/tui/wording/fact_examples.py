@@ -48,6 +48,7 @@ EXAMPLES: tuple[Fact, ...] = (
     facts.SamplesMissing(rank=Rank.TO_KNOW, sensors=A, n_gaps=2, n_samples=40),
     facts.SegmentsExcluded(rank=Rank.TO_KNOW, n_segments=3, reasons={Reason.CLIPPED: 3}),
     facts.GapsBridged(rank=Rank.TO_KNOW, n_segments=4, lost=0.02, leakage=0.01),
+    facts.ChannelsAbsent(rank=Rank.TO_KNOW, channels=("A.X",), n_segments=(40,), most=60),
     facts.OctaveSegments(
         rank=Rank.TO_KNOW, longest=80.0, n_effective=12.0, below=1.0, only_one=False
     ),

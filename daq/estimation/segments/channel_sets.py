@@ -1,0 +1,68 @@
+"""Segments in which some channels have no samples: sums for each set of channels that have.
+
+A matrix of averages whose elements rest on different segments is that of no motion: where motion
+changes, common motion no longer cancels. So every set of channels has averages of its own, each
+channel's noise is estimated in every set that holds it, and the estimates are combined
+(`estimator.self_noise.result.combined`).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.spectra.welch import CrossSpectra, WelchSettings
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    FloatArray = NDArray[np.float64]
+    BoolArray = NDArray[np.bool_]
+    IntArray = NDArray[np.int64]
+
+MOST_SETS = 16
+
+
+class ChannelSets:
+    """Cross-spectra by the columns of the channels that have all samples of a segment.
+
+    Parameters
+    ----------
+    welch : WelchSettings
+    short : float
+        Share of a segment up to which missing samples are a short gap, and no concern here.
+    """
+
+    def __init__(self, welch: WelchSettings, *, short: float) -> None:
+        self._welch, self._short = welch, short
+        self.spectra: dict[tuple[int, ...], CrossSpectra] = {}
+
+    @property
+    def n_segments(self) -> int:
+        """Segments taken."""
+        return sum(each.n_segments for each in self.spectra.values())
+
+    def take(
+        self, samples: FloatArray, present: BoolArray, clipped: BoolArray | None, starts: IntArray
+    ) -> IntArray:
+        """Take the segments at `starts` that some channels have whole; return which.
+
+        `present` has the shape of `samples`. The first `MOST_SETS` sets of channels count.
+        """
+        groups: dict[tuple[int, ...], list[int]] = {}
+        for start in starts.tolist():
+            span = slice(start, start + self._welch.segment_length)
+            if clipped is not None and clipped[span].any():
+                continue
+            here = present[span]
+            if np.mean(~here.all(axis=1)) > self._short:
+                columns = tuple(np.flatnonzero(here.all(axis=0)).tolist())
+                if columns and (columns in self.spectra or len(self.spectra) < MOST_SETS):
+                    groups.setdefault(columns, []).append(start)
+                    self.spectra.setdefault(
+                        columns, CrossSpectra(self._welch, len(columns), threads=1)
+                    )
+        for columns, at in groups.items():
+            self.spectra[columns].add(np.ascontiguousarray(samples[:, columns]), np.array(at))
+        return np.sort(np.array([start for at in groups.values() for start in at], np.int64))

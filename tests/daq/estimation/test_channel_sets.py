@@ -1,0 +1,192 @@
+"""Channels without samples for a while: the others count, and intervals hold the true noise."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import h5py
+import numpy as np
+import pytest
+
+import huddle
+from daq.errors import NotARecordingError
+from daq.estimation.estimation import estimate
+from daq.estimation.segments.clipping import clipped_shares
+from daq.estimation.settings import Settings
+from daq.formats.arrays import recording_of_arrays
+from daq.formats.importer import import_files
+from daq.recording.reader import Recording
+from estimator.levels.pooled import blocks_of
+from estimator.self_noise.result import Flag, SelfNoise, combined
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from daq.estimation.snapshot import Snapshot
+
+RATE, PART, N_PARTS = 20.0, 4000, 4
+NOISE = 3.0
+SETTINGS = Settings(segment=2.0, methods=("three-sensor",))
+LOUDER = (1.0, 30.0, 2.0, 300.0)
+"""Motion by part: averages of different parts do not fit together."""
+
+
+def sensors(names: str, lacking: dict[str, list[int]], seed: int) -> dict[str, NDArray[np.float64]]:
+    """Return triaxial sensors of one motion, each with NaN in parts that a channel lacks."""
+    random = np.random.default_rng(seed)
+    n = N_PARTS * PART
+    motion = random.standard_normal((n, 3)) * np.repeat(LOUDER, PART)[:, None]
+    found = {}
+    for number, name in enumerate(names):
+        turned, _ = np.linalg.qr(np.eye(3) + 0.1 * number * random.standard_normal((3, 3)))
+        samples = motion @ turned + NOISE * random.standard_normal((n, 3))
+        for column in range(3):
+            for part in lacking.get(f"{name}{column}", []):
+                samples[part * PART : (part + 1) * PART, column] = np.nan
+        found[name] = samples
+    return found
+
+
+def estimated(names: str, lacking: dict[str, list[int]], seed: int = 1) -> Snapshot:
+    arrays = sensors(names, lacking, seed)
+    return estimate([recording_of_arrays(arrays, RATE)], SETTINGS)
+
+
+def deviations(snapshot: Snapshot) -> NDArray[np.float64]:
+    """Return by how many standard deviations the mean of all frequencies is off."""
+    noise = snapshot.results["three-sensor"]
+    inner = slice(2, -2)
+    truth = 2 * NOISE**2 / RATE
+    independent = len(noise.noise_psd[inner]) / 1.9  # neighbours under a Hann window
+    spread = np.sqrt(noise.cumulants[0][inner].mean(axis=0) / independent)
+    return np.asarray((noise.noise_psd[inner].mean(axis=0) - truth) / spread)
+
+
+DAYS = {"A2": [1], "B0": [2, 3], "C1": [0]}
+NEVER_TOGETHER = {"A2": [0, 1], "B0": [2, 3]}
+WHOLE_SENSORS = {"A0": [1], "A1": [1], "A2": [1], "B0": [2], "B1": [2], "B2": [2]}
+
+
+@pytest.mark.parametrize(
+    ("names", "lacking"), [("ABC", DAYS), ("ABC", NEVER_TOGETHER), ("ABCD", WHOLE_SENSORS)]
+)
+def test_noise_is_right_where_channels_lack_samples(
+    names: str, lacking: dict[str, list[int]]
+) -> None:
+    snapshot = estimated(names, lacking)
+    off = deviations(snapshot)
+    assert np.isfinite(off).all()
+    assert np.abs(off).max() < 4
+    assert np.sqrt(np.mean(off**2)) < 1.7  # 12 values at most
+    expected = [
+        N_PARTS - len(lacking.get(f"{name}{column}", [])) for name in names for column in range(3)
+    ]
+    per_part = PART / RATE / SETTINGS.segment * 2
+    np.testing.assert_allclose(
+        snapshot.channel_segments, np.array(expected) * per_part, atol=N_PARTS
+    )
+    assert snapshot.n_dropped < 2 * N_PARTS
+
+
+def test_a_part_without_any_channel_missing_gives_the_same_as_alone() -> None:
+    whole = sensors("ABC", {}, 1)
+    cut = {name: samples[: 2 * PART].copy() for name, samples in whole.items()}
+    alone = estimate([recording_of_arrays(cut, RATE)], SETTINGS)
+    assert alone.channel_segments == ()
+    whole["A"][2 * PART :] = np.nan  # two sensors give no result by this method
+    lost = estimate([recording_of_arrays(whole, RATE)], SETTINGS)
+    np.testing.assert_array_equal(lost.csm, alone.csm)
+    for one, other in zip(lost.results.values(), alone.results.values(), strict=True):
+        np.testing.assert_array_equal(one.noise_psd, other.noise_psd)
+    assert lost.channel_segments == ()
+
+
+def test_short_holes_in_a_channel_are_gaps_as_before() -> None:
+    given = sensors("ABC", {}, 1)
+    given["B"][::400, 1] = np.nan
+    snapshot = estimate([recording_of_arrays(given, RATE)], SETTINGS)
+    assert snapshot.channel_segments == ()
+    assert snapshot.left_out  # those with holes
+
+
+def imported(tmp_path: Path, lacking: dict[str, list[int]]) -> Path:
+    arrays = {name: np.rint(each * 50) for name, each in sensors("ABC", lacking, 2).items()}
+    source, out = tmp_path / "given.npz", tmp_path / "given.h5"
+    start = {"start_time": "2026-11-25T00:00:00"}
+    np.savez(source, sampling_rate=RATE, **arrays, **start)  # type: ignore[arg-type]
+    import_files([source], out)
+    return out
+
+
+def test_a_recording_says_where_channels_have_no_samples(tmp_path: Path) -> None:
+    path = imported(tmp_path, DAYS)
+    with h5py.File(path) as file:
+        assert file.attrs["format_version"] == 3
+        absent = file["sensors/B/samples"].attrs["absent"]
+        np.testing.assert_array_equal(absent, [[0, 2 * PART, 4 * PART]])
+    with Recording.open(path) as recording:
+        assert clipped_shares(recording.sensor("B")) == {}
+    opened = huddle.open(path)
+    samples = opened.samples("B")
+    assert np.isnan(samples[2 * PART :, 0]).all()
+    assert np.isfinite(samples[:, 1:]).all()
+    result = huddle.estimate(path, segment=2.0)
+    read = huddle.read(tmp_path / "given.npz")
+    np.testing.assert_array_equal(huddle.self_noise(read, segment=2.0).noise_psd, result.noise_psd)
+    (fact,) = [each for each in result.facts if each.fact.name == "channels-absent"]
+    assert len(fact.fact.channels) == 3
+    (tmp_path / "all").mkdir()
+    complete = imported(tmp_path / "all", {})
+    with h5py.File(complete) as file:
+        assert file.attrs["format_version"] == 2
+        assert "absent" not in file["sensors/B/samples"].attrs
+
+
+def test_rows_absent_from_other_columns_are_refused(tmp_path: Path) -> None:
+    path = imported(tmp_path, DAYS)
+    with h5py.File(path, "r+") as file:
+        file["sensors/B/samples"].attrs["absent"] = np.array([[3, 0, 10]])
+    with pytest.raises(NotARecordingError, match="absent of other columns"):
+        Recording.open(path)
+
+
+def test_exported_channels_have_no_samples_where_they_are_absent(tmp_path: Path) -> None:
+    obspy = pytest.importorskip("obspy", reason="ObsPy is an extra")
+    path = imported(tmp_path, DAYS)
+    huddle.export(path, tmp_path / "out.mseed")
+    stream = obspy.read(str(tmp_path / "out.mseed"), format="MSEED").merge()
+    lengths = [[0] * 3 for _ in "ABC"]
+    for trace in stream:
+        lengths["ABC".index(trace.stats.station)]["123".find(trace.stats.channel[-1])] += int(
+            np.ma.count(trace.data)
+        )
+    lacking = sum(map(len, DAYS.values()))
+    assert sum(map(sum, lengths)) == (9 * N_PARTS - lacking) * PART
+
+
+def test_estimates_combine_by_their_precision() -> None:
+    random = np.random.default_rng(4)
+    n_freqs, truth = 480, 2.0
+    blocks = blocks_of(np.linspace(0, 50, n_freqs))
+
+    def part(n: int) -> SelfNoise:
+        psd = truth * random.gamma(n, 1 / n, (n_freqs, 1))
+        cumulants = np.stack([psd**2 / n, 2 * psd**3 / n**2, 6 * psd**4 / n**3])
+        return SelfNoise.of("three-sensor", psd, cumulants, np.zeros((n_freqs, 1), np.int64))
+
+    parts = [part(40), part(160)]
+    parts[1].noise_psd[:48] = np.nan
+    whole = combined(parts, blocks)
+    np.testing.assert_array_equal(whole.noise_psd[:48], parts[0].noise_psd[:48])
+    rest = whole.noise_psd[48:]
+    assert rest.mean() == pytest.approx(truth, abs=4 * truth / np.sqrt(200 * len(rest)))
+    assert rest.std() == pytest.approx(truth / np.sqrt(200), rel=0.15)
+    assert whole.cumulants[0, 48:].mean() == pytest.approx(truth**2 / 200, rel=0.1)
+    assert combined(parts[:1], blocks) is parts[0]
+    parts[0].noise_psd[:48] = np.nan
+    parts[0].flags[:48] = int(Flag.SINGULAR)
+    nowhere = combined(parts, blocks)
+    assert np.isnan(nowhere.noise_psd[:48]).all()
+    assert (nowhere.flags[:48] == int(Flag.SINGULAR)).all()
