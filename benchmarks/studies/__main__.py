@@ -1,8 +1,4 @@
-"""``python -m benchmarks.studies [STUDY…]``: studies beside theory or truth, with their figures.
-
-``python -m benchmarks.studies public FOLDER…`` takes folders with waveforms and responses of public
-huddle tests.
-"""
+"""``python -m benchmarks.studies [STUDY…]``: studies beside theory or truth, with their figures."""
 
 from __future__ import annotations
 
@@ -14,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from benchmarks.studies import public
 from benchmarks.studies.clocks import clock_coverage, clocks
 from benchmarks.studies.estimates import ESTIMATES
 from benchmarks.studies.gradients import gradients
@@ -61,8 +56,6 @@ def main(arguments: Sequence[str]) -> int:
     given = parser.parse_args(arguments)
     to = {"out": given.out, "json": given.json}
     try:
-        if given.studies[:1] == [public.PUBLIC]:
-            return int(not public.run(given.studies[1:], **to))
         return int(not run(given.studies, length=given.length, studies=further, **to))
     except (HuddleError, ScenarioError, typer.BadParameter) as error:
         parser.error(str(error))

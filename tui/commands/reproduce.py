@@ -13,14 +13,19 @@ from tui.commands.options import JsonOption, examples, with_logging
 from tui.output.exit_codes import ExitCode
 
 
-@examples("huddle reproduce fig4 fig9", "huddle reproduce all --out figures --json points.json")
+@examples(
+    "huddle reproduce fig4 fig9",
+    "huddle reproduce all --out figures --json points.json",
+    "huddle reproduce public FOLDER",
+)
 @with_logging
 def reproduce(
     studies: Annotated[
         list[str] | None,
         typer.Argument(
             metavar="STUDY",
-            help="fig4, fig5, fig9, fig12, fig13, setup1, setup2, fig14, waves (default: all).",
+            help="fig4, fig5, fig9, fig12, fig13, setup1, setup2, fig14, waves (default: all);"
+            " or public, with the FOLDER of each public huddle test after it.",
         ),
     ] = None,
     *,
@@ -37,8 +42,18 @@ def reproduce(
     Recordings are simulated at the length of the paper, three and ten hours.
     All together take a few minutes. The exit code is 1 if a point deviates
     from theory by more than its statistical error.
-    """
-    from tui.studies.reproduce import run
 
-    if not run(studies or (), out=out, json=json):
+    "public" estimates public huddle tests by every method, beside a bound
+    that needs no model: what all other sensors cannot predict of a channel.
+    A folder holds the waveforms of a test, and their responses if there are
+    any. The exit code is 1 if an estimate contradicts the bound.
+    """
+    from tui.studies import public
+    from tui.studies.reproduce import DEFAULT_FOLDER, run
+
+    if studies and studies[0] == public.PUBLIC:
+        agrees = public.run(studies[1:], out=out or DEFAULT_FOLDER, json=json)
+    else:
+        agrees = run(studies or (), out=out, json=json)
+    if not agrees:
         raise typer.Exit(ExitCode.LIMIT_NOT_MET)

@@ -56,18 +56,6 @@ def test_overlap_is_a_choice_of_files_or_a_number_for_segments(tmp_path: Path) -
     assert run(files[0], "--start", "2026-11-21", "--end", "2026-11-20") == ExitCode.USAGE
 
 
-def test_samples_that_only_some_channels_have_are_said(tmp_path: Path) -> None:
-    """A day file of one channel is lost: its hour is lost for all, and not in silence."""
-    later = START + 600 * STEP
-    for channel in ("HHZ", "HHN"):
-        write_records(tmp_path / "a", counts(600, 1), channel=channel)
-    write_records(tmp_path / "a", counts(1400, 2), start=later)
-    arguments = ["import", str(tmp_path / "a"), "-o", str(tmp_path / "a.h5")]
-    found = CliRunner().invoke(app, arguments)
-    assert found.exit_code == ExitCode.DONE
-    assert "not imported: 14 s of HHZ: other channels of XX.ABC.00 have no" in found.stdout
-
-
 def test_of_one_sensor_at_two_rates_the_higher_is_imported(tmp_path: Path) -> None:
     for channel, step in (("HHZ", 1), ("BHZ", 5), ("HHN", 1), ("LDO", 100)):
         samples = counts(1000 // step, step)
@@ -82,3 +70,17 @@ def test_of_one_sensor_at_two_rates_the_higher_is_imported(tmp_path: Path) -> No
         (sensor,) = recording.sensors
         assert [channel.name for channel in sensor.channels] == ["HHN", "HHZ"]
         assert (sensor.sampling_rate, sensor.n_samples) == (100.0, 1000)
+
+
+def test_what_single_channels_lack_is_printed(tmp_path: Path) -> None:
+    write_records(tmp_path / "a", counts(600, 1), channel="HHZ")
+    write_records(tmp_path / "b", counts(200, 2), channel="HHN", start=START + 100 * STEP)
+    write_records(tmp_path / "c", counts(100, 3), channel="HHN", start=START + 500 * STEP)
+    sources = [str(tmp_path / each) for each in "abc"]
+    found = CliRunner().invoke(app, ["import", *sources, "-o", str(tmp_path / "a.h5")])
+    assert found.exit_code == ExitCode.DONE
+    assert "missing where other channels have samples: HHN 3s in 2 pieces" in found.stdout
+    with Recording.open(tmp_path / "a.h5") as recording:
+        (sensor,) = recording.sensors
+        assert sensor.n_samples == 600
+        assert sensor.absent.tolist() == [[0, 0, 100], [0, 300, 500]]

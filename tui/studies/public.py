@@ -1,4 +1,4 @@
-"""``python -m benchmarks.studies public FOLDER…``: every method beside a bound.
+"""``huddle reproduce public FOLDER…``: every method beside a bound, from public huddle tests.
 
 The bound needs no model of the motion: what all other sensors together cannot predict of a channel.
 Noise is below it, whatever the dimension of the motion, the gains and the orientations. It is

@@ -1,4 +1,4 @@
-"""``python -m benchmarks.studies public``: the bound, beside estimates whose truth is known."""
+"""``huddle reproduce public``: the bound, beside estimates whose truth is known."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from benchmarks.studies.__main__ import main
-from benchmarks.studies.public import BOUND, levels, model_free_bound
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
+from tui.commands.main import app
+from tui.output.exit_codes import ExitCode
+from tui.studies.public import BOUND, levels, model_free_bound
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -68,18 +70,15 @@ def test_what_a_model_of_too_few_dimensions_says_contradicts_the_bound() -> None
     assert not any(each.contradicts for each in levels("b", estimate([one], settings), settings))
 
 
-def test_a_folder_of_counts_without_responses(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_of_counts_without_responses(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     folder = tmp_path / "own"
     folder.mkdir()
     np.savez(folder / "a.npz", sampling_rate=RATE, **verticals(4, 1, 20_000)[0])  # type: ignore[arg-type]  # arrays
-    out = str(tmp_path / "out")
-    assert main(["public", str(folder), "--out", out]) == 0
-    found = capsys.readouterr()
-    assert "dB re 1 (counts)²/Hz" in found.out
-    assert re.search(r"^0 of \d+ levels", found.out, re.MULTILINE)
+    found = CliRunner().invoke(app, ["reproduce", "public", str(folder), "-o", str(tmp_path / "o")])
+    assert found.exit_code == 0
+    assert "dB re 1 (counts)²/Hz" in found.stdout
+    assert re.search(r"^0 of \d+ levels", found.stdout, re.MULTILINE)
 
 
 @pytest.mark.long
@@ -88,8 +87,9 @@ def test_folders_of_public_tests(tmp_path: Path, usgs_recording: Path) -> None:
     pytest.importorskip("obspy")
     shutil.copytree(usgs_recording, tmp_path / "usgs")
     (tmp_path / "usgs" / "README.txt").write_text("no waveform")
-    arguments = ["public", str(tmp_path / "usgs"), "--out", str(tmp_path / "out")]
-    assert main([*arguments, "--json", str(tmp_path / "a.json")]) == 1  # methods of one dimension
+    arguments = ["reproduce", "public", str(tmp_path / "usgs"), "--out", str(tmp_path / "out")]
+    found = CliRunner().invoke(app, [*arguments, "--json", str(tmp_path / "a.json")])
+    assert found.exit_code == ExitCode.LIMIT_NOT_MET  # methods of one dimension
     document = json.loads((tmp_path / "a.json").read_text(encoding="utf-8"))
     levels_found = document["levels"]
     assert {each["unit"] for each in levels_found} == {"m/s²"}
@@ -105,9 +105,10 @@ def test_folders_of_public_tests(tmp_path: Path, usgs_recording: Path) -> None:
     assert (tmp_path / "out" / "public-1.png").stat().st_size > 10_000
 
 
-def test_a_folder_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["public"])
-    assert ended.value.code == 2
-    assert main(["public", str(tmp_path / "none"), "--out", str(tmp_path / "out")]) == 1
-    assert "expected a folder of waveforms" in " ".join(capsys.readouterr().err.split())
+def test_a_folder_is_asked_for(tmp_path: Path) -> None:
+    assert CliRunner().invoke(app, ["reproduce", "public"]).exit_code == ExitCode.USAGE
+    found = CliRunner().invoke(
+        app, ["reproduce", "public", str(tmp_path / "none"), "--out", str(tmp_path / "out")]
+    )
+    assert found.exit_code == ExitCode.LIMIT_NOT_MET
+    assert "expected a folder of waveforms" in " ".join(found.stderr.split())
