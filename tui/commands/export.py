@@ -37,7 +37,7 @@ def export(
         typer.Option(
             "--format",
             metavar="FORMAT",
-            help="Samples: mseed. Curves: csv, parquet, netcdf, mat, npz, uff58.",
+            help="Samples: mseed. Curves: csv, parquet, netcdf, zarr, mat, npz, uff58.",
         ),
     ],
     out: Annotated[
@@ -55,7 +55,7 @@ def export(
 
     csv, parquet: a row for each method, channel and frequency.
 
-    netcdf: labelled arrays, for xarray.
+    netcdf, zarr: labelled arrays, for xarray.
 
     mat, npz: an array (n_frequencies, n_channels) of each curve.
 

@@ -1,4 +1,4 @@
-"""Curves and samples in files of other programs: tidy CSV, Parquet, netCDF, MAT, NumPy, UFF 58.
+"""Curves and samples in files of other programs: CSV, Parquet, netCDF, Zarr, MAT, NumPy, UFF 58.
 
 A tidy table has one row for each method, channel and frequency. All densities are one-sided, in
 unit²/Hz; the unit is in a column, an attribute or a variable of every file. What made the estimate
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -32,8 +33,8 @@ if TYPE_CHECKING:
     Said: TypeAlias = dict[str, str]
 
 MINISEED = "mseed"
-_COLUMNS = ("noise_psd", "noise_low", "noise_high", "cov")
-_FIELDS = ("noise_psd", "low", "high", "cov")
+_COLUMNS = ("noise_psd", "noise_low", "noise_high", "cov", "flags")
+_FIELDS = ("noise_psd", "low", "high", "cov", "flags")
 _PSD = 9
 _DOUBLE = 4
 _DIRECTIONS = {"X": 1, "Y": 2, "Z": 3, "E": 1, "N": 2, "1": 1, "2": 2, "3": 3}
@@ -59,7 +60,7 @@ def _rows(snapshot: Snapshot) -> Iterator[tuple[object, ...]]:
             values += [getattr(noise, field)[:, column] for field in _FIELDS]
             for row in np.stack(values, axis=1).tolist():
                 numbers = [None if value != value else value for value in row]  # noqa: PLR0124 - NaN
-                yield (method, label.sensor, label.channel, label.unit, *numbers)
+                yield (method, label.sensor, label.channel, label.unit, *numbers[:-1], int(row[-1]))
 
 
 def _parquet(snapshot: Snapshot, path: Path, said: Said) -> None:
@@ -78,15 +79,48 @@ def _netcdf(snapshot: Snapshot, path: Path, said: Said) -> None:
     to_xarray(snapshot, said).to_netcdf(path, engine="h5netcdf")
 
 
+def _zarr(snapshot: Snapshot, path: Path, said: Said) -> None:
+    _write_zarr(to_xarray(snapshot, said), path)
+
+
+def _write_zarr(dataset: xr.Dataset, path: Path) -> None:
+    load("zarr")
+    for name, coordinate in dataset.coords.items():
+        if coordinate.dtype.kind == "U":  # which no version of the format specifies at a length
+            dataset = dataset.assign_coords({name: coordinate.astype(object)})
+    dataset.to_zarr(path, mode="w", consolidated=True, zarr_format=2)
+
+
 def write_dataset(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
-    """Write a Dataset as netCDF; the file has its name when it is complete."""
-    load("h5netcdf")
+    """Write a Dataset as netCDF, or as Zarr by the suffix; complete when it has its name."""
     out = Path(path)
     part = out.with_name(f".{out.name}.part")
     try:
-        dataset.to_netcdf(part, engine="h5netcdf")
-        part.replace(out)
+        if out.suffix == ".zarr":
+            _write_zarr(dataset, part)
+        else:
+            load("h5netcdf")
+            dataset.to_netcdf(part, engine="h5netcdf")
+        _named(part, out)
     finally:
+        _removed(part)
+
+
+def _named(part: Path, path: Path) -> None:
+    """Give a file or folder its name; a Zarr folder of this name is replaced, and no other."""
+    if part.is_dir():
+        if (path / ".zgroup").is_file():
+            shutil.rmtree(path)
+    else:
+        with part.open("rb") as file:
+            os.fsync(file.fileno())
+    part.replace(path)
+
+
+def _removed(part: Path) -> None:
+    if part.is_dir():
+        shutil.rmtree(part)
+    else:
         part.unlink(missing_ok=True)
 
 
@@ -186,6 +220,7 @@ WRITERS: dict[str, tuple[str, Callable[[Snapshot, Path, Said], None]]] = {
     "csv": (".csv", _csv),
     "parquet": (".parquet", _parquet),
     "netcdf": (".nc", _netcdf),
+    "zarr": (".zarr", _zarr),
     "mat": (".mat", _mat),
     "npz": (".npz", _npz),
     "uff58": (".uff", _uff),
@@ -215,13 +250,11 @@ def write_curves(snapshot: Snapshot, kind: str, path: Path, said: Said) -> None:
     part = path.with_name(f".{path.name}.part")
     try:
         WRITERS[kind][1](snapshot, part, said)
-        with part.open("rb") as file:
-            os.fsync(file.fileno())
-        part.replace(path)
+        _named(part, path)
         if kind == "csv":
             _csv_metadata(path, said)
     finally:
-        part.unlink(missing_ok=True)
+        _removed(part)
 
 
 def write_samples(file: Path, out: Path) -> tuple[Exported, Path]:

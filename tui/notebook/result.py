@@ -435,11 +435,11 @@ class Result:
         return to_xarray(self.snapshot, said, self._recorded, matrix=True)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write what `to_xarray` returns to a netCDF file; `huddle.load` reads it.
+        """Write what `to_xarray` returns as netCDF, or as Zarr if the name ends in ``.zarr``.
 
         The attributes of the file have the SHA-256 of the recordings, too. A file that was there is
-        replaced when the new one is complete. Needs h5netcdf: ``pip install
-        'huddle-bench[notebook]'``.
+        replaced when the new one is complete. `huddle.load` reads it. Needs h5netcdf (``pip install
+        'huddle-bench[notebook]'``) or zarr (``'huddle-bench[zarr]'``).
         """
         from daq.results.sources import sources  # noqa: PLC0415 - seldom needed
         from tui.notebook.curve_files import write_dataset  # noqa: PLC0415

@@ -312,7 +312,7 @@ def noise_model(name: str, frequency: ArrayLike, *, unit: str = "m/s²") -> Floa
 
 
 def load(path: PathLike) -> xr.Dataset:
-    """Read what `Result.save` or ``huddle export --format netcdf`` wrote.
+    """Read what `Result.save` or ``huddle export``, as netCDF or Zarr, wrote.
 
     Parameters
     ----------
@@ -321,12 +321,12 @@ def load(path: PathLike) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        In memory; see `Result.to_xarray`. Needs xarray and h5netcdf.
+        In memory; see `Result.to_xarray`. Needs xarray, and h5netcdf or zarr.
 
     Raises
     ------
     OSError
-        The file is missing, or no netCDF file.
+        The file is missing, or neither netCDF nor Zarr.
 
     Examples
     --------
@@ -337,6 +337,7 @@ def load(path: PathLike) -> xr.Dataset:
     >>> huddle.load("noise.nc").noise_psd.attrs["units"]
     '(m s-2)2 Hz-1'
     """
-    package("h5netcdf")
-    found: xr.Dataset = package("xarray").load_dataset(path, engine="h5netcdf")
+    engine = "zarr" if Path(path).suffix == ".zarr" else "h5netcdf"
+    package(engine)
+    found: xr.Dataset = package("xarray").load_dataset(path, engine=engine)
     return found

@@ -25,6 +25,7 @@ _EXTRA = {
     "pyhanko": "sign",
     "starlette": "web",
     "uvicorn": "web",
+    "zarr": "zarr",
 }
 
 

@@ -18,6 +18,7 @@ from daq.results.clock_effect import relative_time
 from daq.results.facts import Fact, Finding
 from daq.results.sources import conditions
 from estimator.checks.advice import Advice
+from estimator.self_noise.result import Flag
 from tui.output.calibration import channels_of
 from tui.output.json_diagnostics import diagnostics_document, dimension_document, slip_document
 from tui.output.json_values import plain
@@ -133,6 +134,7 @@ def provenance(
         "time_coverage_end": _instant(start_ns + round(snapshot.elapsed * 1e9)),
         "confidence_of_intervals": "0.95",
         "simulated": str(snapshot.simulated).lower(),
+        "flags": json.dumps({str(flag.name).lower(): int(flag) for flag in Flag}),
         "settings": json.dumps(_settings(settings, snapshot), ensure_ascii=False),
         "recordings": json.dumps(recordings, ensure_ascii=False),
     }

@@ -18,6 +18,7 @@ import xarray as xr
 from scipy.io import loadmat
 from typer.testing import CliRunner
 
+import huddle
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.importer import import_files
@@ -30,6 +31,8 @@ from tui.commands.main import app
 from tui.output.exit_codes import ExitCode
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from typer.testing import Result
 
     from daq.estimation.snapshot import Snapshot
@@ -51,6 +54,14 @@ channels = [{{name = "X", sensitivity = 400.0}}, {{name = "Y", sensitivity = 500
 
 def run(*arguments: object) -> Result:
     return CliRunner().invoke(app, ["export", *map(str, arguments)])
+
+
+@pytest.fixture
+def zarr_threads() -> Iterator[None]:
+    """End the threads that zarr leaves running."""
+    sync = pytest.importorskip("zarr.core.sync")
+    yield
+    sync.cleanup_resources()
 
 
 @pytest.fixture(scope="module")
@@ -235,6 +246,8 @@ def test_tidy_csv(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
     assert {row["unit"] for row in rows} == {"m/s²"}
     found = [float(row["noise_psd"]) for row in rows if row["channel"] == "Y" and row["noise_psd"]]
     column = [(label.sensor, label.channel) for label in snapshot.channels].index(("rear", "Y"))
+    flags = [int(row["flags"]) for row in rows if row["channel"] == "Y"]
+    assert flags == snapshot.results[method].flags[:, column].tolist()
     expected = snapshot.results[method].noise_psd[:, column]
     np.testing.assert_array_equal(found, expected[np.isfinite(expected)])
 
@@ -248,6 +261,23 @@ def test_netcdf(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
         assert found["noise_psd"].attrs["units"] == "(m s-2)2 Hz-1"
 
 
+@pytest.mark.usefixtures("zarr_threads")
+def test_zarr(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
+    out = tmp_path / "a.zarr"
+    assert run(recording, "--format", "zarr", "-o", out).exit_code == ExitCode.DONE
+    found = huddle.load(out)
+    (method,) = snapshot.results
+    rear = found["noise_psd"].sel(estimate=method, trace="rear.X")
+    np.testing.assert_array_equal(rear, snapshot.results[method].noise_psd[:, 2])
+    np.testing.assert_array_equal(found["flags"][0].T, snapshot.results[method].flags)
+    assert found["noise_psd"].attrs["units"] == "(m s-2)2 Hz-1"
+    own = tmp_path / "mine.zarr"
+    (own / "thesis").mkdir(parents=True)
+    with pytest.raises(OSError, match="mine"):
+        huddle.estimate(recording).save(own)
+    assert [each.name for each in own.iterdir()] == ["thesis"]
+
+
 def test_mat_and_numpy(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
     for kind in ("mat", "npz"):
         out = tmp_path / f"a.{kind}"
@@ -259,6 +289,7 @@ def test_mat_and_numpy(recording: Path, snapshot: Snapshot, tmp_path: Path) -> N
         for name, expected in (
             ("data_psd", snapshot.data_psd),
             (f"{method.replace('-', '_')}_noise_low", snapshot.results[method].low),
+            (f"{method.replace('-', '_')}_flags", snapshot.results[method].flags),
         ):
             np.testing.assert_array_equal(numpy[name], expected)
             np.testing.assert_array_equal(matlab[name], expected)
@@ -300,11 +331,11 @@ def said_by_file(folder: Path, kind: str, path: Path) -> dict[str, str]:
         metadata = json.loads((folder / f"{path.name}-metadata.json").read_text(encoding="utf-8"))
         assert metadata["url"] == path.name
         return dict(metadata["notes"][0])
-    if kind == "netcdf":
-        with xr.open_dataset(path, engine="h5netcdf") as found:
+    if kind in ("netcdf", "zarr"):
+        with xr.open_dataset(path, engine="zarr" if kind == "zarr" else "h5netcdf") as found:
             assert found.attrs["Conventions"] == "CF-1.11"
             meanings = found["flags"].attrs["flag_meanings"].split()
-            masks = found["flags"].attrs["flag_masks"].tolist()
+            masks = np.asarray(found["flags"].attrs["flag_masks"]).tolist()
             assert dict(zip(meanings, masks, strict=True))["dead_channel"] == 4
             return dict(found.attrs)
     if kind == "mat":
@@ -318,7 +349,8 @@ def said_by_file(folder: Path, kind: str, path: Path) -> dict[str, str]:
     return {key.decode(): value.decode() for key, value in metadata.items()}
 
 
-@pytest.mark.parametrize("kind", ["csv", "netcdf", "mat", "npz", "parquet"])
+@pytest.mark.usefixtures("zarr_threads")
+@pytest.mark.parametrize("kind", ["csv", "netcdf", "zarr", "mat", "npz", "parquet"])
 def test_every_export_says_what_made_it(recording: Path, tmp_path: Path, kind: str) -> None:
     if kind == "parquet":
         pytest.importorskip("pyarrow", reason="pyarrow is large, and an extra")
@@ -334,3 +366,5 @@ def test_every_export_says_what_made_it(recording: Path, tmp_path: Path, kind: s
     assert said["time_coverage_start"] == "2026-11-21T03:00:00.000007000Z"
     assert said["time_coverage_end"].startswith("2026-11-21T03:01:20")
     assert said["confidence_of_intervals"] == "0.95"
+    assert json.loads(said["flags"])["dead_channel"] == 4
+    assert run(recording, "--format", kind, "-o", path).exit_code == ExitCode.DONE  # replaced
