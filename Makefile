@@ -10,7 +10,7 @@ SOURCES := huddle.py daq estimator sim_devices tui tests benchmarks docs example
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[fast,report]'
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[fast,formats,report]'
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed

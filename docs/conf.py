@@ -49,6 +49,24 @@ numpydoc_show_class_members = False
 numpydoc_class_members_toctree = False
 
 
+class Reference(SphinxDirective):
+    """A reference made of what the program declares: ``commands`` or ``bench_file``."""
+
+    required_arguments = 1
+    option_spec: ClassVar[dict[str, object]] = {}
+
+    def run(self) -> list[nodes.Node]:
+        """Make the Markdown, and the page of it."""
+        sys.path.insert(0, str(ROOT))
+        from docs import reference  # noqa: PLC0415 - needs the root on the path
+
+        make = {"commands": reference.commands, "bench_file": reference.bench_file}
+        found: list[nodes.Node] = self.parse_text_to_nodes(
+            make[self.arguments[0]](), allow_section_headings=True
+        )
+        return found
+
+
 class Example(SphinxDirective):
     """Shows a script of ``examples/``, its output and its figures."""
 
@@ -87,6 +105,7 @@ class Example(SphinxDirective):
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Register the directive."""
+    """Register the directives."""
     app.add_directive("example", Example)
+    app.add_directive("reference", Reference)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

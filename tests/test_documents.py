@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from daq.bench.model import Bench
+from docs.reference import bench_file, commands
 from tui.commands.help import COMMANDS, subcommand
 
 ROOT = Path(__file__).parents[1]
@@ -85,3 +87,38 @@ def test_commands_and_their_options_exist() -> None:
         }
         wrong += [f"{where}: huddle {word} {option}" for option in options if option not in known]
     assert wrong == []
+
+
+def test_the_reference_of_the_bench_file_explains_every_key() -> None:
+    text = bench_file()
+    keys = re.findall(r"^\| `(\w+)` \|.*\| (.*?) \|$", text, re.MULTILINE)
+    plain = {"name", "address", "email", "phone", "operator", "location", "model", "manufacturer"}
+    unexplained = {key for key, why in keys if not why.strip()} - plain
+    assert unexplained <= {"serial_number", "date"}
+    assert {*Bench.model_fields} - {"sensors", "estimate", "recording", "schedule"} <= {
+        *(key for key, _ in keys),
+        *re.findall(r"^## `\[+(\w+)\]+`", text, re.MULTILINE),
+    }
+    for table in ("[[sensors.channels]]", "[estimate]", "[[limits]]", "[[schedule]]", "[storage]"):
+        assert f"## `{table}`" in text
+    assert "| `segment` |" in text
+    assert re.search(r"^\| `keep_for` \| duration", text, re.MULTILINE)
+
+
+def test_the_reference_of_commands_has_every_command_and_option() -> None:
+    text = commands()
+    assert "\x1b" not in text
+    for name in COMMANDS:
+        section = text.partition(f"### huddle {name}\n")[2].partition("\n### ")[0]
+        for parameter in subcommand(name).params:
+            flags = [flag for flag in parameter.opts if flag.startswith("--")]
+            assert getattr(parameter, "hidden", False) or all(flag in section for flag in flags)
+
+
+def test_twenty_questions_are_answered_by_pages() -> None:
+    text = (ROOT / "docs" / "questions.md").read_text(encoding="utf-8")
+    questions = re.findall(r"^(\d+)\. \*\*.*\?\*\* (.*)$", text, re.MULTILINE)
+    assert [int(number) for number, _ in questions] == list(range(1, 21))
+    assert all("](" in answer for _, answer in questions)
+    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    assert "[Questions](questions.md)" in index

@@ -95,6 +95,7 @@ class PolesZerosTable(Table):
     zeros: tuple[ComplexNumber, ...] = Field((), description="zeros in rad/s")
     poles: tuple[ComplexNumber, ...] = Field((), description="poles in rad/s")
     normalization: Number | None = None
+    """Factor A0; if not given, the response is 1 at ``frequency``."""
     frequency: PositiveNumber = 1.0
     """Frequency in Hz at which the sensitivity holds."""
 
@@ -121,7 +122,9 @@ class ChannelTable(Table):
     name: Name = Field(description="the channel's name")
     sensitivity: Number = Field(description="counts per unit, not zero")
     unit: str = "m/s²"
+    """What a count is divided into: acceleration, velocity, displacement, or any other."""
     direction: str | None = None
+    """For people: ``up``, ``north``, ``azimuth 90°, dip 0°``."""
     response: Annotated[
         InstanceOf[PolesZeros] | InstanceOf[Response] | None,
         BeforeValidator(_poles_zeros),
@@ -133,6 +136,7 @@ class ChannelTable(Table):
         PlainSerializer(_table_of_certificate),
     ] = None
     auxiliary: bool = False
+    """Recorded and not estimated, such as a temperature."""
 
     @model_validator(mode="before")
     @classmethod
@@ -271,6 +275,7 @@ class RecordingSettings(Table):
     directory: Path = Path("recordings")
     """Relative to the bench file."""
     duration: Duration | None = None
+    """Of a recording; until it is stopped, if not given."""
     retention: Duration | None = None
     """The same as ``keep_for`` of ``[storage]``."""
     report: Literal["html", "pdf"] | None = None

@@ -72,10 +72,13 @@ class ScheduledRun(Table):
     """One ``[[schedule]]`` table: when runs are due, and how long they record."""
 
     name: Name = "runs"
+    """In lists of runs; its place in the file, if not given."""
     cron: CronLine | None = None
+    """When runs are due, such as ``0 22 * * *``; or ``at``."""
     at: datetime | None = None
     """One run at this time."""
     time_zone: TimeZone | None = None
+    """Of the times, such as ``UTC`` or ``Europe/Berlin``."""
     duration: Duration | None = None
     """In seconds; that of ``[recording]`` where neither this nor `longest` is given."""
     target_cov: Annotated[float, Field(strict=True, gt=0, lt=1)] | None = None
@@ -181,7 +184,9 @@ class Hooks(Table):
     on_missed: Command | None = None
     """A run was due and not started."""
     timeout: Duration = 30.0
+    """After which a command is ended, and has failed."""
     retries: Annotated[int, Field(strict=True, ge=0, le=20)] = 3
+    """Further attempts after one that failed."""
     retry_after: Duration = 60.0
     """Seconds between attempts, doubled after each."""
 
@@ -190,7 +195,9 @@ class Metrics(Table):
     """Prometheus metrics of ``huddle serve``."""
 
     port: Annotated[int, Field(strict=True, ge=0, le=65535)]
+    """TCP port of the metrics."""
     address: Annotated[str, AfterValidator(_address)] = "127.0.0.1"
+    """Address on which it is served."""
 
 
 def _secret(value: str) -> str:

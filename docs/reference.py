@@ -1,0 +1,151 @@
+"""The references of commands and of the bench file: Markdown, made of what the program declares."""
+
+# ruff: noqa: ANN401 - annotations and fields of pydantic are of any type
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+import textwrap
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from pydantic import BaseModel, BeforeValidator
+from pydantic_core import PydanticUndefined
+
+from daq.bench.durations import format_duration, parse_duration
+from daq.bench.estimate_settings import OPTIONS, EstimateSettings, table_keys
+from daq.bench.model import TABLES, Bench
+from tui.commands.help import PANELS, subcommand
+
+_WRITTEN = {"[[schedule.runs]]": "[[schedule]]"}
+"""Tables that a person writes by another name than that of their model."""
+_STYLE = re.compile(r"\x1b\[[0-9;]*m")
+_DURATION = "duration, such as `90s` or `2h`"
+_BLANK = "\n\n"
+_NAMES = {str: "text", float: "number", int: "whole number", bool: "true or false"}
+
+
+def commands() -> str:
+    """Return a section for each command, with the text of its help."""
+    parts = []
+    for panel, names in PANELS.items():
+        parts.append(f"## {panel}\n")
+        for name in names:
+            command = subcommand(name)
+            with command.make_context(name, [], resilient_parsing=True) as context:
+                context.info_name = f"huddle {name}"
+                text = command.get_help(context)
+            parts.append(f"### huddle {name}\n\n```text\n{_STYLE.sub('', text).strip()}\n```\n")
+    return "\n".join(parts)
+
+
+def bench_file() -> str:
+    """Return a table of keys for each table of the bench file."""
+    tables: dict[str, type[BaseModel]] = {}
+    _collect("", Bench, tables)
+    del tables["[schedule]"]
+    return "\n".join(_section(path, model) for path, model in tables.items())
+
+
+def _collect(path: str, model: type[BaseModel], tables: dict[str, type[BaseModel]]) -> None:
+    tables[path] = model
+    for key, field in model.model_fields.items():
+        found = _table_of(field.annotation)
+        if found is not None:
+            inner, is_list = found
+            full = f"{path.strip('[]')}.{key}".lstrip(".")
+            _collect(f"[[{full}]]" if is_list else f"[{full}]", inner, tables)
+
+
+def _table_of(annotation: Any) -> tuple[type[BaseModel], bool] | None:
+    """Return the table of an annotation, and whether there may be several."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation, False
+    if isinstance(annotation, type) and annotation in TABLES:
+        return TABLES[annotation], False
+    for each in get_args(annotation):
+        found = _table_of(each)
+        if found is not None:
+            return found[0], found[1] or get_origin(annotation) is tuple
+    return None
+
+
+def _section(path: str, model: type[BaseModel]) -> str:
+    heading = f"`{_WRITTEN.get(path, path)}`" if path else "At the top"
+    about = "" if path == "[estimate]" else inspect.getdoc(model) or ""
+    rows = []
+    for key, field in model.model_fields.items():
+        if _table_of(field.annotation) is None:
+            cells = _kind(field), _default(key, field, path), _text(key, field, model, path)
+            rows.append(f"| `{key}` | {' | '.join(cells)} |")
+    table = "\n".join(["| key | value | default | |", "|---|---|---|---|", *rows]) if rows else ""
+    return f"## {heading}\n\n{_plain(about.partition(_BLANK)[0])}\n\n{table}\n"
+
+
+def explanations(model: type[BaseModel]) -> dict[str, str]:
+    """Return what the docstrings below the keys of a table say."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(model))).body[0]
+    assert isinstance(tree, ast.ClassDef)  # noqa: S101 - for the types
+    found, key = {}, ""
+    for node in tree.body:
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            key = node.target.id
+        elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and key:
+            found[key] = inspect.cleandoc(str(node.value.value))
+    return found
+
+
+def _text(key: str, field: Any, model: type[BaseModel], path: str) -> str:
+    if path == "[estimate]":
+        found = OPTIONS[table_keys()[key]].help
+    else:
+        found = explanations(model).get(key) or field.description or ""
+    return _plain(found).replace("|", "\\|")
+
+
+def _plain(text: str) -> str:
+    return " ".join(text.replace("``", "`").split())
+
+
+def _default(key: str, field: Any, path: str) -> str:
+    if path == "[estimate]":
+        name = table_keys()[key]
+        value = getattr(EstimateSettings(), name)
+        value = None if value is None else OPTIONS[name].show(value)
+    elif field.is_required():
+        return (
+            "that of the bench" if (path, key) == ("[[sensors]]", "sampling_rate") else "required"
+        )
+    else:
+        value = field.get_default(call_default_factory=True)
+    if value is None or value is PydanticUndefined or value in ("", (), {}):
+        return ""
+    if _kind(field) == _DURATION:
+        return f"`{format_duration(float(value))}`"
+    return f"`{value}`".lower() if isinstance(value, bool) else f"`{value}`"
+
+
+def _kind(field: Any) -> str:
+    if any(isinstance(e, BeforeValidator) and e.func is parse_duration for e in field.metadata):
+        return _DURATION
+    found = _named(field.annotation)
+    return found if found != "Any" else ""
+
+
+def _named(annotation: Any) -> str:
+    origin, args = get_origin(annotation), get_args(annotation)
+    if origin is Annotated and BeforeValidator(parse_duration) in args:
+        return _DURATION
+    if origin in (Union, UnionType):
+        return " or ".join(_named(each) for each in args if each is not NoneType)
+    if origin is Literal:
+        return ", ".join(f"`{each}`" for each in args)
+    if origin is tuple:
+        return f"list of {_named(args[0])}"
+    if origin is not None and args and origin is not dict:
+        return _named(args[0])
+    return _NAMES.get(
+        annotation, "table" if origin is dict else getattr(annotation, "__name__", "")
+    )
