@@ -218,7 +218,9 @@ class Web(Table):
     """The pages of the bench in a browser: ``huddle web``, and beside ``huddle serve``."""
 
     port: Annotated[int, Field(strict=True, ge=0, le=65535)] = 8040
+    """TCP port of the pages."""
     address: Annotated[str, AfterValidator(_address)] = "127.0.0.1"
+    """Address on which they are served."""
     read: Secret | None = None
     """Who may look; anybody on this computer where it is not given."""
     steer: Secret | None = None
