@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from benchmarks.studies.clocks import clock_coverage, clocks
+from benchmarks.studies.courses import CONTRASTS, contrasts
 from benchmarks.studies.estimates import ESTIMATES
 from benchmarks.studies.gradients import gradients
 from benchmarks.studies.random_arrays import RANDOM_TESTS, random_tests
@@ -38,6 +39,7 @@ STUDIES: dict[str, Callable[[ProgressCallback, float], Study]] = {
     "clock-coverage": clock_coverage,
     RANDOM_TESTS: random_tests,
     RANDOM_RECORDINGS: random_recordings,
+    CONTRASTS: contrasts,
 }
 
 

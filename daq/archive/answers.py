@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.archive.averages import Average, Estimator
-from daq.archive.changes import Changes, Contrast, Drift, changes, contrast, drift
+from daq.archive.changes import courses
 from daq.archive.density import MIN_BINS
-from daq.archive.spectra_file import DAY_NS, unpacked
+from daq.archive.spectra_file import unpacked
 from daq.archive.years import Years, density_of
 from daq.errors import ArchiveError
 from daq.results.band_summary import band_within, judged_method
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     import h5py
     from numpy.typing import NDArray
 
+    from daq.archive.changes import Course
     from daq.archive.density import Density
     from daq.archive.index import Entry
     from daq.archive.rollup import Grid
@@ -70,12 +71,12 @@ class Answer:
     n_segments : int64, shape (n_days,)
     levels : Levels
         Of shape (n_days, n_bands, n_channels).
-    drift, changes : Drift, Changes
-        Series are bands times channels.
+    courses : tuple of Course
+        Changes, drift and contrasts of each series: bands times channels, a band after another.
+    false_alarm : float
+        Of changes, in all series together.
     density, recorded : Density
         Of the noise, and of the recorded PSD.
-    contrast : Contrast or None
-        None where stretches are longer than an hour, or no day has both of its parts.
     problems : tuple of str
         What could not be read.
     doubted : tuple of Described
@@ -89,11 +90,10 @@ class Answer:
     days_utc_ns: IntArray
     n_segments: IntArray
     levels: Levels
-    drift: Drift
-    changes: Changes
+    courses: tuple[Course, ...]
+    false_alarm: float
     density: Density
     recorded: Density
-    contrast: Contrast | None
     problems: tuple[str, ...]
     doubted: tuple[Described, ...]
 
@@ -120,7 +120,7 @@ def answer(
     zone : tzinfo
         Of working hours and nights.
     false_alarm : float
-        See `daq.archive.changes.changes`.
+        See `daq.archive.changes.courses`.
     progress : callable, optional
         Receives how many recordings are read, and of how many.
 
@@ -161,9 +161,9 @@ def answer(
         raise ArchiveError("\n".join(years.problems))
     snapshot = every.snapshot(pooled, diagnose=True)
     days, levels = np.concatenate(tally.days), tally.levels()
-    n_series = (-1, levels.mean.shape[1] * levels.mean.shape[2])
-    at = (days - days[0]) / DAY_NS
-    mean, spread = levels.mean.reshape(n_series), levels.spread.reshape(n_series)
+    n_series = levels.mean.shape[1] * levels.mean.shape[2]
+    mean, spread = (each.reshape(-1, n_series) for each in (levels.mean, levels.spread))
+    parts = {day: (n, total.reshape(3, n_series)) for day, (n, total) in tally.local.items()}
     return Answer(
         pooled=snapshot,
         settings=settings,
@@ -172,11 +172,10 @@ def answer(
         days_utc_ns=days,
         n_segments=np.concatenate(tally.segments),
         levels=levels,
-        drift=drift(at, mean, spread),
-        changes=changes(mean, spread, false_alarm=false_alarm),
+        courses=courses(days, mean, spread, parts, false_alarm=false_alarm),
+        false_alarm=false_alarm,
         density=reduce(add, tally.noise),
         recorded=reduce(add, tally.recorded),
-        contrast=contrast(tally.local),
         problems=tuple(years.problems),
         doubted=doubted,
     )
@@ -207,16 +206,13 @@ class _Tally:
             month = file["months"][name]
             self.days.append(month["days"][...])
             self.segments.append(month["day_segments"][...])
-            rows = month["levels"][...]
-            found = [self._grid.levels(rows, span) for span in self._spans]
-            parts = [(each.mean, each.of_scatter.spread, *each.ends()) for each in found]
-            arrays = (np.concatenate(each, axis=-2) for each in zip(*parts, strict=True))
-            self._levels.append(Levels(*arrays))
+            found = self._grid.levels(month["levels"][...], self._spans)
+            self._levels.append(Levels(found.mean, found.of_scatter.spread, *found.ends()))
             self._take_parts(month)
 
     def _take_parts(self, month: h5py.Group) -> None:
         noise, n_segments = month["part_noise"][...], month["part_segments"][...]
-        bands = np.stack([self._grid.average(noise, span) for span in self._spans], axis=-2)
+        bands = self._grid.average(noise, self._spans)
         weighted = np.where(n_segments[..., None, None] > 0, bands, 0.0)
         weighted *= n_segments[..., None, None]
         for row, day in enumerate(month["local_days"][...].tolist()):

@@ -1,7 +1,7 @@
-"""Drift of a noise level against time, and the test for a change of level.
+"""The course of a noise level: where it has changed, and drift and contrast between the changes.
 
-Both take a level per day with its standard deviation from the spectra, and look also at the scatter
-from day to day: a level that varies more than its spectra allow is known less well.
+`daq.results.change_test` finds changes, as in the history of a service. Nothing is pooled across
+one: each segment has its own mean, drift, and difference of working hours and nights.
 """
 
 from __future__ import annotations
@@ -9,13 +9,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from datetime import date
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import stdtrit
+from scipy.special import chdtri, stdtrit
 
 from daq.archive.rollup import EARLY, LATE, WORK
-from estimator.levels.interval import CERTAIN
+from daq.archive.spectra_file import DAY_NS
+from daq.results.change_test import changes
+from estimator.levels.interval import CERTAIN, NORMAL_95
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -23,17 +26,76 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     FloatArray = NDArray[np.float64]
+    IntArray = NDArray[np.int64]
     BoolArray = NDArray[np.bool_]
 
 MIN_DAYS = 8
 """With fewer, neither drift nor change is decided."""
+MIN_CONTRAST_DAYS = 3
+"""With fewer days the difference of working hours and nights has no interval."""
 DAYS_PER_YEAR = 365.25
 SATURDAY = 5
-_AT_AN_END = 2  # days, at least, on either side of a change
-_EXCEEDING = 20  # simulated series, at least, beyond the critical value
-_MOST_SIMULATED, _LEAST_SIMULATED = 200_000, 5_000
-_VALUES_AT_ONCE = 1 << 21
-_SEED = 20260
+MIN_LASTING = 40
+"""Days from which scatter that lasts is looked for."""
+LASTING = 1.7
+"""Differences of a week over those of a day, above which scatter lasts."""
+_MOST_POINTS = 256
+"""Means of days that are tested: a test of more takes too long."""
+_EPOCH = date(1970, 1, 1).toordinal()
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """A value with its 95 % interval; NaN where it is not decided."""
+
+    value: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """Days between two changes.
+
+    Attributes
+    ----------
+    begin, end : int
+        Rows of the first day, and after the last one.
+    mean : float
+        In unit²/Hz, days weighted by their precision.
+    drift : Interval
+        In dB a year.
+    contrast : Interval
+        Of working hours over the nights of the same days, in dB.
+    contrast_days : int
+        Days, Monday to Friday, with working hours and both nights.
+    """
+
+    begin: int
+    end: int
+    mean: float
+    drift: Interval
+    contrast: Interval
+    contrast_days: int
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """A series of days.
+
+    Attributes
+    ----------
+    decided : bool
+        Whether there are enough days, and the level is certainly positive.
+    segments : tuple of Segment
+        In order, at least one.
+    steps : tuple of Interval
+        Between segments, in dB: one less.
+    """
+
+    decided: bool
+    segments: tuple[Segment, ...]
+    steps: tuple[Interval, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,31 +110,240 @@ class Drift:
     high: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Changes:
-    """The largest change of level in each series, and whether it is beyond uncertainty.
+def courses(
+    days_utc_ns: IntArray,
+    level: FloatArray,
+    spread: FloatArray,
+    parts: Mapping[int, tuple[FloatArray, FloatArray]],
+    *,
+    false_alarm: float = 0.01,
+) -> tuple[Course, ...]:
+    """Return the course of each series.
 
-    Attributes
+    Parameters
     ----------
-    day : int64, shape (n_series,)
-        Number of the first day after the change; -1 where nothing is decided.
-    amount, low, high : float64, shape (n_series,)
-        In dB, with the 95 % interval of a change at this day.
-    found : bool, shape (n_series,)
-        Whether it exceeds what chance would do in any of the series, at any day, with probability
-        `false_alarm`.
+    days_utc_ns : int64, shape (n_days,)
+        In order.
+    level, spread : float64, shape (n_days, n_series)
+        Levels (power, linear), and their standard deviations; NaN where a day has none.
+    parts : mapping of int to (array, array)
+        Of local days by ordinal: segments of the parts of the day, shape (3,), and the noise times
+        these, (3, n_series); `daq.archive.rollup` names the parts.
     false_alarm : float
-        Probability of at least one false alarm in all series together.
-    decided : bool, shape (n_series,)
+        Probability of a change in any of the series, if none has one, however often one asks and
+        however long the archive becomes.
     """
+    at = (days_utc_ns - days_utc_ns[0]) / DAY_NS
+    local = np.array(
+        [
+            day
+            for day, (n_segments, _) in sorted(parts.items())
+            if np.all(n_segments > 0) and date.fromordinal(day).weekday() < SATURDAY
+        ],
+        np.int64,
+    )
+    shape = (len(local), 3, level.shape[1])
+    noise = np.array([parts[day][1] / parts[day][0][:, None] for day in local.tolist()])
+    noise = noise.reshape(shape)
+    ordinals = days_utc_ns // DAY_NS + _EPOCH
+    found = []
+    for series in range(level.shape[1]):
+        y, s = level[:, series], spread[:, series]
+        known = np.flatnonzero(np.isfinite(y) & np.isfinite(s) & (s > 0))
+        borders = _borders(at[known], y[known], s[known], false_alarm / level.shape[1])
+        decided = borders is not None
+        inner = [] if borders is None else [int(known[border]) for border in borders]
+        ends = [0, *inner, len(y)]
+        segments = []
+        for begin, end in pairwise(ends):
+            rows = slice(begin, end)
+            slope = drift(
+                at[rows], level[rows, series : series + 1], spread[rows, series : series + 1]
+            )
+            # Days of a change have both levels.
+            first = ordinals[begin] + (begin > 0)
+            last = ordinals[end - 1] - (end < len(y))
+            some = noise[(local >= first) & (local <= last), :, series]
+            own = known[(known >= begin) & (known < end)]
+            mean = float(np.average(y[own], weights=s[own] ** -2)) if len(own) else math.nan
+            of_slope = Interval(*(float(each[0]) for each in (slope.slope, slope.low, slope.high)))
+            segments.append(Segment(begin, end, mean, of_slope, contrast(some), len(some)))
+        steps = tuple(_step(y, s, known, one, two) for one, two in pairwise(segments))
+        found.append(Course(decided, tuple(segments), steps))
+    return tuple(found)
 
-    day: NDArray[np.int64]
-    amount: FloatArray
-    low: FloatArray
-    high: FloatArray
-    found: BoolArray
-    false_alarm: float
-    decided: BoolArray
+
+def contrast(parts: FloatArray) -> Interval:
+    """Compare the working hours of days with the nights of the same days.
+
+    Parameters
+    ----------
+    parts : float64, shape (n_days, 3)
+        Noise in the parts of each day.
+
+    Returns
+    -------
+    Interval
+        Of working hours over nights in dB.
+
+    Notes
+    -----
+    What differs between days (changes, drift, weekends without nights) is in neither term of a
+    day's difference; drift within a day is not, as the mean of both nights has the middle of the
+    working hours. The interval is Student's, over days.
+    """
+    parts = parts[np.isfinite(parts).all(axis=1)]
+    n = len(parts)
+    if n < MIN_CONTRAST_DAYS:
+        return Interval()
+    night = (parts[:, EARLY] + parts[:, LATE]) / 2
+    reference = float(night.mean())
+    if reference <= CERTAIN * float(night.std(ddof=1)) / math.sqrt(n):
+        return Interval()  # no level, and so no difference in dB
+    share = (parts[:, WORK] - night) / reference
+    half = float(stdtrit(n - 1, 0.975)) * float(share.std(ddof=1)) / math.sqrt(n)
+    middle = float(share.mean())
+    return Interval(*(_db(1 + each) for each in (middle, middle - half, middle + half)))
+
+
+def _db(ratio: float) -> float:
+    return 10 * math.log10(ratio) if ratio > 0 else math.nan
+
+
+def _borders(at: FloatArray, y: FloatArray, s: FloatArray, rate: float) -> list[int] | None:
+    """Return the first days after changes, as rows; None if nothing is decided.
+
+    Deviations are scaled to the scatter from day to day, if that is larger.
+    """
+    n = len(y)
+    if n < MIN_DAYS:
+        return None
+    weight = s**-2
+    mean = float(np.average(y, weights=weight))
+    if mean <= CERTAIN / math.sqrt(float(weight.sum())):
+        return None
+    x, deviation = y / mean, s / mean
+    deviation = deviation * math.sqrt(max(1.0, _scatter(x, deviation)) * _lasting(x, deviation))
+    found = _changes(x, deviation, rate)
+    if not found:
+        return []
+    line = _line(at, x, deviation)
+    misfit = [
+        float(
+            np.sum(
+                ((x[a:b] - np.average(x[a:b], weights=deviation[a:b] ** -2)) / deviation[a:b]) ** 2
+            )
+        )
+        for a, b in pairwise([0, *found, n])
+    ]
+    of_line = float(np.sum((line / deviation) ** 2))
+    # a drift is not a staircase: Bayes' information criterion, two parameters a change
+    if of_line + math.log(n) <= sum(misfit) + 2 * len(found) * math.log(n):
+        return []
+    return _without_drift(at, x, deviation, found, rate)
+
+
+def _scatter(x: FloatArray, deviation: FloatArray) -> float:
+    """Return the variance from day to day over that of the spectra, as it may be at most.
+
+    It is that of the differences of successive days, which a change enters only once (von Neumann
+    1941): so without the largest, and divided by what that leaves of normal differences. Because
+    few days know it badly, it is the upper end of a 90 % interval.
+    """
+    square = np.diff(x) ** 2 / (deviation[1:] ** 2 + deviation[:-1] ** 2)
+    m = len(square)
+    rest = 1 - float(chdtri(1, 0.56 / m)) / m  # mean of the largest of m: at exp(-0.56) of it
+    freedom = 2 * (m - 1) / 3
+    mean = float(square.sum() - square.max()) / m / rest
+    return mean * freedom / float(chdtri(freedom, 0.95))
+
+
+def _lasting(x: FloatArray, deviation: FloatArray) -> float:
+    """Return by how much more scatter that lasts for days varies the means of many days.
+
+    Squared differences of a week over those of a day, by medians, which drift and a few changes do
+    not move, are ``1 / (1 - rho)`` for a correlation rho from one day to the next.
+    """
+    if len(x) < MIN_LASTING:
+        return 1.0
+    differences = (
+        (x[k:] - x[:-k]) / np.sqrt(deviation[k:] ** 2 + deviation[:-k] ** 2) for k in (1, 7)
+    )
+    day, week = (float(np.median((each - np.median(each)) ** 2)) for each in differences)
+    if week < LASTING * day:
+        return 1.0
+    rho = min(1 - day / week, 0.95)
+    return (1 + rho) / (1 - rho) ** 2
+
+
+def _without_drift(
+    at: FloatArray, x: FloatArray, deviation: FloatArray, found: list[int], rate: float
+) -> list[int]:
+    """Leave out changes that one line through both of their segments explains as well."""
+    n = len(x)
+    least = 2 * math.log(n) - 2 * math.log(rate)
+    while len(found) > 1:
+        ends = [0, *found, n]
+        losses = []
+        for a, b, c in zip(ends, ends[1:], ends[2:], strict=False):
+            one, two, both = (
+                float(np.sum((_line(at[i:j], x[i:j], deviation[i:j]) / deviation[i:j]) ** 2))
+                for i, j in ((a, b), (b, c), (a, c))
+            )
+            losses.append(both - one - two)
+        k = int(np.argmin(losses))
+        if losses[k] >= least:
+            break
+        found = [*found[:k], *found[k + 1 :]]
+    return found
+
+
+def _line(at: FloatArray, x: FloatArray, deviation: FloatArray) -> FloatArray:
+    """Return what is left of a weighted line."""
+    weight = deviation**-2
+    t = at - np.average(at, weights=weight)
+    rest = x - np.average(x, weights=weight)
+    square = float(np.sum(weight * t**2))
+    slope = float(np.sum(weight * t * rest)) / square if square > 0 else 0.0
+    return np.asarray(rest - slope * t)
+
+
+def _changes(x: FloatArray, deviation: FloatArray, rate: float) -> list[int]:
+    """Return the first rows after changes: found in means of days, then dated to the day."""
+    n = len(x)
+    step = -(-n // _MOST_POINTS)
+    starts = np.arange(0, n, step)
+    weight = np.add.reduceat(deviation**-2, starts)
+    means = np.add.reduceat(x * deviation**-2, starts) / weight
+    coarse = [step * each.first for each in changes(means, weight**-0.5, false_alarms=rate)]
+    found: list[int] = []
+    for number, border in enumerate(coarse):
+        begin = found[-1] if found else 0
+        end = coarse[number + 1] if number + 1 < len(coarse) else n
+        mass = np.cumsum(deviation[begin:end] ** -2)
+        total = np.cumsum(x[begin:end] * deviation[begin:end] ** -2)
+        near = np.arange(max(border - 2 * step, begin + 1), min(border + 2 * step, end - 1) + 1)
+        k = near - begin - 1
+        gap = total[k] / mass[k] - (total[-1] - total[k]) / (mass[-1] - mass[k])
+        found.append(int(near[np.argmax(gap**2 / (1 / mass[k] + 1 / (mass[-1] - mass[k])))]))
+    return found
+
+
+def _step(y: FloatArray, s: FloatArray, known: IntArray, one: Segment, two: Segment) -> Interval:
+    """Return by how much the mean of one segment is above that of the one before, in dB."""
+    variance = 0.0
+    for segment in (one, two):
+        rows = known[(known >= segment.begin) & (known < segment.end)]
+        weight = s[rows] ** -2
+        scatter = 1.0
+        if len(rows) > 1:
+            scatter = float(np.sum(weight * (y[rows] - segment.mean) ** 2)) / (len(rows) - 1)
+        variance += max(1.0, scatter) / float(weight.sum()) / segment.mean**2
+    if not (one.mean > 0 and two.mean > 0):
+        return Interval()
+    middle = _db(two.mean / one.mean)
+    half = NORMAL_95 * 10 / math.log(10) * math.sqrt(variance)
+    return Interval(middle, middle - half, middle + half)
 
 
 def drift(days: FloatArray, level: FloatArray, spread: FloatArray) -> Drift:
@@ -130,168 +401,5 @@ def drift(days: FloatArray, level: FloatArray, spread: FloatArray) -> Drift:
     return Drift(*found)
 
 
-def changes(level: FloatArray, spread: FloatArray, *, false_alarm: float = 0.01) -> Changes:
-    """Look for a change of level in each series.
-
-    Parameters
-    ----------
-    level, spread : float64, shape (n_days, n_series)
-        As for `drift`; days in order.
-    false_alarm : float
-        Probability of at least one false alarm in all series together.
-
-    Returns
-    -------
-    Changes
-
-    Notes
-    -----
-    With standard deviations s_i, the statistic is the largest over k of
-    ``z_k = (mean after k - mean before k) / std``, means weighted by 1/s_i². It is compared twice,
-    and a change has to pass both: with the stated spreads, and with spreads scaled so that they
-    account for the differences of successive days, which a change of level enters only once
-    (von Neumann [1]_). The distribution of either without a change follows from simulated series
-    with the same spreads. Bonferroni's inequality allows for the number of series.
-
-    References
-    ----------
-    .. [1] J. von Neumann, "Distribution of the ratio of the mean square successive difference to
-       the variance", Ann. Math. Statist. 12 (1941), 367–395.
-    """
-    n_series = level.shape[1]
-    day = np.full(n_series, -1)
-    amounts = np.full((3, n_series), np.nan)
-    found, decided = np.zeros((2, n_series), dtype=np.bool_)
-    groups: dict[bytes, list[int]] = {}
-    for series in range(n_series):
-        known = _known(level[:, series], spread[:, series])
-        if known.sum() >= MIN_DAYS:
-            groups.setdefault(known.tobytes(), []).append(series)
-    n_tested = sum(map(len, groups.values()))
-    for members in groups.values():
-        known = _known(level[:, members[0]], spread[:, members[0]])
-        rows = np.flatnonzero(known)
-        y, s = level[rows][:, members], spread[rows][:, members]
-        # The same relative weights for all series of a group: one simulation serves them all.
-        weight = np.exp(-2 * np.mean(np.log(s / np.median(s, axis=0)), axis=1))
-        unit = np.sqrt(np.mean(s**2 * weight[:, None], axis=0))
-        z, ratio, at = _statistics(y / unit, weight)
-        limits = _critical(weight, false_alarm / n_tested)
-        for column, series in enumerate(members):
-            decided[series] = True
-            k = int(at[column])
-            before, after = (
-                float(np.average(part[:, column], weights=w))
-                for part, w in ((y[:k], weight[:k]), (y[k:], weight[k:]))
-            )
-            size = (
-                1.96 * float(unit[column]) * math.sqrt(1 / weight[:k].sum() + 1 / weight[k:].sum())
-            )
-            size *= max(1.0, float(z[column] / ratio[column]))
-            day[series] = rows[k]
-            found[series] = z[column] > limits[0] and ratio[column] > limits[1]
-            difference = np.array([0.0, -size, size]) + after - before
-            if before > 0:
-                with np.errstate(invalid="ignore", divide="ignore"):
-                    amounts[:, series] = 10 * np.log10(1 + difference / before)
-    return Changes(day, amounts[0], amounts[1], amounts[2], found, false_alarm, decided)
-
-
 def _known(level: FloatArray, spread: FloatArray) -> BoolArray:
     return np.asarray(np.isfinite(level) & np.isfinite(spread) & (spread > 0))
-
-
-def _statistics(
-    y: FloatArray, weight: FloatArray
-) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
-    """Return the largest z of each column, the same over the scatter of successive days, and where.
-
-    `y` of shape (n_days, n_series) has the variance 1/weight if nothing but its spread varies it.
-    """
-    total = np.cumsum(weight[:, None] * y, axis=0)
-    mass = np.cumsum(weight)
-    first, last = _AT_AN_END - 1, len(weight) - _AT_AN_END
-    before = total[first:last] / mass[first:last, None]
-    rest = mass[-1] - mass[first:last]
-    after = (total[-1] - total[first:last]) / rest[:, None]
-    variance = (1 / mass[first:last] + 1 / rest)[:, None]
-    z = np.abs(after - before) / np.sqrt(variance)
-    at = np.argmax(z, axis=0)
-    largest = np.take_along_axis(z, at[None], axis=0)[0]
-    step = np.diff(y, axis=0) ** 2 / (1 / weight[1:] + 1 / weight[:-1])[:, None]
-    return largest, largest / np.sqrt(step.mean(axis=0)), at + _AT_AN_END
-
-
-def _critical(weight: FloatArray, probability: float) -> tuple[float, float]:
-    """Return what either statistic of a series without a change exceeds with this probability."""
-    wanted = math.ceil(_EXCEEDING / probability)
-    n_simulated = min(_MOST_SIMULATED, max(_LEAST_SIMULATED, wanted))
-    n_simulated = max(n_simulated, math.ceil(1 / probability))
-    rng = np.random.default_rng(_SEED)
-    found: list[tuple[FloatArray, FloatArray]] = []
-    at_once = max(1, _VALUES_AT_ONCE // len(weight))
-    for first in range(0, n_simulated, at_once):
-        count = min(at_once, n_simulated - first)
-        y = rng.standard_normal((len(weight), count)) / np.sqrt(weight)[:, None]
-        found.append(_statistics(y, weight)[:2])
-    rank = max(1, math.floor(probability * (n_simulated + 1)))
-    both = (np.sort(np.concatenate([each[which] for each in found])) for which in (0, 1))
-    z, ratio = (float(values[-rank]) for values in both)
-    return z, ratio
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Contrast:
-    """Noise in working hours against the nights of the same days.
-
-    Attributes
-    ----------
-    n_days : int
-        Days, Monday to Friday, with working hours and both nights.
-    difference, low, high : float64, shape (n_bands, n_channels)
-        Of working hours over nights in dB, with its 95 % interval; NaN where it has none.
-    """
-
-    n_days: int
-    difference: FloatArray
-    low: FloatArray
-    high: FloatArray
-
-
-MIN_CONTRAST_DAYS = 3
-"""With fewer days the difference of working hours and nights has no interval."""
-
-
-def contrast(local: Mapping[int, tuple[FloatArray, FloatArray]]) -> Contrast | None:
-    """Compare the working hours of days with the nights of the same days.
-
-    Parameters
-    ----------
-    local : mapping of int to (array, array)
-        Of local days by ordinal: segments of the parts of the day, shape (3,), and the noise times
-        these, (3, n_bands, n_channels); `daq.archive.rollup` names the parts.
-
-    Notes
-    -----
-    What differs between days (changes, drift, weekends without nights) is in neither term of a
-    day's difference; drift within a day is not, as the mean of both nights has the middle of the
-    working hours. The interval is Student's, over days.
-    """
-    days = [
-        day
-        for day, (n_segments, _) in sorted(local.items())
-        if np.all(n_segments > 0) and date.fromordinal(day).weekday() < SATURDAY
-    ]
-    if len(days) < MIN_CONTRAST_DAYS:
-        return None
-    parts = np.stack([local[day][1] / local[day][0][:, None, None] for day in days])
-    night = (parts[:, EARLY] + parts[:, LATE]) / 2
-    n = len(days)
-    reference = night.mean(axis=0)
-    certain = reference > CERTAIN * night.std(axis=0, ddof=1) / math.sqrt(n)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        share = (parts[:, WORK] - night) / reference
-        half = float(stdtrit(n - 1, 0.975)) * share.std(axis=0, ddof=1) / math.sqrt(n)
-        middle = share.mean(axis=0)
-        found = 10 * np.log10(1 + np.stack([middle, middle - half, middle + half]))
-    return Contrast(n, *np.where(certain, found, np.nan))

@@ -46,6 +46,8 @@ if TYPE_CHECKING:
     ComplexArray = NDArray[np.complex128]
 
 PER_OCTAVE = 24
+_LEAST = 1e-4
+"""Correlation of bins that counts."""
 WORK, EARLY, LATE = range(3)
 """Parts of a local day: 8 to 18 h, 0 to 6 h, 22 to 24 h. The mean of the two nights has the middle
 of the working hours, so that a drift does not enter their difference."""
@@ -72,8 +74,8 @@ class Grid:
     frequency: FloatArray
     edges: IntArray
     correlation: FloatArray
-    _known: dict[tuple[int, int], list[FloatArray]] = field(default_factory=dict)
-    """Correlations of fine bands of each span that has been asked for."""
+    _known: list[FloatArray] = field(default_factory=list)
+    """Correlations of fine bands, once they are needed."""
 
     @classmethod
     def of(cls, estimator: Estimator) -> Self:
@@ -128,80 +130,93 @@ class Grid:
         """Return whether the ends of a band are edges."""
         return bool(np.isin(band_edges(self.frequency, band), self.edges).all())
 
-    def average(self, psd: SmallArray, span: slice) -> FloatArray:
-        """Return the mean over the known bands of a `span`, of (…, n_fine, n_channels)."""
-        own = np.asarray(psd[..., span, :], np.float64)
-        weight = np.where(np.isfinite(own), self.n_bins[span, None], 0.0)
+    def average(self, psd: SmallArray, spans: Sequence[slice]) -> FloatArray:
+        """Return means over the known bands of `spans`, of (…, n_fine, n_channels)."""
+        known = np.isfinite(psd)
+        weight = np.where(known, self.n_bins[:, None], 0)
+        weighted = np.where(known, psd, 0.0) * weight
+        total, weight = (
+            np.stack([each[..., span, :].sum(axis=-2) for span in spans], axis=-2)
+            for each in (weighted, weight)
+        )
         with np.errstate(invalid="ignore", divide="ignore"):
-            total = (np.where(weight > 0, own, 0.0) * weight).sum(axis=-2)
-            return np.asarray(total / weight.sum(axis=-2))
+            return np.asarray(total / weight)
 
     def ends(self, span: slice) -> tuple[float, float]:
         """Return the first and the last frequency of a `span`, in Hz."""
         first, last = int(self.edges[span.start]), int(self.edges[span.stop]) - 1
         return float(self.frequency[first]), float(self.frequency[last])
 
-    def levels(self, days: FloatArray | SmallArray, span: slice) -> Levels:
-        """Return levels of a band from those of days, shape (N_FIELDS, …, n_fine, n_channels).
+    def levels(self, days: FloatArray | SmallArray, spans: Sequence[slice]) -> Levels:
+        """Return levels of bands from those of days.
 
-        The band takes the place of the axis of fine bands, and has a length of 1.
+        Parameters
+        ----------
+        days : float, shape (N_FIELDS, …, n_fine, n_channels)
+        spans : sequence of slice
+            Bands: they take the place of the fine ones.
         """
-        own = np.asarray(days[..., span, :], np.float64)
+        own = np.asarray(days, np.float64)
         known = np.isfinite(own[MEAN]) & np.isfinite(own[DEVIATION])
-        weight = np.where(known, self.n_bins[span, None], 0.0)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            weight /= weight.sum(axis=-2, keepdims=True)
-            weighted = np.where(known, own, 0.0) * weight
-            deviation = weighted[DEVIATION]
-            t2 = deviation**2
-            shape = np.where(known, own, 0.0)
-            added = [
-                each.sum(axis=-2, keepdims=True)
-                for each in (t2, shape[SKEWNESS] * deviation**3, shape[TAIL] * t2**2)
-            ]
-            excess = 1 + self._pairs(deviation, span) / np.where(added[0] > 0, added[0], 1.0)
-            cumulants = np.stack([t * excess ** (k + 1) for k, t in enumerate(added)])
-            part = {
-                name: np.where(weight > 0, own[name] * weight, 0.0).sum(-2, keepdims=True)
-                for name in (MEAN, BELOW, ABOVE, BOUND)
-            }
-            size = np.where(known, np.abs(weighted[MEAN]), 0.0)
-            shares = np.where(size > 0, own[SHARE] * size, 0.0).sum(-2, keepdims=True)
-            share = shares / np.where(
-                size.sum(-2, keepdims=True) > 0, size.sum(-2, keepdims=True), 1
+        bins = np.where(known, self.n_bins[:, None], 0)
+        own = np.where(known, own, 0.0)
+        unbounded = ~(own[BOUND] > 0)
+        deviation = own[DEVIATION] * bins
+        of_bound = np.where(unbounded, 0.0, own[BOUND_DEVIATION]) * bins
+        mean, square = own[MEAN] * bins, deviation**2
+        size = np.abs(mean)
+        with np.errstate(invalid="ignore"):
+            below, above, share = (
+                np.where(by > 0, own[field] * by, 0.0)
+                for field, by in ((BELOW, bins), (ABOVE, bins), (SHARE, size))
             )
-            bound_deviation = np.where(weight > 0, own[BOUND_DEVIATION] * weight, 0.0)
-            spread = (bound_deviation**2).sum(-2, keepdims=True)
-            spread = np.sqrt(spread + self._pairs(bound_deviation, span))
-            bound = part[BOUND]
-        complete = known.all(axis=-2, keepdims=True)
-        nothing = ~known.any(axis=-2, keepdims=True)
-        mean = np.where(nothing, np.nan, part[MEAN])
-        widening = Contribution(Source.MISFIT, part[BELOW], part[ABOVE], share)
-        known_bound = np.isfinite(bound) & (bound > 0) & complete
-        bounded = like_psd(np.where(known_bound, bound, 1.0), np.where(known_bound, spread, 0.0))
+        parts = np.stack(
+            [
+                *(bins, mean, square, own[SKEWNESS] * deviation**3, own[TAIL] * square**2),
+                *(below, above, size, share, np.where(unbounded, 0.0, own[BOUND]) * bins),
+                *(of_bound**2, ~known, unbounded),
+            ]
+        )
+        total, mean, t2, t3, t4, below, above, size, share, bound, spread, n_unknown, n_open = (
+            np.stack([parts[..., span, :].sum(axis=-2) for span in spans], axis=-2)
+        ).astype(np.float64)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            more = self._pairs(deviation, spans)
+            excess = 1 + np.where(t2 > 0, more / t2, 0.0)
+            cumulants = np.stack(
+                [t * excess ** (k - 1) / total**k for k, t in ((2, t2), (3, t3), (4, t4))]
+            )
+            widening = Contribution(
+                Source.MISFIT, below / total, above / total, np.where(size > 0, share / size, 0.0)
+            )
+            mean = np.where(total > 0, mean / total, np.nan)
+            bounded = (n_open == 0) & (n_unknown == 0)
+            bound = np.where(bounded, bound / total, np.nan)
+            spread = np.sqrt(spread + self._pairs(of_bound, spans)) / total
+        scatter = like_psd(np.where(bounded, bound, 1.0), np.where(bounded, spread, 0.0))
         return Levels(
-            BandLevels(mean, np.where(nothing, np.nan, cumulants), complete),
+            BandLevels(mean, np.where(total > 0, cumulants, np.nan), n_unknown == 0),
             (widening,),
-            BandLevels(np.where(known_bound, bound, np.nan), bounded, known_bound),
+            BandLevels(bound, scatter, bounded),
         )
 
-    def _pairs(self, deviation: FloatArray, span: slice) -> FloatArray:
-        """Return what the correlation of bins adds to the variance of a sum over fine bands."""
-        total = np.zeros((*deviation.shape[:-2], 1, deviation.shape[-1]))
-        for lag, factor in enumerate(self._factors(span), 1):
+    def _pairs(self, deviation: FloatArray, spans: Sequence[slice]) -> FloatArray:
+        """Return what the correlation of bins adds to the variance of sums over fine bands."""
+        shape = (*deviation.shape[:-2], len(spans), deviation.shape[-1])
+        total = np.zeros(shape)
+        for lag, factor in enumerate(self._factors(), 1):
             pairs = deviation[..., lag:, :] * deviation[..., :-lag, :] * factor[:, None]
-            total += pairs.sum(axis=-2, keepdims=True)
+            for number, span in enumerate(spans):
+                inside = slice(span.start, max(span.stop - lag, span.start))
+                total[..., number, :] += pairs[..., inside, :].sum(axis=-2)
         return total
 
-    def _factors(self, span: slice) -> list[FloatArray]:
+    def _factors(self) -> list[FloatArray]:
         """Return twice the correlation of fine bands 1, 2, … bands apart."""
-        key = (span.start, span.stop)
-        if key not in self._known:
-            begin, rho = self.edges[:-1][span].tolist(), self.correlation
-            n_bins = self.n_bins[span].tolist()
+        if not self._known:
+            begin, rho = self.edges[:-1].tolist(), self.correlation
+            n_bins = self.n_bins.tolist()
             inner = np.array([_within(n, rho) for n in n_bins])
-            found = []
             for lag in range(1, min(len(rho), len(n_bins))):
                 shared = np.array(
                     [
@@ -209,11 +224,10 @@ class Grid:
                         for b in range(len(n_bins) - lag)
                     ]
                 )
-                if not shared.any():
+                if not np.any(shared > _LEAST):
                     break
-                found.append(2 * shared / np.sqrt(inner[lag:] * inner[:-lag]))
-            self._known[key] = found
-        return self._known[key]
+                self._known.append(2 * shared / np.sqrt(inner[lag:] * inner[:-lag]))
+        return self._known
 
 
 def _usual(frequency: FloatArray) -> tuple[float, float]:

@@ -1,63 +1,93 @@
-"""Drift and change of a level: closed forms, coverage, and the stated rate of false alarms."""
+"""The course of a level: changes, drift and contrasts between them."""
 
 from __future__ import annotations
 
+from datetime import date
+
 import numpy as np
 import pytest
-import scipy
+import scipy.stats
 
-from daq.archive.changes import DAYS_PER_YEAR, changes, drift
+from benchmarks.studies.hours import MONDAY, days_of, drawn
+from daq.archive.changes import DAYS_PER_YEAR, Course, courses, drift
+from daq.archive.spectra_file import DAY_NS
 
 DAYS = np.arange(40.0)
 
 
 def series(
-    rng: np.random.Generator, *, n_days: int = 40, scatter: float = 1.0
+    rng: np.random.Generator, *, n_days: int = 40, n_series: int = 8, scatter: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Eight series of level 100 with different spreads; `scatter` is in standard deviations."""
-    spread = np.full((n_days, 8), 0.5) * rng.uniform(0.5, 1.5, size=(n_days, 1))
-    return 100 + scatter * spread * rng.standard_normal((n_days, 8)), spread
+    """Return levels of 1 with unequal spreads, which scatter more than these say."""
+    spread = np.exp(rng.normal(size=(n_days, 1)) * 0.3) * 2e-3 * np.ones(n_series)
+    return 1 + scatter * spread * rng.standard_normal((n_days, n_series)), spread
 
 
-@pytest.mark.long
+def course_of(level: np.ndarray, spread: np.ndarray, rate: float = 0.01) -> tuple[Course, ...]:
+    days = (MONDAY + np.arange(len(level))) * DAY_NS
+    return courses(days, level, spread, {}, false_alarm=rate)
+
+
 @pytest.mark.parametrize("scatter", [1.0, 4.0])
-def test_the_rate_of_false_alarms_is_as_stated(scatter: float) -> None:
+def test_false_alarms_are_rarer_than_stated(scatter: float) -> None:
     rng = np.random.default_rng(5)
-    rate, n = 0.2, 60
+    n, rate = 150, 0.05
     alarms = sum(
-        changes(*series(rng, scatter=scatter), false_alarm=rate).found.any() for _ in range(n)
+        any(each.steps for each in course_of(*series(rng, scatter=scatter), rate)) for _ in range(n)
     )
-    # At most so many, with a chance of one in a thousand that this test fails by accident.
     assert alarms <= scipy.stats.binom.ppf(0.999, n, rate)
-    if scatter == 4.0:  # scatter from day to day is measured, so the rate is reached
-        assert alarms >= scipy.stats.binom.ppf(0.001, n, rate / 2)
 
 
 def test_a_change_is_found_with_its_day_and_size() -> None:
     level, spread = series(np.random.default_rng(6))
     level[25:, 3] *= 1.02
     level[10, 5] = np.nan
-    found = changes(level, spread)
-    assert list(np.flatnonzero(found.found)) == [3]
-    assert found.day[3] == 25
-    assert found.low[3] < 10 * np.log10(1.02) < found.high[3]
-    assert found.decided.all()
+    found = course_of(level, spread)
+    assert [len(each.steps) for each in found] == [0, 0, 0, 1, 0, 0, 0, 0]
+    (step,) = found[3].steps
+    assert [(each.begin, each.end) for each in found[3].segments] == [(0, 25), (25, 40)]
+    assert step.low < 10 * np.log10(1.02) < step.high
+    assert all(each.decided for each in found)
+
+
+def test_two_changes_in_ten_years_are_found_to_the_day() -> None:
+    level, spread = series(np.random.default_rng(11), n_days=3653, n_series=1)
+    level[1000:] *= 1.02
+    level[2501:] /= 1.03
+    (found,) = course_of(level, spread)
+    assert [each.begin for each in found.segments] == [0, 1000, 2501]
+    assert found.steps[1].low < -10 * np.log10(1.03) < found.steps[1].high
 
 
 def test_scatter_from_day_to_day_is_no_change() -> None:
     """What stays within the scatter is not found, though far beyond the stated spread."""
     level, spread = series(np.random.default_rng(7), scatter=20.0)
     level[25:, 3] += 3 * spread[25:, 3]
-    assert not changes(level, spread).found.any()
+    assert not any(each.steps for each in course_of(level, spread))
+
+
+def test_a_drift_is_no_staircase() -> None:
+    level, spread = series(np.random.default_rng(12), n_days=400)
+    level *= 1 + 1e-4 * np.arange(400)[:, None]
+    found = course_of(level, spread)
+    assert not any(each.steps for each in found)
+    per_year = 10 / np.log(10) * 1e-4 / 1.02 * DAYS_PER_YEAR
+    for each in found:
+        assert each.segments[0].drift.value == pytest.approx(per_year, rel=0.1)
 
 
 def test_few_days_give_no_decision() -> None:
     level, spread = series(np.random.default_rng(8), n_days=7)
     level[4:] *= 3
-    found = changes(level, spread)
-    assert not found.decided.any()
-    assert not found.found.any()
-    assert np.isnan(drift(DAYS[:7], level, spread).slope).all()
+    found = course_of(level, spread)
+    assert not any(each.decided or each.steps for each in found)
+    assert np.isnan(found[0].segments[0].drift.value)
+
+
+def test_a_level_that_may_be_zero_is_not_decided() -> None:
+    rng = np.random.default_rng(10)
+    (found,) = course_of(rng.standard_normal((40, 1)), np.ones((40, 1)))
+    assert not found.decided
 
 
 def test_the_slope_is_that_of_the_line() -> None:
@@ -82,6 +112,37 @@ def test_the_interval_of_the_slope_covers_the_truth(scatter: float) -> None:
     assert covered >= scipy.stats.binom.ppf(0.001, 8 * n, 0.93)
 
 
-def test_a_level_below_zero_has_no_drift_in_decibels() -> None:
-    rng = np.random.default_rng(10)
-    assert np.isnan(drift(DAYS, rng.standard_normal((40, 1)), np.ones((40, 1))).slope).all()
+def test_a_contrast_is_that_within_days_and_of_each_segment() -> None:
+    rng = np.random.default_rng(13)
+    hours = drawn(rng, n_days=60, step_db=3.0, at=22.4, drift_db=2.0, contrast_db=0.5)
+    (found,) = courses(*days_of(hours))
+    assert [each.begin for each in found.segments] in ([0, 22], [0, 23])
+    for each in found.segments:
+        assert each.contrast.low < 0.5 < each.contrast.high
+        assert each.contrast.high - each.contrast.low < 0.3
+    first, second = found.segments
+    assert (first.contrast_days, second.contrast_days) in (
+        (15, 27),
+        (16, 26),
+    )  # 44, less those of the change
+    assert date.fromordinal(date(1970, 1, 1).toordinal() + MONDAY).weekday() == 0
+
+
+def test_weekends_alone_have_no_contrast() -> None:
+    hours = drawn(np.random.default_rng(14), n_days=60, missing=(0, 1, 2, 3, 4))
+    (found,) = courses(*days_of(hours))
+    assert found.segments[0].contrast_days == 0
+    assert np.isnan(found.segments[0].contrast.value)
+
+
+def test_a_large_change_among_few_days_is_found() -> None:
+    level, spread = series(np.random.default_rng(15), n_days=10, n_series=1)
+    level[5:] *= 4
+    (found,) = course_of(level, spread)
+    assert [each.begin for each in found.segments] == [0, 5]
+
+
+def test_scatter_that_lasts_for_days_is_no_change() -> None:
+    rng = np.random.default_rng(16)
+    found = [courses(*days_of(drawn(rng, n_days=60, lasting_db=0.3)))[0] for _ in range(60)]
+    assert sum(bool(each.steps) for each in found) <= 10  # without allowing for it, 50

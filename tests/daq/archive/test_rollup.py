@@ -56,7 +56,7 @@ def test_bands_of_the_grid_are_those_of_the_bins(band: tuple[float, float]) -> N
     csm = drawn(np.random.default_rng(1))
     grid = Grid.of(ESTIMATOR)
     span = grid.span(band)
-    found = grid.levels(summary_of([csm]).levels, span)
+    found = grid.levels(summary_of([csm]).levels, [span])
     average = Average()
     average.add(DESCRIBED, 0, N_SEGMENTS, csm)
     snapshot = ESTIMATOR.snapshot(average)
@@ -80,7 +80,7 @@ def test_days_in_several_recordings_become_one() -> None:
     segments = np.concatenate([each.day_segments for each in parts])
     merged = merged_levels(rows, segments)
     grid = Grid.of(ESTIMATOR)
-    one, two = (grid.levels(each[:, None], grid.span((0.5, 8.0))) for each in (whole, merged))
+    one, two = (grid.levels(each[:, None], [grid.span((0.5, 8.0))]) for each in (whole, merged))
     assert np.all(np.abs(one.mean - two.mean) < one.of_scatter.spread / 10)
     np.testing.assert_allclose(one.of_scatter.spread, two.of_scatter.spread, rtol=0.1)
     np.testing.assert_allclose(one.ends()[1], two.ends()[1], rtol=0.02)
@@ -96,6 +96,6 @@ def test_the_interval_of_a_band_of_merged_days_covers_the_truth() -> None:
         parts = [summary_of([drawn(rng)], first_hour=k) for k in range(3)]
         rows = np.concatenate([each.levels for each in parts], axis=1)
         merged = merged_levels(rows, np.full(3, N_SEGMENTS))
-        low, high = grid.levels(merged[:, None], grid.span((1.0, 4.0))).ends()
+        low, high = grid.levels(merged[:, None], [grid.span((1.0, 4.0))]).ends()
         inside.append((low[0, 0] <= np.arange(1.0, 4)) & (high[0, 0] >= np.arange(1.0, 4)))
     assert np.mean(inside) > 0.9  # binomial, 180 draws of .95; Hann's correlation only widens

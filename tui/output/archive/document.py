@@ -15,6 +15,7 @@ from tui.output.json_values import plain
 
 if TYPE_CHECKING:
     from daq.archive.answers import Answer, Levels
+    from daq.archive.changes import Course
     from daq.archive.density import Density
     from daq.archive.store import Store
 
@@ -26,8 +27,11 @@ PERCENTILES = (10, 50, 90)
 def archive_document(answer: Answer, store: Store, n_recordings: int) -> dict[str, Any]:
     """Return the answer as JSON; arrays in the order that their names say."""
     pooled = answer.pooled
-    shape = (len(answer.bands), len(pooled.channels))
-    changes = answer.changes
+    n_channels = len(pooled.channels)
+    rows = [
+        answer.courses[begin : begin + n_channels]
+        for begin in range(0, len(answer.courses), n_channels)
+    ]
     return {
         "schema_version": SCHEMA_VERSION,
         "archive": {
@@ -49,33 +53,13 @@ def archive_document(answer: Answer, store: Store, n_recordings: int) -> dict[st
             "segments": plain(answer.n_segments),
             **_levels(answer.levels),
         },
-        "drift_db_per_year": {
-            name: plain(getattr(answer.drift, name).reshape(shape))
-            for name in ("slope", "low", "high")
+        "changes": {
+            "false_alarm": answer.false_alarm,
+            "decided": [[each.decided for each in row] for row in rows],
         },
-        "change": {
-            "false_alarm": changes.false_alarm,
-            "decided": plain(changes.decided.reshape(shape)),
-            "found": plain(changes.found.reshape(shape)),
-            "date": [
-                [day_text(int(answer.days_utc_ns[day])) if day >= 0 else None for day in row]
-                for row in changes.day.reshape(shape).tolist()
-            ],
-            **{
-                f"{name}_db": plain(getattr(changes, name).reshape(shape))
-                for name in ("amount", "low", "high")
-            },
-        },
+        "segments": [[_segments(each, answer) for each in row] for row in rows],
         "density": _density(answer.density),
         "recorded_density": _density(answer.recorded),
-        "weekday_against_night": None
-        if answer.contrast is None
-        else {
-            "days": answer.contrast.n_days,
-            "difference_db": plain(answer.contrast.difference),
-            "difference_db_low": plain(answer.contrast.low),
-            "difference_db_high": plain(answer.contrast.high),
-        },
     }
 
 
@@ -110,6 +94,22 @@ def days_csv(answer: Answer) -> str:
             for column, label in enumerate(answer.pooled.channels)
         ),
     )
+
+
+def _segments(course: Course, answer: Answer) -> list[dict[str, Any]]:
+    """Return the segments of a series, each with the change at its beginning."""
+    return [
+        {
+            "first_day": day_text(int(answer.days_utc_ns[each.begin])),
+            "last_day": day_text(int(answer.days_utc_ns[each.end - 1])),
+            "change_db": None if step is None else plain(step),
+            "noise_psd": plain(each.mean),
+            "drift_db_per_year": plain(each.drift),
+            "work_minus_night_db": plain(each.contrast),
+            "work_minus_night_days": each.contrast_days,
+        }
+        for step, each in zip((None, *course.steps), course.segments, strict=True)
+    ]
 
 
 def _density(density: Density) -> dict[str, Any]:

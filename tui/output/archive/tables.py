@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 from rich.text import Text
 
-from daq.archive.changes import MIN_DAYS
+from daq.archive.changes import MIN_CONTRAST_DAYS, MIN_DAYS
 from daq.bench.units import decibels
 from tui.wording.formatting import listed, percent, several, signed, span
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from daq.archive.answers import Answer
+    from daq.archive.changes import Interval, Segment
 
 LARGE = 8
 """Changes in single octaves that are listed."""
@@ -64,8 +65,8 @@ def course_table(answer: Answer) -> Table:
                     label.channel,
                     signed(min(known), ".2f") if known else "?",
                     signed(max(known), ".2f") if known else "?",
-                    _drift(answer, column),
-                    _contrast(answer, column),
+                    _interval(answer.courses[column].segments[-1].drift),
+                    _interval(answer.courses[column].segments[-1].contrast),
                     _change(answer, column),
                 ),
             )
@@ -84,45 +85,57 @@ def remarks(answer: Answer, zone: str) -> Iterator[str]:
             " are lost or repeated without being counted (buffers, cable, the logger's software),"
             " and the sampling rate."
         )
-    changes = answer.changes
     n_channels = len(answer.pooled.channels)
-    if changes.decided.any():
+    n_decided = sum(each.decided for each in answer.courses)
+    if n_decided:
         yield (
-            f"The test for a change has {several(int(changes.decided.sum()), 'series', 'series')}"
+            f"The test for changes has {several(n_decided, 'series', 'series')}"
             f" ({several(n_channels, 'channel')}, {several(len(answer.bands), 'band')}); without a"
             " change it raises a false alarm in any of them with a probability of"
-            f" {percent(changes.false_alarm)}."
+            f" {percent(answer.false_alarm)} at most, however often one asks."
         )
     else:
         yield (
             f"Drift and change are not decided: {several(len(answer.days_utc_ns), 'day')}, and"
             f" {MIN_DAYS} with an estimate are needed."
         )
-    found = [
-        series for series in range(n_channels, len(changes.found)) if bool(changes.found[series])
+    for series, course in enumerate(answer.courses[:n_channels]):
+        if course.steps:
+            name = answer.pooled.channels[series].name
+            for segment in course.segments:
+                yield f"{name}, {_between(answer, segment)}: {_segment(segment)}"
+    single = [
+        (series, step, segment)
+        for series, course in enumerate(answer.courses[n_channels:], n_channels)
+        for step, segment in zip(course.steps, course.segments[1:], strict=True)
     ]
-    for series in found[:LARGE]:
+    for series, step, segment in single[:LARGE]:
         band, column = divmod(series, n_channels)
         yield (
             f"{answer.pooled.channels[column].name}, {span(*answer.bands[band])}:"
-            f" changed by {_amount(answer, series)}"
+            f" changed by {_amount(answer, step, segment)}"
         )
-    if len(found) > LARGE:
-        yield f"{several(len(found) - LARGE, 'further change')} in single octaves: see --json."
+    if len(single) > LARGE:
+        yield f"{several(len(single) - LARGE, 'further change')} in single octaves: see --json."
     density = answer.density
     if density.n_short:
         yield (
             f"{several(density.n_short, 'stretch', 'stretches')} with less than half of the"
             " segments are not in the probability density."
         )
-    if answer.contrast is None:
+    if any(each.steps for each in answer.courses[:n_channels]):
         yield (
-            "Working hours and nights are not compared: stretches are days, or one of the two has"
-            " too few segments."
+            "Drift and difference in the table are those since the last change; no interval of"
+            " theirs spans a change. The estimate above is of all days together."
+        )
+    if all(each.contrast_days < MIN_CONTRAST_DAYS for c in answer.courses for each in c.segments):
+        yield (
+            "Working hours and nights are not compared: stretches are days, or fewer than"
+            f" {MIN_CONTRAST_DAYS} days between changes have both."
         )
     else:
         yield (
-            "Work: Monday to Friday, 8–18 h; night: 22–6 h"
+            "Work: Monday to Friday, 8–18 h; night: 0–6 h and 22–24 h of the same days"
             f" ({zone}). Each ± is half of a 95 % interval."
         )
 
@@ -133,32 +146,40 @@ def _names(answer: Answer) -> str:
     return ", ".join(names) + ", …" * (len(answer.doubted) > LARGE)
 
 
-def _contrast(answer: Answer, column: int) -> str:
-    found = answer.contrast
-    if found is None:
-        return "?"
-    return _with_interval(float(found.difference[0, column]), float(found.high[0, column]))
-
-
-def _drift(answer: Answer, series: int) -> str:
-    slope, high = float(answer.drift.slope[series]), float(answer.drift.high[series])
-    return "not decided" if math.isnan(slope) else _with_interval(slope, high)
-
-
-def _change(answer: Answer, series: int) -> str:
-    changes = answer.changes
-    if not changes.decided[series]:
+def _change(answer: Answer, column: int) -> str:
+    course = answer.courses[column]
+    if not course.decided:
         return "not decided"
-    if not changes.found[series]:
+    if not course.steps:
         return "none beyond uncertainty"
-    return _amount(answer, series)
+    last = _amount(answer, course.steps[-1], course.segments[-1])
+    return last if len(course.steps) == 1 else f"{last}, the last of {len(course.steps)}"
 
 
-def _amount(answer: Answer, series: int) -> str:
-    changes = answer.changes
-    day = day_text(int(answer.days_utc_ns[changes.day[series]]))
-    size = _with_interval(float(changes.amount[series]), float(changes.high[series]), plus=True)
-    return f"{size} dB on {day}"
+def _amount(answer: Answer, step: Interval, segment: Segment) -> str:
+    """Return the size and the date of a change before a segment."""
+    day = day_text(int(answer.days_utc_ns[segment.begin]))
+    return f"{_interval(step, plus=True)} dB on {day}"
+
+
+def _between(answer: Answer, segment: Segment) -> str:
+    first, last = (
+        day_text(int(answer.days_utc_ns[row])) for row in (segment.begin, segment.end - 1)
+    )
+    return f"{first} to {last}"
+
+
+def _segment(segment: Segment) -> str:
+    return (
+        f"{signed(decibels(segment.mean), '.2f')} dB, drift {_interval(segment.drift)} dB/year,"
+        f" work − night {_interval(segment.contrast)} dB ({several(segment.contrast_days, 'day')})"
+    )
+
+
+def _interval(found: Interval, *, plus: bool = False) -> str:
+    if math.isnan(found.value):
+        return "not decided"
+    return _with_interval(found.value, found.high, plus=plus)
 
 
 def _with_interval(value: float, high: float, *, plus: bool = False) -> str:

@@ -139,16 +139,18 @@ def days_figure(answer: Answer) -> Figure:
             days, mean, yerr=np.stack([mean - floor, high - mean]), fmt=".", ms=2.5, lw=0.6,
             color=drawing.NOISE, label="day, with its 95 % interval",
         )  # fmt: skip
-        slope = answer.drift.slope[column]
-        if np.isfinite(slope):
-            level = np.nanmean(mean)
-            line = level + slope / DAYS_PER_YEAR * (days - days[~np.isnan(mean)].mean())
-            axes.plot(days, line, color=drawing.INK, lw=0.7, label="drift")
-        if answer.changes.found[column]:
-            axes.axvline(
-                days[answer.changes.day[column]], color=drawing.LIMIT, lw=0.9, dashes=(4, 1.5),
-                label="change beyond uncertainty",
-            )  # fmt: skip
+        for number, segment in enumerate(answer.courses[column].segments):
+            own = days[segment.begin : segment.end]
+            middle = levels_db(np.array([segment.mean]))[0]
+            slope = segment.drift.value
+            slope = slope if np.isfinite(slope) else 0.0
+            line = middle + slope / DAYS_PER_YEAR * (own - own.mean())
+            axes.plot(own, line, color=drawing.INK, lw=0.7, label="mean and drift of a segment")
+            if number:
+                axes.axvline(
+                    own[0], color=drawing.LIMIT, lw=0.9, dashes=(4, 1.5),
+                    label="change beyond uncertainty",
+                )  # fmt: skip
         axes.xaxis.set_major_locator(MaxNLocator(nbins=3, integer=True))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda day, _: day_text(int(day * DAY_NS))))
         axes.yaxis.set_major_locator(MaxNLocator(nbins=5))
