@@ -10,10 +10,14 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from numpy.typing import NDArray
+
     from daq.protocols.block import Block
 
 MIN_BLOCKS, MAX_RATE_ERROR = 3, 0.01
 """Blocks that a measured rate takes, and its standard error at most, as a fraction of the rate."""
+PARTS = 5
+"""Parts of the time whose rates show how much they depend on when the host reads."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +52,20 @@ def arrivals(blocks: Sequence[Block]) -> Arrivals:
     times = np.array(arrived) * 1e-9
     (period, start), cov = np.polyfit(samples, times, 1, cov=True)
     scatter = float(np.std(times - start - period * samples))
-    error = float(np.sqrt(cov[0, 0]))
+    error = max(float(np.sqrt(cov[0, 0])), _scatter_of_parts(samples, times))
     if not 0 < period >= error / MAX_RATE_ERROR:
         return Arrivals(scatter=scatter)
     return Arrivals(float(1 / period), error / float(period), scatter)
+
+
+def _scatter_of_parts(samples: NDArray[np.int64], times: NDArray[np.float64]) -> float:
+    """Return the standard error of the period, in s, by the periods of `PARTS` of the time.
+
+    On a busy host, delays of consecutive reads are alike: their scatter about a straight line says
+    too little. A wrong rate is the same in all parts.
+    """
+    if len(samples) < PARTS * MIN_BLOCKS:
+        return 0.0
+    parts = zip(np.array_split(samples, PARTS), np.array_split(times, PARTS), strict=True)
+    periods = [np.polyfit(*part, 1)[0] for part in parts]
+    return float(np.std(periods, ddof=1) / np.sqrt(PARTS))

@@ -154,6 +154,8 @@ def _rate(each: SensorPreview) -> Iterator[Finding]:
         yield _of(Problem.UNEVEN, each, each.arrival_scatter)
     elif abs(each.measured_rate / rate - 1) > max(RATE_ERROR, SIGNIFICANCE * each.rate_error):
         yield replace(_of(Problem.RATE, each, each.measured_rate), wanted=rate)
+    elif SIGNIFICANCE * each.rate_error > RATE_ERROR:
+        yield _of(Problem.UNEVEN, each, each.arrival_scatter)
     if each.n_missing > MISSING_SHARE * (n_samples + each.n_missing):
         yield _of(Problem.MISSING, each, each.n_missing)
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from dataclasses import replace
 from datetime import timedelta
 from typing import TYPE_CHECKING
@@ -39,6 +40,9 @@ if TYPE_CHECKING:
 _LOGGER = logging.getLogger(__name__)
 MAX_SLEEP = 30.0
 """Seconds between two readings of the clock, which may be set."""
+CHECK_AHEAD = 40.0
+"""Seconds before a run is due at which its check list begins, which takes a dozen on an idle
+computer. Sensors that another run was recorded with until then are not checked."""
 STEP = 1.0
 """Seconds by which the clock is set at least: runs are then planned again."""
 MAX_ATTEMPTS = 5
@@ -111,6 +115,9 @@ class Service:
         self._repeats: set[asyncio.Task[None]] = set()
         self.recording: Run | None = None
         self.window: Window | None = None
+        self._ahead: tuple[str, asyncio.Task[str]] | None = None
+        """The check list of the run that is due next, with the key of that run."""
+        self._freed_at = -math.inf  # when the last window ended, by the clock that is never set
 
     def request_stop(self) -> None:
         """End: recordings are closed, and their runs taken up by the next service."""
@@ -164,6 +171,7 @@ class Service:
                 task.result()
         finally:
             workers.extend(self._repeats)
+            workers.extend([self._ahead[1]] if self._ahead is not None else [])
             for task in workers:
                 task.cancel()
             await asyncio.gather(*workers, return_exceptions=True)
@@ -277,7 +285,10 @@ class Service:
             run, now = self.next_run, self._clock.now()
             left = MAX_SLEEP if run is None else (run.due - now).total_seconds()
             if run is None or left > 0:
-                await self._clock.sleep(min(left, MAX_SLEEP), self._wake)
+                if run is not None and self._can_check(run, left):
+                    self._ahead = run.key, asyncio.create_task(self._steps.check())
+                until_check = left - CHECK_AHEAD if left > CHECK_AHEAD else left
+                await self._clock.sleep(min(until_check, MAX_SLEEP), self._wake)
                 continue
             del self._planned[run.key]
             if now - run.due > self._grace(run):
@@ -289,6 +300,22 @@ class Service:
             else:
                 self._begin(run)
             self._plan()
+
+    def _can_check(self, run: Run, left: float) -> bool:
+        """Whether to begin the check list of a run that is due in so many seconds."""
+        key, task = self._ahead or ("", None)
+        is_checking = key == run.key or (task is not None and not task.done())
+        is_busy = self.recording is not None or not self._windows.empty()
+        return left <= CHECK_AHEAD and not is_checking and not is_busy
+
+    async def _checked_ahead(self, run: Run) -> asyncio.Task[str] | None:
+        """Return the check list of a run, if it was begun; end that of another one."""
+        (key, task), self._ahead = self._ahead or ("", None), None
+        if task is None or key == run.key:
+            return task
+        task.cancel()
+        await asyncio.wait({task})
+        return None
 
     def _notice_step(self) -> None:
         """Plan again if the clock was set: what was due in between was never due.
@@ -348,12 +375,13 @@ class Service:
                 if not self._is_trusted:
                     run = run.because(UNVERIFIED)
                 self._note(run)
-            window = self._window()
+            window = self._window(await self._checked_ahead(run))
             self.recording, self.window = run, window
             try:
                 run = await window.record(run)
             finally:
                 self.recording = self.window = None
+                self._freed_at = self._clock.elapsed()
             if run.state is RunState.RECORDING:
                 return
             self._note(run)
@@ -369,7 +397,7 @@ class Service:
             return f"{free / 1e6:.0f} MB of free space; expected at least {least / 1e6:.0f} MB"
         return ""
 
-    def _window(self) -> Window:
+    def _window(self, ahead: asyncio.Task[str] | None) -> Window:
         return Window(
             steps=self._steps,
             clock=self._clock,
@@ -378,6 +406,8 @@ class Service:
             folder=self.bench.recording_directory,
             min_free=self.bench.storage.min_free,
             shortest=2 * self.bench.estimate.segment,
+            ahead=ahead,
+            is_fresh=self._clock.elapsed() - self._freed_at < CHECK_AHEAD,
         )
 
     async def _estimate_runs(self) -> None:

@@ -64,6 +64,10 @@ class Window:
         Bytes of free space at which a recorder is stopped.
     shortest : float
         Seconds of a rest that is worth recording.
+    ahead : Task, optional
+        The check list, begun before the run was due.
+    is_fresh : bool
+        Whether another run has just been recorded with these sensors: no check list is made.
     """
 
     def __init__(
@@ -76,9 +80,12 @@ class Window:
         folder: Path,
         min_free: int,
         shortest: float,
+        ahead: asyncio.Task[str] | None = None,
+        is_fresh: bool = False,
     ) -> None:
         self._steps, self._clock, self._stop, self._save = steps, clock, stop, save
         self._folder, self._min_free, self._shortest = folder, min_free, shortest
+        self._ahead, self._is_fresh = ahead, is_fresh
         self.status: dict[str, Any] | None = None
         """Latest status that the recorder reported of itself and its sensors; None before."""
         self._ends_at = 0.0
@@ -106,7 +113,7 @@ class Window:
                     return run
                 if self._rest() < (self._shortest if run.parts else 0.0):
                     break
-                if not run.parts and (wrong := await self._steps.check()):
+                if not run.parts and (wrong := await self._wrong()):
                     _LOGGER.warning("the check list fails: %s", wrong)
                     run = run.because(f"the check list fails: {wrong}")
                     self._save(run)
@@ -135,6 +142,19 @@ class Window:
             run = await self._pause(run, wait)
             wait = min(2 * wait, MAX_RETRY)
         return self._recorded(run)
+
+    async def _wrong(self) -> str:
+        """Return what the check list finds, without a delay of a recording that is due."""
+        ahead, self._ahead = self._ahead, None
+        is_fresh, self._is_fresh = self._is_fresh, False
+        if ahead is None:
+            return "" if is_fresh else await self._steps.check()
+        if ahead.done():
+            return ahead.result()
+        _LOGGER.warning("the check list was not ready when the run was due; it is recorded")
+        ahead.cancel()
+        await asyncio.wait({ahead})  # the ports are free then
+        return ""
 
     def _left_over(self, run: Run) -> Recorder | None:
         return self._steps.running(run.parts[-1]) if run.parts else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -10,11 +11,18 @@ from scipy.spatial.transform import Rotation
 
 from daq.bench.model import DataSheet
 from daq.devices.interface import DeviceInformation
+from daq.preflight.arrivals import arrivals
 from daq.preflight.findings import Check, CheckRow, Finding, Outcome, Problem
 from daq.preflight.preflight import check_list, is_complete
 from daq.preflight.preview import SensorPreview
+from daq.protocols.block import Block, HostTime
 from estimator.checks.sensitivities import Cause
 from tests.tui.example_snapshot import demo_bench
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from estimator.types import FloatArray
 
 RATE = 200.0
 BENCH = demo_bench()
@@ -239,3 +247,31 @@ def test_a_disk_without_room_fails() -> None:
     assert found is not None
     assert found.problem is Problem.DISK_FULL
     assert found.wanted == pytest.approx(4 * 9 * 200 * 1e13)
+
+
+@pytest.mark.parametrize(
+    ("late", "expected"),
+    [
+        (lambda at: 0.0 * at, None),
+        (lambda at: 0.025 * at, Problem.RATE),
+        (lambda at: 0.35 * np.maximum(at / 10 - 0.6, 0) / 0.4, Problem.UNEVEN),
+        (lambda at: 0.25 * (np.floor(at / 2.5) % 2), Problem.UNEVEN),
+    ],
+    ids=["right", "another rate", "a backlog at the end", "held up now and then"],
+)
+def test_a_rate_that_a_busy_host_reads_is_not_called_wrong(
+    late: Callable[[FloatArray], FloatArray], expected: Problem | None
+) -> None:
+    """Ten seconds of blocks of 0.1 s, and by how much they are read late."""
+    rng = np.random.default_rng(3)
+    at = np.arange(101) * 0.1
+    read = at + late(at) + rng.uniform(0, 0.004, at.size)
+    counts = np.zeros((20, 3), np.int32)
+    blocks = [
+        Block("A", 20 * n, counts, HostTime(round(each * 1e9), 0)) for n, each in enumerate(read)
+    ]
+    known = arrivals(blocks)
+    a, b, c = previews()
+    a = replace(a, measured_rate=known.rate, rate_error=known.error, arrival_scatter=known.scatter)
+    (row,) = [each for each in check_list(BENCH, [a, b, c]) if each.check is Check.RATES]
+    assert (None if row.finding is None else row.finding.problem) == expected

@@ -123,6 +123,9 @@ class FakeSteps:
     refuses_first: int = 0
     wrong: list[str] = field(default_factory=list)
     """What the next check lists say; nothing fails afterwards."""
+    check_takes: float = 12.0
+    checked: list[float] = field(default_factory=list)
+    """Times of the event loop at which a check list was begun."""
     started: list[tuple[str, float]] = field(default_factory=list)
     until: list[str] = field(default_factory=list)
     finished: list[Request] = field(default_factory=list)
@@ -133,6 +136,8 @@ class FakeSteps:
 
     async def check(self) -> str:
         """Say what the test wants."""
+        self.checked.append(asyncio.get_running_loop().time())
+        await asyncio.sleep(self.check_takes)
         return self.wrong.pop(0) if self.wrong else ""
 
     def start(self, part: str, seconds: float, until: EndCondition) -> Recorder:

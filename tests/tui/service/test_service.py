@@ -193,6 +193,30 @@ async def test_a_run_waits_for_its_check_list_and_fails_with_what_is_wrong(tmp_p
     assert START_LIMIT < run.ended - run.due < 2 * START_LIMIT
 
 
+@pytest.mark.parametrize("takes", [12.0, 300.0], ids=["idle", "busy"])
+async def test_a_check_list_is_made_before_its_run_is_due_and_costs_it_nothing(
+    tmp_path: Path, takes: float
+) -> None:
+    """A check list that is not ready is given up; one that fails delays the run."""
+    place = Place(tmp_path)
+    place.steps.check_takes = takes
+    await place.serve(1.2 * HOUR)
+    run = place.store.runs()[0]
+    assert run.started is not None
+    assert (run.started - run.due).total_seconds() == pytest.approx(0.0, abs=0.01)
+    assert [seconds for _, seconds in place.steps.started] == [600]
+    assert len(place.steps.checked) == 1
+
+
+async def test_runs_without_a_pause_between_them_are_recorded_without_a_check_list(
+    tmp_path: Path,
+) -> None:
+    place = Place(tmp_path, HOURLY + 'duration = "1h"\n')
+    await place.serve(3.2 * HOUR)
+    assert [seconds for _, seconds in place.steps.started][:2] == [3600, 3600]
+    assert len(place.steps.checked) == 1
+
+
 async def test_an_estimate_that_the_disk_refuses_is_made_again(tmp_path: Path) -> None:
     place = Place(tmp_path)
     refused = Outcome(error="cannot be rewritten", refused=True)
