@@ -294,6 +294,12 @@ class ProgressCallback:
     announced: list[str] = field(default_factory=list)
     plan: TestPlan | None = None
     sensors: Preview | None = None
+    wrong: tuple[str, ...] = ()
+
+    def check(self, plan: TestPlan) -> Sequence[str]:
+        """Return what was prepared."""
+        del plan
+        return self.wrong
 
     def start(self, plan: TestPlan) -> Path:
         """Note it."""

@@ -11,7 +11,7 @@ from textual import work
 from textual.binding import Binding, BindingType
 
 from daq.bench.end_condition import EndCondition
-from tui.application.dialogs import MarkScreen, StopScreen
+from tui.application.dialogs import MarkScreen, QuestionScreen, StopScreen
 from tui.application.following import FollowingApp
 from tui.application.forms.form import Field, Form
 from tui.application.messages import RecordingOpened
@@ -21,6 +21,7 @@ from tui.application.state import TITLES, VIEWS
 from tui.wording.formatting import clock_time
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from textual.driver import Driver
@@ -91,6 +92,7 @@ class StartForm(Form[TestPlan]):
         )
 
 
+CONNECTING = "connecting to the sensors …"
 SLOW_REMARK = 2.0  # seconds that writing a remark may take before the mark says so
 
 
@@ -166,18 +168,45 @@ class HuddleApp(FollowingApp):
 
         def start(plan: TestPlan | None) -> None:
             if plan is not None:
-                self._begin(plan)
+                self._begin(plan, checked=True)
 
         kept = "" if self.path is None else self.path.name
         self.push_screen(StartForm(self._controls.bench, kept), start)
 
-    def _begin(self, plan: TestPlan) -> None:
-        note = "connecting to the sensors …"
+    def _note(self, note: str) -> None:
+        self.state = replace(self.state, note=note)
+
+    def _confirm(self, plan: TestPlan, wrong: Sequence[str]) -> None:
+        """Start what the check list forbids, once that has been confirmed."""
+
+        def begin(really: bool | None) -> None:
+            if really:
+                self._begin(plan)
+            else:
+                failure = "\n".join(wrong)
+                self.state = replace(self.state, is_starting=False, note="", failure=failure)
+
+        lines = "\n".join(f"✗ {line}" for line in wrong)
+        question = QuestionScreen(
+            "not ready", f"{lines}\n\nStart the test all the same?", does="starts it anyway"
+        )
+        self.push_screen(question, begin)
+
+    def _begin(self, plan: TestPlan, *, checked: bool = False) -> None:
+        note = "checking the sensors …" if checked else CONNECTING
         self.state = replace(self.state, is_starting=True, failure="", note=note)
-        self._start(plan)
+        self._start(plan, checked=checked)
 
     @work(thread=True, group="control", exclusive=True)
-    def _start(self, plan: TestPlan) -> None:
+    def _start(self, plan: TestPlan, *, checked: bool) -> None:
+        if checked:
+            wrong = self._try(partial(self._controls.check, plan))
+            if wrong is None:
+                return
+            if wrong:
+                self.call_from_thread(self._confirm, plan, wrong)
+                return
+            self.call_from_thread(self._note, CONNECTING)
         path = self._try(partial(self._controls.start, plan))
         if path is not None:
             self.post_message(RecordingOpened(path))

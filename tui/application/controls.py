@@ -62,6 +62,10 @@ class Controls(Protocol):
         """Whether a recording can be started from here."""
         ...
 
+    def check(self, plan: TestPlan) -> Sequence[str]:
+        """Make the check list; return what fails, a sentence a row. Blocks."""
+        ...
+
     def start(self, plan: TestPlan) -> Path:
         """Start a recorder; return its file once it exists. Blocks."""
         ...

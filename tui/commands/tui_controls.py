@@ -18,13 +18,16 @@ from daq.devices.bench_file import parse
 from daq.errors import HuddleError, RecordingError
 from daq.host_clock import SystemClock
 from daq.preflight.device_check import discover
+from daq.preflight.findings import Outcome
 from daq.preflight.preview import preview
 from daq.recording.control import ask
 from daq.recording.reader import Recording
 from daq.recording.storage.names import continuations, continued_name, recording_path
 from daq.results.sources import sources
 from daq.results.store import store_results
+from tui.commands.check import examined_bench
 from tui.commands.runs import RunNotFoundError, runs_named
+from tui.output.check_list import sentence
 from tui.output.console import write_json
 from tui.output.extras import require
 from tui.output.json_document import document
@@ -179,6 +182,14 @@ class BenchControls(_Controls):
         """Where the bench file wants recordings."""
         return self.bench.recording_directory
 
+    def check(self, plan: TestPlan) -> list[str]:
+        """Make the check list; return what fails, a sentence a row."""
+        with self.ports:  # a preview has released them
+            rows = examined_bench(self.bench, duration=plan.end.duration).rows
+        return [
+            sentence(row.finding) for row in rows if row.finding and row.outcome is Outcome.FAILED
+        ]
+
     def start(self, plan: TestPlan) -> Path:
         """Start a recorder; return its file once it exists."""
         out = recording_path(self.bench, SystemClock().now())
@@ -296,6 +307,11 @@ class RecordingControls(_Controls):
     def folder(self) -> Path:
         """The folder of the recording."""
         return self.path.parent
+
+    def check(self, plan: TestPlan) -> tuple[str, ...]:
+        """Return nothing: there is nothing to be started."""
+        del plan
+        return ()
 
     def start(self, plan: TestPlan) -> Path:
         """Raise an error: a recording cannot be started again."""

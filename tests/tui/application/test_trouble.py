@@ -86,6 +86,29 @@ async def test_why_no_recording_started_stays_on_the_screen(
         assert "connecting" not in text
 
 
+@pytest.mark.parametrize("size", [NARROW, (120, 36), WIDE])
+async def test_a_red_row_of_the_check_list_keeps_a_test_from_starting_unless_confirmed(
+    told: ProgressCallback, size: tuple[int, int]
+) -> None:
+    told.wrong = ("B.X reads 0.102 of A and C (g in place of m/s²)", "C.Z is reversed")
+    app = HuddleApp(told)
+    async with app.run_test(size=size) as pilot:
+        for answer in ("escape", "y"):
+            await pilot.press("s", "enter")
+            await app.workers.wait_for_complete()
+            await shown(pilot, app)
+            text = screen_text(app)
+            assert all(f"✗ {line}" in text for line in told.wrong)
+            assert told.told == []
+            await pilot.press(answer)
+            await app.workers.wait_for_complete()
+            await shown(pilot, app)
+            if answer == "escape":
+                await pilot.press("1")
+                assert "▲ C.Z is reversed" in screen_text(app)  # and what is wrong stays there
+    assert told.told == ["start"]
+
+
 async def test_a_recorder_that_is_gone_leaves_no_sensor_live(told: ProgressCallback) -> None:
     app = HuddleApp(told)
     async with app.run_test(size=NARROW) as pilot:
