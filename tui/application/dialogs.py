@@ -27,7 +27,7 @@ GLOBAL_KEYS = (
 )
 WORDS = (
     ("data", "what the channel recorded: motion and noise (grey)"),
-    ("noise", "the channel's own noise (colour), ± its 95 % interval (shade)"),
+    ("noise", "the channel's own noise (colour), ± its 95 % interval (whisker)"),
     ("▾", "the estimate came out below zero there: its upper bound, or floor"),
     ("known to", "c.o.v. in the worst third of an octave, worst channel"),
     ("wanted", "the scatter to reach: the bench file's target_cov"),

@@ -171,10 +171,10 @@ class Service:
                 task.result()
         finally:
             workers.extend(self._repeats)
-            workers.extend([self._ahead[1]] if self._ahead is not None else [])
-            for task in workers:
+            ahead = [] if self._ahead is None else [self._ahead[1]]
+            for task in (*workers, *ahead):
                 task.cancel()
-            await asyncio.gather(*workers, return_exceptions=True)
+            await asyncio.gather(*workers, *ahead, return_exceptions=True)
             self._write_unsaved()
 
     def _take_up(self, runs: list[Run]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -180,3 +181,52 @@ async def test_noise_models_are_named_in_the_key(told: ProgressCallback) -> None
         screen = screen_text(app)
     assert "NHNM" in screen
     assert "NLNM" in screen
+
+
+@pytest.mark.parametrize("size", [NARROW, (120, 36), (200, 60)])
+async def test_estimates_are_steps_with_whiskers_and_bins_by_a_key(
+    told: ProgressCallback, size: tuple[int, int]
+) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=size) as pilot:
+        await shown(pilot, app, *running(n_effective=500))
+        state, choice = app.state, app.screen.choice  # type: ignore[attr-defined]
+        for is_fine in (False, True):
+            found = curves(state, replace(choice, bins=is_fine), n_points=size[0] - 12)
+            noise = next(each for each in found if each.label == "three-sensor")
+            assert noise.is_stepped is not is_fine
+            octaves = np.ptp(noise.log_frequency) / np.log10(2)
+            assert (len(noise.log_frequency) <= 1 + 3.5 * octaves) is not is_fine
+        steps = next(e for e in curves(state, choice, n_points=size[0] - 12) if e.is_stepped)
+        line, levels = steps.line
+        assert len(line) == 2 * len(steps.level_db)
+        assert (np.diff(levels)[::2] == 0).all()  # flat from edge to edge
+        zoomed = curves(state, replace(choice, span=(0.9, 1.2)), n_points=size[0] - 12)
+        fine = next(each for each in zoomed if each.is_stepped)
+        assert len(fine.log_frequency) >= 2 * len(steps.log_frequency)  # twelfths where they fit
+        before = screen_text(app)
+        await pilot.press("b")
+        await shown(pilot, app)
+        assert screen_text(app) != before
+        await pilot.press("b")
+        await shown(pilot, app)
+        assert screen_text(app) == before
+
+
+async def test_limits_are_drawn_apart_and_named_on_their_lines(told: ProgressCallback) -> None:
+    limits = tuple(
+        Limit(name=name, frequency=(1.0, 50.0), psd=(psd, psd))
+        for name, psd in (("data sheet", 7e-12), ("order 17", 7e-12))
+    )
+    told.bench = demo_bench().model_copy(update={"limits": limits})
+    for size in (NARROW, (120, 36), (200, 60)):
+        app = HuddleApp(told)
+        async with app.run_test(size=size) as pilot:
+            await shown(pilot, app, *running())
+            found = curves(app.state, Choice(methods=("three-sensor",)), n_points=60)
+            drawn = [each for each in found if each.name]
+            assert [each.name for each in drawn] == ["data sheet", "order 17"]
+            assert len({each.style for each in drawn}) == len({each.marker for each in drawn}) == 2
+            rows = [row for row in screen_text(app).splitlines() if "┃" in row or "┫" in row]
+            named = {name: sum(name in row for row in rows) for name in ("data sheet", "order 17")}
+            assert named == {"data sheet": 2, "order 17": 2}  # on its line, and in the legend

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,7 +26,9 @@ class Curve:
     ``level_db`` is 10 log10 of the mean PSD, NaN where only its upper bound is known; ``negative``
     says where that is so. ``low_db`` and ``high_db`` bound the 95 % interval, NaN where a
     bound is not positive, and throughout for a curve without one. ``marker`` is drawn on the
-    curve at intervals, to identify it without colour; empty for none.
+    curve at intervals, to identify it without colour; empty for none. ``edges`` has the ends of
+    bands that are drawn as steps, shape (n_points, 2), as log10 of Hz; none for a line. ``name`` is
+    written on the curve.
     """
 
     label: str
@@ -38,6 +40,20 @@ class Curve:
     low_db: FloatArray
     high_db: FloatArray
     negative: NDArray[np.bool_]
+    edges: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    name: str = ""
+
+    @property
+    def is_stepped(self) -> bool:
+        """Whether bands are drawn as steps, and their intervals as whiskers."""
+        return self.edges.size > 0
+
+    @property
+    def line(self) -> tuple[FloatArray, FloatArray]:
+        """The points of the line that is drawn: of steps, both ends of each band."""
+        if not self.is_stepped:
+            return self.log_frequency, self.level_db
+        return self.edges.ravel(), np.repeat(self.level_db, 2)
 
     def within(self, low: float, high: float) -> Curve:
         """Return the points between two frequencies, as log10 of Hz."""
@@ -49,6 +65,7 @@ class Curve:
             low_db=self.low_db[inside],
             high_db=self.high_db[inside],
             negative=self.negative[inside],
+            edges=np.clip(self.edges[inside], low, high) if self.is_stepped else self.edges,
         )
 
 
@@ -90,8 +107,10 @@ def noise_curve(
     style: str,
     band_style: str,
     marker: str,
+    stepped: bool = False,
 ) -> Curve:
     """Return the levels of a channel as a curve with the 95 % interval of each of its points."""
+    ends = np.log10(frequency[edges])
     return Curve(
         label=label,
         style=style,
@@ -102,6 +121,7 @@ def noise_curve(
         low_db=levels_db(np.where(np.isinf(means.low), np.nan, means.low)),
         high_db=levels_db(means.high),
         negative=means.outside,
+        edges=np.stack([ends[:-1], ends[1:]], axis=1) if stepped else np.empty((0, 2)),
     )
 
 
@@ -134,6 +154,7 @@ def mask_curve(
         low_db=nothing,
         high_db=nothing,
         negative=np.zeros(centre.size, dtype=bool),
+        name=label,
     )
 
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from tui.application.test_view.curves import Curve, Line
 
 DOTS_PER_ROW = 4  # of a Braille character
-MARKED = 12  # points from one mark of a curve to the next
+MARKED, STEPS_MARKED = 12, 5  # points from one mark of a curve to the next; and steps
 LEAST_LAG = 1.0  # µs: what is less is not worth a picture that fills the screen
 SHORT, LONG, DAYS = 2.0, 300.0, 7200.0  # minutes: below seconds, from there on hours, days
 TIME_STEPS = (1 / 60, 1 / 30, 1 / 12, 1 / 6, 0.25, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 180, 360, 720)
@@ -121,8 +121,16 @@ class FullPlot(PlotWidget, can_focus=False):
         return rendered
 
     def _render_scatter_plot(self, dataset: ScatterPlot) -> None:
-        """Draw dots as arrays: one by one, those of a band take tens of milliseconds."""
-        if dataset.hires_mode is None:
+        """Draw dots as arrays: one by one, those of a band take tens of milliseconds.
+
+        A marker of several characters is a name, which begins at its point.
+        """
+        if len(dataset.marker) > 1:
+            canvas = self.query_one("#plot", Canvas)
+            column, row = self.get_pixel_from_coordinate(dataset.x[0], dataset.y[0])
+            for n, character in enumerate(dataset.marker[: max(0, canvas.size.width - column)]):
+                canvas.set_pixel(column + n, row, character, dataset.marker_style)
+        elif dataset.hires_mode is None:
             super()._render_scatter_plot(dataset)
         else:
             self._set_dots(*self._dots(dataset), dataset.marker_style)
@@ -242,19 +250,20 @@ class PsdPlot(FullPlot):
             self.add_v_line(cursor, "#e8edf6")
         rows = max(4, self.size.height - self.margin_bottom - 2)
         dot = (high - low) / (rows * DOTS_PER_ROW)
+        column = (last - first) / self.n_points
         for curve in curves:
-            if curve.band_style:
+            if curve.band_style or curve.is_stepped:
                 self._draw_band(curve, dot=dot, limits=(low, high))
         for curve in curves:
             self.plot(
-                curve.log_frequency,
-                curve.level_db,
+                *curve.line,
                 line_style=curve.style,
                 hires_mode=HiResMode.BRAILLE,
                 label=None if curve.marker else curve.label,
             )
         for number, curve in enumerate(curve for curve in curves if curve.marker):
-            chosen = slice((1 + number) * MARKED // 3, None, MARKED)
+            apart = STEPS_MARKED if curve.is_stepped else MARKED
+            chosen = slice((1 + number) * apart // 3, None, apart)
             self.scatter(
                 curve.log_frequency[chosen],
                 curve.level_db[chosen],
@@ -262,7 +271,25 @@ class PsdPlot(FullPlot):
                 marker_style=curve.style,
                 label=curve.label,
             )
+        self._write_names(curves, column=column, row=DOTS_PER_ROW * dot, top=high)
         self.write_legend(tuple((curve.label, curve.style, curve.marker) for curve in curves))
+
+    def _write_names(
+        self, curves: Sequence[Curve], *, column: float, row: float, top: float
+    ) -> None:
+        """Write names on their curves, above their beginnings, and none upon another."""
+        taken: list[tuple[float, float]] = []
+        for curve in curves:
+            known = np.flatnonzero(np.isfinite(curve.level_db))
+            if not curve.name or not known.size:
+                continue
+            x = float(curve.log_frequency[known[0]]) + column
+            y = float(curve.level_db[known[0]]) + row
+            y -= 2 * row if y > top else 0.0
+            while any(abs(y - other) < row and abs(x - at) < 24 * column for at, other in taken):
+                y -= row
+            taken.append((x, y))
+            self.scatter([x], [y], marker=f"{curve.name} ", marker_style=curve.style)
 
     def _draw_band(self, curve: Curve, *, dot: float, limits: tuple[float, float]) -> None:
         """Fill the 95 % interval with dots, two across each column as Braille has them."""
@@ -274,11 +301,13 @@ class PsdPlot(FullPlot):
             step = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
             x = np.repeat(curve.log_frequency[known], counts)
             y = np.minimum(np.repeat(low[known], counts) + step * dot, limits[1])
-            half = np.ptp(curve.log_frequency) / (2 * self.n_points)
+            if not curve.is_stepped:
+                half = np.ptp(curve.log_frequency) / (2 * self.n_points)
+                x, y = np.concatenate((x, x + half)), np.concatenate((y, y))
             self.scatter(
-                np.concatenate((x, x + half)),
-                np.concatenate((y, y)),
-                marker_style=curve.band_style,
+                x,
+                y,
+                marker_style=curve.style if curve.is_stepped else curve.band_style,
                 hires_mode=HiResMode.BRAILLE,
             )
         below = curve.negative

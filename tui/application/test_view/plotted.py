@@ -25,9 +25,14 @@ if TYPE_CHECKING:
     from tui.application.test_view.curves import Curve
     from tui.application.test_view.units import SpectrumUnit
 
+THIRDS, TWELFTHS = 3, 12
+"""Steps to an octave."""
+LEAST_WIDTH = 3.0
+"""Columns of a step at least where they are twelfths."""
 NARROWEST = 0.02  # of a decade
 DATA_STYLE = "#7d8799"
-LIMIT_STYLE, LIMIT_MARKER = "#ff6b6b", "■"
+LIMITS = (("#ff6b6b", "■"), ("#ff9f43", "□"), ("#ff6bb5", "▣"), ("#e0e04c", "▢"))
+"""Colour and marker of each limit of a bench file, in turn."""
 MODEL_STYLE, MODEL_MARKERS = "#aab4be", "▽△◇○"
 MARKERS = "●×◆+■▲"
 REFERENCE_STYLE = ("#7bd88f", "#3f6d4b", "≈")
@@ -63,6 +68,8 @@ class Choice:
         Shown part of the frequencies, as log10 of Hz; None for all.
     cursor : float or None
         Where values are read off, as log10 of Hz.
+    bins : bool
+        As fine as the screen shows, in place of steps of a third or a twelfth of an octave.
     """
 
     channel: int = 0
@@ -74,6 +81,7 @@ class Choice:
     unit: int = 0
     span: tuple[float, float] | None = None
     cursor: float | None = None
+    bins: bool = False
 
 
 def whole_span(snapshot: Snapshot) -> tuple[float, float]:
@@ -175,6 +183,7 @@ def curves(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
                     label=method,
                     style=STYLES[method],
                     n_points=n_points,
+                    bins=choice.bins,
                 )
             )
     return shown
@@ -195,6 +204,7 @@ def _compared(
             label=snapshot.channels[column].name,
             style=(COLOURS[n % len(COLOURS)], "", MARKERS[n % len(MARKERS)]),
             n_points=n_points,
+            bins=choice.bins,
         )
         for n, column in sorted(enumerate(columns), key=lambda each: each[1] == choice.channel)
     ]
@@ -209,8 +219,10 @@ def _noise(
     label: str,
     style: tuple[str, str, str],
     n_points: int,
+    bins: bool,
 ) -> Curve:
-    edges = log_edges(snapshot.frequency, n_points)
+    n_bands = n_points if bins else steps_of(snapshot, n_points)
+    edges = log_edges(snapshot.frequency, n_bands)
     found = levels(snapshot.results[method], snapshot, settings, edges)
     return noise_curve(
         snapshot.frequency,
@@ -220,7 +232,16 @@ def _noise(
         style=style[0],
         band_style=style[1],
         marker=style[2],
+        stepped=not bins,
     )
+
+
+def steps_of(snapshot: Snapshot, n_points: int) -> int:
+    """Return into how many bands so many columns are divided: twelfths of an octave, or thirds."""
+    first, last = whole_span(snapshot)
+    octaves = (last - first) / math.log10(2)
+    width = n_points / (TWELFTHS * octaves)
+    return max(1, round((TWELFTHS if width >= LEAST_WIDTH else THIRDS) * octaves))
 
 
 def _reference(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
@@ -245,6 +266,7 @@ def _reference(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
             label=reference.path.stem,
             style=REFERENCE_STYLE,
             n_points=n_points,
+            bins=choice.bins,
         )
     ]
 
@@ -262,10 +284,10 @@ def _limits(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
             span=(limit.mask.frequency[0], limit.mask.frequency[-1]),
             n_points=n_points,
             label=limit.name,
-            style=LIMIT_STYLE,
-            marker=LIMIT_MARKER,
+            style=LIMITS[number % len(LIMITS)][0],
+            marker=LIMITS[number % len(LIMITS)][1],
         )
-        for limit in bench.limits
+        for number, limit in enumerate(bench.limits)
         if concerns(limit, label)
     ]
 

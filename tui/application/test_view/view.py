@@ -29,7 +29,18 @@ if TYPE_CHECKING:
 
 
 SNAPSHOT_ACTIONS = {
-    *("channel", "sensor", "method", "clocks", "unit", "table", "overlay", "pick", "freeze"),
+    *(
+        "channel",
+        "sensor",
+        "method",
+        "clocks",
+        "unit",
+        "table",
+        "overlay",
+        "bins",
+        "pick",
+        "freeze",
+    ),
     *("cursor", "zoom", "pan", "whole"),
 }
 """What can be done once there is an estimate."""
@@ -54,6 +65,7 @@ class TestView(View):
         Binding("c", "clocks", "Clocks"),
         Binding("d", "details", "Details"),
         Binding("v", "app.save", "Save", show=False),
+        Binding("b", "bins", "Bins or steps", show=False),
         Binding("l", "overlay", "Like channels", show=False),
         Binding("space", "pick", "Pick channel", show=False),
         Binding("f", "freeze", "Freeze", show=False),
@@ -74,6 +86,7 @@ class TestView(View):
         ("← → ↑ ↓", "channel, and sensor"),
         ("e", "estimate shown: each method in turn, then all"),
         ("u", "unit of the curves: dB, unit²/Hz, g²/Hz, ng/√Hz"),
+        ("b", "single bins in place of steps of a third or twelfth of an octave"),
         ("l", "like channels of all sensors in one plot; l again: one channel"),
         ("space", "draw this channel beside others that you choose; space again: no longer"),
         (", .  < >", "cursor left and right, and far: values are read off above the plot"),
@@ -165,6 +178,10 @@ class TestView(View):
     def action_overlay(self) -> None:
         """Show like channels of all sensors, or one channel again."""
         self.choice = replace(self.choice, overlay=not self.choice.overlay)
+
+    def action_bins(self) -> None:
+        """Show the estimates as finely as the screen allows, or in steps again."""
+        self.choice = replace(self.choice, bins=not self.choice.bins)
 
     def action_pick(self) -> None:
         """Draw the chosen channel beside others, or no longer."""
