@@ -68,6 +68,7 @@ class SensorStatus:
     n_clipped: int = 0
     stuck: tuple[str, ...] = ()
     was_stuck: tuple[str, ...] = ()
+    serial_number: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,6 +249,7 @@ class RecordingMonitor:
             n_clipped=blocks.n_clipped,
             stuck=blocks.stuck,
             was_stuck=tuple(name for name in blocks.ever_stuck if name not in blocks.stuck),
+            serial_number=record.serial_number,
         )
 
     def _state(

@@ -295,6 +295,7 @@ class ProgressCallback:
     plan: TestPlan | None = None
     sensors: Preview | None = None
     wrong: tuple[str, ...] = ()
+    since: tuple[str, ...] = ()
 
     def check(self, plan: TestPlan) -> Sequence[str]:
         """Return what was prepared."""
@@ -354,6 +355,13 @@ class ProgressCallback:
         """Note it."""
         assert verdict is None
         self.told.append(f"keep {path.name} {', '.join(snapshot.results)}")
+
+    def noted(
+        self, path: Path, snapshot: Snapshot, settings: Settings, verdict: TestVerdict | None
+    ) -> Sequence[str]:
+        """Return what was prepared."""
+        del path, snapshot, settings, verdict
+        return self.since
 
     def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
         """Note it."""

@@ -147,6 +147,12 @@ class Controls(Protocol):
         """Write the result into a recording whose end has been seen here. Blocks."""
         ...
 
+    def noted(
+        self, path: Path, snapshot: Snapshot, settings: Settings, verdict: TestVerdict | None
+    ) -> Sequence[str]:
+        """Write a test into the ledger of sensors; return how they have changed. Blocks."""
+        ...
+
     def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
         """Write the report of a recording; returns its file. Blocks."""
         ...

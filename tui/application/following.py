@@ -30,6 +30,7 @@ from tui.application.messages import (
     RecordingOpened,
     ReferenceReady,
     ReferenceRequested,
+    SensorsNoted,
     SnapshotReady,
     StatusUpdated,
 )
@@ -246,6 +247,15 @@ class FollowingApp(App[None]):
             if is_kept and result is not None and messenger.settings is not None:
                 verdict = judge(bench, result, messenger.settings)
                 self._try(partial(self._controls.keep, path, result, verdict))
+                of_test = path, result, messenger.settings, verdict
+                lines = self._try(partial(self._controls.noted, *of_test))
+                if lines and not ended.is_set():
+                    self.post_message(SensorsNoted(path, tuple(lines)))
+
+    @on(SensorsNoted)
+    def _on_noted(self, message: SensorsNoted) -> None:
+        if message.path == self.path:
+            self.state = replace(self.state, sensors_since=message.lines)
 
     @on(StatusUpdated)
     def _on_looked(self, message: StatusUpdated) -> None:

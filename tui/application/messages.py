@@ -64,6 +64,14 @@ class ReferenceReady(Message):
 
 
 @dataclass
+class SensorsNoted(Message):
+    """The ledger of sensors says how those of a recording have changed."""
+
+    path: Path
+    lines: tuple[str, ...]
+
+
+@dataclass
 class DeletionRequested(Message):
     """A recording is to be deleted; that has been confirmed."""
 

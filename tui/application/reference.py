@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from daq.errors import HuddleError
 from daq.estimation.estimation import estimate
+from daq.recording.reader import Recording
 from tui.application.state import Reference
 
 if TYPE_CHECKING:
@@ -56,7 +57,9 @@ def reference_of(
             raise _CancelledError
 
     try:
-        return Reference(path, estimate([path], settings, progress=progress), settings)
+        with Recording.open(path) as recording:
+            numbers = {each.name: each.serial_number for each in recording.sensors}
+        return Reference(path, estimate([path], settings, progress=progress), settings, numbers)
     except _CancelledError:
         return None
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from daq.devices.bench_file import is_simulated
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from daq.bench.masks.mask import Mask
@@ -23,11 +24,15 @@ TITLES: Final = {BENCH: "Bench", TEST: "Test", RESULT: "Result", RECORDINGS: "Re
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reference:
-    """An earlier recording that the one shown is compared with: its path and its estimate."""
+    """An earlier recording that the one shown is compared with: its path and its estimate.
+
+    ``serial_numbers`` are those of its sensors, by name.
+    """
 
     path: Path
     snapshot: Snapshot
     settings: Settings
+    serial_numbers: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,6 +68,8 @@ class State:
         What the recording is compared with.
     models : tuple of Mask
         Noise models to show.
+    sensors_since : tuple of str
+        How sensors have changed since earlier tests, by the ledger; of a test that ended here.
     """
 
     name: str
@@ -81,6 +88,7 @@ class State:
     is_starting: bool = False
     reference: Reference | None = None
     models: tuple[Mask, ...] = ()
+    sensors_since: tuple[str, ...] = ()
 
     @property
     def is_simulated(self) -> bool:

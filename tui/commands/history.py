@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from rich.table import Table
 
-    from tui.service.history.series import Series
+    from tui.service.history.series import Found, Series
 
 _WIDTH, _HEIGHT = 8.0, 2.4
 """Inches, of one sensor."""
@@ -42,14 +42,23 @@ def _band(text: str) -> tuple[float, float]:
 @examples(
     "huddle history lab.toml",
     "huddle history lab.toml --band 1:10 --since 2026-01-01 --out noise.png",
+    "huddle history --sensor S4254475 --band 1:2   (its tests on all benches)",
     "huddle history lab/recordings office/recordings --csv -   (sensors by serial number)",
 )
 def history(
     sources: Annotated[
-        list[Path],
+        list[Path] | None,
         typer.Argument(metavar="BENCH", help="Bench files, or folders of recordings."),
-    ],
+    ] = None,
     *,
+    sensor: Annotated[
+        str,
+        typer.Option(
+            "--sensor",
+            metavar="SERIAL",
+            help="Show this sensor only; without BENCH, its tests on all benches, by the ledger.",
+        ),
+    ] = "",
     band: Annotated[
         str | None,
         typer.Option(
@@ -100,7 +109,6 @@ def history(
     """
     from tui.output.console import check_places, for_people, write_json, write_text
     from tui.service.history.series import bands_of, history
-    from tui.service.records.places import Place
 
     wanted = None if band is None else _band(band)
     since = None if since is None else since.replace(tzinfo=UTC)
@@ -109,8 +117,7 @@ def history(
         require("matplotlib")
         if out.suffix.lower() not in PICTURES:
             raise typer.BadParameter(f"{out}: expected a name that ends in {', '.join(PICTURES)}")
-    places = [Place.of(source) for source in sources]
-    noise = [found for place in places for found in place.store.noise(place.bench_name, since)]
+    noise = _noise(sources or [], sensor, since)
     found = history(noise, band=wanted, scatter=scatter, false_alarms=false_alarms)
     if wanted is not None and not found:
         kept = ", ".join(f"{low:g}:{high:g}" for low, high in bands_of(noise)) or "none"
@@ -147,6 +154,25 @@ def history(
         write_text(csv, csv_text(_COLUMNS, _rows(found)))
     if out is not None:
         write_figure(found, out)
+
+
+def _noise(sources: list[Path], sensor: str, since: datetime | None) -> list[Found]:
+    """Return the noise that the runs of benches have stored, or that the ledger has of a sensor."""
+    from tui.service.history.ledger import ledger_path, noise_of
+    from tui.service.records.places import Place
+
+    if sources:
+        places = [Place.of(source) for source in sources]
+        noise = [found for place in places for found in place.store.noise(place.bench_name, since)]
+        return [found for found in noise if not sensor or found[2].serial_number == sensor]
+    if not sensor:
+        raise typer.BadParameter("expected BENCH, or --sensor SERIAL")
+    noise = [found for found in noise_of(sensor) if since is None or found[1] >= since]
+    if not noise:
+        raise typer.BadParameter(
+            f"--sensor {sensor}: no test in the ledger of sensors ({ledger_path() or 'off'})"
+        )
+    return noise
 
 
 def write_figure(found: Sequence[Series], out: Path) -> None:

@@ -111,6 +111,7 @@ def run(
     from tui.runs.estimate_settings import check_fit, chosen
     from tui.runs.interrupt import defer_interrupt
     from tui.runs.recorder_process import RecorderProcess
+    from tui.service.history.ledger import noted
 
     end = EndCondition(duration, until_cov, until_decided)
     bench = load(path)
@@ -146,6 +147,8 @@ def run(
                 diagnostics=diagnostics,
             )
             recorder.check()  # its error says more than one that follows from it
+            for line in noted(out, snapshot, settings, found):
+                for_people(json, csv).print(line, soft_wrap=True)
             stored.check()
             if report is not None:
                 write_report(

@@ -34,6 +34,7 @@ from tui.output.json_document import document
 from tui.output.results import curves_csv
 from tui.runs.estimate_settings import settings_for
 from tui.runs.recorder_process import RecorderProcess
+from tui.service.history.ledger import noted
 from tui.service.records.places import NoServiceError, Place
 from tui.simulation.host_time import host_time
 
@@ -137,6 +138,12 @@ class _Controls:
     def announce(self, event: str, text: str, path: Path | None) -> None:
         """Start the command that the user gave for events."""
         announce(self.on_event, event, text, path)
+
+    def noted(
+        self, path: Path, snapshot: Snapshot, settings: Settings, verdict: TestVerdict | None
+    ) -> list[str]:
+        """Write a test into the ledger of sensors; return how they have changed."""
+        return noted(path, snapshot, settings, verdict)
 
     def about(self, path: Path, changes: Mapping[str, Any]) -> tuple[Settings, Bench | None]:
         """Return the settings for a recording, with changes and methods for comparison; its bench.

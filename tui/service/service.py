@@ -172,8 +172,8 @@ class Service:
         finally:
             workers.extend(self._repeats)
             ahead = [] if self._ahead is None else [self._ahead[1]]
-            for task in (*workers, *ahead):
-                task.cancel()
+            for each in (*workers, *ahead):
+                each.cancel()
             await asyncio.gather(*workers, *ahead, return_exceptions=True)
             self._write_unsaved()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from estimator.checks.advice import (
@@ -16,7 +17,7 @@ from estimator.checks.advice import (
 )
 from estimator.checks.kinds import Level
 from tui.wording.findings import Explanation, explain, where
-from tui.wording.formatting import listed, percent, ratio, signed
+from tui.wording.formatting import listed, percent, ratio, several, signed, span
 
 if TYPE_CHECKING:
     from tui.wording.findings import Names
@@ -141,4 +142,21 @@ def _unequal_responses(advice: UnequalResponses, names: Names) -> Explanation:
     return Explanation(
         f"{text}; {percent(advice.share)} of the estimate is left.",
         "Use longer segments, or give poles and zeros in the bench file.",
+    )
+
+
+def drift_line(
+    sensor: str,
+    change: tuple[float, float],
+    *,
+    since: datetime,
+    n_tests: int,
+    band: tuple[float, float],
+) -> str:
+    """Return by how many dB, ± the 95 % interval, the noise of a sensor differs from the first."""
+    year = "" if since.year == datetime.now(UTC).year else f" {since.year}"
+    db, error = change
+    return (
+        f"{sensor}: {signed(round(db, 1) + 0.0, '+.1f')} ± {error:.1f} dB since {since.day}"
+        f" {since:%B}{year}, {several(n_tests, 'test')} ({span(*band)})"
     )

@@ -264,7 +264,7 @@ def test_a_rate_that_a_busy_host_reads_is_not_called_wrong(
 ) -> None:
     """Ten seconds of blocks of 0.1 s, and by how much they are read late."""
     rng = np.random.default_rng(3)
-    at: FloatArray = np.arange(101) * 0.1
+    at = np.linspace(0.0, 10.0, 101)
     read = at + late(at) + rng.uniform(0, 0.004, at.size)
     counts = np.zeros((20, 3), np.int32)
     blocks = [

@@ -16,7 +16,7 @@ from tests.tui.application.screen_text import assert_looks_as_before, screen_tex
 from tests.tui.application.test_app import NARROW, WIDE, ended, running, shown
 from tests.tui.example_snapshot import SETTINGS, ProgressCallback, demo_bench, made_snapshot
 from tui.application.app import HuddleApp
-from tui.application.messages import ReferenceReady
+from tui.application.messages import ReferenceReady, SensorsNoted, StatusUpdated
 from tui.application.reference import reference_of
 from tui.application.state import RECORDINGS, RESULT, Reference
 from tui.commands.tui_controls import save_result
@@ -125,3 +125,38 @@ def test_csv_and_json_are_those_of_the_commands(tmp_path: Path) -> None:
     assert csv.read_text(encoding="utf-8") == curves_csv(snapshot)
     found = loads(json.read_text(encoding="utf-8"))
     assert len(found["results"]) == len(snapshot.results)
+
+
+@pytest.mark.parametrize("size", [NARROW, (120, 36), (200, 60)])
+async def test_how_sensors_have_changed_stands_with_the_result_by_itself(
+    told: ProgressCallback, size: tuple[int, int]
+) -> None:
+    line = "A S4254475: +0.7 ± 0.2 dB since 25 October, 3 tests (1–20 Hz)"
+    app = HuddleApp(told)
+    async with app.run_test(size=size) as pilot:
+        await shown(pilot, app, *ended())
+        app.state = replace(app.state, path=told.path)
+        await shown(pilot, app, SensorsNoted(told.path.with_name("other.h5"), ("of another",)))
+        await shown(pilot, app, SensorsNoted(told.path, (line,)))
+        await pilot.press("3")
+        text = screen_text(app)
+    assert line in text
+    assert "of another" not in text
+
+
+async def test_a_comparison_says_where_a_name_is_another_sensor_now(
+    told: ProgressCallback, tmp_path: Path
+) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=WIDE) as pilot:
+        status, snapshot = ended()
+        assert isinstance(status, StatusUpdated)
+        sensors = tuple(replace(s, serial_number=f"S{s.name}") for s in status.now.sensors)
+        before = replace(earlier(tmp_path), serial_numbers={"A": "SA", "B": "S7", "C": ""})
+        now = replace(status.now, sensors=sensors)
+        await shown(pilot, app, StatusUpdated(now), snapshot, ReferenceReady(before))
+        await pilot.press("3")
+        text = screen_text(app)
+    assert text.count("was another sensor in") == 1
+    assert "B was another sensor in" in text
+    assert "S7, now SB" in text

@@ -58,7 +58,7 @@ def result(state: State, *, width: int) -> RenderableType:
     parts.append("")
     if snapshot.results:
         parts += [_channels(state, snapshot, settings, width=width)]
-        parts += [*_notes(state, snapshot, settings), ""]
+        parts += [*_notes(state, snapshot, settings), *map(Text, state.sensors_since), ""]
     facts = [  # with limits, how long to record is said with the verdict
         each
         for each in known(snapshot, settings)
@@ -186,6 +186,14 @@ def _notes(state: State, snapshot: Snapshot, settings: Settings) -> Iterator[Tex
     reference = state.reference
     if reference is not None:
         differences = _differences(state)
+        for sensor in () if state.now is None else state.now.sensors:
+            before = reference.serial_numbers.get(sensor.name, "")
+            if before and sensor.serial_number and before != sensor.serial_number:
+                yield Text(
+                    f"▲ {sensor.name} was another sensor in {_reference(state)}: {before}, now "
+                    f"{sensor.serial_number}",
+                    "yellow",
+                )
         if differences:
             n_certain = sum(each.is_certain for each in differences.values())
             summary = (

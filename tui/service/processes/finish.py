@@ -27,16 +27,16 @@ from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
 from daq.recording.repair import repair
 from daq.recording.signing import identity, sign, signature_of
-from daq.results.band_summary import band_of, channel_means, judged_method
 from daq.results.decision.limits import judge
 from daq.results.sources import sources
 from daq.results.store import store_results
-from estimator.errors import BandError, EstimatorError
+from estimator.errors import EstimatorError
 from tui.output.console import finite, write_json
 from tui.output.json_document import document
 from tui.output.logs.lines import configure
 from tui.output.logs.options import LogFormat
 from tui.runs.estimate_settings import chosen
+from tui.service.history.ledger import band_noise, noted
 from tui.service.records.parts import with_continuations
 from tui.service.records.run_state import RUN, BandNoise
 
@@ -190,7 +190,7 @@ def _finished(request: Request, progress: Callable[[], object]) -> Outcome:
     last = paths[-1]
     found = judge(bench, snapshot, settings)
     verdict = "" if found is None else str(found.verdict)
-    noise = _noise(snapshot, settings, request.bands, about, notes)
+    noise = band_noise(snapshot, settings, request.bands, about, notes)
     about_run = {}
     if request.run is not None:
         record = request.run | {
@@ -204,6 +204,7 @@ def _finished(request: Request, progress: Callable[[], object]) -> Outcome:
     except HuddleError as error:
         notes.append(f"the result is not in the recording: {error}")
         refused |= is_of_disk(error)
+    noted(last, snapshot, settings, found)
     result = document(snapshot, settings, sources=sources(paths), verdict=found)
     try:
         write_json(str(last.with_suffix(".json")), result)
@@ -284,31 +285,6 @@ def _report(
 
     out = last.with_suffix(f".{kind}")
     write(snapshot, out, recordings=paths, settings=settings, taken="beside")
-
-
-def _noise(
-    snapshot: Snapshot,
-    settings: Settings,
-    bands: Sequence[tuple[float, float]],
-    about: Mapping[str, tuple[str, str]],
-    notes: list[str],
-) -> tuple[BandNoise, ...]:
-    method = judged_method(snapshot, settings)
-    if method not in snapshot.results:
-        return ()
-    found = []
-    for band in dict.fromkeys([band_of(settings, snapshot), *bands]):
-        try:
-            means = channel_means(snapshot.results[method], snapshot, settings, band)
-        except BandError as error:
-            notes.append(f"no noise for the history: {error}")
-            continue
-        for label, each in zip(snapshot.channels, means, strict=True):
-            values = (float(each.mean[0]), float(each.low[0]), float(each.high[0]))
-            model, serial_number = about.get(label.sensor, ("", ""))
-            own = (label.sensor, model, serial_number, label.channel, label.unit)
-            found.append(BandNoise(*own, method, float(band[0]), float(band[1]), *values))
-    return tuple(found)
 
 
 class _Heartbeat:
