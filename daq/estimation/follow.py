@@ -234,16 +234,15 @@ def follow(
                 if recording.closed:
                     break
                 _check_left(path, is_open=left_open)
-                if estimation.n_seen >= wanted and estimates.is_due:
-                    wanted = max(estimation.n_seen + 1, estimation.n_seen * (1 + growth))
-                    if sensors is not None:
-                        sensors.look_closely()
-                    with estimates:
-                        snapshot = estimation.snapshot()
+                is_due = estimation.n_seen >= wanted and estimates.is_due
+                if sensors is not None:
+                    (sensors.look_closely if is_due else sensors.look)()
+            if is_due:  # beside the looks, which go on at their own pace
+                wanted = max(estimation.n_seen + 1, estimation.n_seen * (1 + growth))
+                with estimates:
+                    snapshot = estimation.snapshot()
                     observer.snapshot(snapshot, estimation.settings)
-                    uncounted.take(recording.path, snapshot)
-                elif sensors is not None:
-                    sensors.look()
+                uncounted.take(recording.path, snapshot)
             memory.give_back()
             interval = STATUS_INTERVAL if sensors is not None else _until_segment(estimation)
             known.ends_within(min(max(interval, looks.remaining), MAX_INTERVAL))

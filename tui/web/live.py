@@ -275,7 +275,8 @@ class _Page:
         self._live, self.state, self._bench = live, state, bench
         self._recent = RecentMotion()
         self._traces: tuple[Trace, ...] = ()
-        self._of_estimate: dict[str, object] = {}
+        self._drawn: Snapshot | None = None
+        self._of_estimate = dict.fromkeys(("verdict", "noise", "clocks"), "")
 
     def look(self, recording: Recording) -> None:
         """Read the last seconds."""
@@ -310,40 +311,52 @@ class _Page:
         self._live.taken(self.state, is_new=False)
 
     def draw(self) -> None:
-        """Draw all parts of the page."""
+        """Draw all parts of the page: what follows from the estimate once for each of them."""
         state, now = self.state, self.state.now
         snapshot, settings = state.snapshot, state.settings
-        about: dict[str, Any] = {
-            "state": state,
-            "now": now,
-            "events": () if now is None else now.events[-EVENTS:][::-1],
-            "traces": self._traces,
-            "service": self._live.status_lines(),
-            "sensors": None if now is None else state_table(now, state.trouble),
-            "alerts": [] if now is None else alerts(now, settings),
-            **dict.fromkeys(("progress", "noise", "advice", "clock", "clocks")),
-            "facts": [],
-        }
-        if snapshot is not None and settings is not None:
-            choice = choice_of(state, {})
-            about |= {
-                "advice": advice(snapshot, choice, state.verdict),
-                "facts": [each for each in known(snapshot) if each.needs_action],
-                "clock": clock_line(snapshot, settings, width=WIDE),
-                "clocks": clock_table(snapshot, settings, chosen="", width=WIDE)
-                if snapshot.clocks
-                else None,
-            }
-            if now is not None:
-                about["progress"] = progress_line(now, snapshot, settings, state.verdict, width=1)
-            if snapshot.n_segments:
-                about["noise"] = channel_table(
-                    state, choice, means=band_means(snapshot, settings), width=WIDE
-                )
+        if snapshot is not None and settings is not None and snapshot is not self._drawn:
+            self._of_estimate = _of_estimate(state, snapshot, settings)
+            self._drawn = snapshot
+        progress = None
+        if now is not None and snapshot is not None and settings is not None:
+            progress = progress_line(now, snapshot, settings, state.verdict, width=1)
+        parts = _parts(
+            "now_status",
+            state=state,
+            now=now,
+            progress=progress,
+            alerts=[] if now is None else alerts(now, settings),
+            events=() if now is None else now.events[-EVENTS:][::-1],
+            traces=self._traces,
+            service=self._live.status_lines(),
+            sensors=None if now is None else state_table(now, state.trouble),
+        )
         at = datetime.now(UTC)
-        parts = page("now_parts", **about).split("<!--part-->")
-        named = dict(zip(parts[1::2], parts[2::2], strict=True))
-        self._live.publish({**named, "at": f"{at:%H:%M:%S} UTC"})
+        self._live.publish({**self._of_estimate, **parts, "at": f"{at:%H:%M:%S} UTC"})
+
+
+def _of_estimate(state: State, snapshot: Snapshot, settings: Settings) -> dict[str, str]:
+    """Return the parts of the page that follow from the estimate."""
+    choice, noise, clocks = choice_of(state, {}), None, None
+    if snapshot.n_segments:
+        means = band_means(snapshot, settings)
+        noise = channel_table(replace(state, now=None), choice, means=means, width=WIDE)
+    if snapshot.clocks:
+        clocks = clock_table(snapshot, settings, chosen="", width=WIDE)
+    return _parts(
+        "now_estimate",
+        advice=advice(snapshot, choice, state.verdict),
+        facts=[each for each in known(snapshot) if each.needs_action],
+        noise=noise,
+        clock=clock_line(snapshot, settings, width=WIDE),
+        clocks=clocks,
+    )
+
+
+def _parts(template: str, **about: object) -> dict[str, str]:
+    """Return the parts that a template has, by the id of their element."""
+    parts = page(template, **about).split("<!--part-->")
+    return dict(zip(parts[1::2], parts[2::2], strict=True))
 
 
 def band_means(snapshot: Snapshot, settings: Settings) -> tuple[BandMeans, ...]:

@@ -58,12 +58,13 @@ def traces(recording: Recording) -> tuple[Trace, ...]:
             ends[1::2] = ends[1::2, ::-1]
             y = HEIGHT - 1 - scale * (ends.ravel() - least)
             x = np.repeat(np.arange(len(edges)) * COLUMNS / len(edges), 2)
+            points = np.rint(np.stack((x, y), axis=1)).astype(np.int64).ravel().tolist()
             size = (most - least) / abs(channel.sensitivity)
             (text,), unit = readings([size], channel.unit)
             found.append(
                 Trace(
                     f"{sensor.name}.{channel.name}",
-                    " ".join(f"{a:.0f},{b:.0f}" for a, b in zip(x, y, strict=True)),
+                    " ".join(map(str, points)),
                     f"{text} {unit}",
                 )
             )

@@ -14,7 +14,7 @@ function curves() {
   let chart = null, span = null, asked = 0;
 
   const query = () => {
-    const found = new URLSearchParams(form ? new FormData(form) : {});
+    const found = new URLSearchParams(new FormData(form));
     if (!found.get("with")) found.delete("with");
     return found;
   };
@@ -34,6 +34,7 @@ function curves() {
     if (form.elements.channel.options.length) return;
     for (const [name, words] of [["channel", found.channels], ["unit", found.units]])
       words.forEach((word, n) => form.elements[name].add(new Option(word, n)));
+    form.hidden = false;
   }
 
   function draw(found) {
@@ -114,15 +115,13 @@ function curves() {
     return item;
   }
 
-  if (form) {
-    form.addEventListener("change", (event) => {
-      if (event.target.name === "with") { form.submit(); return; }
-      history.replaceState(null, "", `?${query()}`);
-      load();
-    });
-    form.querySelector("button:not([type])").hidden = true;
-    whole.addEventListener("click", () => { span = null; whole.hidden = true; load(); });
-  }
+  form.addEventListener("change", (event) => {
+    if (event.target.name === "with") { form.submit(); return; }
+    history.replaceState(null, "", `?${query()}`);
+    load();
+  });
+  form.querySelector("button:not([type])").hidden = true;
+  whole.addEventListener("click", () => { span = null; whole.hidden = true; load(); });
   let width = plot.clientWidth;
   new ResizeObserver(() => {
     if (chart && plot.clientWidth !== width) {
