@@ -27,18 +27,6 @@ HEADERS = {
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("open")
-
-
-@pytest.fixture(scope="module")
-def server(folder: Path) -> Iterator[Server]:
-    """Serve without secrets, on this computer."""
-    with serving(bench_file(folder)) as found:
-        yield found
-
-
-@pytest.fixture(scope="module")
 def closed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     """Serve with secrets, which nobody tries to guess."""
     with serving(bench_file(tmp_path_factory.mktemp("closed"), SECRETS)) as found:

@@ -183,8 +183,13 @@ function live(reload) {
     };
   }
 
+  /* Browsers open six connections to a server: tabs that nobody sees keep none. */
+  document.addEventListener("visibilitychange", () => {
+    if (document.hidden) source.close();
+    else { heard = Date.now(); connect(); }
+  });
   setInterval(() => { // a network that is gone closes nothing
-    if (Date.now() - heard < SILENT) return;
+    if (document.hidden || Date.now() - heard < SILENT) return;
     lost();
     if (Date.now() - tried > SILENT) connect();
   }, 1000);
