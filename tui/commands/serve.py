@@ -36,10 +36,13 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.bench.model import Bench
+    from daq.bench.tables.unattended import Web
     from tui.service.clock import Clock
     from tui.service.records.run_state import Run
     from tui.service.service import Service
 
+PAGES_AGAIN = 10.0
+"""Seconds until pages that have ended are served again."""
 INTERVAL = 10.0
 """Seconds between two signs of life, at most."""
 _LOGGER = logging.getLogger(__name__)
@@ -170,6 +173,8 @@ def accepted(path: Path, wanted: Mapping[str, object]) -> Bench:
             )
     if bench.metrics is not None:
         require("prometheus_client")
+    if bench.web is not None:
+        require("starlette", "uvicorn", "jinja2", "matplotlib")
     if faults:
         raise BenchFileError(*faults, source=path)
     return bench
@@ -234,6 +239,8 @@ async def serve_runs(
             asyncio.create_task(hook_runner.work()),
             asyncio.create_task(signs_of_life(service, notifier)),
         ]
+        if bench.web is not None:
+            helpers.append(asyncio.create_task(keep_pages(path, bench.web)))
         _LOGGER.info("serving %s; recordings go to %s", bench.name, folder)
         try:
             with contextlib.ExitStack() as stack:
@@ -248,6 +255,36 @@ async def serve_runs(
             await asyncio.gather(*helpers, return_exceptions=True)
     finally:
         lock.release()
+
+
+async def keep_pages(path: Path, web: Web) -> None:
+    """Keep a server of pages running as a process of its own, until cancelled."""
+    import asyncio
+
+    from daq.python_process import python_command
+    from tui.output.logs import lines
+    from tui.runs.child_log import ChildLog
+
+    command = python_command("tui", "web", str(path), *lines.arguments_for_child())
+    while True:
+        _LOGGER.info("pages at %s port %d", web.address, web.port)
+        server = await asyncio.create_subprocess_exec(
+            *command,
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.DEVNULL,
+            stderr=asyncio.subprocess.PIPE,
+        )
+        log = ChildLog("the server of pages")
+        try:
+            while server.stderr is not None and (said := await server.stderr.read(1 << 16)):
+                log.feed(said)
+            code = await server.wait()
+        except asyncio.CancelledError:
+            server.terminate()
+            await server.wait()
+            raise
+        _LOGGER.warning("the pages ended with exit code %d; started again", code)
+        await asyncio.sleep(PAGES_AGAIN)
 
 
 def _locked(bench: Bench, folder: Path) -> Lock:
@@ -287,6 +324,7 @@ def _again(path: Path, wanted: Mapping[str, object], first: Bench) -> Bench:
         ("name", first.name, bench.name),
         ("recording.directory", first.recording_directory, bench.recording_directory),
         ("metrics", first.metrics, bench.metrics),
+        ("web", first.web, bench.web),
     ):
         if old != new:
             expected = (

@@ -6,19 +6,29 @@ import html
 import json
 import os
 import re
+import signal
+import socket
 import subprocess
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
 from tests.tui.night_recording import HOSTILE
-from tests.tui.web.pages import READER, SECRETS, STEERER, Server, bench_file, serving
+from tests.tui.web.pages import READER, SECRETS, STEERER, Server, Visit, bench_file, serving
+from tests.waiting import limit, wait_until
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
+SERVICE = """
+[[schedule]]
+at = 2099-01-01T00:00:00Z
+duration = "3h"
+[web]
+port = {port}
+"""
 HEADERS = {
     "x-content-type-options": "nosniff",
     "referrer-policy": "same-origin",
@@ -220,3 +230,34 @@ def test_the_login_leads_to_these_pages_only(closed: Server) -> None:
     for after in ("https://evil.example/", "//evil.example", "/\\evil.example"):
         form = {"name": "Ada", "secret": READER, "next": after}
         assert closed.visit().post("/login", form).headers["location"] == "/"
+
+
+@pytest.mark.long
+def test_a_service_keeps_its_pages_running(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    bench = bench_file(tmp_path, SERVICE.format(port=port))
+    visit = Visit(f"http://127.0.0.1:{port}")
+
+    def answers() -> bool:
+        try:
+            return visit.get("/tests").status == 200
+        except OSError:
+            return False
+
+    with (tmp_path / "log").open("wb") as log:
+        service = subprocess.Popen(
+            [sys.executable, "-m", "tui", "serve", str(bench)], stderr=log, stdout=log
+        )
+    try:
+        wait_until(answers, "the pages of the service")
+        assert "service    running, bench cellar" in visit.get("/").text
+        children = Path(f"/proc/{service.pid}/task/{service.pid}/children").read_text().split()
+        (pages,) = (pid for pid in children if b"web" in Path(f"/proc/{pid}/cmdline").read_bytes())
+        os.kill(int(pages), signal.SIGKILL)
+        wait_until(lambda: not answers(), "the pages have ended")
+        wait_until(answers, "the pages are served again")
+    finally:
+        service.terminate()
+        service.wait(limit(60))
+    assert not answers()
