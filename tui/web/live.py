@@ -16,6 +16,7 @@ import threading
 import time
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from itertools import groupby
 from typing import TYPE_CHECKING
 
 from daq.errors import HuddleError
@@ -37,13 +38,14 @@ from tui.web.traces import traces
 from tui.wording.facts import known
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator, Callable, Sequence
     from pathlib import Path
     from typing import Any
 
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from daq.protocols.block import Event
     from daq.recording.monitor import RecordingStatus
     from daq.recording.reader import Recording
     from daq.results.band_summary import BandMeans
@@ -326,7 +328,7 @@ class _Page:
             now=now,
             progress=progress,
             alerts=[] if now is None else alerts(now, settings),
-            events=() if now is None else now.events[-EVENTS:][::-1],
+            events=() if now is None else _newest(now.events),
             traces=self._traces,
             service=self._live.status_lines(),
             sensors=None if now is None else state_table(now, state.trouble),
@@ -351,6 +353,12 @@ def _of_estimate(state: State, snapshot: Snapshot, settings: Settings) -> dict[s
         clock=clock_line(snapshot, settings, width=WIDE),
         clocks=clocks,
     )
+
+
+def _newest(events: Sequence[Event]) -> list[Event]:
+    """Return the newest events, the last of each sort that came several times in a row."""
+    last = [list(group)[-1] for _, group in groupby(events, lambda e: (e.sensor, e.kind))]
+    return last[-EVENTS:][::-1]
 
 
 def _parts(template: str, **about: object) -> dict[str, str]:
