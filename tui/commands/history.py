@@ -18,12 +18,8 @@ from tui.service.records.run_state import utc_text
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from rich.table import Table
-
     from tui.service.history.series import Found, Series
 
-_WIDTH, _HEIGHT = 8.0, 2.4
-"""Inches, of one sensor."""
 PICTURES = (".png", ".svg", ".pdf")
 _COLUMNS = (
     *("serial_number", "sensor", "channel", "model", "bench", "due", "method", "unit"),
@@ -109,6 +105,7 @@ def history(
     """
     from tui.output.console import check_places, for_people, write_json, write_text
     from tui.service.history.series import bands_of, history
+    from tui.service.history.shown import history_figure, history_lines, history_table
 
     wanted = None if band is None else _band(band)
     since = None if since is None else since.replace(tzinfo=UTC)
@@ -126,22 +123,9 @@ def history(
             " [history] bands in the bench file adds bands"
         )
     screen = for_people(json, csv)
-    screen.print(_table(found))
-    n_changed = 0
-    for series in found:
-        for line in change_lines(series):
-            n_changed += 1
-            screen.print(line, style="yellow")
-        left_out = len(series.noise) - len(series.usable)
-        if left_out:
-            screen.print(f"{series.name}: {left_out} runs not tested: their interval reaches zero")
-    if found:
-        screen.print(
-            f"{'No change' if not n_changed else 'Changes'} beyond uncertainty and"
-            f" {scatter:g} dB of scatter from run to run. The test gives a false alarm in"
-            f" {false_alarms:.2g} of all histories without a change, however long they become.",
-            soft_wrap=True,
-        )
+    screen.print(history_table(found))
+    for line in history_lines(found, scatter=scatter, false_alarms=false_alarms):
+        screen.print(line, soft_wrap=True)
     write_json(
         json,
         {
@@ -153,7 +137,7 @@ def history(
     if csv is not None:
         write_text(csv, csv_text(_COLUMNS, _rows(found)))
     if out is not None:
-        write_figure(found, out)
+        history_figure(found).savefig(out, dpi=150)
 
 
 def _noise(sources: list[Path], sensor: str, since: datetime | None) -> list[Found]:
@@ -173,106 +157,6 @@ def _noise(sources: list[Path], sensor: str, since: datetime | None) -> list[Fou
             f"--sensor {sensor}: no test in the ledger of sensors ({ledger_path() or 'off'})"
         )
     return noise
-
-
-def write_figure(found: Sequence[Series], out: Path) -> None:
-    """Write a picture with a panel for each sensor and band, and lines where noise has changed.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
-    """
-    from matplotlib.figure import Figure
-
-    from daq.bench.units import decibels
-    from tui.report.figures.drawing import look
-
-    panels: dict[tuple[str, float, float, str], list[Series]] = {}
-    for series in found:
-        last = series.last
-        sensor = f"{last.sensor} {last.serial_number}".strip()
-        panels.setdefault((sensor, last.low_hz, last.high_hz, last.unit), []).append(series)
-    with look():
-        figure = Figure(figsize=(_WIDTH, 0.8 + _HEIGHT * max(1, len(panels))), layout="constrained")
-        axes = figure.subplots(max(1, len(panels)), squeeze=False, sharex=True)[:, 0]
-        for panel, ((sensor, low, high, unit), own) in zip(axes, panels.items(), strict=False):
-            for number, series in enumerate(own):
-                colour = f"C{number}"
-                used = series.usable
-                dates = [series.runs[n][1] for n in used]
-                noise = [series.noise[n] for n in used]
-                middle = [decibels(each.psd) for each in noise]
-                below = [decibels(each.psd) - decibels(each.low) for each in noise]
-                above = [decibels(each.high) - decibels(each.psd) for each in noise]
-                panel.errorbar(
-                    dates,
-                    middle,
-                    yerr=[below, above],
-                    fmt="o-",
-                    markersize=3,
-                    linewidth=0.7,
-                    color=colour,
-                    label=series.last.channel,
-                )
-                for change in series.changes:
-                    panel.axvline(series.due_of(change.first), color=colour, linestyle="--")
-            panel.set_title(f"{sensor}, {low:.3g} to {high:.3g} Hz", loc="left")
-            panel.set_ylabel(f"noise, dB re 1 ({unit})²/Hz")
-            panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-        axes[-1].set_xlabel("date (UTC); bars: 95 % intervals; dashed: change")
-        figure.savefig(out, dpi=150)
-
-
-def _table(found: Sequence[Series]) -> Table:
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for name in ("serial number", "sensor", "channel", "band (Hz)", "unit²/Hz of"):
-        table.add_column(name)
-    for name in ("runs", "first (dB)", "last (dB)"):
-        table.add_column(name, justify="right")
-    table.add_column("changed")
-    for series in found:
-        last = series.last
-        table.add_row(
-            *(last.serial_number or "-", last.sensor, last.channel),
-            *(f"{last.low_hz:.3g} to {last.high_hz:.3g}", last.unit, str(len(series.noise))),
-            *(level(series.noise[0].psd, *_ends(series, 0)), level(last.psd, *_ends(series, -1))),
-            f"{len(series.changes)} ×" if series.changes else "no",
-        )
-    return table
-
-
-def _ends(series: Series, position: int) -> tuple[float, float]:
-    noise = series.noise[position]
-    return noise.low, noise.high
-
-
-def level(psd: float, low: float, high: float) -> str:
-    """Return a PSD in dB with half the width of its interval."""
-    from daq.bench.units import decibels
-
-    if not psd > 0:
-        return "below 0"
-    if not 0 < low <= high:
-        return f"below {decibels(high):.2f}"
-    return f"{decibels(psd):.2f} ±{(decibels(high) - decibels(low)) / 2:.2f}".replace("-", "−")
-
-
-def change_lines(series: Series) -> Iterator[str]:
-    """Yield a sentence for each change of a channel."""
-    from daq.results.change_test import DECIBEL, NORMAL_95
-
-    for change in series.changes:
-        first, found = series.due_of(change.first), series.due_of(change.found)
-        shift, width = change.shift / DECIBEL, NORMAL_95 * change.deviation / DECIBEL
-        serial = f" ({series.last.serial_number})" if series.last.serial_number else ""
-        yield (
-            f"{series.name}{serial}, {series.last.low_hz:.3g} to {series.last.high_hz:.3g} Hz:"
-            f" {shift:+.2f} ±{width:.2f} dB since {first:%Y-%m-%d %H:%M}, decided by the run of"
-            f" {found:%Y-%m-%d %H:%M}"
-        )
 
 
 def _rows(found: Sequence[Series]) -> Iterator[list[object]]:

@@ -56,9 +56,10 @@ def web(
 ) -> None:
     """Show a bench in the browser, until Ctrl-C.
 
-    Pages: the running test, and all tests with curves, facts, reports and
-    data. Without a table [web] in the bench file, only this computer reaches
-    them, and they start and stop nothing (docs/web.md).
+    Pages: the running test, all tests with curves, facts, reports and data,
+    sensors over months, and an archive. Without a table [web] in the bench
+    file, only this computer reaches them, and they start and stop nothing
+    (docs/web.md).
     """
     if [bench is not None, password, token].count(True) != 1:
         raise typer.BadParameter("expected a bench file, or --password, or --token")

@@ -41,6 +41,7 @@ def environment() -> Environment:
     )
     made.filters |= {
         "clock_time": clock_time,
+        "plain": _plain,
         "rank_tone": _RANKS.get,
         "rich": line,
         "several": several,

@@ -36,6 +36,7 @@ from tui.web.access import Access, TooManyAttemptsError, Visitor, server_key
 from tui.web.chart import choice_of, numbers, picture
 from tui.web.html import page
 from tui.web.live import Live
+from tui.web.months import Months
 from tui.web.pages import about_test
 from tui.web.tests import PAGE, NoSuchTestError, Tests, compared
 from tui.wording.verdict_text import WORDS
@@ -209,6 +210,7 @@ class Server:
         self._access = Access(web, server_key(bench))
         self._live = Live(controls, status)
         self._tests = Tests(controls, lambda: self._live.followed)
+        self._months = Months(bench)
         self._checking = asyncio.Lock()
         """Passwords are hashed one at a time: each takes a tenth of a second of a core."""
 
@@ -262,6 +264,11 @@ class Server:
             Route("/tests/{name}/result.json", self._json),
             Route("/tests/{name}/curves.csv", self._csv),
             Route("/tests/{name}/certificate/{number:int}", self._certificate),
+            Route("/sensors", self._sensors),
+            Route("/sensors.png", self._picture),
+            Route("/archive", self._archive),
+            Route("/archive/days.png", self._picture),
+            Route("/archive/density.png", self._picture),
             Route("/login", self._log_in, methods=["GET", "POST"]),
             Route("/logout", self._log_out, methods=["POST"]),
             Route("/start", self._start, methods=["GET", "POST"]),
@@ -467,6 +474,27 @@ class Server:
         _, path = found[number]
         content = await run_in_threadpool(path.read_bytes)
         return _download(content, "application/pdf", path.name)
+
+    async def _sensors(self, request: Request) -> Response:
+        about = await asyncio.wrap_future(self._tests.in_worker(self._months.sensors))
+        return self._page(request, "sensors", title="Sensors", **about)
+
+    async def _archive(self, request: Request) -> Response:
+        about = await asyncio.wrap_future(self._tests.in_worker(self._months.archive))
+        return self._page(request, "archive", title="Archive", **about)
+
+    async def _picture(self, request: Request) -> Response:
+        name = request.url.path.rpartition("/")[2].removesuffix(".png")
+        months = self._months
+
+        def drawn() -> bytes:
+            return months.sensors_picture() if name == "sensors" else months.archive_picture(name)
+
+        try:
+            content = await asyncio.wrap_future(self._tests.in_worker(drawn))
+        except LookupError as error:
+            raise HTTPException(HTTPStatus.NOT_FOUND, str(error)) from None
+        return Response(content, media_type="image/png")
 
     # ------------------------------------------------------------------------- steering
 
