@@ -11,7 +11,7 @@ function curves() {
   if (!box || !window.uPlot) return () => {};
   const form = byId("choice"), plot = byId("plot"), reading = byId("reading"), whole = byId("whole");
   const RESTING = reading.textContent;
-  let chart = null, span = null, asked = 0;
+  let chart = null, span = null, isLoading = false, isOld = false;
 
   const query = () => {
     const found = new URLSearchParams(new FormData(form));
@@ -19,14 +19,19 @@ function curves() {
     return found;
   };
 
+  /* One request at a time: where answers are slow, newer requests must not starve all of them. */
   async function load() {
-    const number = ++asked, wanted = query();
-    if (span) { wanted.set("from", span[0]); wanted.set("to", span[1]); }
-    const answer = await fetch(`${box.dataset.source}?${wanted}`).catch(() => null);
-    if (!answer || !answer.ok || number !== asked) return;
-    const found = await answer.json();
-    if (number !== asked) return;
-    if (found.curves.length) { choices(found); draw(found); }
+    if (isLoading) { isOld = true; return; }
+    isLoading = true;
+    do {
+      isOld = false;
+      const wanted = query();
+      if (span) { wanted.set("from", span[0]); wanted.set("to", span[1]); }
+      const answer = await fetch(`${box.dataset.source}?${wanted}`).catch(() => null);
+      const found = answer && answer.ok ? await answer.json().catch(() => null) : null;
+      if (found && found.curves.length) { choices(found); draw(found); }
+    } while (isOld);
+    isLoading = false;
   }
 
   /* A page that was opened before there were channels gets its choices now. */
