@@ -38,6 +38,7 @@ from tui.application.recordings_view.view import RecordingsView
 from tui.application.reference import reference_of
 from tui.application.result_view.view import ResultView
 from tui.application.state import BENCH, RESULT, TEST, TITLES, VIEWS, State
+from tui.application.test_view.panels import note
 from tui.application.test_view.recent_motion import RecentMotion, with_advice
 from tui.application.test_view.view import TestView
 from tui.application.themes import (
@@ -267,9 +268,7 @@ class FollowingApp(App[None]):
 
     @on(Progress)
     def _on_progress(self, message: Progress) -> None:
-        closed = self.now is not None and self.now.closed
-        what = "the result is being computed" if closed else "reading what was recorded"
-        self.state = replace(self.state, note=f"{what}: {message.done / message.total:.0%}")
+        self.state = replace(self.state, note=note(self.now, message.done, message.total))
 
     @on(SnapshotReady)
     async def _on_fresh(self, message: SnapshotReady) -> None:

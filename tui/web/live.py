@@ -28,7 +28,7 @@ from estimator.errors import EstimatorError
 from tui.application.state import State
 from tui.application.test_view.channels import channel_table
 from tui.application.test_view.clocks import clock_line, clock_table
-from tui.application.test_view.panels import advice, alerts, progress_line, state_table
+from tui.application.test_view.panels import advice, alerts, note, progress_line, state_table
 from tui.application.test_view.recent_motion import RecentMotion, with_advice
 from tui.runs.estimate_settings import settings_for
 from tui.service.status import status_lines
@@ -278,6 +278,7 @@ class _Page:
         self._recent = RecentMotion()
         self._traces: tuple[Trace, ...] = ()
         self._drawn: Snapshot | None = None
+        self._next_note = 0.0
         self._of_estimate = dict.fromkeys(("verdict", "noise", "clocks"), "")
 
     def look(self, recording: Recording) -> None:
@@ -300,6 +301,7 @@ class _Page:
             settings=settings,
             judged_by=self._bench,
             verdict=judge(self._bench, snapshot, settings),
+            note="",
         )
         self._live.taken(self.state, is_new=True)
         self.draw()
@@ -308,9 +310,12 @@ class _Page:
         """Take nothing: the estimate has them."""
 
     def progress(self, done: int, total: int) -> None:
-        """End early when nobody looks any more."""
-        del done, total
+        """Show how far the reading is; it ends early when nobody looks any more."""
+        self.state = replace(self.state, note=note(self.state.now, done, total))
         self._live.taken(self.state, is_new=False)
+        if time.monotonic() >= self._next_note:
+            self._next_note = time.monotonic() + LOOK
+            self.draw()
 
     def draw(self) -> None:
         """Draw all parts of the page: what follows from the estimate once for each of them."""

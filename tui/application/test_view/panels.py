@@ -260,6 +260,13 @@ def progress_line(
     return line
 
 
+def note(now: RecordingStatus | None, done: int, total: int) -> str:
+    """Return what an estimate of many segments is, and how far."""
+    closed = now is not None and now.closed
+    what = "the result is being computed" if closed else "reading what was recorded"
+    return f"{what}: {done / total:.0%}"
+
+
 def known_to(reached: Precision) -> str:
     """Return how well the noise at one frequency is known, and how well that is wanted."""
     wanted = "" if reached.target is None else f", wanted {percent(reached.target)}"

@@ -66,7 +66,7 @@ function curves() {
         y: { distr: found.is_logarithmic ? 3 : 1, log: 10, range: () => found.range },
       },
       axes: [
-        { ...axis, label: "frequency (Hz)", values: (_, ticks) => ticks.map((t) => (t === null ? "" : String(+t.toPrecision(6)))) },
+        { ...axis, label: "frequency (Hz)", filter: round, values: (_, ticks) => ticks.map((t) => (t === null ? "" : String(+t.toPrecision(6)))) },
         { ...axis, label: found.unit, size: 70, values: (_, ticks) => ticks.map((t) => (t === null ? "" : found.is_logarithmic ? t.toExponential(0) : String(t).replace("-", "−"))) },
       ],
       series, bands,
@@ -99,6 +99,12 @@ function curves() {
     reading.hidden = false;
     box.dataset.drawn = found.curves.map((each) => each.label).join(" ");
     box.dataset.span = found.span.join(" ");
+  }
+
+  /* 1, 2 and 5 of each decade have a number; all, where less than a decade is seen. */
+  function round(chart, ticks) {
+    const { min, max } = chart.scales.x;
+    return ticks.map((tick) => (max < 10 * min || "125".includes(tick.toExponential()[0]) ? tick : null));
   }
 
   /* Curves of two tests have frequencies of their own: the value nearest to the cursor is read. */
