@@ -73,7 +73,7 @@ TAIL = """
   must have all runs. SQLite has no checksums, so a bit of a number changes it unseen.
 - *Bench files*: one to three lines lost, repeated, exchanged, or with another value or byte.
 - *Clocks*: a service at 20 times real time, whose clock is set by −25 to 30 min once a minute.
-- *Starved recorder*: two busy processes for each processor while it records.
+- *Starved recorder*: a busy process for each processor beside the recorder and the played devices.
 - *Accelerated day*: a service at 20 times real time. It may grow by 50 kB a run.
 """
 
