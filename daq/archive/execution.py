@@ -163,7 +163,7 @@ def on_cluster(
         )
     try:
         client = distributed.Client(scheduler, timeout=CONNECT_SECONDS)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, MemoryError) as error:  # lengths, as a web server sends them
         raise ArchiveError(
             f"--scheduler {scheduler}: no Dask scheduler answers ({error}); start one with:"
             " dask scheduler"

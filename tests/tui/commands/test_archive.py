@@ -7,6 +7,7 @@ import gc
 import json
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 from contextlib import ExitStack
@@ -198,6 +199,26 @@ def test_the_workers_of_a_cluster_write_the_same_values(folder: Path, tmp_path: 
     assert code == 0, said
     assert "dashboard: http" in said
     assert_same(Store.open(store), Store.open(folder / "huddle-archive"))  # type: ignore[arg-type]
+
+
+@pytest.mark.long
+def test_a_web_server_is_no_scheduler(folder: Path, tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        command = [*python_command("tui"), "archive", str(folder), "--scheduler", address]
+        with subprocess.Popen(
+            [*command, "--store", str(tmp_path / "store"), *OPTIONS],
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as huddle_command:
+            connection, _ = server.accept()
+            with connection:
+                connection.sendall(b"HTTP/1.1 400 Bad Request\r\nConnection: close\r\n\r\n")
+            server.close()
+            code, _, said = finish(huddle_command)
+    assert code == 3
+    assert "no Dask scheduler answers" in said
 
 
 @pytest.mark.long
