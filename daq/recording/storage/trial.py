@@ -70,7 +70,7 @@ def trials(paths: Sequence[Path], task: str) -> Iterator[tuple[Path, dict[str, A
     """
     left = list(paths)
     while left:
-        for found in _trials(left, task):
+        for found in _trials(tuple(left), task):
             yield left.pop(0), found
 
 
@@ -103,6 +103,8 @@ def _trials(paths: Sequence[Path], task: str) -> Iterator[dict[str, Any]]:
                     if line.startswith(b"{"):
                         n_found += 1
                         yield json.loads(line)
+                if n_found == len(paths):  # how long it takes to end is no matter
+                    return
             else:  # silence
                 yield {"fatal": f"HDF5 does not come back from it within {LIMIT:g} s"}
                 return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 from typing import TYPE_CHECKING
 
 import pytest
@@ -45,6 +46,15 @@ def test_the_files_after_one_that_hangs_are_verified(loop: Path, tmp_path: Path)
     assert found[good]["intact"]
     assert found[good]["root_sha256"] == verify(good).root_sha256
     assert "cannot be read" in found[lost]["error"]
+
+
+def test_a_child_that_is_slow_to_end_says_nothing_of_further_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = "import signal; print('{}', flush=True); signal.pause()"
+    monkeypatch.setattr(trial, "LIMIT", limit(0.1))
+    monkeypatch.setattr(trial, "python_command", lambda *_: [sys.executable, "-S", "-c", program])
+    assert list(trial.trials([tmp_path / "a.h5"], "open")) == [(tmp_path / "a.h5", {})]
 
 
 def test_a_file_that_crashes_the_child_is_damaged(
