@@ -28,8 +28,7 @@ from daq.bench.channel import Channel
 from daq.bench.loading import parse
 from daq.bench.model import Bench, Sensor
 from daq.devices.epson import commands
-from daq.estimation.estimation import Estimation
-from daq.estimation.follow import COMMIT_INTERVAL, SHORTEST_INTERVAL
+from daq.estimation.follow import SHORTEST_INTERVAL, follow
 from daq.estimation.settings import Settings
 from daq.python_process import python_command
 from daq.recorder.recorder import run as record
@@ -39,6 +38,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from numpy.typing import NDArray
+
+    from daq.estimation.snapshot import Snapshot
+    from daq.recording.monitor import RecordingStatus
 
 SEND_INTERVAL = 0.05
 AXES = tuple(Channel(name=axis, sensitivity=commands.COUNTS_PER_UNIT) for axis in "xyz")
@@ -169,7 +171,7 @@ def live(n_sensors: int, sampling_rate: float, *, begin: float, duration: float)
         bench_file, path = Path(folder) / "bench.toml", Path(folder) / "r.h5"
         bench_file.write_text(bench.text, encoding="utf-8")
         command = python_command("tui", "run", str(bench_file), "--out", str(path))
-        command += ["--duration", str(begin + duration + 10)]
+        command += ["--duration", str(begin + duration + 30)]
         with (
             _terminal() as screen,
             subprocess.Popen(command, stdout=screen, stderr=screen) as huddle,
@@ -180,7 +182,7 @@ def live(n_sensors: int, sampling_rate: float, *, begin: float, duration: float)
             (recorder,) = _children(huddle.pid)
             processes = (huddle.pid, recorder)
             before, since = [_work_of(pid) for pid in processes], time.monotonic()
-            delay = _longest_delay(path, until=since + duration)
+            delays = _delays(path, until=since + duration)
             passed = time.monotonic() - since
             share = [
                 100 * (_work_of(pid) - work) / passed
@@ -189,24 +191,53 @@ def live(n_sensors: int, sampling_rate: float, *, begin: float, duration: float)
             huddle.wait()
     what = f"{n_sensors} triaxial sensors × {sampling_rate:g} Hz, recorded and estimated"
     note = f"huddle run {share[0]:.2f} %, its recorder {share[1]:.2f} %"
+    late = f"{what}: a segment is in the estimate after its end by"
+    seen, worked = delays.seen[1:], delays.worked[1:]  # the first has what was recorded before
     return [
         Row(f"{what}: one core", sum(share), "%", at_most=5.0, note=note),
-        Row(f"{what}: a segment is there after its end by", delay, "s", at_most=2.0),
+        Row(late, float(np.median(seen)), "s", at_most=2.0, note=f"median of {len(seen)}"),
+        Row(late, max(seen), "s", at_most=2.0, note="longest"),
+        Row(f"{what}: processor time of an estimate", float(np.median(worked)), "s", note="median"),
+        Row(f"{what}: processor time of an estimate", max(worked), "s", 2.0, note="longest"),
     ]
 
 
-def _longest_delay(path: Path, *, until: float) -> float:
-    """Follow a recording as `huddle run` does; return how late a segment was, at most."""
-    delays: list[float] = []
-    with Estimation([path], Settings()) as estimation:
-        estimation.update()
-        while time.monotonic() < until:
-            time.sleep(max(SHORTEST_INTERVAL, estimation.lacking - COMMIT_INTERVAL))
-            if estimation.update():
-                estimated = estimation.snapshot()
-                end = estimated.start_utc_ns * 1e-9 + estimated.elapsed
-                delays.append(time.time() - end)
-    return max(delays[1:])  # the first may have waited for those before it
+class _Delays:
+    """An observer that notes how late segments are in what it sees, and what they cost."""
+
+    def __init__(self, until: float) -> None:
+        self.cancelled = threading.Event()
+        self.seen: list[float] = []
+        """Seconds from the end of a segment to the estimate that has it."""
+        self.worked: list[float] = []
+        """Processor time of this process since the estimate before, in s."""
+        self._until, self._work = until, time.process_time()
+
+    def status(self, status: RecordingStatus) -> None:
+        """Look whether it is time to end."""
+        del status
+        if time.monotonic() > self._until:
+            self.cancelled.set()
+
+    def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
+        """Note when the last segment of the estimate ended, and what was done since."""
+        del settings
+        self.seen.append(time.time() - snapshot.start_utc_ns * 1e-9 - snapshot.elapsed)
+        self.worked.append(time.process_time() - self._work)
+        self._work = time.process_time()
+
+    def segments(self, n_segments: int, elapsed: float) -> None:
+        """Ignore segments that no estimate has yet."""
+
+    def progress(self, done: int, total: int) -> None:
+        """Ignore what was recorded before."""
+
+
+def _delays(path: Path, *, until: float) -> _Delays:
+    """Follow a recording by the loop of the application."""
+    found = _Delays(until)
+    follow(path, Settings(), found, cancelled=found.cancelled)
+    return found
 
 
 @contextlib.contextmanager

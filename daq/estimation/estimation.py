@@ -419,6 +419,11 @@ class Estimation:
         self._equalisation.prove([piece for piece in pieces if piece[2] > 0])
         self._filter()
 
+    @property
+    def occasional_cost(self) -> float:
+        """Seconds that diagnoses, and estimates with a choice of the dimension, cost so far."""
+        return self._snapshots.occasional_cost
+
     @one_blas_thread()
     def snapshot(self) -> Snapshot:
         """Return the estimate from the segments taken so far."""

@@ -170,7 +170,7 @@ def follow(
     share : float
         Of the time, at most, that estimates of the growing recording may cost.
     of_diagnoses : float
-        Share of that, at most, for the diagnoses in them.
+        Share of that, at most, for the diagnoses in them, which are not part of it.
     silence : float
         In seconds.
     whole : bool
@@ -240,11 +240,13 @@ def follow(
             if is_due:  # beside the looks, which go on at their own pace
                 wanted = max(estimation.n_seen + 1, estimation.n_seen * (1 + growth))
                 with estimates:
-                    snapshot = estimation.snapshot()
+                    snapshot = _estimated(estimation, estimates)
                     observer.snapshot(snapshot, estimation.settings)
                 uncounted.take(recording.path, snapshot)
             memory.give_back()
-            interval = STATUS_INTERVAL if sensors is not None else _until_segment(estimation)
+            interval = min(
+                _until_segment(estimation), MAX_INTERVAL if sensors is None else STATUS_INTERVAL
+            )
             known.ends_within(min(max(interval, looks.remaining), MAX_INTERVAL))
             if cancelled.is_set():
                 return None
@@ -254,6 +256,14 @@ def follow(
             return _result(estimation, observer, cancelled)
     with Estimation([path], estimation.settings) as again:
         return _result(again, observer, cancelled)
+
+
+def _estimated(estimation: Estimation, estimates: Throttle) -> Snapshot:
+    """Return an estimate; what is not usual in its cost delays no later estimate."""
+    before = estimation.occasional_cost
+    snapshot = estimation.snapshot()
+    estimates.deduct(estimation.occasional_cost - before)
+    return snapshot
 
 
 def _with_target(settings: Settings | None, recording: Recording) -> Settings | None:

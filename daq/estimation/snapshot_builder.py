@@ -105,6 +105,9 @@ class SnapshotBuilder:
         self._dimensions: Dimensions | None = None
         self._findings = Findings()
         self._diagnoses = Throttle(diagnosis_share)
+        self._choices = Throttle(1.0)  # limited by `_RECHOICE`
+        self.occasional_cost = 0.0
+        """Seconds that diagnoses, and estimates with a choice of the dimension, cost so far."""
         self._chosen_at = 0
 
     def build(
@@ -163,6 +166,7 @@ class SnapshotBuilder:
             with self._diagnoses:
                 bands_of_all = bands if raw else ()
                 self._findings = self._diagnose(recordings, passes, raw, bands_of_all, estimates)
+            self.occasional_cost += self._diagnoses.cost
         if self._findings.fits(frequency):
             diagnostics = self._findings.added_to(diagnostics)
         snapshot = Snapshot(
@@ -258,17 +262,19 @@ class SnapshotBuilder:
         if not bands:
             return Estimates({}, {}, None)
         keep = not final and n_segments < _RECHOICE * self._chosen_at
-        estimates = noise_estimates(
-            bands,
-            self._settings,
-            dims=first.aligned.dims,
-            gains=self._gains,
-            dimensions=self._dimensions if keep and self._fits(bands) else None,
-            positions=known_positions(recording, first.aligned.channels),
-            known=self._known(bands, raw),
-        )
+        with self._choices:
+            estimates = noise_estimates(
+                bands,
+                self._settings,
+                dims=first.aligned.dims,
+                gains=self._gains,
+                dimensions=self._dimensions if keep and self._fits(bands) else None,
+                positions=known_positions(recording, first.aligned.channels),
+                known=self._known(bands, raw),
+            )
         if estimates.dimensions is not self._dimensions:
             self._dimensions, self._chosen_at = estimates.dimensions, n_segments
+            self.occasional_cost += self._choices.cost
         return estimates
 
     def _known(

@@ -26,7 +26,9 @@ class Throttle:
     def __init__(self, share: float, now: Callable[[], float] = time.monotonic) -> None:
         self._share, self._now = share, now
         self._began = self._next = now()
-        self._used_before = 0.0
+        self._used_before = self._elsewhere = 0.0
+        self.cost = 0.0
+        """Seconds that the work cost the last time."""
 
     @property
     def remaining(self) -> float:
@@ -38,10 +40,16 @@ class Throttle:
         """Whether the work may be done now."""
         return self._now() >= self._next
 
+    def deduct(self, seconds: float) -> None:
+        """Deduct what another throttle limits from the cost of the present work."""
+        self._elsewhere += seconds
+
     def __enter__(self) -> Self:
         self._began, self._used_before = self._now(), time.process_time()
+        self._elsewhere = 0.0
         return self
 
     def __exit__(self, *_: object) -> None:
         cost = max(self._now() - self._began, time.process_time() - self._used_before)
-        self._next = self._began + cost / self._share
+        self.cost = max(0.0, cost - self._elsewhere)
+        self._next = self._began + self.cost / self._share

@@ -12,15 +12,17 @@ import numpy as np
 import pytest
 
 from daq.estimation import estimation as memory
-from daq.estimation.estimation import estimate
+from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.follow import (
     COMMIT_INTERVAL,
     MAX_INTERVAL,
     SHORTEST_INTERVAL,
+    STATUS_INTERVAL,
     RecordingLeftOpenError,
     follow,
 )
 from daq.estimation.settings import Settings
+from daq.estimation.throttle import Throttle
 from daq.recording.control import Command, serve
 from daq.results.facts import NotInLiveEstimate
 from daq.results.known_facts import facts_of
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
 
 
@@ -259,6 +262,27 @@ def test_an_observer_that_decides_by_the_estimate_gets_all_sensors(
         Bench(writer).send("ABC", 30)
         follow(writer.path, SETTINGS, noted, recorder=Process(writer.close), whole=True)
     assert [live.not_estimated for live in noted.snapshots] == [(), ()]
+
+
+def test_estimates_delay_no_look(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An estimate costs three seconds: its own limit holds it up, not that of the looks."""
+    at = 0.0
+
+    def slowly(estimation: Estimation) -> Snapshot:
+        nonlocal at
+        at += 3.0
+        return made(estimation)
+
+    made = Estimation.snapshot
+    monkeypatch.setattr(Estimation, "snapshot", slowly)
+    monkeypatch.setattr("daq.estimation.follow.Throttle", partial(Throttle, now=lambda: at))
+    monkeypatch.setattr("daq.estimation.throttle.time.process_time", lambda: 0.0)
+    with growing(tmp_path / "run.h5") as writer:
+        Bench(writer).send("ABC", 30)
+        process = Process(writer.close)
+        follow(writer.path, SETTINGS, Noted(), recorder=process)
+    assert at == 3.0
+    assert process.waits[0] <= STATUS_INTERVAL
 
 
 def test_without_sensors_to_watch_the_next_look_is_when_a_segment_can_be_there(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from daq.estimation.throttle import Throttle
 
 
@@ -30,3 +32,17 @@ def test_quick_work_is_done_every_time() -> None:
         assert throttle.is_due
         with throttle:
             at += 0.4
+
+
+def test_work_that_is_limited_elsewhere_delays_nothing() -> None:
+    at = 0.0
+    throttle = Throttle(0.1, lambda: at)
+    with throttle:
+        at += 1.3
+        throttle.deduct(0.9)
+    assert throttle.cost == 1.3 - 0.9
+    at = 4.01
+    assert throttle.is_due
+    with throttle:
+        at += 1.3
+    assert throttle.cost == pytest.approx(1.3)  # deducted once
