@@ -70,6 +70,11 @@ class Noise:
             self._counts[sensor] = self._motion + own
         return self._counts[sensor].take(np.arange(first, first + n), axis=0, mode="wrap")
 
+    def temperature(self, _: str, now: float) -> float:
+        """Return the temperature in °C."""
+        del now
+        return 23.0
+
     def times(self, _: str, first: int, n: int) -> NDArray[np.float64]:
         """Return when samples are taken, in s."""
         return np.arange(first, first + n) / self.sampling_rate
