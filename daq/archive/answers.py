@@ -16,6 +16,7 @@ import numpy as np
 from daq.archive.averages import Average, Estimator
 from daq.archive.changes import courses
 from daq.archive.density import MIN_BINS
+from daq.archive.rollup import MEAN
 from daq.archive.spectra_file import unpacked
 from daq.archive.years import Years, density_of
 from daq.errors import ArchiveError
@@ -77,6 +78,10 @@ class Answer:
         Of changes, in all series together.
     density, recorded : Density
         Of the noise, and of the recorded PSD.
+    fine_hz : float64, shape (n_fine + 1,)
+        Edges of bands of 1/24 octave.
+    spectrogram : float32, shape (n_days, n_fine, n_channels)
+        Noise of every day in these, in unit²/Hz.
     problems : tuple of str
         What could not be read.
     doubted : tuple of Described
@@ -94,6 +99,8 @@ class Answer:
     false_alarm: float
     density: Density
     recorded: Density
+    fine_hz: FloatArray
+    spectrogram: NDArray[np.float32]
     problems: tuple[str, ...]
     doubted: tuple[Described, ...]
 
@@ -176,6 +183,8 @@ def answer(
         false_alarm=false_alarm,
         density=reduce(add, tally.noise),
         recorded=reduce(add, tally.recorded),
+        fine_hz=years.grid.frequency[years.grid.edges],
+        spectrogram=np.concatenate(tally.noise_of_days),
         problems=tuple(years.problems),
         doubted=doubted,
     )
@@ -193,6 +202,7 @@ class _Tally:
         self.days: list[IntArray] = []
         self.segments: list[IntArray] = []
         self._levels: list[Levels] = []
+        self.noise_of_days: list[NDArray[np.float32]] = []
         self.noise: list[Density] = []
         self.recorded: list[Density] = []
         self.local: dict[int, tuple[FloatArray, FloatArray]] = {}
@@ -206,7 +216,9 @@ class _Tally:
             month = file["months"][name]
             self.days.append(month["days"][...])
             self.segments.append(month["day_segments"][...])
-            found = self._grid.levels(month["levels"][...], self._spans)
+            rows = month["levels"][...]
+            self.noise_of_days.append(rows[MEAN].copy())  # a view would keep all of the rows
+            found = self._grid.levels(rows, self._spans)
             self._levels.append(Levels(found.mean, found.of_scatter.spread, *found.ends()))
             self._take_parts(month)
 

@@ -52,6 +52,12 @@ class Density:
             self.n_short + other.n_short,
         )
 
+    @property
+    def mode(self) -> FloatArray:
+        """Middle of the most frequent level in dB, (n_points, n_channels); NaN without any."""
+        level = LOWEST_DB + 0.5 + np.argmax(self.counts, axis=1)
+        return np.where(self.counts.any(axis=1), level, np.nan)
+
     def percentile(self, share: float) -> FloatArray:
         """Return the level in dB below which this share of stretches lies, (n_points, n_channels).
 

@@ -93,7 +93,12 @@ def archive(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", metavar="FOLDER", help="Folder for figures: density and days."),
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="FOLDER",
+            help="Folder for figures (PNG, SVG, PDF) and their numbers.",
+        ),
     ] = None,
     models: ModelsOption = "",
     time_zone: Annotated[

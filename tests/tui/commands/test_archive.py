@@ -225,7 +225,17 @@ def test_a_web_server_is_no_scheduler(folder: Path, tmp_path: Path) -> None:
 def test_figures_show_the_density_and_the_days(folder: Path, tmp_path: Path) -> None:
     result = huddle("--store", folder / "huddle-archive", "-o", tmp_path, "--models", "nlnm")
     assert result.exit_code == 0, result.output
-    written = {"density.png", "density.svg", "days.png", "days.svg"}
+    names = ["density", "recorded", "spectrogram", "days"]
+    names += [f"channel-{sensor}.{channel}" for sensor in "ABC" for channel in "XY"]
+    written = {f"{name}.{kind}" for name in names for kind in ("png", "svg", "pdf")}
+    written.add("figures.npz")
+    with np.load(tmp_path / "figures.npz", allow_pickle=False) as arrays:
+        assert list(arrays["channels"]) == ["A.X", "A.Y", "B.X", "B.Y", "C.X", "C.Y"]
+        assert arrays["spectrogram"].shape == (2, len(arrays["fine_hz"]) - 1, 6)
+        # the motion is 28 dB above the noise
+        gap = arrays["recorded_mode_db"] - arrays["noise_mode_db"]
+        assert np.abs(gap - 28).max() < 4
+        assert np.all(arrays["recorded_p10_db"] <= arrays["recorded_p90_db"])
     assert {path.name for path in tmp_path.iterdir() if path.stat().st_size > 5000} == written
 
 
