@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+import contextlib
 import html
+import http.client
+import ipaddress
 import json
 import os
 import re
 import signal
 import socket
+import ssl
 import subprocess
 import sys
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import urlencode, urlsplit
 
 import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
 
 from tests.tui.night_recording import HOSTILE
 from tests.tui.web.pages import READER, SECRETS, STEERER, Server, Visit, bench_file, serving
 from tests.waiting import limit, wait_until
+from tui.web.access import token_hash
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -105,6 +115,61 @@ def test_the_downloads_are_those_of_the_command(server: Server, folder: Path) ->
     curves = visit.get("/tests/night.h5/curves.csv").content
     assert curves == (folder / "night.csv").read_bytes()
     assert visit.get("/tests/night.h5/report.pdf").content.startswith(b"%PDF-")
+
+
+def test_certificates_of_a_test_are_read(server: Server, folder: Path) -> None:
+    recording = folder / "recordings" / "night.h5"
+    assert "Certificate" not in server.visit().get("/tests/night.h5").text
+    issue = ("issue", str(recording), "--by", "Ada", "--allow-incomplete")
+    subprocess.run([sys.executable, "-m", "tui", *issue], check=False, capture_output=True)
+    (issued,) = (folder / "recordings" / "certificates").glob("*.pdf")
+    visit = server.visit()
+    assert re.search(
+        r'href="/tests/night\.h5/certificate/0">Certificate \S+-0001, revision 0<',
+        visit.get("/tests/night.h5").text,
+    )
+    assert visit.get("/tests/night.h5/certificate/0").content == issued.read_bytes()
+    assert visit.get("/tests/night.h5/certificate/1").status == 404
+
+
+def test_pages_are_served_over_tls(tmp_path: Path) -> None:
+    certificate, key = _self_signed(tmp_path)
+    table = f'[web]\ncertificate = "{certificate}"\nkey = "{key}"\nsteer = "{token_hash(READER)}"\n'
+    with serving(bench_file(tmp_path, table)) as found:
+        assert found.url.startswith("https://127.0.0.1:")
+        trusted = ssl.create_default_context(cafile=str(certificate))
+        place = urlsplit(found.url)
+        connection = http.client.HTTPSConnection(place.netloc, timeout=limit(60), context=trusted)
+        with contextlib.closing(connection):
+            form = urlencode({"name": "Ada", "secret": READER})
+            connection.request("POST", "/login", form)
+            answer = connection.getresponse()
+            assert answer.status == 303
+            assert "Secure" in str(answer.getheader("set-cookie"))
+
+
+def _self_signed(folder: Path) -> tuple[Path, Path]:
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "bench")])
+    now = datetime.now(UTC)
+    made = (
+        x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
+        .not_valid_before(now - timedelta(days=1))
+        .not_valid_after(now + timedelta(days=1))
+        .add_extension(
+            x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]),
+            critical=False,
+        )
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    pem = serialization.Encoding.PEM
+    certificate, private = folder / "bench.pem", folder / "bench.key"
+    certificate.write_bytes(made.public_bytes(pem))
+    private.write_bytes(
+        key.private_bytes(pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    )
+    return certificate, private
 
 
 def test_curves_are_finer_where_less_is_shown(server: Server) -> None:
