@@ -89,6 +89,7 @@ def _serve(path: Path, changes: dict[str, Any]) -> None:
     from daq.estimation.settings import Settings
     from daq.recorder.schedule import utc_now
     from tui.commands.tui_controls import BenchControls
+    from tui.service.processes.steps import ProcessSteps
     from tui.service.records.store import RunStore
     from tui.service.status import service_status
     from tui.web.server import Server
@@ -112,7 +113,7 @@ def _serve(path: Path, changes: dict[str, Any]) -> None:
         console().print(f"{bench.name}: {url}", soft_wrap=True)
 
     try:
-        Server(controls, bench, table, status).run(ready)
+        Server(controls, bench, table, status, ProcessSteps(bench, path).check).run(ready)
     finally:
         controls.release()
 

@@ -42,7 +42,7 @@ from tui.web.tests import PAGE, NoSuchTestError, Tests, compared
 from tui.wording.verdict_text import WORDS
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Mapping
+    from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
     from concurrent.futures import Future
     from pathlib import Path
     from types import FrameType
@@ -201,12 +201,20 @@ class Server:
         The table of the bench file, with address and port as they are used.
     status : callable
         Returns what `tui.service.status.service_status` does.
+    check : callable
+        Makes the check list; returns what fails.
     """
 
     def __init__(
-        self, controls: Controls, bench: Bench, web: Web, status: Callable[[], dict[str, Any]]
+        self,
+        controls: Controls,
+        bench: Bench,
+        web: Web,
+        status: Callable[[], dict[str, Any]],
+        check: Callable[[], Awaitable[str]],
     ) -> None:
         self._controls, self._bench, self._web = controls, bench, web
+        self._check = check
         self._access = Access(web, server_key(bench))
         self._live = Live(controls, status)
         self._tests = Tests(controls, lambda: self._live.followed)
@@ -576,11 +584,14 @@ class Server:
         visitor, form = await self._steering(request)
         kept = self._bench.recording.duration
         shown: dict[str, Any] = {"title": "Start a test", "action": "start", "test": ""}
-        duration = "" if kept is None else format_duration(kept)
+        shown["duration"] = form.get("duration", "" if kept is None else format_duration(kept))
         if request.method == "GET":
-            return self._page(request, "steer", **shown, duration=duration, problem="")
+            return self._page(request, "steer", **shown, problem="", may_confirm=False)
+        is_confirmed = "anyway" in form
         by = f"started in the browser by {visitor.name} ({client_of(request)})"
+        by += ", whatever the check list says" if is_confirmed else ""
         note = f"{form.get('text', '').strip()}; {by}".removeprefix("; ")
+        failed = ""
 
         def start() -> Path:
             if self._controls.find_running() is not None:
@@ -591,22 +602,31 @@ class Server:
             self._controls.mark(path, note)
             return path
 
-        try:
-            await self._act(request, "started", start)
-        except (HuddleError, OSError, ValueError) as error:
-            duration = form.get("duration", "")
-            code = HTTPStatus.CONFLICT
-            return self._page(
-                request, "steer", code=code, **shown, duration=duration, problem=str(error)
-            )
-        return _see("/")
+        if self._live.followed is None and not is_confirmed:
+            failed = await self._check()
+        problem = f"The check list fails: {failed}" if failed else ""
+        if not failed:
+            try:
+                await self._act(request, "started", start)
+            except (HuddleError, OSError, ValueError) as error:
+                problem = str(error)
+            else:
+                return _see("/")
+        return self._page(
+            request,
+            "steer",
+            code=HTTPStatus.CONFLICT,
+            **shown,
+            problem=problem,
+            may_confirm=bool(failed),
+        )
 
     async def _stop(self, request: Request) -> Response:
         visitor, _ = await self._steering(request)
         if request.method == "GET":
             path = await run_in_threadpool(self._running)
             shown: dict[str, Any] = {"title": "Stop the test", "action": "stop", "test": path.stem}
-            return self._page(request, "steer", **shown, duration="", problem="")
+            return self._page(request, "steer", **shown, duration="", problem="", may_confirm=False)
         by = f"stopped in the browser by {visitor.name} ({client_of(request)})"
 
         def stop() -> Path:

@@ -250,6 +250,17 @@ def test_forms_of_other_sites_do_nothing(closed: Server) -> None:
     assert other.post("/mark", {"token": token, "text": "x"}).status == 403
 
 
+def test_a_test_that_fails_its_check_list_waits_for_a_confirmation(closed: Server) -> None:
+    visit = closed.visit()
+    visit.log_in(STEERER)
+    (token,) = set(re.findall(r'name="token" value="(\w+)"', visit.get("/start").text))
+    found = visit.post("/start", {"token": token, "duration": "1h"})
+    assert found.status == 409
+    assert re.search(r"The check list fails: .*/dev/ttyA", found.text), found.text
+    assert 'type="checkbox" name="anyway" required' in found.text
+    assert 'value="1h"' in found.text
+
+
 def test_wrong_passwords_are_soon_not_looked_at(tmp_path: Path) -> None:
     with serving(bench_file(tmp_path, SECRETS)) as closed:
         _guess(closed)
