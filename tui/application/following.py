@@ -196,18 +196,25 @@ class FollowingApp(App[None]):
         self.watch_state()
 
     def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
-        """Yield the commands of the palette: views, recording, and what the view offers."""
+        """Yield the commands of the palette: views, and the tasks of all of them."""
         for name in VIEWS:
             title = f"View: {TITLES[name]}"
             yield SystemCommand(title, f"Show the {name} view", partial(self.action_view, name))
-        for binding in screen.active_bindings.values():
-            if binding.enabled and binding.binding.description not in TITLES.values():
-                action = partial(self.run_action, binding.binding.action, binding.node)
-                title = binding.binding.description
-                yield SystemCommand(title, f"Key {binding.binding.key}", action)
+        for view in (BenchView, TestView, ResultView, RecordingsView):
+            for title, action in view.TASKS:
+                target = self if action.startswith("app.") else screen
+                is_here = target is self or getattr(screen, "VIEW", "") == view.VIEW
+                if not is_here or target.check_action(action.removeprefix("app."), ()):
+                    shown = f"In the {TITLES[view.VIEW]} view"
+                    yield SystemCommand(title, shown, partial(self._do, view.VIEW, action))
         for command in super().get_system_commands(screen):
             if command.title in {"Theme", "Screenshot"}:
                 yield command
+
+    async def _do(self, view: str, action: str) -> None:
+        """Do a task of a view, which is shown."""
+        await self.action_view(view)
+        await self.run_action(action, self.screen)
 
     # ------------------------------------------------------------------ following
 

@@ -75,10 +75,13 @@ class View(Screen[None]):
         One of `VIEWS`.
     KEYS : sequence of (str, str)
         Keys of the view and what they do, for its help.
+    TASKS : sequence of (str, str)
+        What can be done in the view, and the action that does it, for the palette.
     """
 
     VIEW: ClassVar[str]
     KEYS: ClassVar[tuple[tuple[str, str], ...]] = ()
+    TASKS: ClassVar[tuple[tuple[str, str], ...]] = ()
 
     def __init__(self, state: State) -> None:
         super().__init__()

@@ -77,18 +77,24 @@ async def test_what_came_while_a_view_was_hidden_is_shown_in_it(told: ProgressCa
         assert "530 segments" in screen_text(app)
 
 
-async def test_the_palette_runs_what_keys_do(told: ProgressCallback) -> None:
+@pytest.mark.parametrize("size", [NARROW, (120, 36), (200, 60)])
+async def test_the_palette_lists_the_tasks_of_all_views_and_does_them(
+    told: ProgressCallback, size: tuple[int, int]
+) -> None:
     app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
+    async with app.run_test(size=size) as pilot:
         await shown(pilot, app, *running())
-        titles = {command.title for command in app.get_system_commands(app.screen)}
-        assert {"View: Result", "Clocks", "Stop", "Mark", "Theme"} <= titles
-        assert "Start" not in titles  # one runs already
-        command = next(c for c in app.get_system_commands(app.screen) if c.title == "View: Result")
-        result = command.callback()
-        if result is not None:
-            await result
-        assert app.current_mode == RESULT
+        commands = {each.title: each for each in app.get_system_commands(app.screen)}
+        tasks = {"Stop the test", "Show how the clocks drift", "Add a sensor"}
+        assert tasks | {"View: Result", "Find a recording by words", "Theme"} <= set(commands)
+        assert "Start a test" not in commands  # one runs already
+        for title, mode in (("View: Result", RESULT), ("Show how the clocks drift", TEST)):
+            result = commands[title].callback()
+            if result is not None:
+                await result
+            await shown(pilot, app)
+            assert app.current_mode == mode
+        assert app.screen.choice.clocks  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(("width", "named"), [(40, 1), (80, len(VIEWS))])

@@ -59,6 +59,15 @@ class BenchView(View):
         Binding("x", "app.stop", "Stop"),
         Binding("m", "app.mark", "Mark"),
     ]
+    TASKS = (
+        ("Start a test", "app.start"),
+        ("Stop the test", "app.stop"),
+        ("Mark this moment with a remark", "app.mark"),
+        ("Check the sensors, live", "preview"),
+        ("Add a sensor", "add"),
+        ("Change the chosen sensor", "edit"),
+        ("Remove the chosen sensor", "remove"),
+    )
     KEYS = (
         ("p", "check the sensors: read them live without recording; p again ends it"),
         ("f", "freeze the traces; f again lets them go on"),

@@ -125,6 +125,12 @@ class RecordingsView(View):
         Binding("delete", "delete", "Delete", key_display="del"),
         Binding("r", "read", "Read again", show=False),
     ]
+    TASKS = (
+        ("Find a recording by words", "filter"),
+        ("Keep the chosen recording of a service", "pin"),
+        ("Delete the chosen recording", "delete"),
+        ("Read the folder again", "read"),
+    )
     KEYS = (
         ("↑ ↓ enter", "choose and open a recording: its result, or its test while it grows"),
         ("/", "show only recordings with these words: bench, date, verdict, file, operator"),

@@ -35,6 +35,12 @@ class ResultView(View):
         Binding("v", "app.save", "Save", show=False),
         Binding("s", "app.start", "Start"),
     ]
+    TASKS = (
+        ("Write the report", "app.report"),
+        ("Open the report in a browser", "app.open_report"),
+        ("Estimate again with other settings", "estimate"),
+        ("Compare with an earlier test", "compare"),
+    )
     KEYS = (
         ("w", "write the report beside the recording"),
         ("o", "open the report in a browser; written first, if it is not there"),

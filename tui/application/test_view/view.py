@@ -79,6 +79,17 @@ class TestView(View):
         Binding("left_square_bracket", "pan(-0.25)", "Lower frequencies", show=False),
         Binding("escape,0", "whole", "Whole spectrum", show=False),
     ]
+    TASKS = (
+        ("Show the estimate of another method", "method"),
+        ("Change the unit of the curves", "unit"),
+        ("Compare like channels of all sensors", "overlay"),
+        ("Show single bins, or steps of an octave", "bins"),
+        ("Show a row per channel, or per sensor", "table"),
+        ("Show how the clocks drift", "clocks"),
+        ("Freeze the curves", "freeze"),
+        ("Show all details of the test", "details"),
+        ("Save the estimate and a picture of the screen", "app.save"),
+    )
     KEYS = (
         ("s", "start a test: operator, note, and when it ends by itself"),
         ("x", "stop it; the result is then computed from the whole recording"),
