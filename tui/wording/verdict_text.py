@@ -76,9 +76,12 @@ def not_judged(found: TestVerdict) -> list[str]:
 
 
 def record_for(found: TestVerdict) -> str:
-    """Return how long a recording has to be for a decision; empty if its length does not decide."""
+    """Return how long a recording has to be for a decision; empty if its length does not decide.
+
+    Empty, too, where the verdict is there: only a test that ends by itself goes on to make it sure.
+    """
     prediction = found.prediction
-    if prediction is None:
+    if prediction is None or found.verdict is not Verdict.NOT_DECIDED:
         return ""
     if prediction.seconds is not None:
         long = (

@@ -12,7 +12,7 @@ from daq.results.decision.end import Goal, Remaining, remaining
 from estimator.decision.verdict import Obstacle, Verdict
 from tests.daq.results.decision.benches import verdict_on
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
-from tui.wording.verdict_text import how_long
+from tui.wording.verdict_text import how_long, what_to_do
 
 SNAPSHOT = made_snapshot(n_effective=100.0)
 CLOSE_TO_IT = verdict_on(SNAPSHOT, 12e-12)
@@ -88,6 +88,8 @@ def test_a_verdict_that_is_not_sure_ends_only_what_nobody_looks_at() -> None:
     assert (passed.verdict, passed.is_sure) == (Verdict.PASS, False)
     by_hand = remaining(NEVER, passed, SNAPSHOT, FREE, elapsed=SNAPSHOT.elapsed)
     assert how_long(by_hand, AT) == "Enough is recorded: the limits are decided."
+    assert what_to_do(passed) == []  # a finished recording need not be longer
+    assert what_to_do(CLOSE_TO_IT)[-1].startswith("Record for ")
     until = EndCondition(decided=True)
     by_itself = remaining(until, passed, SNAPSHOT, FREE, elapsed=SNAPSHOT.elapsed)
     assert by_itself.seconds is not None
