@@ -45,6 +45,10 @@ MISSING_SHARE = 0.01
 """Share of missing samples from which on a port is bad."""
 NEAR = 0.9
 """Share of the full scale from which on a channel may clip in a test."""
+OF_CHANNELS = {Problem.DEAD, Problem.HUM, Problem.NEAR_FULL_SCALE, Problem.SENSITIVITY}
+"""Problems that all channels of a sensor have for one cause."""
+ALIKE = 1.05
+"""Largest over smallest value of the channels of a sensor up to which they have one cause."""
 BYTES_PER_VALUE = 4
 """Of a count on the disk, before compression."""
 OPEN_END = 3600.0
@@ -105,8 +109,38 @@ def check_list(
     return tuple(
         row
         for check, several in found.items()
-        for row in ([CheckRow(check, one) for one in several] or [CheckRow(check)])
+        for row in (
+            [CheckRow(check, one) for one in _together(several, sensors)] or [CheckRow(check)]
+        )
     )
+
+
+def _together(found: Sequence[Finding], sensors: Sequence[SensorPreview]) -> Iterator[Finding]:
+    """Yield findings, those of all channels of a sensor as one: one cause, one row."""
+    for each in found:
+        main = [
+            channel.name
+            for preview in sensors
+            if preview.sensor.name == each.sensor
+            for channel in preview.sensor.channels
+            if not channel.auxiliary
+        ]
+        alike = [
+            one
+            for one in found
+            if (one.problem, one.sensor, one.against) == (each.problem, each.sensor, each.against)
+            and one.channel in main
+        ]
+        values = [one.value for one in alike]
+        is_one = (
+            len(main) > 1
+            and sorted(one.channel for one in alike) == sorted(main)
+            and (all(map(math.isnan, values)) or max(values) <= ALIKE * min(values))
+        )
+        if each.problem not in OF_CHANNELS or not is_one or each.channel not in main:
+            yield each
+        elif each is alike[0]:
+            yield replace(each, channel="", value=float(np.median(values)))
 
 
 def _of(problem: Problem, each: SensorPreview, value: float = math.nan) -> Finding:

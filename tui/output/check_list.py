@@ -85,14 +85,14 @@ MERGED = frozenset(
 
 def sentence(finding: Finding, sensors: Sequence[str] = ()) -> str:
     """Return a finding with what to do; `sensors` are all of which it is true."""
+    name = f"{finding.sensor}.{finding.channel}" if finding.channel else finding.sensor
     if finding.problem is Problem.SENSITIVITY:
         cause = "" if finding.cause is None else f" ({CAUSES[finding.cause]})"
         others = listed(finding.against) if finding.against else "the others, which do not agree"
-        return (
-            f"{finding.sensor}.{finding.channel} reads {finding.value:.3g} of {others}{cause}:"
-            " correct its sensitivity"
-        )
-    return SENTENCES[finding.problem].format(
+        return f"{name} reads {finding.value:.3g} of {others}{cause}: correct its sensitivity"
+    text = SENTENCES[finding.problem].replace("{sensor}.{channel}", "{name}")
+    return text.format(
+        name=name,
         sensor=listed(sensors or [finding.sensor]),
         channel=finding.channel,
         value=finding.value,

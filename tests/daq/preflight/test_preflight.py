@@ -124,7 +124,7 @@ def test_a_channel_in_g_is_named_with_its_factor(late: int, turned: bool) -> Non
 def test_a_whole_sensor_may_be_off(factor: float, cause: Cause) -> None:
     a, b, c = previews(turned=True)
     found = failures([a, b, replace(c, samples=c.samples * factor)])
-    assert found == [(Problem.SENSITIVITY, "C", name) for name in "XYZ"]
+    assert found == [(Problem.SENSITIVITY, "C", "")]  # one cause, one row
     (one, *_) = findings([a, b, replace(c, samples=c.samples * factor)])
     assert one.cause is cause
 
@@ -275,3 +275,15 @@ def test_a_rate_that_a_busy_host_reads_is_not_called_wrong(
     a = replace(a, measured_rate=known.rate, rate_error=known.error, arrival_scatter=known.scatter)
     (row,) = [each for each in check_list(BENCH, [a, b, c]) if each.check is Check.RATES]
     assert (None if row.finding is None else row.finding.problem) == expected
+
+
+def test_one_cause_of_all_channels_of_a_sensor_is_one_row() -> None:
+    a, b, c = previews()
+    at = np.arange(len(b.samples)) / RATE
+    hum = 0.01 * np.sin(2 * np.pi * 50 * at)[:, None]
+    found = failures([replace(a, samples=0 * a.samples), replace(b, samples=b.samples + hum), c])
+    assert (Problem.DEAD, "A", "") in found
+    assert (Problem.HUM, "B", "") in found
+    assert sum(problem in {Problem.DEAD, Problem.HUM} for problem, _, _ in found) == 2
+    one = np.array([1.0, 0.0, 0.0])
+    assert failures([a, replace(b, samples=b.samples + hum * one), c]) == [(Problem.HUM, "B", "X")]

@@ -20,7 +20,15 @@ from tests.tui.application.test_app import NARROW, WIDE, shown
 from tests.tui.example_snapshot import ProgressCallback, demo_bench
 from tests.waiting import limit
 from tui.application.app import HuddleApp
-from tui.application.bench_view.sensors import channel_traces, sensors_of_bench, trace
+from tui.application.bench_view.sensors import (
+    SPECTRUM_POINTS,
+    SPECTRUM_SEGMENT,
+    channel_traces,
+    sensors_of_bench,
+    spectra,
+    trace,
+)
+from tui.application.bench_view.view import SITES
 from tui.application.state import State
 
 if TYPE_CHECKING:
@@ -264,3 +272,35 @@ def test_a_trace_shows_the_range_of_the_values() -> None:
     assert trace(np.zeros(80), width=4) == "⠤⠤⠤⠤"
     assert trace(np.tile([0.0, 1.0], 40), width=2) == "⣿⣿"
     assert trace(np.array([1.0]), width=3) == "   "
+
+
+@pytest.mark.parametrize("size", [NARROW, (120, 36), (200, 60)])
+async def test_hum_is_seen_in_spectra_beside_noise_models_before_a_test(
+    told: ProgressCallback, size: tuple[int, int]
+) -> None:
+    a, b, c = SOUND
+    rate = a.sensor.sampling_rate
+    at = np.arange(len(a.samples)) / rate
+    hum = 1e-3 * np.sin(2 * np.pi * 50 * at)[:, None]
+    reading = await live(told, a, replace(b, samples=b.samples + hum), c)
+    app = HuddleApp(told)
+    async with app.run_test(size=size) as pilot:
+        await pilot.press("p")
+        reading.begun.wait(limit())
+        await shown(pilot, app)
+        await pilot.press("g")
+        await shown(pilot, app)
+        text = screen_text(app)
+        assert "NHNM" in text
+        assert "NLNM" in text
+        assert "● live" in text  # the states of the sensors stay
+        assert "last 10 s" not in text
+        await pilot.press("g")
+        await shown(pilot, app)
+        assert "last 10 s" in screen_text(app)
+    drawn = {each.label: each for each in spectra(reading.sensors, SITES)}
+    near = np.abs(10 ** drawn["A"].log_frequency - 50) < 1
+    assert (drawn["B"].level_db[near].max() - drawn["A"].level_db[near].max()) > 10
+    width = 50 * np.log(rate / 2 * SPECTRUM_SEGMENT) / SPECTRUM_POINTS  # Hz of the point there
+    expected = 10 * np.log10(1e-6 / 2 / width)  # the mean square of the sine, in that band
+    assert drawn["B"].level_db[near].max() == pytest.approx(expected, abs=1.5)

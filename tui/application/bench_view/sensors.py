@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,9 +10,14 @@ from rich.cells import cell_len
 from rich.style import Style
 from rich.text import Text
 
+from daq.errors import HuddleError
 from daq.preflight.findings import Check, Outcome
 from daq.preflight.preflight import check_list, is_complete
+from estimator.spectra.welch import CrossSpectra, WelchSettings
 from tui.application.test_view.braille import DOTS, FIRST
+from tui.application.test_view.clocks import COLOURS
+from tui.application.test_view.curves import data_curve, mask_curve
+from tui.application.test_view.plotted import MARKERS, MODEL_MARKERS
 from tui.output.check_list import sentence
 from tui.wording.formatting import listed, readings
 
@@ -20,11 +26,15 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from daq.bench.masks.mask import Mask
     from daq.bench.model import Bench
     from daq.preflight.preview import SensorPreview
     from tui.application.state import State
+    from tui.application.test_view.curves import Curve
 
 MUTED = "#9aa5b8"
+SPECTRUM_SEGMENT, SPECTRUM_POINTS = 2.0, 120
+"""Seconds of a segment of the spectra before a test, and points of a curve at most."""
 GAP = 2
 """Blanks between columns."""
 
@@ -220,6 +230,70 @@ def _readings(
         for n, text in zip(at, texts, strict=True):
             cells[n] = text if len(at) == len(units) else f"{text} {found}"
     return cells, f"{title}, {found}" if len(set(units)) == 1 else title
+
+
+def spectra(sensors: Sequence[SensorPreview], models: Sequence[Mask]) -> list[Curve]:
+    """Return the spectrum of every channel, by the last seconds, and noise models beside them.
+
+    Channels of one unit only, that of the first: of the others no level would be comparable. A
+    colour and a mark for each sensor, whose first channel is labelled.
+    """
+    units = [c.unit for each in sensors for c in each.sensor.channels if not c.auxiliary]
+    unit, found = units[0] if units else "", []
+    highest = 0.0
+    for number, each in enumerate(sensors):
+        length = round(SPECTRUM_SEGMENT * each.sensor.sampling_rate)
+        if len(each.samples) < 2 * length or length < 8:
+            continue
+        frequency, psd = _welch(each.samples, length, each.sensor.sampling_rate)
+        highest = max(highest, float(frequency[-1]))
+        of_sensor = 0
+        for column, channel in enumerate(each.sensor.channels):
+            if channel.auxiliary or channel.unit != unit:
+                continue
+            style = COLOURS[number % len(COLOURS)]
+            curve = data_curve(frequency, psd[:, column], n_points=SPECTRUM_POINTS, style=style)
+            label = "" if of_sensor else each.sensor.name
+            marker = "" if of_sensor else MARKERS[number % len(MARKERS)]
+            found.append(replace(curve, label=label, band_style="", marker=marker))
+            of_sensor += 1
+    frequency = np.linspace(0.0, highest, 1 + round(highest * SPECTRUM_SEGMENT))
+    drawn = [
+        mask_curve(
+            frequency,
+            model.at(np.clip(frequency[1:], model.frequency[0], model.frequency[-1]), unit),
+            span=(model.frequency[0], model.frequency[-1]),
+            n_points=SPECTRUM_POINTS,
+            label=model.name,
+            style=MUTED,
+            marker=MODEL_MARKERS[number % len(MODEL_MARKERS)],
+        )
+        for number, model in enumerate(models)
+        if found and _fits(model, unit)
+    ]
+    return [*drawn, *found]
+
+
+def _fits(model: Mask, unit: str) -> bool:
+    try:
+        model.check_unit(unit)
+    except HuddleError:  # a channel in V, say
+        return False
+    return True
+
+
+def _welch(
+    samples: NDArray[np.float64], length: int, rate: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return frequencies and mean one-sided PSD of segments that overlap by half."""
+    settings = WelchSettings(
+        sampling_rate=rate, segment_length=length, overlap=0.5, window="hann", detrend="linear"
+    )
+    found = CrossSpectra(settings, samples.shape[1], threads=1)
+    starts = np.arange(0, len(samples) - length + 1, settings.hop)
+    found.add(np.ascontiguousarray(samples), starts)
+    psd = np.diagonal(found.csm(), axis1=1, axis2=2).real
+    return settings.frequencies, np.ascontiguousarray(psd)
 
 
 def checks(bench: Bench, sensors: Sequence[SensorPreview]) -> list[Text]:

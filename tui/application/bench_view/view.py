@@ -12,18 +12,22 @@ from textual.containers import VerticalScroll
 from textual.widgets import Static
 
 from daq.bench.editing import without_sensor
+from daq.bench.masks.mask import NOISE_MODELS
 from daq.errors import HuddleError
 from tui.application.bench_view.sensors import (
     channel_traces,
     checks,
     sensor_states,
     sensors_of_bench,
+    spectra,
 )
 from tui.application.dialogs import QuestionScreen
 from tui.application.forms.certificate import CertificateForm
 from tui.application.forms.sensor import PortForm, SensorForm, sensor_table
 from tui.application.messages import BenchEdited, ErrorReported, PreviewUpdated
 from tui.application.state import BENCH
+from tui.application.test_view.plot import PsdPlot
+from tui.application.test_view.units import SpectrumUnit
 from tui.application.view import BAD, MUTED, View
 
 if TYPE_CHECKING:
@@ -36,6 +40,8 @@ if TYPE_CHECKING:
     from tui.application.state import State
 
 
+SITES = tuple(NOISE_MODELS[name] for name in ("nlnm", "nhnm"))
+"""Noise models beside the spectra, if no others were chosen."""
 MOST_LINES = 6
 """Lines of findings that are shown."""
 CHECKED_EVERY = 2
@@ -50,6 +56,7 @@ class BenchView(View):
         Binding("p", "preview", "Check sensors"),
         Binding("s", "app.start", "Start test"),
         Binding("f", "freeze", "Freeze"),
+        Binding("g", "spectra", "Spectra"),
         Binding("down", "choose_next(1)", "Choose", key_display="↑↓", show=False),
         Binding("up", "choose_next(-1)", "Choose", show=False),
         Binding("a", "add", "Add"),
@@ -64,6 +71,7 @@ class BenchView(View):
         ("Stop the test", "app.stop"),
         ("Mark this moment with a remark", "app.mark"),
         ("Check the sensors, live", "preview"),
+        ("Show the spectra of all channels before a test", "spectra"),
         ("Add a sensor", "add"),
         ("Change the chosen sensor", "edit"),
         ("Remove the chosen sensor", "remove"),
@@ -71,6 +79,7 @@ class BenchView(View):
     KEYS = (
         ("p", "check the sensors: read them live without recording; p again ends it"),
         ("f", "freeze the traces; f again lets them go on"),
+        ("g", "spectra of all channels beside noise models, in place of traces: hum, and siting"),
         ("↑ ↓, click", "choose a sensor"),
         ("a", "add a sensor: huddle looks what is on its port, if you do not name a driver"),
         ("e", "change the chosen sensor in the bench file; comments there stay"),
@@ -84,7 +93,7 @@ class BenchView(View):
         self._controls = controls
         self._sensors: Sequence[SensorPreview] = ()
         self._ended: threading.Event | None = None
-        self._is_frozen = False
+        self._is_frozen = self._shows_spectra = False
         self._chosen = ""
         self._n_lines, self._alert = (-1, -1), ""
         self._findings: list[Text] = []
@@ -94,6 +103,7 @@ class BenchView(View):
         """Yield the sensors, what is wrong, and one line on what to do."""
         with VerticalScroll(id="bench", can_focus=False):
             yield Static(id="table")
+        yield PsdPlot(id="spectra")
         yield Static(id="alert")
         yield Static(id="progress")
 
@@ -106,11 +116,16 @@ class BenchView(View):
         table = self.query_one("#table", Static)
         if is_live:
             width = self.app.size.width - 4
-            traces = channel_traces(self._sensors, width=width)
-            states = sensor_states(self._sensors, width=width, chosen=self._chosen)
-            shown = Text("\n\n", no_wrap=True).join((states, traces))
+            shown = sensor_states(self._sensors, width=width, chosen=self._chosen)
+            if not self._shows_spectra:
+                traces = channel_traces(self._sensors, width=width)
+                shown = Text("\n\n", no_wrap=True).join((shown, traces))
         else:
             shown = sensors_of_bench(state, chosen=self._chosen)
+        has_spectra = is_live and self._shows_spectra
+        self.set_class(has_spectra, "-spectra")
+        if has_spectra:
+            self.call_after_refresh(self._draw_spectra)  # when the plot has its room
         lines = [Text(f"▲ {line}", BAD) for line in state.failure.splitlines()]
         lines += self._findings if is_live else []
         self.set_class(bool(lines), "-alert")
@@ -124,6 +139,10 @@ class BenchView(View):
         todo = Text(state.note or self._todo(), MUTED)
         self.query_one("#progress", Static).update(todo, layout=False)
         self._n_lines, self._alert = n_lines, alert.plain
+
+    def _draw_spectra(self) -> None:
+        shown = spectra(self._sensors, self.state.models or SITES)
+        self.query_one("#spectra", PsdPlot).show(shown, unit=SpectrumUnit("dB", is_db=True))
 
     def _todo(self) -> str:
         if self._ended is not None:
@@ -144,7 +163,7 @@ class BenchView(View):
             return state.can_start and not is_busy and state.bench is not None
         if action == "preview":
             return self._controls.preview is not None and state.can_start and not is_busy
-        return self._ended is not None if action == "freeze" else True
+        return self._ended is not None if action in {"freeze", "spectra"} else True
 
     def on_screen_suspend(self) -> None:
         """Release the ports when another view is shown."""
@@ -248,6 +267,11 @@ class BenchView(View):
     def action_freeze(self) -> None:
         """Keep the traces as they are, or let them go on."""
         self._is_frozen = not self._is_frozen
+        self.show(self.state)
+
+    def action_spectra(self) -> None:
+        """Show the spectra of all channels, or their traces again."""
+        self._shows_spectra = not self._shows_spectra
         self.show(self.state)
 
     @work(thread=True, group="preview")

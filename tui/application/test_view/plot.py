@@ -259,7 +259,7 @@ class PsdPlot(FullPlot):
                 *curve.line,
                 line_style=curve.style,
                 hires_mode=HiResMode.BRAILLE,
-                label=None if curve.marker else curve.label,
+                label=None if curve.marker else curve.label or None,
             )
         for number, curve in enumerate(curve for curve in curves if curve.marker):
             apart = STEPS_MARKED if curve.is_stepped else MARKED
@@ -272,7 +272,7 @@ class PsdPlot(FullPlot):
                 label=curve.label,
             )
         self._write_names(curves, column=column, row=DOTS_PER_ROW * dot, top=high)
-        self.write_legend(tuple((curve.label, curve.style, curve.marker) for curve in curves))
+        self.write_legend(tuple((c.label, c.style, c.marker) for c in curves if c.label))
 
     def _write_names(
         self, curves: Sequence[Curve], *, column: float, row: float, top: float
