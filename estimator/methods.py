@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from estimator.errors import EstimatorError, UnknownMethodError
-from estimator.levels.bound import unpredicted
+from estimator.levels.interval import unpredicted
 from estimator.levels.pooled import pooled_noise, unresolved_blocks
 from estimator.likelihood.maximum_likelihood import maximum_likelihood
 from estimator.self_noise.coherency import coherency

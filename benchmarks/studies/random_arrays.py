@@ -25,9 +25,9 @@ from estimator.checks.advice import (
     ModelMisfit,
     NoSharedMotion,
     Rotated,
+    SharedNoise,
     UnequalResponses,
 )
-from estimator.checks.misfit import SharedNoise
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -21,11 +21,12 @@ from estimator.checks.advice import (
     Delay,
     Gain,
     ModelMisfit,
+    NoiseChanges,
     NoSharedMotion,
     Rotated,
+    SharedNoise,
     UnequalResponses,
 )
-from estimator.checks.misfit import NoiseChanges, SharedNoise
 from sim_devices.world.scenario import Scenario
 
 if TYPE_CHECKING:

@@ -20,12 +20,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.clocks.clock_model import ClockSource, ClockState, nominal
-from daq.clocks.grid import SNAP, Grid, grid_rate
-from daq.clocks.own_samples import OwnSamples
+from daq.clocks.device_utc import UtcRate
+from daq.clocks.grid import SNAP, Grid, OwnSamples, grid_rate
 from daq.clocks.resampling import USABLE
 from daq.clocks.sensor_reader import SensorSource, main_columns
 from daq.clocks.slip_search import find_by_arrivals, find_by_motion
-from daq.clocks.utc_rate import UtcRate
 from daq.errors import CannotAlignError
 
 if TYPE_CHECKING:

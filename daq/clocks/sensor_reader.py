@@ -19,10 +19,10 @@ from daq.clocks.clock_model import (
     MeasuredDelays,
     OffsetSource,
 )
+from daq.clocks.device_utc import UtcRate
 from daq.clocks.growing_rows import GrowingRows
 from daq.clocks.quantiles import median
 from daq.clocks.slips import Slips
-from daq.clocks.utc_rate import UtcRate
 from daq.errors import CannotAlignError
 from daq.protocols.block import BlockFlag, Uncounted
 from daq.recording.interface import absences

@@ -9,11 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.estimation.settings import DIMENSIONS
-from estimator.checks.advice import ModelMisfit, TooFewDimensions
-from estimator.checks.kinds import Level
-from estimator.checks.misfit import SharedNoise
-from estimator.levels.axes import across
-from estimator.levels.contributions import Contribution, Source, contribution, widened
+from estimator.checks.advice import Level, ModelMisfit, SharedNoise, TooFewDimensions
+from estimator.levels.contributions import Contribution, Source, across, contribution, widened
 from estimator.levels.interval import NORMAL_95
 from estimator.likelihood.dimension import most_testable
 from estimator.likelihood.gradients import misfit

@@ -19,12 +19,10 @@ from daq.estimation.snapshot_diagnostics import (
     SnapshotDiagnostics,
     Synchronisation,
 )
-from estimator.checks.advice import Advice, Delay, Gain, ModelMisfit
+from estimator.checks.advice import Advice, Delay, Gain, Level, ModelMisfit, SharedNoise, Untested
 from estimator.checks.diagnose import Diagnostics, diagnose
-from estimator.checks.kinds import Level, Untested
-from estimator.checks.misfit import SharedNoise
 from estimator.errors import InsufficientDataError
-from estimator.levels.axes import across
+from estimator.levels.contributions import across
 from estimator.responses.equalisation import leakage_advice
 
 if TYPE_CHECKING:

@@ -44,11 +44,10 @@ from daq.estimation.recording_set import (
     is_left,
     open_another,
 )
-from daq.estimation.segment_course import keep_few
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError, Snapshot
-from daq.estimation.snapshot_builder import DIAGNOSIS_SHARE, SnapshotBuilder, why_nothing
+from daq.estimation.snapshot_builder import DIAGNOSIS_SHARE, SnapshotBuilder, keep_few, why_nothing
 from estimator.checks.shared_noise import MAX_CHANNELS
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.checks.kinds import Untested
+from estimator.checks.advice import Untested
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

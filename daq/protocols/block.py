@@ -23,7 +23,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.protocols.plural import several
+from daq.protocols.errors import several
 
 UNCOUNTED_CHECK = "check the buffers and the cable of the logger, and the load of its computer"
 """What to do about samples that are not counted."""

@@ -1,4 +1,7 @@
-"""Errors in received bytes and in settings."""
+"""Errors in received bytes and in settings.
+
+Counts with singular or plural nouns.
+"""
 
 from __future__ import annotations
 
@@ -25,3 +28,8 @@ class DeviceSettingError(ValueError):
     def __init__(self, key: str, expected: str) -> None:
         super().__init__(f"{key}: {expected}" if key else expected)
         self.key, self.expected = key, expected
+
+
+def several(count: int, one: str, rest: str = "") -> str:
+    """Return a count with its noun, such as "1 frame lost" or "2 frames lost"."""
+    return f"{count} {one}{'s' * (count != 1)}{' ' * bool(rest)}{rest}"

@@ -1,7 +1,11 @@
-"""Noise of every channel in bands: its level, its interval, and what the interval consists of."""
+"""Noise of every channel in bands: its level, its interval, and what the interval consists of.
+
+Channels whose noise cannot be told from motion, because a sensor records another motion.
+"""
 
 from __future__ import annotations
 
+import enum
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -9,10 +13,10 @@ import numpy as np
 
 from daq.estimation.contributions import contributions
 from daq.estimation.noise_estimates import ALL_METHODS
+from estimator.checks.advice import NoSharedMotion
 from estimator.levels.bands import band_edges, band_levels, bin_correlation
-from estimator.levels.bound import unpredicted
 from estimator.levels.contributions import widened
-from estimator.levels.interval import NORMAL_95, interval
+from estimator.levels.interval import NORMAL_95, interval, unpredicted
 from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:
@@ -246,3 +250,32 @@ def highest_known(snapshot: Snapshot) -> float:
     """Return the frequency in Hz above which clocks that ran freely leave nothing to be said."""
     known = np.isfinite(snapshot.data_psd).any(axis=1)
     return float(snapshot.frequency[known].max(initial=0.0))
+
+
+class WithoutPartner(enum.StrEnum):
+    """Why the noise of a channel cannot be told from motion."""
+
+    ALONE = "alone"
+    """Its sensor records none of the motion that the others share."""
+    ONE_PARTNER = "one-partner"
+    """Only one other sensor records the same motion; it takes two."""
+
+
+def without_partners(snapshot: Snapshot, band: tuple[float, float]) -> dict[int, WithoutPartner]:
+    """Return the channels, by column, whose noise cannot be told from motion somewhere in a band.
+
+    As far as the test has been diagnosed.
+    """
+    found: dict[int, WithoutPartner] = {}
+    sensors = [number for number, n_channels in enumerate(snapshot.dims) for _ in range(n_channels)]
+    for advice in snapshot.diagnostics.advice:
+        if not isinstance(advice, NoSharedMotion):
+            continue
+        if advice.band is not None and (advice.band[1] < band[0] or advice.band[0] > band[1]):
+            continue
+        for column, sensor in enumerate(sensors):
+            if sensor in advice.sensors:
+                found[column] = WithoutPartner.ALONE
+            elif sensor in advice.partners and len(advice.partners) < 3:
+                found.setdefault(column, WithoutPartner.ONE_PARTNER)
+    return found

@@ -12,8 +12,7 @@ from daq.clocks.clock_model import RelativeTime
 from daq.errors import WrongSettingError
 from daq.results.band_summary import band_of, correlation_of
 from daq.results.clock_effect import relative_time
-from daq.results.noise_budget import known, noise_budgets
-from daq.results.uncertainty_budget import Budget, Component
+from daq.results.uncertainty_budget import Budget, Component, known, noise_budgets
 from estimator.errors import InsufficientDataError
 from estimator.responses.calibration import calibrate_sensor, response_curve
 from estimator.responses.derived_quantities import Value

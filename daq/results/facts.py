@@ -11,15 +11,14 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from estimator.checks.kinds import Level
+from estimator.checks.advice import Level
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from daq.protocols.block import Uncounted
     from daq.recording.sensor_state import SensorState
-    from estimator.checks.advice import Advice
-    from estimator.checks.kinds import Untested
+    from estimator.checks.advice import Advice, Untested
     from estimator.checks.sensitivities import Cause
     from estimator.decision.verdict import Obstacle
     from estimator.levels.contributions import Source

@@ -65,8 +65,8 @@ from estimator.checks.advice import (
     NoSignal,
     TooFewDimensions,
     TooFewSensors,
+    Untested,
 )
-from estimator.checks.kinds import Untested
 from estimator.checks.shared_noise import MAX_CHANNELS
 from estimator.decision.verdict import Obstacle, Verdict
 from estimator.errors import BandError

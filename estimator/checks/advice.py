@@ -2,14 +2,94 @@
 
 Sensors and channels are indices from 0, in the order of the cross-spectral matrix. Front ends
 convert advice to sentences.
+
+Enumerations of a diagnosis: kinds of advice, levels, reasons for missing tests.
+
+Advice on known causes of misfit: shared noise, disturbed segments, changing noise.
 """
 
 from __future__ import annotations
 
+import enum
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-from estimator.checks.kinds import AdviceKind, Level
+
+class Level(enum.StrEnum):
+    """Severity of advice."""
+
+    PROBLEM = "problem"
+    """The estimate is wrong or missing."""
+    WARNING = "warning"
+    """The estimate may be wrong, or is less certain than possible."""
+    NOTE = "note"
+    """The estimate is valid."""
+
+
+class AdviceKind(enum.StrEnum):
+    """Subject of advice."""
+
+    NO_SIGNAL = "no-signal"
+    """Channels have no power, or a constant count."""
+    COPIES = "copies"
+    """Channels repeat others sample for sample."""
+    NO_SHARED_MOTION = "no-shared-motion"
+    """A sensor records none of the motion that others share."""
+    TOO_FEW_SENSORS = "too-few-sensors"
+    """Fewer than three sensors have a signal of their own."""
+    MISSING_CHANNELS = "missing-channels"
+    """Fewer than three sensors have a signal on every channel."""
+    TOO_FEW_DIMENSIONS = "too-few-dimensions"
+    """The model has fewer dimensions than the sensors sense, and does not explain the averages."""
+    MODEL_MISFIT = "model-misfit"
+    """One common motion does not explain the averages."""
+    SHARED_NOISE = "shared-noise"
+    """Channels of one sensor, or of two, share noise."""
+    DISTURBED_SEGMENTS = "disturbed-segments"
+    """Single segments differ from all others beyond their common motion."""
+    NOISE_CHANGES = "noise-changes"
+    """The noise differs between parts of the recording."""
+    MOTION_ACROSS = "motion-across"
+    """Sensors of fewer than three channels do not measure motion across their planes or axes."""
+    MISSING_DIMENSION = "missing-dimension"
+    """Motion is found in fewer dimensions than the sensors sense."""
+    NEARLY_SINGULAR = "nearly-singular"
+    """The cross-spectral matrix between two sensors is nearly singular."""
+    WEAK_MOTION = "weak-motion"
+    """The motion is weaker than the noise in every channel."""
+    """The averages are too few to remove weak motion from the estimate."""
+    SWAPPED_CHANNELS = "swapped-channels"
+    """Two channels of a sensor are swapped."""
+    ROTATED = "rotated"
+    """Two sensors point in different directions."""
+    NOT_ORTHOGONAL = "not-orthogonal"
+    """Channels of a sensor are not at right angles."""
+    REVERSED_POLARITY = "reversed-polarity"
+    """A channel has the opposite sign of its counterpart."""
+    GAIN = "gain"
+    """A channel's gain differs from that of its counterpart."""
+    UNEQUAL_RESPONSES = "unequal-responses"
+    """Sensors with different responses leak motion into their noise at the edges of segments."""
+    DELAY = "delay"
+    """One sensor lags another."""
+
+
+class Untested(enum.StrEnum):
+    """Reason why the model of one common motion was not tested."""
+
+    UNFINISHED = "unfinished"
+    """The recording has just started; the test follows with the first segments."""
+    NO_SEGMENTS = "no-segments"
+    """There are no averages."""
+    TOO_FEW_SENSORS = "too-few-sensors"
+    """Fewer than three sensors have a signal of their own."""
+    TOO_FEW_AVERAGES = "too-few-averages"
+    """The test needs more averages than channels."""
+    TOO_FEW_CHANNELS = "too-few-channels"
+    """The model has as many parameters as the matrix: it explains any averages."""
+    SINGULAR = "singular"
+    """At no frequency is the cross-spectral matrix finite and regular."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -371,3 +451,88 @@ class UnequalResponses(Advice):
     share_without: float
     equalised_by: tuple[str, ...]
     unproven: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SharedNoise(Advice):
+    """Pairs of channels, of one sensor or of two, share noise.
+
+    Attributes
+    ----------
+    channels : tuple of (int, int)
+    amounts : tuple of float
+        Coherency of the noise of each pair, from -1 to 1.
+    errors : tuple of float
+        Their standard errors.
+    alternatives : tuple of (int, int)
+        Pairs, of these sensors or of others, one of which may share noise instead.
+    three_sensor : float
+        Largest bias of the three-sensor noise of any channel, as a fraction of the noise; NaN
+        without such an estimate.
+    maximum_likelihood : float
+        The same for the maximum likelihood noise.
+    channel : int
+        The channel with the largest bias.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.SHARED_NOISE
+    channels: tuple[tuple[int, int], ...]
+    amounts: tuple[float, ...]
+    errors: tuple[float, ...]
+    alternatives: tuple[tuple[int, int], ...]
+    three_sensor: float
+    maximum_likelihood: float
+    channel: int
+
+    @property
+    def harm(self) -> float:
+        """Larger of the two biases, as a fraction of the noise."""
+        known = [abs(x) for x in (self.three_sensor, self.maximum_likelihood) if not math.isnan(x)]
+        return max(known, default=0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DisturbedSegments(Advice):
+    """Single segments differ from all others beyond their common motion.
+
+    Attributes
+    ----------
+    n_disturbed, n_segments : int
+    times : tuple of float
+        Start times of the first disturbed segments, s from the start.
+    excess : float
+        Noise added by these segments, as a fraction, at the frequencies with the largest fraction.
+    channel : int
+        The channel with the largest excess.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.DISTURBED_SEGMENTS
+    n_disturbed: int
+    n_segments: int
+    times: tuple[float, ...]
+    excess: float
+    channel: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoiseChanges(Advice):
+    """The noise of a channel differs between parts of the recording.
+
+    Attributes
+    ----------
+    channel : int
+    deviation : float
+        Standard deviation between parts, as a fraction of the noise.
+    expected : float
+        Expected standard deviation for steady noise.
+    n_parts : int
+    inflation : float
+        Correction of the model test and the tests of shared noise.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.NOISE_CHANGES
+    channel: int
+    deviation: float
+    expected: float
+    n_parts: int
+    inflation: float

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimator.checks.advice import DisturbedSegments, Level, NoiseChanges, Untested
 from estimator.checks.band import BandDiagnosis
-from estimator.checks.kinds import Level, Untested
-from estimator.checks.misfit import DisturbedSegments, NoiseChanges
 from estimator.checks.relative_response import RelativeResponse, relative_response
 from estimator.checks.rules import advise
 from estimator.checks.shared_motion import (
@@ -30,13 +29,13 @@ from estimator.checks.shared_noise import shared_noise
 from estimator.checks.stability import Stability, stability
 from estimator.errors import InsufficientDataError
 from estimator.likelihood import fisher
-from estimator.likelihood.chi_square import critical_value
 from estimator.likelihood.dimension import bands
 from estimator.likelihood.factor_analysis import Maximum, maximise
 from estimator.likelihood.goodness_of_fit import (
     HANN_HALF,
     REJECT,
     ModelTest,
+    critical_value,
     deflated,
     model_test,
     p_values,
@@ -45,13 +44,14 @@ from estimator.likelihood.goodness_of_fit import (
 from estimator.likelihood.maximum_likelihood import standard_error
 from estimator.median import median_of_columns
 from estimator.self_noise.coherency import (
+    Presence,
     check_averages,
     check_dims,
     check_frequency,
     coherency,
+    presence,
     testable,
 )
-from estimator.self_noise.live_channels import Presence, presence
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.likelihood.chi_square import critical_value
+from estimator.likelihood.goodness_of_fit import critical_value
 from estimator.median import median
 from estimator.self_noise.coherency import blocks, own_channels
 

@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.likelihood.chi_square import upper_tail
-from estimator.likelihood.goodness_of_fit import REJECT
+from estimator.likelihood.goodness_of_fit import REJECT, upper_tail
 from estimator.likelihood.score_test import Scores, pair_scores, shift, usable
 from estimator.median import median
 from estimator.self_noise.three_sensor import three_sensor

@@ -16,6 +16,21 @@ smallest effect on the data, the variance is
     ``T_2 + 2 (T_3 / T_2) delta + (T_4 / T_2**2) delta**2``:
 
 proportional to the square of the noise for a PSD, and constant if leaking motion dominates.
+
+Scatter of an estimate that is, to first order, a linear function of the cross-spectral matrix.
+
+Its cumulants are traces of powers of its differential times the matrix: `moments`, divided by the
+averages, is what an interval takes.
+
+A bound of the noise that needs no model of the motion.
+
+What all channels of the *other* sensors together cannot predict of a channel is above its
+self-noise, whatever the dimension of the motion, tilts, gains and linear responses:
+
+    ``1 / (S**-1)_ii * n / (n - m)``
+
+with S of the channel and the m channels of the other sensors. Its scatter is that of a PSD of n - m
+averages. For equal noise it is above the noise by a factor of ``1 + q / (N - 1)``.
 """
 
 from __future__ import annotations
@@ -25,7 +40,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from estimator.types import FloatArray
+    from estimator.types import ComplexArray, FloatArray
 
 NORMAL_95 = 1.959963984540054
 """Standard normal quantile of 97.5 %."""
@@ -134,3 +149,109 @@ def worth(most: int, correlation: FloatArray) -> FloatArray:
     lag = np.arange(1, len(correlation))
     pairs = np.maximum(1 - lag[None, :] / count[:, None], 0.0) @ correlation[1:]
     return np.concatenate([[0.0], count / (1 + 2 * pairs)])
+
+
+def moments(csm: ComplexArray, differential: ComplexArray | FloatArray) -> FloatArray:
+    """Return the traces that determine the scatter of an estimate.
+
+    Parameters
+    ----------
+    csm : complex128, shape (..., p, p)
+        Cross-spectral matrix S.
+    differential : complex128 or float64, shape (..., p, p)
+        Hermitian M: a small change E of S changes the estimate by ``tr(M E)``.
+
+    Returns
+    -------
+    float64, shape (3, ...)
+        ``tr((M S)**k)`` for k = 2, 3, 4; the first is n times the variance of the estimate.
+    """
+    once = _product(differential, csm)
+    twice = _product(once, once)
+    return np.stack(
+        [
+            np.einsum("...pp->...", twice).real,
+            np.einsum("...pq,...qp->...", once, twice).real,
+            np.einsum("...pq,...qp->...", twice, twice).real,
+        ]
+    )
+
+
+def _product(a: ComplexArray | FloatArray, b: ComplexArray) -> ComplexArray:
+    """Multiply many small matrices in real arithmetic, in half the time."""
+    b = np.ascontiguousarray(b)
+    if np.iscomplexobj(a):  # column by column, real part times b and imaginary part times i b
+        a = np.ascontiguousarray(a).view(np.float64)
+        *many, p, q = b.shape
+        b = np.stack([b, 1j * b], axis=-2).reshape(*many, 2 * p, q)
+    return np.asarray((a @ b.view(np.float64)).view(np.complex128))
+
+
+def cumulants(traces: FloatArray, averages: float, gain: FloatArray | float = 1.0) -> FloatArray:
+    """Return the cumulants of an estimate from its traces.
+
+    Parameters
+    ----------
+    traces : float64, shape (3, ...)
+        From `moments`.
+    averages : float
+        Effective averages minus those used up by the estimate.
+    gain : float64, shape (...), optional
+        Factor of the estimate that the traces lack.
+    """
+    scale = np.stack([np.asarray(gain) ** (m + 2) / averages ** (m + 1) for m in range(3)])
+    return np.asarray(
+        traces * scale.reshape(3, *np.shape(gain), *[1] * (traces.ndim - 1 - np.ndim(gain)))
+    )
+
+
+LEAST_AVERAGES = 4.0
+"""Averages beyond the number of predictors without which nothing is bounded."""
+
+
+def unpredicted(
+    csm: ComplexArray, *, dims: tuple[int, ...], n_effective: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return what the other sensors do not predict of every channel, and its cumulants.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        One-sided cross-spectral matrix in unit**2/Hz, channels grouped by sensor.
+    dims : tuple of int
+        Channels of each sensor.
+    n_effective : float64, shape (n_freqs,)
+        Independent averages.
+
+    Returns
+    -------
+    level : float64, shape (n_freqs, n_channels)
+        In unit**2/Hz; NaN where nothing is bounded: averages that are not finite or too few, and
+        predictors of which one has no power or repeats others.
+    cumulants : float64, shape (3, n_freqs, n_channels)
+    """
+    psd = np.einsum("fii->fi", csm).real
+    sensor = np.repeat(np.arange(len(dims)), dims)
+    level = np.full(psd.shape, np.nan)
+    averages = np.full(psd.shape, np.nan)
+    good = np.isfinite(csm).all(axis=(1, 2)) & (psd > 0).all(axis=1)
+    scale = 1 / np.sqrt(np.where(good[:, None], psd, 1.0))
+    unit = csm * scale[:, :, None] * scale[:, None, :]
+    for i in range(len(dims)):
+        own, others = np.flatnonzero(sensor == i), np.flatnonzero(sensor != i)
+        left = n_effective - len(others)
+        some = np.flatnonzero(good & (left > LEAST_AVERAGES))
+        if not len(some) or not len(others):
+            continue
+        rows = unit if len(some) == len(unit) else unit[some]
+        within, towards = rows[:, others[:, None], others], rows[:, others[:, None], own]
+        try:
+            predicted = np.linalg.solve(within, towards)
+        except np.linalg.LinAlgError:
+            continue
+        rest = 1 - (towards.real * predicted.real + towards.imag * predicted.imag).sum(axis=1)
+        gain = (n_effective / left)[some, None]
+        level[np.ix_(some, own)] = np.where(rest > 0, rest * gain, np.nan)
+        averages[np.ix_(some, own)] = left[some, None]
+    level *= np.where(good[:, None], psd, np.nan)
+    return level, np.stack([level**k / averages ** (k - 1) for k in (2, 3, 4)])

@@ -24,9 +24,9 @@ from estimator.self_noise.coherency import (
     check_dims,
     check_frequency,
     coherency,
+    presence,
     testable,
 )
-from estimator.self_noise.live_channels import presence
 
 if TYPE_CHECKING:
     from estimator.types import ComplexArray, FloatArray, IntArray

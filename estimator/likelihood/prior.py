@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.likelihood.factor_analysis import Maximum, maximise
-from estimator.self_noise.live_channels import presence
+from estimator.self_noise.coherency import presence
 
 if TYPE_CHECKING:
     from estimator.self_noise.coherency import Coherency
@@ -40,7 +40,7 @@ def kinds(given: Coherency, dims: tuple[int, ...]) -> IntArray:
     Returns
     -------
     int64, shape (n_channels,)
-        Equal for like channels; a dead or copied channel (`estimator.self_noise.live_channels`) has
+        Equal for like channels; a dead or copied channel (`estimator.self_noise.coherency`) has
         its own kind.
     """
     position = np.concatenate([np.arange(d) for d in dims])

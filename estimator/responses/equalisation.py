@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.checks.advice import UnequalResponses
-from estimator.checks.kinds import Level
+from estimator.checks.advice import Level, UnequalResponses
 from estimator.likelihood.dimension import bands
 from estimator.responses.edge_leakage import band_shares
 from estimator.self_noise.coherency import own_channels

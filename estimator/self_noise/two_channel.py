@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.errors import EstimatorError
+from estimator.levels.interval import cumulants, moments
 from estimator.self_noise.coherency import check_averages, check_dims, coherency, from_parts
 from estimator.self_noise.result import Flag
-from estimator.self_noise.uncertainty import cumulants, moments
 
 if TYPE_CHECKING:
     from estimator.self_noise.result import SelfNoise

@@ -17,8 +17,7 @@ import numpy as np
 from daq.devices.modbus import rtu
 from daq.devices.modbus.fifo_protocol import FIFO_REGISTER, MAX_WORDS, RATE_REGISTER
 from daq.devices.modbus.rtu import RequestFinder
-from sim_devices.devices.interface import NEVER, Line
-from sim_devices.devices.sampling import Samples, whole
+from sim_devices.devices.interface import NEVER, Line, Samples, whole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -24,8 +24,7 @@ from daq.devices.guralp import gcf, scream
 from daq.devices.guralp.brp import Transmitter
 from daq.devices.guralp.gcf import SampleBlock, StatusBlock, SystemId
 from daq.devices.guralp.scream import Packet
-from sim_devices.devices.interface import NEVER, Line
-from sim_devices.devices.sampling import Samples, whole
+from sim_devices.devices.interface import NEVER, Line, Samples, whole
 from sim_devices.errors import ScenarioError
 
 if TYPE_CHECKING:

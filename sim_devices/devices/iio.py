@@ -8,8 +8,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from daq.devices.iio.protocol import RATE_ATTRIBUTE, TIMESTAMP, ScanElement, ScanLayout, mask_of
-from sim_devices.devices.interface import NEVER, Line
-from sim_devices.devices.sampling import Samples, whole
+from sim_devices.devices.interface import NEVER, Line, Samples, whole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

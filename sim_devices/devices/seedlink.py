@@ -25,8 +25,7 @@ from daq.devices.seedlink.packets import (
     encode_packet,
 )
 from daq.devices.seedlink.records import WaveRecord, encode_log, encode_record
-from sim_devices.devices.interface import NEVER, Line
-from sim_devices.devices.sampling import Samples, whole
+from sim_devices.devices.interface import NEVER, Line, Samples, whole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -20,8 +20,7 @@ from daq.devices.text.format import (
     encode_row,
     encode_time,
 )
-from sim_devices.devices.interface import NEVER, Line
-from sim_devices.devices.sampling import Samples, whole
+from sim_devices.devices.interface import NEVER, Line, Samples, whole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

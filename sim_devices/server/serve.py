@@ -98,8 +98,8 @@ class WorldClock:
 
 FAMILIES = {
     "epson": "sim_devices.devices.epson:create",
-    "registers": "sim_devices.devices.registers:create",
-    "labjack": "sim_devices.devices.labjack_ports:create",
+    "registers": "sim_devices.devices.modbus:create",
+    "labjack": "sim_devices.devices.labjack:create",
     "guralp": "sim_devices.devices.guralp:create",
     "fifo": "sim_devices.devices.fifo:create",
     "text": "sim_devices.devices.text:create",

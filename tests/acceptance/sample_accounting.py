@@ -18,7 +18,7 @@ from daq.protocols.block import BlockFlag
 from daq.recording.reader import Recording
 from sim_devices.devices.epson import FULL_SCALE
 from sim_devices.devices.interface import Source
-from sim_devices.devices.labjack_stream import CENTER
+from sim_devices.devices.labjack import CENTER
 from sim_devices.faults import SampleFaults, parse
 from sim_devices.server.serve import device_spec
 from sim_devices.world.scenario import Scenario

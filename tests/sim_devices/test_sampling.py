@@ -10,8 +10,7 @@ import numpy as np
 from daq.devices.modbus import rtu
 from sim_devices.devices.fifo import FifoDevice
 from sim_devices.devices.guralp import create as create_guralp
-from sim_devices.devices.interface import Source
-from sim_devices.devices.sampling import Samples
+from sim_devices.devices.interface import Samples, Source
 from sim_devices.server.serve import device_spec
 from tests.sim_devices.simulated_bench import device, scenario
 

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from sim_devices.world.gaussian import GaussianSeries, WhiteSources
 from sim_devices.world.scenario import Scenario
-from sim_devices.world.world import Motion, World
+from sim_devices.world.world import GaussianSeries, Motion, WhiteSources, World
 
 if TYPE_CHECKING:
     from sim_devices.arrays import ComplexArray, FloatArray

@@ -29,9 +29,8 @@ from daq.recording.monitor import RecordingStatus, SensorStatus
 from daq.recording.sensor_state import SensorState
 from daq.recording.storage.names import CONTINUES
 from daq.recording.writer import RecordingWriter
-from estimator.checks.advice import NoSharedMotion
+from estimator.checks.advice import Level, NoSharedMotion
 from estimator.checks.diagnose import Diagnostics, diagnose
-from estimator.checks.kinds import Level
 from estimator.methods import self_noise
 from tui.wording.facts import known
 

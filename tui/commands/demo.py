@@ -172,8 +172,7 @@ def _show(path: Path, settings: Settings) -> Path | None:
 def _record(path: Path, out: Path, settings: Settings, duration: float, speed: float) -> bool:
     """Record; return whether Ctrl-C ended it."""
     from tui.output.console import notices
-    from tui.runs.interrupt import defer_interrupt
-    from tui.runs.recorder_process import RecorderProcess
+    from tui.runs.recorder_process import RecorderProcess, defer_interrupt
 
     notices().print(
         f"Recording three simulated accelerometers for {format_duration(duration)} at {speed:g} "

@@ -66,7 +66,7 @@ def plot(
     check_places(str(out))
     masks = masks_named(models)
     snapshot, settings, first = estimated(files, start=start, end=end, **wanted)
-    from tui.report.figures.sheet import write_figure
+    from tui.report.figures.curves import write_figure
 
     with notices().status("drawing"):
         write_figure(snapshot, settings, first.bench, out, models=masks, width=width / 25.4)

@@ -109,8 +109,7 @@ def run(
     from daq.results.decision.limits import judge
     from tui.output.console import check_places, for_people, hint
     from tui.runs.estimate_settings import check_fit, chosen
-    from tui.runs.interrupt import defer_interrupt
-    from tui.runs.recorder_process import RecorderProcess
+    from tui.runs.recorder_process import RecorderProcess, defer_interrupt
     from tui.service.history.ledger import noted
 
     end = EndCondition(duration, until_cov, until_decided)

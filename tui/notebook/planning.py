@@ -18,8 +18,8 @@ from daq.estimation.noise_estimates import responses
 from daq.estimation.settings import ROOM, ROOM_OF_ONE_CHANNEL, Settings
 from daq.results.band_summary import correlation_of
 from estimator import planning
-from estimator.levels.axes import across
 from estimator.levels.bands import third_octaves
+from estimator.levels.contributions import across
 from estimator.levels.interval import worth
 from estimator.responses.edge_leakage import slope_factor
 from estimator.responses.equalisation import THRESHOLD

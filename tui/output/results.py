@@ -10,8 +10,7 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from daq.results.band_summary import band_of, channel_means, data_means
-from daq.results.partners import without_partners
+from daq.results.band_summary import band_of, channel_means, data_means, without_partners
 from estimator.self_noise.result import Flag
 from tui.wording.formatting import (
     clock_time,

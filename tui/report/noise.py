@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 from daq.bench.masks.mask import SOURCES
 from daq.bench.tables.certificate import Rule
 from daq.bench.units import decibels
-from daq.results.band_summary import band_of, channel_means, data_means
+from daq.results.band_summary import band_of, channel_means, data_means, without_partners
 from daq.results.decision.conformity import Statement
-from daq.results.partners import without_partners
 from daq.results.precision import channel_covs
 from estimator.decision.verdict import Verdict
 from estimator.self_noise.result import Flag

@@ -3,11 +3,16 @@
 It runs in its own session, so that neither Ctrl-C nor the end of whoever started it stops it. Its
 standard error is a file without a name: unlike a pipe, that never makes it wait, and it outlives
 us. The recorder logs JSON there; a thread reads it and logs each record here as well.
+
+Ctrl-C during a run: the first ends the recording and keeps the result, the second aborts.
+
+Standard error of a child process: its log records, and the reason of a failure.
 """
 
 from __future__ import annotations
 
 import json
+import logging
 import os
 import select
 import signal
@@ -16,7 +21,9 @@ import sys
 import tempfile
 import threading
 import time
-from contextlib import suppress
+from collections import deque
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,10 +34,55 @@ from daq.python_process import python_command
 from daq.recording.control import ask
 from tui.output.exit_codes import ExitCode
 from tui.output.logs import lines as logs
-from tui.runs.child_log import ChildLog
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from types import FrameType
+
     from daq.bench.estimate_settings import EstimateSettings
+
+MAX_LINES = 20
+"""Lines that are no log records, of which the last are kept: a traceback of the interpreter's."""
+
+
+class ChildLog:
+    """Takes the standard error of a command that logs JSON, and logs its records here.
+
+    Parameters
+    ----------
+    name : str
+        What the process is, for lines that are no log records.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._pending = b""
+        self._errors: list[str] = []
+        self._others: deque[str] = deque(maxlen=MAX_LINES)
+
+    def feed(self, content: bytes) -> None:
+        """Take output, in pieces of any length."""
+        *lines, self._pending = (self._pending + content).split(b"\n")
+        for line in lines:
+            self._take(line.decode(errors="replace").rstrip())
+
+    @property
+    def errors(self) -> list[str]:
+        """The errors that the command reported; otherwise its output that is not a log line."""
+        return self._errors or [line for line in self._others if line]
+
+    def _take(self, line: str) -> None:
+        record = logs.record_of(line)
+        if record is None:
+            self._others.append(line)
+            _LOGGER.error("%s wrote: %s", self._name, line)
+            return
+        errors = getattr(record, "errors", None)
+        if isinstance(errors, list):  # of this failure our own will say
+            self._errors += map(str, errors)
+        else:
+            logs.write(record)
+
 
 POLL = 0.05
 LOG_POLL = 0.25
@@ -267,3 +319,38 @@ def _own_session() -> dict[str, Any]:
     if sys.platform == "win32":
         return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
     return {"start_new_session": True}
+
+
+_LOGGER = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class Interruption:
+    """Whether Ctrl-C has been pressed."""
+
+    pressed: bool = False
+
+
+@contextmanager
+def defer_interrupt(stop: Callable[[], None]) -> Iterator[Interruption]:
+    """Call `stop` at the first Ctrl-C, and raise `KeyboardInterrupt` at the second.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        At the second.
+    """
+    found = Interruption()
+    before = signal.getsignal(signal.SIGINT)
+
+    def note(_number: int, _frame: FrameType | None) -> None:
+        signal.signal(signal.SIGINT, before)
+        found.pressed = True
+        _LOGGER.warning("stopping; the result follows. Press Ctrl-C again to end without it")
+        stop()
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield found
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -10,11 +10,13 @@ from estimator.checks.advice import (
     Copies,
     Delay,
     Gain,
+    Level,
     MissingChannels,
     MissingDimension,
     ModelMisfit,
     MotionAcross,
     NearlySingular,
+    NoiseChanges,
     NoSharedMotion,
     NoSignal,
     NotOrthogonal,
@@ -26,8 +28,6 @@ from estimator.checks.advice import (
     UnequalResponses,
     WeakMotion,
 )
-from estimator.checks.kinds import Level
-from estimator.checks.misfit import NoiseChanges
 from tui.wording.differences import followers, opposite
 from tui.wording.findings import explain, where
 from tui.wording.formatting import listed, percent

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 from estimator.checks.advice import (
     Delay,
     Gain,
+    Level,
     NotOrthogonal,
     ReversedPolarity,
     Rotated,
     SwappedChannels,
     UnequalResponses,
 )
-from estimator.checks.kinds import Level
 from tui.wording.findings import Explanation, explain, where
 from tui.wording.formatting import listed, percent, ratio, several, signed, span
 

@@ -58,7 +58,7 @@ from daq.results.facts import (
     WrongSensitivity,
 )
 from daq.results.known_facts import facts_of, facts_of_sensors, facts_of_verdict
-from estimator.checks.kinds import Untested
+from estimator.checks.advice import Untested
 from estimator.decision.comparison import MIN_AVERAGES
 from estimator.decision.verdict import Obstacle
 from estimator.spectra.segment_rejection import Reason

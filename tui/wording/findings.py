@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from estimator.checks.advice import (
     Advice,
     Copies,
+    Level,
     MissingChannels,
     MissingDimension,
     ModelMisfit,
@@ -21,7 +22,6 @@ from estimator.checks.advice import (
     TooFewSensors,
     WeakMotion,
 )
-from estimator.checks.kinds import Level
 from tui.wording.formatting import listed, percent, ratio, span
 
 if TYPE_CHECKING:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from estimator.checks.kinds import Level
-from estimator.checks.misfit import DisturbedSegments, NoiseChanges, SharedNoise
+from estimator.checks.advice import DisturbedSegments, Level, NoiseChanges, SharedNoise
 from tui.wording.alerts import alert
 from tui.wording.findings import Explanation, explain, where
 from tui.wording.formatting import listed, percent, several

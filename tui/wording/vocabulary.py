@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from daq.clocks.clock_model import ClockSource
 from daq.recording.sensor_state import SensorState
-from daq.results.partners import WithoutPartner
+from daq.results.band_summary import WithoutPartner
 from estimator.checks.sensitivities import Cause
 from estimator.levels.contributions import Source
 from estimator.self_noise.result import Flag

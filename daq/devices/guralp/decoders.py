@@ -27,8 +27,7 @@ from daq.devices.guralp.scream import (
 )
 from daq.devices.guralp.streams import Streams, cut, only
 from daq.protocols.block import DeviceItem, Event, EventKind, HostTime
-from daq.protocols.errors import RemoteProtocolError
-from daq.protocols.plural import several
+from daq.protocols.errors import RemoteProtocolError, several
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping

@@ -48,7 +48,7 @@ import numpy as np
 from daq.devices.labjack.packets import Packet, PacketFinder
 from daq.devices.labjack.registers import CORE_HZ, CORE_TIMER, STREAM_DATA_CAPTURE_16
 from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
-from daq.protocols.plural import several
+from daq.protocols.errors import several
 from daq.protocols.sample_counter import CLOCK_TOLERANCE, SLACK, SampleCounter
 
 if TYPE_CHECKING:

@@ -21,8 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 
 from daq.protocols.block import Block, BlockFlag, CountsArray, Event, EventKind
-from daq.protocols.errors import DeviceSettingError, RemoteProtocolError
-from daq.protocols.plural import several
+from daq.protocols.errors import DeviceSettingError, RemoteProtocolError, several
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -12,8 +12,7 @@ import numpy as np
 
 from daq.clocks.delay_estimation import MIN_SEGMENTS, REFERENCES, DelayEstimator
 from estimator.median import median
-from estimator.spectra.gap_window import gap_window, without_trend
-from estimator.spectra.windows import get_window
+from estimator.spectra.windows import gap_window, get_window, without_trend
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

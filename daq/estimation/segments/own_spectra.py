@@ -14,7 +14,7 @@ from estimator.spectra.welch import trends
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from daq.clocks.own_samples import OwnSamples
+    from daq.clocks.grid import OwnSamples
     from daq.estimation.settings import Settings
     from estimator.spectra.welch import WelchSettings
 

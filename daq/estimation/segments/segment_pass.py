@@ -19,12 +19,10 @@ from daq.estimation.segments.delay_measurement import DelayMeasurement
 from daq.estimation.segments.flatline import FlatlineDetector, stands_still
 from daq.estimation.segments.own_spectra import OwnSpectra, need_samples_of_grid
 from daq.estimation.segments.stated_times import agree, compare
-from estimator.spectra.gap_window import Leakage, gap_window, without_trend
 from estimator.spectra.multiresolution import MultiResolution
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
-from estimator.spectra.segment_spectra import SegmentSpectra, kept_bins
-from estimator.spectra.welch import CrossSpectra, WelchSettings
-from estimator.spectra.windows import get_window
+from estimator.spectra.welch import CrossSpectra, SegmentSpectra, WelchSettings, kept_bins
+from estimator.spectra.windows import Leakage, gap_window, get_window, without_trend
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence

@@ -34,8 +34,7 @@ if TYPE_CHECKING:
 
     from daq.clocks.aligned_recording import AlignedRecording
     from daq.estimation.settings import Settings
-    from estimator.spectra.segment_spectra import SegmentSpectra
-    from estimator.spectra.welch import WelchSettings
+    from estimator.spectra.welch import SegmentSpectra, WelchSettings
 
     BoolArray = NDArray[np.bool_]
     FloatArray = NDArray[np.float64]

@@ -13,19 +13,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.results.band_summary import Spectrum, averages_at, highest_known, judged_method
+from daq.results.band_summary import (
+    Spectrum,
+    averages_at,
+    highest_known,
+    judged_method,
+    without_partners,
+)
 from daq.results.decision.verdict import LimitResult, TestVerdict
 from daq.results.facts import Rank, WrongSensitivity
-from daq.results.partners import without_partners
 from estimator.checks.sensitivities import TOLERANCE, wrong_gains
 from estimator.decision.comparison import (
     Comparison,
     Judged,
     joint_quantile,
+    mask_edges,
+    mean_mask,
     prediction,
     whole,
 )
-from estimator.decision.mask_bands import mask_edges, mean_mask
 from estimator.decision.verdict import Obstacle
 from estimator.levels.contributions import Source
 

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.devices.epson.burst import find_frames
 from daq.protocols.block import Block, BlockFlag, Event, EventKind
-from daq.protocols.framing import find_frames
 from daq.protocols.sample_counter import SampleCounter
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from daq.devices.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, HostTime
-from sim_devices.devices.epson_can import SimulatedBus
+from sim_devices.devices.epson import SimulatedBus
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

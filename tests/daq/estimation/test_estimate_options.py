@@ -16,8 +16,14 @@ from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError
 from daq.protocols.block import BlockFlag
-from estimator.checks.advice import Copies, Gain, NoSharedMotion, NoSignal, SwappedChannels
-from estimator.checks.kinds import Untested
+from estimator.checks.advice import (
+    Copies,
+    Gain,
+    NoSharedMotion,
+    NoSignal,
+    SwappedChannels,
+    Untested,
+)
 from estimator.errors import InsufficientDataError
 from estimator.methods import Flag, self_noise
 from estimator.spectra.segment_rejection import Reason

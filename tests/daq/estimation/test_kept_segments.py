@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from daq.estimation.segment_course import keep_few
-from estimator.spectra.segment_spectra import MAX_SEGMENTS, SegmentSpectra
+from daq.estimation.snapshot_builder import keep_few
+from estimator.spectra.welch import MAX_SEGMENTS, SegmentSpectra
 
 
 def _recordings(n_recordings: int, n_segments: int) -> list[SegmentSpectra]:

@@ -13,7 +13,7 @@ from daq.estimation.estimation import bytes_of
 from estimator.checks.stability import SegmentCourse, stability
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.goodness_of_fit import HANN_HALF
-from estimator.spectra.segment_spectra import SegmentSpectra
+from estimator.spectra.welch import SegmentSpectra
 from tests.traced_memory import peak_of
 
 _AFTER_MANY_ARRAYS = """

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.protocols.framing import find_frames
+from daq.devices.epson.burst import find_frames
 
 SIZE = 6
 

@@ -10,8 +10,8 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
 from daq.results.band_summary import channel_means
-from estimator.checks.misfit import SharedNoise
-from estimator.levels.axes import across
+from estimator.checks.advice import SharedNoise
+from estimator.levels.contributions import across
 
 RATE, SNR = 100.0, 5e4
 BANDS = ((2.0, 10.0), (10.0, 30.0), (5.0, 6.0))

@@ -10,8 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from estimator.checks.advice import (
     Advice,
+    AdviceKind,
     Delay,
     Gain,
+    Level,
     MissingDimension,
     ModelMisfit,
     NoSharedMotion,
@@ -20,10 +22,10 @@ from estimator.checks.advice import (
     Rotated,
     SwappedChannels,
     TooFewDimensions,
+    Untested,
     WeakMotion,
 )
 from estimator.checks.diagnose import Diagnostics, diagnose
-from estimator.checks.kinds import AdviceKind, Level, Untested
 from estimator.errors import InsufficientDataError, InvalidMatrixError
 from estimator.likelihood.factor_analysis import maximise
 from tests.estimator.csm_models import pentagon, plane_waves, random_bench, wishart

@@ -8,13 +8,14 @@ from scipy.spatial.transform import Rotation
 
 from estimator.checks.advice import (
     Copies,
+    Level,
     MissingChannels,
     MotionAcross,
     NoSignal,
     TooFewSensors,
+    Untested,
 )
 from estimator.checks.diagnose import diagnose
-from estimator.checks.kinds import Level, Untested
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.goodness_of_fit import model_test
 from tests.estimator.checks.test_diagnose import (

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from estimator.checks.advice import ModelMisfit, Rotated
 from estimator.checks.diagnose import diagnose
-from estimator.checks.orientation import orientation
 from estimator.checks.relative_response import relative_response
+from estimator.checks.rules import orientation
 from estimator.checks.shared_motion import CanonicalCoherence, matched_coherence
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.spectra.welch import CrossSpectra, WelchSettings

@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from estimator.checks.advice import ModelMisfit
+from estimator.checks.advice import Level, ModelMisfit, SharedNoise
 from estimator.checks.diagnose import diagnose
-from estimator.checks.kinds import Level
-from estimator.checks.misfit import SharedNoise
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.score_test import pair_scores
 from estimator.self_noise.three_sensor import three_sensor

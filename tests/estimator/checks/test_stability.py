@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from estimator.checks.advice import AdviceKind, DisturbedSegments, NoiseChanges
 from estimator.checks.diagnose import Diagnostics, diagnose
-from estimator.checks.kinds import AdviceKind
-from estimator.checks.misfit import DisturbedSegments, NoiseChanges
 from estimator.checks.shared_motion import (
     CanonicalCoherence,
     may_have_moved,
@@ -18,13 +17,14 @@ from estimator.checks.shared_motion import (
 )
 from estimator.checks.stability import PARTS, SegmentCourse
 from estimator.likelihood.goodness_of_fit import neighbour_correlation
-from estimator.spectra.segment_spectra import (
+from estimator.spectra.welch import (
     MAX_SEGMENTS,
     MAX_VALUES,
+    CrossSpectra,
     SegmentSpectra,
+    WelchSettings,
     kept_bins,
 )
-from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window
 from tests.estimator.csm_models import rotation
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from estimator.levels.bands import band_levels
-from estimator.levels.bound import unpredicted
 from estimator.levels.contributions import Source, contribution, widened
+from estimator.levels.interval import unpredicted
 from tests.estimator.csm_models import wishart
 
 

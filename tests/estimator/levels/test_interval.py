@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import scipy
 
-from estimator.levels.interval import interval
+from estimator.levels.interval import cumulants, interval
 from estimator.methods import METHODS, self_noise
-from estimator.self_noise.uncertainty import cumulants
 from estimator.spectra.welch import WelchSettings
 from tests.estimator.csm_models import common_motion
 

@@ -8,7 +8,7 @@ import sys
 import pytest
 from scipy import special
 
-from estimator.likelihood.chi_square import critical_value, digamma, upper_tail
+from estimator.likelihood.goodness_of_fit import critical_value, digamma, upper_tail
 
 DEGREES = [0.3, 1.0, 2.0, 7.5, 27.0, 100.0, 433.3, 2000.0, 9000.0, 40000.0]
 

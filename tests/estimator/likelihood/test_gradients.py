@@ -9,8 +9,12 @@ import pytest
 
 from estimator.likelihood.dimension import BandDimension
 from estimator.likelihood.goodness_of_fit import BandTest, pool
-from estimator.likelihood.gradients import noise_by_gradients, with_gradients
-from estimator.likelihood.known_loadings import known_loadings_test, maximise_known
+from estimator.likelihood.gradients import (
+    known_loadings_test,
+    maximise_known,
+    noise_by_gradients,
+    with_gradients,
+)
 from estimator.likelihood.maximum_likelihood import maximum_likelihood
 from tests.estimator.csm_models import plane_waves, rotation, wishart
 

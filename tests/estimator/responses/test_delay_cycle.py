@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from estimator.checks.advice import Delay, ReversedPolarity
-from estimator.checks.orientation import orientation
 from estimator.checks.relative_response import cycle_is_ambiguous, relative_response
+from estimator.checks.rules import orientation
 from estimator.responses.calibration import calibrate_sensor
 
 if TYPE_CHECKING:

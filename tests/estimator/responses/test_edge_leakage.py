@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from estimator.checks.kinds import Level
+from estimator.checks.advice import Level
 from estimator.methods import self_noise
 from estimator.responses.edge_leakage import (
     band_shares,

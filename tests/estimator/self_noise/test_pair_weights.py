@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from estimator.methods import self_noise
-from estimator.self_noise import pair_weights
-from estimator.self_noise.three_sensor import three_sensor
+from estimator.self_noise.three_sensor import DENSE_BINS, sampled, three_sensor
 from tests.estimator.csm_models import random_bench, wishart
 
 FIVE = (3,) * 5
@@ -97,10 +96,10 @@ def test_an_unusable_pair_does_not_affect_the_others() -> None:
 
 
 def test_sampled_frequencies_are_dense_below_and_rising() -> None:
-    bins = pair_weights.sampled(10_000)
+    bins = sampled(10_000)
     steps = np.diff(bins)
     assert bins[0] == 0
     assert np.all(steps >= 1)
-    assert np.all(steps <= np.maximum(1, bins[:-1] / pair_weights.DENSE_BINS))
+    assert np.all(steps <= np.maximum(1, bins[:-1] / DENSE_BINS))
     np.testing.assert_array_equal(bins[:64], np.arange(64))
     assert len(bins) < 250

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from estimator.self_noise.three_sensor import three_sensor
-from estimator.spectra.gap_window import Leakage, gap_window, without_trend
 from estimator.spectra.welch import CrossSpectra, WelchSettings
-from estimator.spectra.windows import get_window
+from estimator.spectra.windows import Leakage, gap_window, get_window, without_trend
 from tests.estimator.csm_models import rotation
 
 LENGTH = 512

@@ -19,7 +19,7 @@ from daq.estimation.snapshot_diagnostics import (
     Synchronisation,
 )
 from daq.results.facts import ModelUntested
-from estimator.checks.kinds import Untested
+from estimator.checks.advice import Untested
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
 from tests.tui.example_snapshot import SETTINGS, STRANGER, diagnosed, made_snapshot, rotation, said

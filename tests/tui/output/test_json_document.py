@@ -9,9 +9,8 @@ import numpy as np
 
 from daq.results.decision.verdict import LimitResult, TestVerdict
 from daq.results.facts import Fact, WrongSensitivity
-from estimator.checks import advice, misfit
-from estimator.checks.advice import Advice
-from estimator.checks.kinds import Untested
+from estimator.checks import advice
+from estimator.checks.advice import Advice, Untested
 from estimator.decision.verdict import Obstacle, Verdict
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
@@ -94,7 +93,7 @@ DIMENSIONLESS = {
 
 
 def test_numbers_of_facts_have_their_units_in_their_names() -> None:
-    for kind in {*kinds(), *kinds(Advice, advice, misfit)}:
+    for kind in {*kinds(), *kinds(Advice, advice)}:
         common = {each.name for each in fields(Fact if issubclass(kind, Fact) else Advice)}
         for each in fields(kind):
             if each.name in {*common, "transients_by_octave"} or "float" not in str(each.type):

@@ -17,7 +17,7 @@ from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics, Synchronisa
 from daq.results.band_summary import levels
 from daq.results.decision.limits import judge
 from daq.results.facts import IntervalsWidened
-from daq.results.noise_budget import noise_budgets
+from daq.results.uncertainty_budget import noise_budgets
 from estimator.levels.bands import band_edges
 from estimator.levels.contributions import Source
 from tests.tui.example_snapshot import SETTINGS, demo_bench, made_snapshot

@@ -20,8 +20,7 @@ from tests.tui.example_snapshot import SETTINGS, made_snapshot
 from tests.tui.night_recording import record
 from tui.commands.main import app
 from tui.report.figures import drawing
-from tui.report.figures.curves import MODEL_RANGE_DB, noise_plots
-from tui.report.figures.sheet import write_figure
+from tui.report.figures.curves import MODEL_RANGE_DB, noise_plots, write_figure
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -9,9 +9,9 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tui.report.page import page
 from tui.report.paper import write_paper
 from tui.report.parts import Facts, Items, Paragraph, Plot, Report, Table
+from tui.report.writing import page
 
 if TYPE_CHECKING:
     from daq.estimation.settings import Settings

@@ -6,7 +6,7 @@ import signal
 
 import pytest
 
-from tui.runs.interrupt import defer_interrupt
+from tui.runs.recorder_process import defer_interrupt
 
 
 def test_the_first_ctrl_c_stops_the_recorder_and_the_second_raises() -> None:

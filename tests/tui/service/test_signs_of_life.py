@@ -14,8 +14,7 @@ import pytest
 from daq.bench.tables.unattended import Metrics
 from tests.tui.service.bench_files import HOURLY, Place
 from tui.commands.serve import is_alive, signs_of_life
-from tui.output.logs.journal import JournalHandler
-from tui.output.logs.lines import fields_of
+from tui.output.logs.lines import JournalHandler, fields_of
 from tui.service.hooks import HookRunner
 from tui.service.metrics import MetricsError, ServiceMetrics
 from tui.service.notify import Notifier, watchdog_interval

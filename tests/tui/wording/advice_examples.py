@@ -8,25 +8,27 @@ from estimator.checks.advice import (
     Advice,
     Copies,
     Delay,
+    DisturbedSegments,
     Gain,
+    Level,
     MissingChannels,
     MissingDimension,
     ModelMisfit,
     MotionAcross,
     NearlySingular,
+    NoiseChanges,
     NoSharedMotion,
     NoSignal,
     NotOrthogonal,
     ReversedPolarity,
     Rotated,
+    SharedNoise,
     SwappedChannels,
     TooFewDimensions,
     TooFewSensors,
     UnequalResponses,
     WeakMotion,
 )
-from estimator.checks.kinds import Level
-from estimator.checks.misfit import DisturbedSegments, NoiseChanges, SharedNoise
 from tui.wording.findings import Names
 
 BAND = (2.0, 8.0)

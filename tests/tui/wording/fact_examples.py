@@ -8,7 +8,7 @@ from daq.protocols.block import Uncounted
 from daq.recording.sensor_state import SensorState
 from daq.results import facts
 from daq.results.facts import Fact, Rank
-from estimator.checks.kinds import Untested
+from estimator.checks.advice import Untested
 from estimator.checks.sensitivities import Cause
 from estimator.decision.verdict import Obstacle
 from estimator.levels.contributions import Source

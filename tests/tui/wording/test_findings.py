@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from estimator.checks.kinds import AdviceKind
+from estimator.checks.advice import AdviceKind
 from tests.tui.wording.advice_examples import EXAMPLES, MISFIT, names
 from tui.wording.findings import explain
 

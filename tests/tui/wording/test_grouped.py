@@ -11,10 +11,10 @@ import pytest
 from daq.results.facts import Finding, Rank
 from estimator.checks.advice import (
     Advice,
+    Level,
     NearlySingular,
     WeakMotion,
 )
-from estimator.checks.kinds import Level
 from tests.tui.wording.advice_examples import (
     BAND,
     EXAMPLES,

@@ -9,10 +9,15 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from daq.results.band_summary import band_of, channel_means, data_means, judged_method
+from daq.results.band_summary import (
+    band_of,
+    channel_means,
+    data_means,
+    judged_method,
+    without_partners,
+)
 from daq.results.comparison import compare
 from daq.results.facts import Rank, TargetMissed
-from daq.results.partners import without_partners
 from daq.results.precision import channel_covs, precision
 from tui.application.test_view.panels import alerts, known_to
 from tui.output.results import averages_line

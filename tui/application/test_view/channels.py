@@ -9,8 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.bench.units import decibels
-from daq.results.band_summary import band_of, data_means
-from daq.results.partners import without_partners
+from daq.results.band_summary import band_of, data_means, without_partners
 from daq.results.precision import channel_covs
 from tui.application.test_view.panels import MUTED, grouped
 from tui.wording.formatting import level, level_with_error, percent, signed

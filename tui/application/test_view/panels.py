@@ -13,11 +13,10 @@ from rich.text import Text
 
 from daq.bench.units import decibels
 from daq.recording.sensor_state import SensorState
-from daq.results.band_summary import band_of, channel_means
+from daq.results.band_summary import band_of, channel_means, without_partners
 from daq.results.decision.end import NOT_KNOWN_FROM, Goal, remaining
 from daq.results.facts import Rank, SensorsSimulated
 from daq.results.known_facts import WITHOUT_ESTIMATE
-from daq.results.partners import without_partners
 from daq.results.precision import precision
 from tui.wording.facts import known, known_of_sensors
 from tui.wording.formatting import clock_time, percent, several, signed
@@ -31,10 +30,9 @@ if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus, SensorStatus
-    from daq.results.band_summary import BandMeans
+    from daq.results.band_summary import BandMeans, WithoutPartner
     from daq.results.decision.verdict import TestVerdict
     from daq.results.facts import Fact
-    from daq.results.partners import WithoutPartner
     from daq.results.precision import Precision
     from tui.application.test_view.plotted import Choice
 

@@ -9,8 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from estimator.checks.advice import NoSharedMotion
-from estimator.checks.kinds import Level
+from estimator.checks.advice import Level, NoSharedMotion
 from estimator.checks.shared_motion import CanonicalCoherence, outsiders, shared_motion
 
 if TYPE_CHECKING:

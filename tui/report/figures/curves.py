@@ -1,25 +1,35 @@
-"""Noise against frequency, with limits and noise models."""
+"""Noise against frequency, with limits and noise models.
+
+The noise plots of a report as one figure in a file of its own.
+"""
 
 from __future__ import annotations
 
+import io
 import math
 from dataclasses import dataclass
 from itertools import cycle, groupby
 from typing import TYPE_CHECKING
 
+import matplotlib as mpl
 import numpy as np
+from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
 from daq.bench.units import levels_db
 from daq.results.band_summary import levels
 from daq.results.decision.limits import concerns, mask_psd
+from estimator.errors import InsufficientDataError
 from estimator.levels.bands import log_edges
+from tui.output.console import write_whole
 from tui.report.figures import drawing
+from tui.report.figures.drawing import look, stack, stack_height
 from tui.report.parts import Plot
 from tui.report.wording import power_of_ten
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
+    from pathlib import Path
 
     from matplotlib.axes import Axes
     from numpy.typing import NDArray
@@ -348,3 +358,63 @@ def logarithmic(axes: Axes, span: tuple[float, float]) -> None:
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_xlabel("frequency (Hz)")
+
+
+RESOLUTION = 300
+"""Dots per inch of a PNG, as journals ask for."""
+
+
+def write_figure(
+    snapshot: Snapshot,
+    settings: Settings,
+    bench: Bench | None,
+    path: Path,
+    *,
+    models: Sequence[Mask] = (),
+    width: float,
+) -> None:
+    """Write the curves of the report as SVG, PNG or PDF, as the suffix says.
+
+    Letters of an SVG are shapes, so that it looks alike wherever it is opened; those of a PDF are
+    text. The same estimate gives the same file.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+    settings : Settings
+    bench : Bench or None
+        Its limits are shown.
+    path : Path
+    models : sequence of Mask
+        Noise models to show.
+    width : float
+        Of the figure in inches.
+
+    Raises
+    ------
+    InsufficientDataError
+        If there is no estimate by any method.
+    WrongSettingError
+        If a noise model cannot be turned into the unit of the estimate.
+    OSError
+        If the file cannot be written; an earlier one stays.
+    """
+    kind = path.suffix.lower().removeprefix(".")
+    content = io.BytesIO()
+    with look(), mpl.rc_context({"svg.fonttype": "path"}):
+        plots = noise_plots(snapshot, settings, bench, models, width=width)
+        if not plots:
+            raise InsufficientDataError("no noise estimate by any method: nothing can be drawn")
+        figure = Figure(figsize=(width, stack_height(plots)), facecolor="white")
+        stack(plots, figure)
+        figure.savefig(content, format=kind, dpi=RESOLUTION, metadata=_ABOUT[kind])
+    write_whole(path, content.getvalue())
+
+
+_TITLE = "Self-noise of every channel, one-sided power spectral density"
+_ABOUT: dict[str, dict[str, str | None]] = {
+    "svg": {"Title": _TITLE, "Creator": "huddle", "Date": None},
+    "png": {"Title": _TITLE, "Software": "huddle"},
+    "pdf": {"Title": _TITLE, "Creator": "huddle", "Producer": None, "CreationDate": None},
+}
+"""What a file says of itself; no date, so that the same estimate gives the same file."""

@@ -21,8 +21,7 @@ from daq.recording.control import ask
 from daq.recording.reader import Recording
 from daq.recording.storage.locking import is_being_written
 from daq.recording.storage.names import recording_path
-from tui.runs.child_log import ChildLog
-from tui.runs.recorder_process import RecorderFailedError, RecorderProcess
+from tui.runs.recorder_process import ChildLog, RecorderFailedError, RecorderProcess
 from tui.service.processes.finish import Outcome, Request
 from tui.service.processes.locks import Lock, is_held, kill_holder
 from tui.service.records.parts import mark_of, with_continuations

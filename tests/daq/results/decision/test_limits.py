@@ -15,8 +15,7 @@ from daq.estimation.contributions import contributions
 from daq.estimation.snapshot_diagnostics import Synchronisation
 from daq.results.band_summary import channel_means
 from daq.results.decision.limits import judge
-from estimator.checks.advice import ModelMisfit
-from estimator.checks.kinds import Level
+from estimator.checks.advice import Level, ModelMisfit
 from estimator.decision.comparison import MIN_AVERAGES
 from estimator.decision.verdict import Obstacle, Verdict
 from estimator.levels.contributions import Source

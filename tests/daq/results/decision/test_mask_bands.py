@@ -10,7 +10,7 @@ import pytest
 
 from daq.bench.loading import parse
 from daq.results.decision.limits import judge
-from estimator.decision.mask_bands import mask_edges
+from estimator.decision.comparison import mask_edges
 from estimator.decision.verdict import Obstacle, Verdict
 from estimator.self_noise.result import SelfNoise
 from tests.daq.results.decision.benches import MASK, verdict_on

@@ -13,7 +13,7 @@ from tui.output.console import notices
 from tui.output.logs import lines as logs
 from tui.output.logs.lines import configure
 from tui.output.logs.options import LogFormat, LogLevel
-from tui.runs.child_log import ChildLog
+from tui.runs.recorder_process import ChildLog
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
