@@ -263,7 +263,7 @@ async def keep_pages(path: Path, web: Web) -> None:
 
     from daq.python_process import python_command
     from tui.output.logs import lines
-    from tui.runs.child_log import ChildLog
+    from tui.runs.recorder_process import ChildLog
 
     command = python_command("tui", "web", str(path), *lines.arguments_for_child())
     while True:
