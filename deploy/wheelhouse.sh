@@ -16,6 +16,6 @@ wheel=$(basename "$folder"/huddle_bench-*.whl)
 version=$(echo "$wheel" | cut -d- -f2)
 {
     cat "$here/deploy/requirements.txt"
-    echo "huddle-bench[fast,metrics,report,signing]==$version \\"
+    echo "huddle-bench[fast,metrics,report,signing,web]==$version \\"
     echo "    --hash=sha256:$(sha256sum "$folder/$wheel" | cut -d' ' -f1)"
 } > "$folder/requirements.txt"
