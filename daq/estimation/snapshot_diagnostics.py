@@ -107,7 +107,8 @@ def added_by_clocks(
     if share is None or not results:
         return None
     psd = np.abs(next(iter(results.values())).noise_psd)
-    added = CLOCK_FACTOR * share * psd
+    with np.errstate(invalid="ignore"):  # of a noise of zero
+        added = CLOCK_FACTOR * share * psd
     return np.where(np.isfinite(added), np.clip(added, 0.0, psd), 0.0)
 
 

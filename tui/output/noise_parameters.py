@@ -9,7 +9,7 @@ import numpy as np
 
 from daq.results.noise_parameters import QUANTISATION_SHARE, Outcome, Quantity
 from estimator.noise_parameters.fit import Term
-from tui.wording.formatting import level, percent, span
+from tui.wording.formatting import level, percent, scientific, span
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -84,8 +84,8 @@ def allan_table(found: Sequence[ChannelNoise]) -> tuple[tuple[str, ...], list[tu
 def _allan(found: AllanDeviation, at: int) -> str:
     value, low, high = (float(each[at]) for each in (found.deviation, found.low, found.high))
     if not low > 0:
-        return f"< {high:.2g}"
-    return f"{value:.3g} ±{percent((high - low) / 2 / value)}"
+        return f"< {scientific(high, 2)}"
+    return f"{scientific(value)} ±{percent((high - low) / 2 / value)}"
 
 
 def sheet_table(found: Sequence[ChannelNoise]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:

@@ -16,7 +16,7 @@ from daq.estimation.settings import Settings
 from daq.protocols.block import Quantity
 from daq.results.sources import conditions
 from tui.report.parts import Facts, Paragraph, Section, Table
-from tui.report.wording import plain_number, utc_time
+from tui.wording.formatting import plain_number, utc_time
 
 if TYPE_CHECKING:
     import datetime as dt

@@ -42,9 +42,8 @@ from tui.report.noise import limits_section, noise_section, verdict
 from tui.report.parameters import parameters_section
 from tui.report.parts import Facts, Paragraph, Part, Report, Section, Signatures, Table
 from tui.report.uncertainty import uncertainty_section
-from tui.report.wording import is_known, local_time, utc_time
 from tui.wording.facts import known
-from tui.wording.formatting import span
+from tui.wording.formatting import is_known, local_time, span, utc_time
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

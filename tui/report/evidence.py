@@ -19,15 +19,17 @@ from estimator.likelihood.goodness_of_fit import rejected_below
 from tui.report.figures.drift import drift_plot
 from tui.report.figures.model_test import model_test_plot
 from tui.report.parts import Items, Paragraph, Part, Section, Table
-from tui.report.wording import (
+from tui.wording.facts import MARKS, NOTHING_TO_DO, RANKS
+from tui.wording.formatting import (
     NOTHING,
     plain_number,
     probability,
     scientific,
+    several,
     share,
+    span,
+    utc,
 )
-from tui.wording.facts import MARKS, NOTHING_TO_DO, RANKS
-from tui.wording.formatting import several, span, utc
 from tui.wording.vocabulary import clock_source
 
 if TYPE_CHECKING:

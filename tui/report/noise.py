@@ -15,8 +15,15 @@ from estimator.decision.verdict import Verdict
 from estimator.self_noise.result import Flag
 from tui.report.figures.curves import noise_plots
 from tui.report.parts import Paragraph, Part, Section, Table
-from tui.report.wording import NOTHING, decibel, plain_number, scientific
-from tui.wording.formatting import NOT_KNOWN, level_with_error, span
+from tui.wording.formatting import (
+    NOT_KNOWN,
+    NOTHING,
+    level,
+    level_with_error,
+    plain_number,
+    scientific,
+    span,
+)
 from tui.wording.verdict_text import WORDS, headline, margin, not_judged, what_to_do
 from tui.wording.vocabulary import FLAG_WORDS, PARTNER_WORDS
 
@@ -81,8 +88,8 @@ def limits_section(
                 each.name,
                 each.limit,
                 plain_number(each.frequency, ".3g"),
-                decibel(each.noise_psd),
-                decibel(each.limit_psd),
+                level(each.noise_psd, 1),
+                level(each.limit_psd, 1),
                 margin(each),
                 WORDS[each.verdict] if each.known else "no estimate",
             )
@@ -188,7 +195,7 @@ def _band_table(snapshot: Snapshot, settings: Settings) -> Table:
     rows = []
     alone = without_partners(snapshot, band)
     for number, label in enumerate(snapshot.channels):
-        name, recorded = f"{label.sensor}.{label.channel}", decibel(float(data[number]))
+        name, recorded = f"{label.sensor}.{label.channel}", level(float(data[number]), 1)
         if number in alone:
             rows.append((name, recorded, PARTNER_WORDS[alone[number]], *["?"] * 5))
             continue
@@ -196,10 +203,10 @@ def _band_table(snapshot: Snapshot, settings: Settings) -> Table:
         rows.append(
             (
                 f"{label.sensor}.{label.channel}",
-                decibel(float(data[number])) if data[number] > 0 else no_signal,
-                "withdrawn" if mean[0] > mean[2] else decibel(mean[0], 2),
+                level(float(data[number]), 1) if data[number] > 0 else no_signal,
+                "withdrawn" if mean[0] > mean[2] else level(mean[0]),
                 _interval(mean[1], mean[2]),
-                scientific(math.sqrt(mean[0])) if 0 < mean[0] <= mean[2] else decibel(math.nan),
+                scientific(math.sqrt(mean[0])) if 0 < mean[0] <= mean[2] else NOTHING,
                 plain_number(covs[number], ".3f"),
                 plain_number(mean[3], ".3f"),
                 _snr(float(data[number]), mean[0]),
@@ -224,13 +231,13 @@ def _interval(low: float, high: float) -> str:
     if math.isinf(high):
         return NOT_KNOWN
     if not high > 0:
-        return "below 0" if high <= 0 else decibel(math.nan)
-    return f"{decibel(low, 2)} … {decibel(high, 2)}" if low > 0 else f"below {decibel(high, 2)}"
+        return "below 0" if high <= 0 else NOTHING
+    return f"{level(low)} … {level(high)}" if low > 0 else f"below {level(high)}"
 
 
 def _snr(data: float, noise: float) -> str:
     if not noise > 0:
-        return decibel(math.nan)
+        return NOTHING
     return plain_number(decibels(data - noise) - decibels(noise), ".1f") if data > noise else "< 0"
 
 

@@ -19,7 +19,7 @@ from tui.output.noise_parameters import (
 )
 from tui.report.figures import drawing
 from tui.report.parts import Items, Paragraph, Part, Plot, Section, Table
-from tui.report.wording import power_of_ten
+from tui.wording.formatting import power_of_ten
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -15,8 +15,7 @@ from estimator.levels.interval import NORMAL_95
 from tui.report.figures import drawing
 from tui.report.figures.curves import logarithmic
 from tui.report.parts import Paragraph, Plot, Section, Table
-from tui.report.wording import NOTHING, decibel, plain_number, scientific
-from tui.wording.formatting import span
+from tui.wording.formatting import NOTHING, level, plain_number, scientific, span
 from tui.wording.vocabulary import SOURCE_WORDS
 
 if TYPE_CHECKING:
@@ -182,13 +181,13 @@ def uncertainty_section(
     rows = tuple(
         (
             name,
-            decibel(each.level, 2),
+            level(each.level),
             _ends(each.statistical),
             _ends(each.total),
             plain_number(each.k, ".2f"),
             _root(each.level),
             *((_root(each.level, of_g), _root(each.level, 1e6 * of_g)) if of_g else ()),
-            *((decibel(each.level * in_si**2, 2),) if in_si and unit != "m/s²" else ()),
+            *((level(each.level * in_si**2),) if in_si and unit != "m/s²" else ()),
         )
         for name, each in zip(names, found, strict=True)
     )
@@ -398,7 +397,7 @@ def _ends(ends: tuple[float, float]) -> str:
     low, high = ends
     if not math.isfinite(high):
         return "not known"
-    return f"{decibel(low, 2)} … {decibel(high, 2)}" if low > 0 else f"below {decibel(high, 2)}"
+    return f"{level(low)} … {level(high)}" if low > 0 else f"below {level(high)}"
 
 
 def _percent(value: float) -> str:

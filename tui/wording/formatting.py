@@ -11,6 +11,8 @@ from daq.bench.units import decibels
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from daq.bench.model import Bench
+
 
 ONE_SIDED = 1.1
 """Lower half of an interval over its upper half, from which on both are shown."""
@@ -22,7 +24,9 @@ _PREFIXES = {0: "", -3: "m", -6: "µ", -9: "n"}
 _PREFIXED = {"m/s²", "m/s", "m", "g", "Gal", "V", "rad"}
 """Units that take a prefix."""
 _MOST_DECIMALS = 3
-_NO_NUMBER = "?"
+NOTHING = "?"
+"""Where nothing can be said."""
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def utc(ns: int) -> str:
@@ -48,11 +52,11 @@ def roughly(seconds: float) -> str:
     return f"{math.ceil(seconds / 86400)} days"
 
 
-def level(psd: float) -> str:
+def level(psd: float, digits: int = 2) -> str:
     """Return a PSD in dB, or a word if it has none."""
     if math.isnan(psd):
-        return "?"
-    return "below 0" if psd <= 0 else signed(decibels(psd), ".2f")
+        return NOTHING
+    return "below 0" if psd <= 0 else plain_number(decibels(psd), f".{digits}f")
 
 
 def level_with_error(psd: float, high: float, low: float = math.nan) -> str:
@@ -109,7 +113,7 @@ def readings(values: Sequence[float], unit: str) -> tuple[list[str], str]:
     known = [abs(value) for value in values if value and math.isfinite(value)]
     exponents = [math.floor(math.log10(value)) for value in known]
     if not exponents:
-        return ["0" if value == 0 else _NO_NUMBER for value in values], unit
+        return ["0" if value == 0 else NOTHING for value in values], unit
     takes_prefix = base in _PREFIXED
     largest = 3 * ((max(exponents) + own) // 3)
     if takes_prefix:
@@ -123,14 +127,13 @@ def readings(values: Sequence[float], unit: str) -> tuple[list[str], str]:
     for value in values:
         text = signed(value * 10.0 ** (own - shift), f".{decimals}f")
         if not math.isfinite(value):
-            text = _NO_NUMBER
+            text = NOTHING
         elif value and not any(digit in text for digit in "123456789"):
             text = f"<{least:.{decimals}f}" if value > 0 else f">−{least:.{decimals}f}"
         texts.append(text)
     if takes_prefix:
         return texts, _PREFIXES[shift] + base
-    power = str(shift).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-    return texts, f"10{power} {unit}" if shift else unit
+    return texts, f"{power_of_ten(shift)} {unit}" if shift else unit
 
 
 def degrees(angle: float) -> str:
@@ -157,3 +160,68 @@ def span(low: float, high: float) -> str:
 def listed(words: Sequence[str], conjunction: str = "and") -> str:
     """Return words as a list with "and"."""
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {conjunction} {words[-1]}"
+
+
+def power_of_ten(exponent: float) -> str:
+    """Return a power of ten as people write it."""
+    return "10" + f"{exponent:.0f}".translate(_SUPERSCRIPTS)
+
+
+def scientific(value: float, digits: int = 3) -> str:
+    """Return a number with so many digits, and a power of ten where it is far from one."""
+    if not math.isfinite(value):
+        return NOTHING
+    if value == 0:
+        return "0"
+    if 1e-3 <= abs(value) < 1e5:
+        places = max(0, digits - 1 - math.floor(math.log10(abs(value))))
+        return plain_number(value, f".{places}f")
+    mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
+    return f"{mantissa}×{power_of_ten(int(exponent))}".replace("-", "−")
+
+
+def plain_number(value: float, form: str) -> str:
+    """Return a number in Python's format, with a true minus; ``?`` where there is none."""
+    if not math.isfinite(value):
+        return NOTHING
+    text = format(value, form)
+    return text.replace("-", "−") if text.strip("+-0.") else text.lstrip("-")
+
+
+def share(value: float) -> str:
+    """Return a fraction in percent."""
+    if not math.isfinite(value):
+        return NOTHING
+    percent = 100 * value
+    return (
+        "< 0.1 %" if percent < 0.1 else f"{percent:.2g} %" if percent < 100 else f"{percent:.0f} %"
+    )
+
+
+def probability(value: float) -> str:
+    """Return a probability; small ones as a bound."""
+    if not math.isfinite(value):
+        return NOTHING
+    return "< 0.001" if value < 0.001 else f"{value:.2g}"
+
+
+def utc_time(moment: datetime) -> str:
+    """Return an instant in UTC to the second."""
+    return f"{moment.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC" if is_known(moment) else "not known"
+
+
+def is_known(moment: datetime) -> bool:
+    """Whether an instant is one: files from elsewhere without a time begin at that of computers."""
+    return moment.timestamp() > 366 * 86400
+
+
+def local_time(moment: datetime, bench: Bench | None) -> str:
+    """Return an instant in the bench's time zone where its file names one, or this machine's."""
+    if not is_known(moment):
+        return "not known"
+    from zoneinfo import ZoneInfo  # noqa: PLC0415 - a report needs it
+
+    named = bench is not None and bench.schedule.named_zone != "UTC"
+    name = bench.schedule.named_zone if bench is not None and named else ""
+    local = moment.astimezone(ZoneInfo(name) if name else None)
+    return f"{local:%Y-%m-%d %H:%M:%S} UTC{local:%z}" + (f" ({name})" if name else "")

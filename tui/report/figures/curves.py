@@ -25,7 +25,7 @@ from tui.output.console import write_whole
 from tui.report.figures import drawing
 from tui.report.figures.drawing import look, stack, stack_height
 from tui.report.parts import Plot
-from tui.report.wording import power_of_ten
+from tui.wording.formatting import power_of_ten
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
