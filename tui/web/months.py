@@ -9,6 +9,7 @@ from daq.archive.answers import answer
 from daq.archive.store import Store
 from tui.output.archive.tables import course_table, course_title, remarks
 from tui.output.results import averages_line, result_table, result_title
+from tui.service.history.ledger import noise_of
 from tui.service.history.series import history
 from tui.service.history.shown import history_figure, history_lines, history_table
 from tui.service.records.store import RunStore
@@ -41,7 +42,20 @@ class Months:
     def sensors(self) -> dict[str, Any]:
         """Return what the page of the sensors shows."""
         found = self._series()
-        return {"table": history_table(found), "lines": list(history_lines(found)), "found": found}
+        serial_numbers = {each.serial_number for each in self._bench.sensors}
+        serial_numbers |= {each.last.serial_number for each in found}
+        everywhere = [
+            series
+            for serial_number in sorted(serial_numbers - {""})
+            for series in history(noise_of(serial_number))
+        ]
+        return {
+            "table": history_table(found),
+            "lines": list(history_lines(found)),
+            "found": found,
+            "everywhere": history_table(everywhere) if everywhere else None,
+            "everywhere_lines": list(history_lines(everywhere)),
+        }
 
     def _series(self) -> list[Series]:
         return history(RunStore(self._bench.recording_directory).noise(self._bench.name))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from daq.bench.loading import parse
+from daq.bench.loading import load, parse
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.protocols.block import HostTime
@@ -18,6 +18,7 @@ from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
 from tui.commands.main import app
 from tui.service.history.ledger import ledger_path, noise_of, noted, record_test
+from tui.web.months import Months
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -106,6 +107,18 @@ def test_history_shows_a_sensor_over_all_benches(tmp_path: Path) -> None:
     assert unknown.exit_code == 2
     assert "no test in the ledger" in unknown.output
     assert CliRunner().invoke(app, ["history"]).exit_code == 2
+
+
+def test_the_page_of_sensors_shows_their_tests_on_other_benches(tmp_path: Path) -> None:
+    for day, bench in enumerate(["lab", "office"]):
+        recorded_test(recorded(tmp_path, bench=bench, day=day))
+    path = tmp_path / "yard.toml"
+    about = BENCH.replace('name = "A"', 'name = "A"\nserial_number = "S2"')
+    path.write_text(f'name = "yard"\n{about}', encoding="utf-8")
+    shown = Months(load(path)).sensors()
+    assert not shown["found"]
+    assert set(shown["everywhere"].columns[0].cells) == {"S2"}
+    assert set(shown["everywhere"].columns[5].cells) == {"2"}
 
 
 def test_without_serial_numbers_or_a_ledger_nothing_is_kept(
