@@ -294,6 +294,7 @@ def test_the_examples_pass_their_suite(chosen: str, n_tests: int, tmp_path: Path
     assert f"{n_tests} passed" in done.stdout
 
 
+@pytest.mark.long
 def test_the_suite_catches_every_broken_driver(tmp_path: Path, subtests: pytest.Subtests) -> None:
     """Also those that yield blocks in perfect order: rows, times, rates or the loop are wrong."""
     sound = (EXAMPLE / "tests" / "test_conformance.py").read_text(encoding="utf-8")

@@ -12,7 +12,6 @@ from typer.testing import CliRunner
 from benchmarks.studies.clocks import free_running, residuals, study
 from benchmarks.studies.synthesis import Latency, synthesise
 from daq.clocks.clock_model import ClockSource, ClockState
-from daq.errors import CannotAlignError
 from daq.estimation.diagnosis import residuals as residuals_between
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
@@ -152,15 +151,6 @@ def test_device_utc_and_host_times_meet_though_the_hosts_utc_is_off(
     # 23 segments, 850 frequencies: 0.5 % an average.
     assert noise[band].mean(axis=0) == pytest.approx(1e-13, rel=0.03)
     assert snapshot.start_utc_ns > 0
-
-
-def test_a_rate_that_is_off_by_one_per_cent_is_refused(tmp_path: Path) -> None:
-    """No clock of a device is: the rate in the bench file is wrong, or samples are lost."""
-    table = free_running(snr=1e4, duration=40.0, seed=8).to_dict()
-    table["sensors"]["B"]["clock"] |= {"ppm": -1e4}
-    path = synthesise(tmp_path / "r.h5", Scenario.from_dict(table), duration=40.0)
-    with pytest.raises(CannotAlignError, match="'B' sent 198 samples per second"):
-        estimate([path])
 
 
 @pytest.mark.long

@@ -123,7 +123,7 @@ def test_a_wav_file_that_is_cut_off_is_read_and_said(
 def test_the_unit_of_times_without_one_is_said(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level("INFO")
+    caplog.set_level("INFO", "daq.formats")
     (tmp_path / "a.csv").write_bytes(b"time,A.X\n1e12,1\n1000000000010,2\n")
     assert opened(tmp_path / "a.csv")["A"].sampling_rate == 100.0
     assert "times such as 1e12 have no unit; read as ms since 1970" in caplog.text

@@ -165,6 +165,7 @@ def test_no_process_of_python_is_started_in_any_other_way() -> None:
         str(Path("daq", "recording", "storage", "trial.py")),
         str(Path("sim_devices", "server", "launch.py")),
         str(Path("tui", "commands", "record.py")),
+        str(Path("tui", "commands", "serve.py")),
         str(Path("tui", "runs", "recorder_process.py")),
         str(Path("tui", "service", "processes", "steps.py")),
     }

@@ -235,6 +235,7 @@ async def test_a_service_starts_on_a_damaged_database(tmp_path: Path) -> None:
     assert ("14:00", "done") in place.states()
 
 
+@pytest.mark.long
 @pytest.mark.virtual_time
 async def test_seven_daily_copies_are_kept(tmp_path: Path) -> None:
     place = Place(tmp_path)
