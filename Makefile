@@ -44,6 +44,7 @@ bench: $(VENV)/.installed-dev  ## speed and memory, as ratios within one run
 	$(BIN)/python -m benchmarks
 
 studies: $(VENV)/.installed-dev  ## coverage of intervals and verdicts; hours
+	$(BIN)/pytest -m study
 	$(BIN)/python -m benchmarks.studies
 	$(BIN)/python -m benchmarks.studies.levels
 	$(BIN)/python -m benchmarks.studies.leaning

@@ -104,10 +104,11 @@ def sent_by_epson(log: Log, sensor: str, truth: Counts, rate: float) -> Indices:
         places.setdefault(row.tobytes(), []).append(index)
     found = []
     for at, unit in log.sent[sensor]:
-        if len(unit) == 20 and unit[0] == 0x80 and unit[-1] == 0x0D:  # FLAG, x, y, z, COUNT, sum
-            words = np.frombuffer(unit, ">u2", 8, 1)
-            if int(words.sum(dtype=np.int64)) % 65536 == int.from_bytes(unit[17:19], "big"):
-                candidates = places[unit[3:15]]
+        # FLAG, TEMP, x, y, z, COUNT, sum
+        if len(unit) == 24 and unit[0] == 0x80 and unit[-1] == 0x0D:
+            words = np.frombuffer(unit, ">u2", 10, 1)
+            if int(words.sum(dtype=np.int64)) % 65536 == int.from_bytes(unit[21:23], "big"):
+                candidates = places[unit[7:19]]
                 found.append(min(candidates, key=lambda index: abs(index / rate - at)))
     return np.unique(found)
 

@@ -35,7 +35,7 @@ def test_lost_samples_are_gaps_and_the_others_are_those_of_the_whole(tmp_path: P
         np.testing.assert_array_equal(after.counts(), before.counts()[kept])
 
 
-@pytest.mark.long
+@pytest.mark.study
 @pytest.mark.parametrize("length", [0.05])
 def test_intervals_cover_and_advice_is_true(length: float) -> None:
     study = random_recordings(lambda *_: None, length=length)
