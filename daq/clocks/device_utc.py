@@ -1,6 +1,4 @@
-"""The clock of a device that states UTC itself.
-
-How fast the UTC that a device states runs against the computer's clock.
+"""The clock of a device that states UTC itself, and how fast that UTC runs against the computer's.
 
 Arrival times are by the computer's clock. A sensor without UTC beside one that states it needs both
 in one time. Neither need be right: a computer without time service runs off by tens of ppm, and so

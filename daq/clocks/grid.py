@@ -1,10 +1,9 @@
-"""The common grid of a recording: copies or interpolates a sensor's samples.
+"""The common grid of a recording: a sensor's samples copied, interpolated, or as they are.
 
-Segments of the grid in each sensor's own samples: what needs no interpolation.
-
-A segment lies on a sensor's clock at a whole number of samples, a fraction and a drift, as long as
-that clock is straight within it. Where samples are missing, clocks restart or bend, or rates
-differ, there are no such segments, and the grid is interpolated.
+Segments in the sensor's own samples need no interpolation. A segment lies on a sensor's clock at a
+whole number of samples, a fraction and a drift, as long as that clock is straight within it. Where
+samples are missing, clocks restart or bend, or rates differ, there are no such segments, and the
+grid is interpolated.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Makes snapshots of an estimate from the segments taken so far.
 
-The segments of recordings one by one, as far as they are kept.
+They are at hand one by one, as far as they are kept.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Errors in received bytes and in settings.
-
-Counts with singular or plural nouns.
-"""
+"""Errors in received bytes and in settings, and counts with their nouns for messages."""
 
 from __future__ import annotations
 

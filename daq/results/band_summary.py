@@ -1,6 +1,7 @@
 """Noise of every channel in bands: its level, its interval, and what the interval consists of.
 
-Channels whose noise cannot be told from motion, because a sensor records another motion.
+The noise of some channels cannot be told from motion, because a sensor records another motion: they
+are named here, too.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Uncertainty budgets by the GUM: their lines, their combination, and the coverage factor.
 
-Budgets of the noise of calibrated channels, in terms of their calibrated sensitivities.
+Those of calibrated channels are in terms of their calibrated sensitivities.
 """
 
 from __future__ import annotations

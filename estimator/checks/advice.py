@@ -1,11 +1,8 @@
 """Advice on a test: one class per kind, with numbers.
 
 Sensors and channels are indices from 0, in the order of the cross-spectral matrix. Front ends
-convert advice to sentences.
-
-Enumerations of a diagnosis: kinds of advice, levels, reasons for missing tests.
-
-Advice on known causes of misfit: shared noise, disturbed segments, changing noise.
+convert advice to sentences. Known causes of misfit (shared noise, disturbed segments, changing
+noise) are advice of their own.
 """
 
 from __future__ import annotations

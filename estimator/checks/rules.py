@@ -9,7 +9,7 @@ waves that cross sensors 0.1 m apart it is larger by up to `CROSSING` times with
 more, by up to `CROSSING_THREE` times with three triaxial sensors, and without bound with three
 sensors of fewer channels. See `docs/decisions/0012`.
 
-Advice on two sensors: rotation, orthogonality, swapped or reversed channels, gain, delay.
+Advice on two sensors is on rotation, orthogonality, swapped or reversed channels, gain, delay.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ Noise that is below zero for certain is wrong, so it decides nothing. Of a chann
 or was dead for a while, the estimate is an upper bound. Where the motion contradicts a channel's
 sensitivity, the verdict must be the same with either, or the channel is not decided.
 
-The bands in which a noise mask is judged, and the mask in them.
+A mask is judged in bands, which follow from it and from the spectrum.
 """
 
 from __future__ import annotations

@@ -2,11 +2,9 @@
 
 Every cause enters once, here: table, plot, report, JSON, budget and verdict have the same two ends.
 
-Motion across the axes of sensors with one or two channels, in their noise.
-
-Channel i feels motion outside of its axis through its lean a (a vector across the axis, in radians;
-in two-channel sensors out of the plane). Beside channels j and k, motion of PSD S there changes its
-noise by
+One cause is motion across the axes of sensors with one or two channels. Channel i feels motion
+outside of its axis through its lean a (a vector across the axis, in radians; in two-channel sensors
+out of the plane). Beside channels j and k, motion of PSD S there changes its noise by
 
     ``S (a_i - a_j) . (a_i - a_k)``,
 

@@ -17,15 +17,12 @@ smallest effect on the data, the variance is
 
 proportional to the square of the noise for a PSD, and constant if leaking motion dominates.
 
-Scatter of an estimate that is, to first order, a linear function of the cross-spectral matrix.
+The cumulants of such an estimate are traces of powers of its differential times the matrix:
+`moments`, divided by the averages, is what an interval takes.
 
-Its cumulants are traces of powers of its differential times the matrix: `moments`, divided by the
-averages, is what an interval takes.
-
-A bound of the noise that needs no model of the motion.
-
-What all channels of the *other* sensors together cannot predict of a channel is above its
-self-noise, whatever the dimension of the motion, tilts, gains and linear responses:
+No interval ends above the bound that needs no model of the motion. What all channels of the *other*
+sensors together cannot predict of a channel is above its self-noise, whatever the dimension of the
+motion, tilts, gains and linear responses:
 
     ``1 / (S**-1)_ii * n / (n - m)``
 

@@ -3,9 +3,8 @@
 The alternative is any covariance matrix. Sensors that measure different motion, tilt, noise common
 to two channels (a cable, a digitizer), and clock errors make the test fail.
 
-The chi-square distribution and the digamma function, for single numbers.
-
-`scipy.special` has both, but its import takes a quarter of a second of processor time: a third of
+The chi-square distribution and the digamma function are here for single numbers. `scipy.special`
+has both, but its import takes a quarter of a second of processor time: a third of
 that of ``huddle estimate`` for a recording of four minutes. The tests compare the two.
 """
 

@@ -8,13 +8,12 @@ space that 1, x and y span over the sensors matters: 2 (N - 3) numbers for N sen
 to the averages at frequencies where gradients are seen but not yet bent; positions measured to 5 mm
 would be too coarse, and none are needed.
 
-Maximum likelihood of noise where the motion's loadings are known: ``S = U T U* + diag(psi)``.
-
-For given psi the best T is known: with Q an orthonormal basis of ``psi^(-1/2) U`` and ``w`` the
-eigenvalues of ``Q* psi^(-1/2) S psi^(-1/2) Q``, it takes up those that exceed one. What is left of
--1/n times the log likelihood is minimised over x = ln psi by Fisher scoring with damping, every
-frequency at its own pace. Free factors may lie anywhere, and every factor costs information on the
-noise of all channels. Known loadings cost less, and weak motion along them nearly nothing.
+With the loadings known, ``S = U T U* + diag(psi)``. For given psi the best T is known: with Q an
+orthonormal basis of ``psi^(-1/2) U`` and ``w`` the eigenvalues of ``Q* psi^(-1/2) S psi^(-1/2) Q``,
+it takes up those that exceed one. What is left of -1/n times the log likelihood is minimised over x
+= ln psi by Fisher scoring with damping, every frequency at its own pace. Free factors may lie
+anywhere, and every factor costs information on the noise of all channels. Known loadings cost less,
+and weak motion along them nearly nothing.
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
 """Maximum likelihood self-noise from all channels of all sensors, with its uncertainty.
 
-The dimensions of motion that the averages resolve, at each frequency.
-
-Factors that the averages do not resolve are fitted to scatter, which removes noise: without motion
-17 to 30 % at n = 20, and 6 to 15 % at n = 1080. A model without these factors has no such bias. So
-the weakest factor is kept only if it improves the fit by more than scatter does; then the next is
-tested. Motion of an excluded factor counts as noise: `docs/decisions/0010`.
+It has as many dimensions of motion as the averages resolve, at each frequency. Factors that the
+averages do not resolve are fitted to scatter, which removes noise: without motion 17 to 30 % at n =
+20, and 6 to 15 % at n = 1080. A model without these factors has no such bias. So the weakest factor
+is kept only if it improves the fit by more than scatter does; then the next is tested. Motion of an
+excluded factor counts as noise: `docs/decisions/0010`.
 
 This concerns motion that several sensors measure. Motion measured by only one channel is
 indistinguishable from its noise: `alone` finds these channels (`docs/decisions/0011`).

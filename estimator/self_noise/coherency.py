@@ -3,9 +3,8 @@
 Methods use the coherency matrix, ``csm`` divided by the root of its two channels' PSDs, so that
 units and gains cause neither overflow nor underflow and do not hide a singular matrix.
 
-Live channels and sensors of a test: neither dead nor copies of others.
-
-Live channels are estimated as if the other channels did not exist.
+Live channels and sensors are neither dead nor copies of others. They are estimated as if the other
+channels did not exist.
 """
 
 from __future__ import annotations

@@ -9,19 +9,17 @@ the real part of ``E[u conj(v)]`` of two residuals,
 the channel minus its predictions by sensor j and by sensor k. The same two rows, ``u = a X`` and
 ``v = b X``, give its differential: ``M = (b^H a + a^H b) / 2``. With more than three sensors the
 estimate is a weighted mean over all pairs (j, k), and so is M: pairs of poor sensors have less
-weight (`estimator.self_noise.three_sensor`).
+weight.
 
 Only j and k need as many channels as the motion has dimensions; the target may have fewer.
 
-Weights of the pairs of other sensors, for channels comparable with more than one pair.
-
-A pair (j, k) estimates the noise of channel r with the variance
+Channels comparable with more than one pair take weights. A pair (j, k) estimates the noise of
+channel r with the variance
 
     ``v = (G_jj G_kk + Re G_jk**2) / (2 n)``,
 
-with G the spectra of the two residuals ``u`` and ``v`` of `estimator.self_noise.three_sensor`. A
-poor sensor increases the variance of all its pairs, and so of their unweighted mean. So pairs are
-weighted by ``1 / v``.
+with G the spectra of the two residuals ``u`` and ``v``. A poor sensor increases the variance of all
+its pairs, and so of their unweighted mean. So pairs are weighted by ``1 / v``.
 
 Weights from a frequency's own averages would favour pairs with small residuals, and bias the
 estimate. The weights at a frequency therefore follow from its neighbours, without the frequency

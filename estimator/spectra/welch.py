@@ -4,9 +4,8 @@ Convention, here and everywhere in this package: ``csm[f, p, q] = E[X_p conj(X_q
 in unit**2/Hz. (``scipy.signal.csd(x, y)`` is its transpose.)
 
 Segments are processed in groups that fit into the cache. Several threads process equal shares;
-their sums are added in order, so that the result does not depend on timing.
-
-Spectra of single segments at a few frequencies, which show changes with time.
+their sums are added in order, so that the result does not depend on timing. Spectra of single
+segments are kept at a few frequencies: they show changes with time.
 """
 
 from __future__ import annotations

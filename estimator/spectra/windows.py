@@ -1,12 +1,11 @@
 """Windows, and the number of independent averages of overlapping segments.
 
-Segments with short gaps: a common window that is zero in the gaps.
-
-All channels of all sensors are multiplied by one function of time: 0 in every gap of any sensor, 1
-elsewhere, with cosine ramps between. Common motion remains common with any window, and so is
-removed as before. After division by the energy of the window, the noise keeps its PSD if its
-spectrum is smooth. At frequencies with much lower noise than elsewhere, the side lobes of the
-window add noise from other frequencies: `Leakage` computes this bias.
+Segments with short gaps have a common window that is zero in the gaps. All channels of all sensors
+are multiplied by one function of time: 0 in every gap of any sensor, 1 elsewhere, with cosine ramps
+between. Common motion remains common with any window, and so is removed as before. After division
+by the energy of the window, the noise keeps its PSD if its spectrum is smooth. At frequencies with
+much lower noise than elsewhere, the side lobes of the window add noise from other frequencies:
+`Leakage` computes this bias.
 """
 
 from __future__ import annotations

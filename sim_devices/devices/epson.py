@@ -14,11 +14,10 @@ with 1PPS uses its own clock.
 
 Not simulated: attenuation and delay of the filters, and sleep mode, which only a reset ends.
 
-Simulated Epson M-A552 accelerometers on a CAN bus: canopen's own nodes, on any python-can bus.
-
-Buses have no line to be served on (:mod:`sim_devices.server.serve`): this simulator runs in a
-thread of whoever needs it. The device that is told to produces SYNC; at each SYNC every operational
-device sends its next sample. The codec of samples is the driver's; the rest is canopen's.
+The M-A552 on a CAN bus is simulated by canopen's own nodes, on any python-can bus. Buses have no
+line to be served on (:mod:`sim_devices.server.serve`): this simulator runs in a thread of whoever
+needs it. The device that is told to produces SYNC; at each SYNC every operational device sends its
+next sample. The codec of samples is the driver's; the rest is canopen's.
 """
 
 from __future__ import annotations

@@ -4,9 +4,7 @@ A family module (``sim_devices/devices/<family>.py``) has ``create(spec, source)
 endpoint is sans-IO and uses world time in seconds. :mod:`sim_devices.server.serve` puts each on a
 pseudo-terminal or a port, calls it for received bytes and at due times, and writes the returned
 bytes. Bytes are returned in units of the device (a frame, a packet, a datagram), so that a fault
-can affect exactly one.
-
-The samples of a device's sensors, simulated in stretches.
+can affect exactly one. The samples of its sensors are simulated in stretches.
 """
 
 from __future__ import annotations

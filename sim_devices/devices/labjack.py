@@ -11,9 +11,8 @@ An analog input reads the counts of its channel relative to the centre of the co
 besides those of the driver: ``ends_with``, a fatal status that ends the first stream after
 ``ends_after`` scans.
 
-The stream of a simulated LabJack: a buffer of scans, read in packets.
-
-The ports of a simulated LabJack: registers on one, spontaneous streams on the other.
+A stream is a buffer of scans, read in packets. Registers have one port, spontaneous streams the
+other.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Simulated Modbus slaves, RTU or TCP, with pymodbus's server codec and no sockets.
 
-Simulated devices with readings in Modbus registers, one or several on a bus.
-
-A device samples at its own rate and holds the latest reading, with counter and time if the map has
-them. All its registers are writable, including WitMotion's unlock and rate registers.
+There are one or several on a bus, with readings in their registers. A device samples at its own
+rate and holds the latest reading, with counter and time if the map has them. All its registers are
+writable, including WitMotion's unlock and rate registers.
 """
 
 from __future__ import annotations

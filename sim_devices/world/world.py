@@ -4,13 +4,12 @@ The motion is computed on a master grid, fast enough for interpolation at any in
 of −120 dB. Direction, gain, delay, response and position of a sensor are part of the filters of its
 channels. Its clock defines the instants of its samples. Its noise is computed at these samples.
 
-Stationary Gaussian series with random access, equal in every process.
-
-White sources are generated in blocks, each by a counter-based generator whose counter is the index
-of the block: block 10 million costs as much as block 0, and two processes compute the same block. A
-series is the sources filtered by a matrix of finite impulse responses (overlap-save), so it is
-exactly stationary. Its PSD is the target PSD at the resolution of the impulse response, half a
-block to either side.
+Motion and noise are stationary Gaussian series with random access, equal in every process. White
+sources are generated in blocks, each by a counter-based generator whose counter is the index of the
+block: block 10 million costs as much as block 0, and two processes compute the same block. A series
+is the sources filtered by a matrix of finite impulse responses (overlap-save), so it is exactly
+stationary. Its PSD is the target PSD at the resolution of the impulse response, half a block to
+either side.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Writes a report into a file, whole or not at all.
-
-A report as one HTML page that needs nothing else.
-"""
+"""Writes a report into a file, whole or not at all; HTML is one page that needs nothing else."""
 
 from __future__ import annotations
 

@@ -2,11 +2,9 @@
 
 It runs in its own session, so that neither Ctrl-C nor the end of whoever started it stops it. Its
 standard error is a file without a name: unlike a pipe, that never makes it wait, and it outlives
-us. The recorder logs JSON there; a thread reads it and logs each record here as well.
-
-Ctrl-C during a run: the first ends the recording and keeps the result, the second aborts.
-
-Standard error of a child process: its log records, and the reason of a failure.
+us. The recorder logs JSON there; a thread reads it and logs each record here as well, and keeps the
+reason of a failure. The first Ctrl-C during a run ends the recording and keeps the result, the
+second aborts.
 """
 
 from __future__ import annotations

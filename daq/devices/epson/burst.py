@@ -6,8 +6,6 @@ Each read is decoded in one pass. Length, header, delimiter and checksum togethe
 COUNT gives the sample index of each frame, and consecutive frames become one block. Bytes outside
 frames are skipped, counted, and reported as an event at most once a second; the samples lost with
 them appear as a gap in COUNT. The first block of a session starts at index 0.
-
-Frames of one fixed length in a byte stream that may hold other bytes.
 """
 
 from __future__ import annotations

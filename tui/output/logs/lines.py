@@ -2,9 +2,8 @@
 
 Library modules log through ``logging.getLogger(__name__)`` and pass typed fields as ``extra``.
 Handlers and formats are set here and nowhere else. A child process logs JSON; `record_of` turns its
-lines into records again, which the parent then writes in its own format and by its own level.
-
-Log records as entries of systemd's journal, each typed field a field of the entry.
+lines into records again, which the parent then writes in its own format and by its own level. For
+systemd's journal, each typed field is a field of the entry.
 """
 
 # ruff: noqa: PLC0415 - rich is loaded when something is written

@@ -1,7 +1,4 @@
-"""Noise against frequency, with limits and noise models.
-
-The noise plots of a report as one figure in a file of its own.
-"""
+"""Noise against frequency, with limits and noise models: in a report, or in a file of its own."""
 
 from __future__ import annotations
 
