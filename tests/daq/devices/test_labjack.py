@@ -231,7 +231,8 @@ async def test_a_t8_streams(running: tuple[RunningDevice, ...]) -> None:
     assert not events
     blocks = found["T"]
     assert [b.first_sample for b in blocks] == [0, *(b.end_sample for b in blocks[:-1])]
-    truth = World(scenario([*NAMES, "F", "T"], sampling_rate=RATE)).samples("T", 0, 20_000) * COUNTS
+    world = World(scenario([*NAMES, "F", "T"], sampling_rate=RATE))
+    truth = world.samples("T", 0, 400_000) * COUNTS
     counts = joined(blocks).astype(float) - CENTER
     start = int(np.abs(truth - counts[0]).max(axis=1).argmin())
     assert np.abs(truth[start : start + len(counts)] - counts).max() <= 0.5
