@@ -300,7 +300,7 @@ def _clocks(snapshot: Snapshot) -> Iterator[Fact]:
         yield RatesNominal(rank=Rank.DELAYS, sensors=nominal)
     if any(isinstance(each, _LIKE_A_CLOCK) for each in snapshot.diagnostics.advice):
         omega = 2 * math.pi * highest_known(snapshot)
-        loose = {sensor: late for sensor, late in left.items() if omega * late > _TURN}
+        loose = {sensor: late for sensor, late in left.items() if _TURN < omega * late < math.inf}
         if loose:
             yield ClocksMayExplain(
                 rank=Rank.DELAYS, sensors=tuple(loose), error=max(loose.values())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -17,7 +18,13 @@ from daq.estimation.segments.stated_times import compare, drift_of
 from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
 from daq.results.band_summary import channel_means
-from daq.results.facts import ClockNotUnderstood, StatedTimesDrift, StatedTimesUnchecked
+from daq.results.facts import (
+    ClockNotUnderstood,
+    ClocksMayExplain,
+    StatedTimesDrift,
+    StatedTimesUnchecked,
+)
+from daq.results.known_facts import facts_of
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
 from tests.daq.clock_facts import clock_facts
@@ -373,6 +380,8 @@ def test_a_step_in_the_middle_is_not_taken_for_noise(
         assert clock.corrected or clock.drifts
     else:  # about half a piece and more: nobody knows by how much
         assert not clock.is_understood or clock.drifts
+        may = [each for each in facts_of(snapshot, SETTINGS) if isinstance(each, ClocksMayExplain)]
+        assert all(math.isfinite(each.error) for each in may)
 
 
 @pytest.mark.parametrize("ppm", [0.3, 3.0, 60.0, 500.0])

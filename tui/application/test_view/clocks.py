@@ -154,7 +154,7 @@ def _ppm(value: float) -> str:
 
 def microseconds(seconds: float) -> str:
     """Return a short time in a readable unit."""
-    if math.isnan(seconds):
+    if not math.isfinite(seconds):
         return "?"
     value, unit = (seconds * 1e6, "µs") if seconds < 1e-3 else (seconds * 1e3, "ms")
     return f"{value:.0f} {unit}" if value >= 10 else f"{value:.1f} {unit}"
