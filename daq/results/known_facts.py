@@ -396,7 +396,8 @@ def _methods(snapshot: Snapshot) -> Iterator[Fact]:
         values = noise.noise_psd[1:-1]
         if n := int(np.sum(values <= 0)):
             yield ValuesBelowZero(rank=Rank.TO_KNOW, method=method, n=n, n_values=values.size)
-    rank = Rank.DELAYS if snapshot.results else Rank.INVALIDATES
+    grows = not snapshot.closed  # it may come yet
+    rank = Rank.DELAYS if snapshot.results or grows else Rank.INVALIDATES
     for method, reason in snapshot.refused.items():
         yield MethodRefused(rank=rank, method=method, reason=reason)
 

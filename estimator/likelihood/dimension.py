@@ -29,6 +29,7 @@ from estimator.self_noise.coherency import (
 )
 
 if TYPE_CHECKING:
+    from estimator.self_noise.coherency import Presence
     from estimator.types import ComplexArray, FloatArray, IntArray
 
 LEVEL = 0.05
@@ -114,6 +115,20 @@ def bands(frequency: FloatArray) -> IntArray:
     return blocks_of(frequency, least=MIN_BINS)
 
 
+def _check_enough(there: Presence, dims: tuple[int, ...], n_effective: float) -> None:
+    few = len(there.sensors) < 3  # so few averages make channels copies of each other
+    needed = sum(dims) if few else len(there.channels)
+    if n_effective <= needed:
+        raise InsufficientDataError(
+            f"{n_effective:.1f} averages of {needed} channels: more averages than channels "
+            "are needed"
+        )
+    if few:
+        raise InsufficientDataError(
+            f"{len(there.sensors)} sensors have a signal of their own; expected at least 3"
+        )
+
+
 def choose_dimension(
     csm: ComplexArray,
     frequency: FloatArray,
@@ -173,15 +188,7 @@ def choose_dimension(
     there = presence(given, dims)
     kind = kinds(given, dims)[list(there.channels)]
     given, n_channels = given.part(list(there.channels)), len(there.channels)
-    if len(there.sensors) < 3:
-        raise InsufficientDataError(
-            f"{len(there.sensors)} sensors have a signal of their own; expected at least 3"
-        )
-    if n_effective <= n_channels:
-        raise InsufficientDataError(
-            f"{n_effective:.1f} averages of {n_channels} channels: more averages than channels "
-            "are needed"
-        )
+    _check_enough(there, dims, n_effective)
     number = bands(frequency) if band is None else np.asarray(band)
     if number.shape != frequency.shape or np.any(np.diff(number) < 0):
         raise InvalidMatrixError("band: expected one number per frequency, non-decreasing")

@@ -214,6 +214,14 @@ def test_a_singular_frequency_does_not_affect_its_band() -> None:
     assert choice.test.n_frequencies == 19
 
 
+def test_one_average_says_that_there_are_too_few() -> None:
+    """Its channels are copies of each other, which says nothing of the sensors."""
+    one = np.random.default_rng(3).standard_normal((20, 9)).astype(np.complex128)
+    csm = one[:, :, np.newaxis] * one[:, np.newaxis]
+    with pytest.raises(InsufficientDataError, match=r"1\.0 averages of 9 channels"):
+        choose_dimension(csm, np.linspace(1, 2, 20), dims=THREE, n_effective=1)
+
+
 def test_a_dead_sensor_does_not_count() -> None:
     """Four sensors of which one is dead are three: no room for further factors; two are refused."""
     frequency = np.linspace(18, 22, 20)

@@ -143,3 +143,12 @@ def printed(*parts: object) -> str:
 def squeezed(text: str) -> str:
     """Return text without blanks: renderers wrap it."""
     return "".join(text.split())
+
+
+def test_a_method_that_waits_for_averages_invalidates_no_test_that_goes_on() -> None:
+    ended = replace(made_snapshot(), results={}, refused={"three-sensor": "1 average"}, closed=True)
+    for snapshot, rank in ((ended, Rank.INVALIDATES), (replace(ended, closed=False), Rank.DELAYS)):
+        (refused,) = (
+            each for each in known_facts.facts_of(snapshot) if isinstance(each, facts.MethodRefused)
+        )
+        assert refused.rank is rank
