@@ -85,7 +85,8 @@ SHORTEST_INTERVAL, MAX_INTERVAL = 0.25, 5.0
 COMMIT_INTERVAL = 1.0
 """Seconds of samples that a commit usually adds to the file: no look can find more."""
 LOOK_SHARE, ESTIMATE_SHARE = 0.03, 0.1
-"""Share of the time that looks, and that estimates on a screen, may take."""
+"""Share of the time that looks for segments, and at the sensors, may take each; and estimates on a
+screen."""
 SILENCE = 10.0
 """Seconds without a sample after which a recorder in another process is asked whether it runs."""
 
@@ -207,10 +208,9 @@ def follow(
             return remote if recorder is None else recorder, sensors
 
         known, sensors = seen(recording)
-        looks, estimates, memory = Throttle(LOOK_SHARE), Throttle(share), FreedMemory()
-        wanted, uncounted = 0.0, _Uncounted()
-        if sensors is not None:
-            sensors.look()
+        looks, states, estimates = Throttle(LOOK_SHARE), Throttle(LOOK_SHARE), Throttle(share)
+        wanted, uncounted, memory = 0.0, _Uncounted(), FreedMemory()
+        _look(sensors)
 
         def catch_up(done: int, total: int) -> None:
             if cancelled.is_set():
@@ -219,24 +219,26 @@ def follow(
                 observer.progress(done, total)
 
         while not recording.closed:
-            with looks:
-                # Asked before: what it wrote last is seen below.
-                left_open = known.ended and not is_continued(recording)
+            # Asked before: what it wrote last is seen below.
+            left_open = known.ended and not is_continued(recording)
+            recording.refresh()
+            if looks.is_due or recording.closed:
                 try:
-                    if estimation.update(catch_up):
-                        observer.segments(estimation.n_segments, estimation.elapsed)
+                    with looks:
+                        if estimation.update(catch_up):
+                            observer.segments(estimation.n_segments, estimation.elapsed)
                 except _CancelledError:
                     return None
                 newest = estimation.recordings[-1]
                 if newest is not recording and isinstance(newest, Recording):
                     recording = newest  # the disk refused the one before
                     known, sensors = seen(recording)
-                if recording.closed:
-                    break
-                _check_left(path, is_open=left_open)
-                is_due = estimation.n_seen >= wanted and estimates.is_due
-                if sensors is not None:
-                    (sensors.look_closely if is_due else sensors.look)()
+            if recording.closed:
+                break
+            _check_left(path, is_open=left_open)
+            is_due = estimation.n_seen >= wanted and estimates.is_due
+            with states:
+                _look(sensors, closely=is_due)
             if is_due:  # beside the looks, which go on at their own pace
                 wanted = max(estimation.n_seen + 1, estimation.n_seen * (1 + growth))
                 with estimates:
@@ -244,14 +246,12 @@ def follow(
                     observer.snapshot(snapshot, estimation.settings)
                 uncounted.take(recording.path, snapshot)
             memory.give_back()
-            interval = min(
-                _until_segment(estimation), MAX_INTERVAL if sensors is None else STATUS_INTERVAL
-            )
-            known.ends_within(min(max(interval, looks.remaining), MAX_INTERVAL))
+            longest = MAX_INTERVAL if sensors is None else STATUS_INTERVAL
+            interval = min(max(_until_segment(estimation), looks.remaining), longest)
+            known.ends_within(min(max(interval, states.remaining), MAX_INTERVAL))
             if cancelled.is_set():
                 return None
-        if sensors is not None:
-            sensors.look_closely()
+        _look(sensors, closely=True)
         if estimation.is_whole:
             return _result(estimation, observer, cancelled)
     with Estimation([path], estimation.settings) as again:
@@ -334,6 +334,11 @@ class _Uncounted:
 
 def _is_among(sensor: str, one: Uncounted, others: Iterable[tuple[str, Uncounted]]) -> bool:
     return any(sensor == name and one.is_that(other) for name, other in others)
+
+
+def _look(sensors: _Sensors | None, *, closely: bool = False) -> None:
+    if sensors is not None:
+        (sensors.look_closely if closely else sensors.look)()
 
 
 class _Sensors:

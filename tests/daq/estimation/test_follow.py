@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from daq.estimation import estimation as memory
+from daq.estimation import follow as following
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.follow import (
     COMMIT_INTERVAL,
@@ -85,8 +86,9 @@ def test_what_closes_with_its_last_segment_has_one_result(tmp_path: Path) -> Non
 
 
 async def test_samples_that_a_sensor_does_not_count_become_an_event_of_the_recorder(
-    tmp_path: Path,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(following, "LOOK_SHARE", 1e9)  # nobody waits here
     path, heard = tmp_path / "run.h5", list[str]()
     scene = Scene(rates=(50.0, 50.0, 50.0), seconds=300.0, slips={1: [(150.0, 1)]})
 
@@ -188,8 +190,9 @@ def test_a_process_that_closes_its_recording_as_it_ends_has_a_result(tmp_path: P
 @pytest.mark.skipif(sys.platform == "win32", reason="no locks are seen there")
 @pytest.mark.parametrize("started_here", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_what_the_disk_refused_is_followed_into_the_next_file(
-    tmp_path: Path, started_here: bool
+    tmp_path: Path, started_here: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(following, "LOOK_SHARE", 1e9)  # nobody waits here
     path = tmp_path / "run.h5"
     unrelated = tmp_path / "run-2.h5"
     with growing(unrelated) as writer:
@@ -283,6 +286,38 @@ def test_estimates_delay_no_look(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         follow(writer.path, SETTINGS, Noted(), recorder=process)
     assert at == 3.0
     assert process.waits[0] <= STATUS_INTERVAL
+
+
+def test_new_segments_delay_no_look_at_the_sensors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A segment costs a second: the next one waits half a minute, the sensors do not."""
+    at = 0.0
+
+    def slowly(estimation: Estimation, progress: Callable[[int, int], None]) -> bool:
+        nonlocal at
+        at += 1.0
+        return made(estimation, progress)
+
+    made = Estimation.update
+    monkeypatch.setattr(Estimation, "update", slowly)
+    monkeypatch.setattr("daq.estimation.follow.Throttle", partial(Throttle, now=lambda: at))
+    monkeypatch.setattr("daq.estimation.throttle.time.process_time", lambda: 0.0)
+    with growing(tmp_path / "run.h5") as writer:
+        bench, noted = Bench(writer), Noted()
+        steps: list[Callable[[], object]] = [partial(bench.send, "ABC", t) for t in range(9, 54, 9)]
+        steps.append(writer.close)
+        stages = iter(steps)
+
+        def goes_on() -> None:
+            next(stages)()
+
+        process = Process(goes_on)
+        follow(writer.path, SETTINGS, noted, recorder=process)
+    assert max(process.waits) <= STATUS_INTERVAL
+    assert at == 2.0  # the first, and the last when it is closed
+    seen = [status.sensors[0].n_samples for status in noted.seen]
+    assert seen == [0, *range(0, 9001, 1800), 9000]
 
 
 def test_without_sensors_to_watch_the_next_look_is_when_a_segment_can_be_there(
