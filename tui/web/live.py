@@ -19,6 +19,8 @@ from datetime import UTC, datetime
 from itertools import groupby
 from typing import TYPE_CHECKING
 
+from rich.text import Text
+
 from daq.errors import HuddleError
 from daq.estimation.follow import follow
 from daq.recording.storage.locking import LOCKS_ARE_VISIBLE, is_being_written
@@ -352,7 +354,8 @@ def _of_estimate(state: State, snapshot: Snapshot, settings: Settings) -> dict[s
         clocks = clock_table(snapshot, settings, chosen="", width=WIDE)
     return _parts(
         "now_estimate",
-        advice=advice(snapshot, choice, state.verdict),
+        # Without a verdict, what delays it is among the facts.
+        advice=Text() if state.verdict is None else advice(snapshot, choice, state.verdict),
         facts=[each for each in known(snapshot) if each.needs_action],
         noise=noise,
         clock=clock_line(snapshot, settings, width=WIDE),
