@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from sim_devices.devices.interface import DeviceSpec, Source
 
 FORMAT, TIME_FORMAT = "be:s32/32>>0", "le:s64/64>>0"
-VERSION = "0.25.v0.25   "
+VERSION = "0.25.v0.25  "
+"""Clients of libiio require seven characters of a tag."""
 GRAMMAR = (
     "<!ELEMENT context (device)*><!ELEMENT device (channel | attribute)*>"
     "<!ELEMENT channel (scan-element?, attribute*)><!ELEMENT attribute EMPTY>"
@@ -90,7 +91,7 @@ class Iiod:
                 text = self._context()
                 return [f"{len(text)}\n{text}\n".encode()]
             case ["VERSION"]:
-                return [f"{VERSION[:13].strip()}\n".encode()]
+                return [f"{VERSION}\n".encode()]
             case ["READ", "iio:device0", name] if name == RATE_ATTRIBUTE:
                 text = f"{self._rate:.6f}"
                 return [f"{len(text)}\n{text}\n".encode()]

@@ -1,19 +1,28 @@
-"""The simulated IIOD, read by the programs of libiio.
+"""The simulated IIOD read by the clients of libiio, and our driver served by its real server.
 
-They open a second connection for the buffer, and our ports of simulated devices have one reader: so
-each connection has a server of its own here.
+``iiod`` serves the simulated board again: all that our driver says and hears there is its own.
+
+Clients of libiio open a second connection for the buffer, and our ports of simulated devices have
+one reader: so each connection has a server of its own here.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import ctypes.util
 import shutil
-from typing import TYPE_CHECKING
+import socket
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
+from daq.bench.channel import Channel
+from daq.bench.model import Sensor
+from daq.devices.registry import driver_type
+from daq.host_clock import SystemClock
+from daq.protocols.block import Block
 from sim_devices.devices.iio import Iiod
 from sim_devices.devices.interface import Source
 from sim_devices.server.serve import device_spec
@@ -23,21 +32,32 @@ from tests.waiting import limit
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from numpy.typing import NDArray
+
 pytestmark = pytest.mark.peer
 
 RATE = 200.0
+IIOD = shutil.which("iiod", path="/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin")
+SPEC = device_spec(device("A", "iio", port="tcp", sampling_rate=RATE))
+
+
+def sampled(times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return what the board sampled at these times of its own."""
+    first, last = round(times_ns[0] * 1e-9 * RATE), round(times_ns[-1] * 1e-9 * RATE)
+    source = Source(scenario("A"), SPEC)
+    assert source.times("A", first, 1)[0] * 1e9 == pytest.approx(times_ns[0], abs=2)
+    return source.counts("A", first, last - first + 1)
 
 
 @contextlib.asynccontextmanager
 async def serving() -> AsyncIterator[str]:
     """Serve the simulated board; yield its URI."""
-    spec = device_spec(device("A", "iio", port="tcp", sampling_rate=RATE))
-    source, loop = Source(scenario("A"), spec), asyncio.get_running_loop()
+    source, loop = Source(scenario("A"), SPEC), asyncio.get_running_loop()
     began, tasks = loop.time() - 5.0, set()
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         tasks.add(asyncio.current_task())
-        iiod = Iiod(spec, source)
+        iiod = Iiod(SPEC, source)
         iiod.connected(loop.time() - began)
         with contextlib.suppress(ConnectionError):
             while True:
@@ -85,4 +105,78 @@ async def test_iio_readdev_reads_every_scan() -> None:
     rows = np.frombuffer(scans, [("xyz", ">i4", 3), ("", "V4"), ("time", "<i8")])
     assert len(rows) == 300
     np.testing.assert_allclose(np.diff(rows["time"]), 1e9 / RATE, atol=2)
-    assert rows["xyz"].std(axis=0).min() > 0
+    np.testing.assert_allclose(rows["xyz"], sampled(rows["time"]), atol=0.5)
+
+
+@pytest.mark.skipif(ctypes.util.find_library("iio") is None, reason="libiio is not installed")
+async def test_pylibiio_reads_every_scan() -> None:
+    def read(uri: str) -> NDArray[np.int64]:
+        iio: Any = pytest.importorskip("iio")
+        context = iio.Context(uri)
+        board = context.find_device("adxl355")
+        assert float(board.attrs["sampling_frequency"].value) == RATE
+        for channel in board.channels:
+            channel.enabled = True
+        buffer, scans = iio.Buffer(board, 50), []
+        for _ in range(4):
+            buffer.refill()
+            columns = [
+                np.frombuffer(c.read(buffer), "i8" if c.id == "timestamp" else "i4")
+                for c in board.channels
+            ]
+            scans.append(np.stack(columns, axis=1).astype(np.int64))
+        return np.concatenate(scans)
+
+    async with serving() as uri:
+        rows = await asyncio.to_thread(read, uri)
+    assert len(rows) == 200
+    np.testing.assert_allclose(rows[:, :3], sampled(rows[:, 3]), atol=0.5)
+
+
+@pytest.mark.skipif(IIOD is None, reason="iiod is not installed")
+async def test_a_real_iiod_serves_our_driver() -> None:
+    driver, found = driver_type("iio"), list[object]()
+    channels = tuple(Channel(name=axis, sensitivity=1e6) for axis in "xyz")
+    async with serving() as uri, asyncio.timeout(limit()), _iiod(uri) as port:
+        sensor = Sensor(name="A", driver="iio", port=port, sampling_rate=RATE, channels=channels)
+        for _ in range(2):  # the buffer is free again after a session
+            found.clear()
+            async with driver.open([sensor], SystemClock()) as session:
+                (information,) = session.information
+                async for item in session.read():
+                    found.append(item)
+                    if len(found) == 10:
+                        break
+    assert (information.model, information.sampling_rate) == ("adxl355", RATE)
+    blocks = [item for item in found if isinstance(item, Block)]
+    assert len(blocks) == len(found)
+    assert [b.first_sample for b in blocks] == [20 * k for k in range(10)]
+    times = np.array([b.device_counter for b in blocks], np.int64)
+    np.testing.assert_allclose(np.diff(times), 20 * 1e9 / RATE, atol=2)
+    counts = np.concatenate([block.counts for block in blocks])
+    ends = np.array([times[0], times[0] + round((len(counts) - 1) * 1e9 / RATE)])
+    np.testing.assert_allclose(counts, sampled(ends), atol=0.5)
+
+
+@contextlib.asynccontextmanager
+async def _iiod(uri: str) -> AsyncIterator[str]:
+    """Run the server of libiio on the context of another; yield its address."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        number = free.getsockname()[1]
+    nothing = asyncio.subprocess.DEVNULL
+    process = await asyncio.create_subprocess_exec(
+        str(IIOD), "-p", str(number), "-u", uri, stdout=nothing, stderr=nothing
+    )
+    try:
+        while True:  # it binds its port once it knows the context
+            with contextlib.suppress(ConnectionError):
+                _, writer = await asyncio.open_connection("127.0.0.1", number)
+                writer.close()
+                await writer.wait_closed()
+                break
+            await asyncio.sleep(0.05)
+        yield f"iio://127.0.0.1:{number}"
+    finally:
+        process.kill()  # on SIGTERM it waits a minute for its own client
+        await process.wait()

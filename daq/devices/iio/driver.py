@@ -40,6 +40,8 @@ PORT = 30431
 REPLY_TIMEOUT = 5.0
 BLOCK_SECONDS = 0.1
 """Seconds of samples in one buffer."""
+MIN_SET_NS = 100_000_000
+"""Shortest step of the board's clock, in ns, that is held against the host's time."""
 
 
 class IioSettings(BaseModel):
@@ -143,6 +145,7 @@ class IioSession:
         self._period_ns = 1e9 / (information.sampling_rate or sensor.sampling_rate)
         self._next = 0
         self._latest_ns: int | None = None
+        self._least_lag_ns = 0  # of arrivals behind the board's clock
         limits = {one.channel: one for one in enabled}
         self._full_scales = np.array(
             [2 ** (limits[name].bits - limits[name].is_signed) - 1 for name in inputs]
@@ -191,7 +194,7 @@ class IioSession:
         columns = [self._layout.decode(scans, name) for name in self._inputs]
         counts = np.stack(columns, axis=1)
         times = self._layout.decode(scans, protocol.TIMESTAMP) if self._has_times else None
-        cuts, missing, flags = self._gaps(times, len(counts))
+        cuts, missing, flags = self._gaps(times, at)
         found: list[Block | Event] = []
         if BlockFlag.MISSING_ESTIMATED in flags:
             text = "the clock of the board was set"
@@ -214,12 +217,13 @@ class IioSession:
         return found
 
     def _gaps(
-        self, times: NDArray[np.int64] | None, n_scans: int
+        self, times: NDArray[np.int64] | None, at: HostTime
     ) -> tuple[NDArray[np.int64], list[int], BlockFlag]:
         """Return the rows before which scans are missing, and how many: one more number than rows.
 
         Times jitter with the interrupts of the board, so the whole buffer decides how many there
-        are, and its long steps where.
+        are, and its long steps where. Lost scans cannot arrive before they were sampled: if the
+        arrival is too early for them, the clock of the board was set forward.
         """
         nothing = np.empty(0, np.int64), [0], BlockFlag.NONE
         if times is None:
@@ -227,9 +231,14 @@ class IioSession:
         before, self._latest_ns = self._latest_ns, int(times[-1])
         known = times if before is None else np.concatenate(([before], times))
         steps = np.diff(known) / self._period_ns
+        lag_ns = at.monotonic_ns - int(times[-1])
+        least_ns = lag_ns if before is None else self._least_lag_ns
+        self._least_lag_ns = min(least_ns, lag_ns)
         if not len(steps):
             return nothing
-        if steps.min() < -1.0 or steps.max() > 1e8:  # the system's clock was set
+        early_ns, set_ns = least_ns - lag_ns, (steps.max() - 1) * self._period_ns
+        if steps.min() < -1.0 or (set_ns > MIN_SET_NS and early_ns > set_ns / 2):
+            self._least_lag_ns = lag_ns
             return np.empty(0, np.int64), [0], BlockFlag.MISSING_ESTIMATED
         total = round(float(steps.sum()) - len(steps))
         long = np.flatnonzero(steps > 1.5)
@@ -243,7 +252,6 @@ class IioSession:
         rows = long + (1 if before is None else 0)
         if rows[0] == 0:
             return rows[1:], [int(n) for n in each], flags
-        del n_scans
         return rows, [0, *map(int, each)], flags
 
 

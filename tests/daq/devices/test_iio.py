@@ -20,6 +20,8 @@ from tests.devices import serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from daq.protocols.block import DeviceItem
     from sim_devices.server.launch import RunningDevice
 
@@ -66,8 +68,13 @@ async def test_another_device_is_refused(settings: dict[str, Any], said: str) ->
         await record(DRIVER, of(running, **settings), 1)
 
 
-def decoded(*buffers: list[float], jitter: float = 0.0) -> list[DeviceItem]:
-    """Return what becomes of scans at these numbers of a sample, their values."""
+def decoded(
+    *buffers: list[float], jitter: float = 0.0, arrivals: Sequence[float] | None = None
+) -> list[DeviceItem]:
+    """Return what becomes of scans at these numbers of a sample, their values.
+
+    Each buffer arrives with its last scan, or when the number of ``arrivals`` is sampled.
+    """
     channels = (Channel(name="x", sensitivity=1.0),)
     one = Sensor(name="A", driver="iio", port="iio://x", sampling_rate=RATE, channels=channels)
     session = IioSession(
@@ -80,11 +87,11 @@ def decoded(*buffers: list[float], jitter: float = 0.0) -> list[DeviceItem]:
     )
     layout, rng = ScanLayout(ELEMENTS), np.random.default_rng(1)
     found: list[DeviceItem] = []
-    for numbers in buffers:
+    for numbers, arrival in zip(buffers, arrivals or [n[-1] for n in buffers], strict=True):
         late = rng.uniform(-jitter, jitter, len(numbers)) / RATE
         times = np.rint((np.array(numbers) / RATE + late + 1.8e9) * 1e9).astype(np.int64)
         scans = layout.encode({"accel_x": np.array(numbers, np.int64), "timestamp": times})
-        found += session._blocks(scans, HostTime(0, 0))  # noqa: SLF001
+        found += session._blocks(scans, HostTime(round(arrival / RATE * 1e9), 0))  # noqa: SLF001
     return found
 
 
@@ -100,8 +107,19 @@ def test_lost_scans_are_gaps_where_the_times_have_them(jitter: float) -> None:
     assert BlockFlag.CLOCK_RESTART in blocks[0].flags
 
 
-def test_a_clock_that_is_set_makes_no_gap() -> None:
-    found = decoded([0, 1, 2, 3], [4, 5, 6], [-5000, -4999, -4998], [-4997, -4996])
+@pytest.mark.parametrize("step", [-5000, 5000])
+def test_a_clock_that_is_set_makes_no_gap(step: int) -> None:
+    """Back, or forward by more than has passed on the host: nothing was lost meanwhile."""
+    after = [8 + step, 9 + step, 10 + step], [11 + step, 12 + step]
+    found = decoded([0, 1, 2, 3], [4, 5, 6], *after, arrivals=[3, 6, 10, 12])
     blocks = [item for item in found if isinstance(item, Block)]
     assert [(b.first_sample, b.end_sample) for b in blocks] == [(0, 4), (4, 7), (7, 10), (10, 12)]
     assert [item.kind for item in found if isinstance(item, Event)] == ["reset"]
+
+
+def test_scans_lost_while_the_network_was_held_up_are_a_gap() -> None:
+    """The board's buffer was read late, and had overflowed."""
+    found = decoded([0, 1, 2], [3, 4, 5], [6, 7], [1006, 1007], arrivals=[2, 5, 1006, 1007])
+    blocks = [item for item in found if isinstance(item, Block)]
+    assert [b.first_sample for b in blocks if b.reason] == [1006]
+    assert len(blocks) == len(found)
