@@ -52,8 +52,10 @@ from estimator.checks.shared_noise import MAX_CHANNELS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from concurrent.futures import Future
     from pathlib import Path
 
+    from daq.estimation.noise_estimates import Dimensions
     from daq.recording.interface import ReadableRecording
     from estimator.spectra.welch import WelchSettings
 
@@ -199,6 +201,7 @@ class Estimation:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._snapshots.close()
         self.close()
 
     def _pass(self, recording: ReadableRecording) -> Pass:
@@ -420,13 +423,17 @@ class Estimation:
 
     @property
     def occasional_cost(self) -> float:
-        """Seconds that diagnoses, and estimates with a choice of the dimension, cost so far."""
+        """Seconds that diagnoses and choices of the dimension cost so far."""
         return self._snapshots.occasional_cost
 
     @one_blas_thread()
     def snapshot(self) -> Snapshot:
         """Return the estimate from the segments taken so far."""
         return self._snapshots.build(self._recordings, self._passes, final=False)
+
+    def choose_again(self) -> Future[Dimensions] | None:
+        """Begin to choose the dimension again where it is time: `SnapshotBuilder.choose_again`."""
+        return self._snapshots.choose_again()
 
 
 def estimate(

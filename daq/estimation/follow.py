@@ -3,7 +3,9 @@
 Theory of operation
 -------------------
 One loop looks at the file again and again. Each look takes what the recorder has committed since;
-where a new segment is complete, the estimate is made again. Looks and estimates are throttled, so
+where a new segment is complete, the estimate is made again. The
+choice of the dimension of the motion takes seconds: it is made again beside the looks, in a thread.
+Looks and estimates are throttled, so
 that a bench box stays free to record. When the recording is closed, the whole of it is estimated
 once more: that is the result. A recorder that ends without closing its file ends the loop with
 `RecordingLeftOpenError`.
@@ -32,7 +34,7 @@ from daq.recording.reader import Recording, control_address
 from daq.recording.storage import locking
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Generator, Iterable
     from pathlib import Path
 
     from daq.estimation.snapshot import Snapshot
@@ -224,7 +226,7 @@ def follow(
             recording.refresh()
             if looks.is_due or recording.closed:
                 try:
-                    with looks:
+                    with looks, _usual_cost(estimation, looks):
                         if estimation.update(catch_up):
                             observer.segments(estimation.n_segments, estimation.elapsed)
                 except _CancelledError:
@@ -241,10 +243,11 @@ def follow(
                 _look(sensors, closely=is_due)
             if is_due:  # beside the looks, which go on at their own pace
                 wanted = max(estimation.n_seen + 1, estimation.n_seen * (1 + growth))
-                with estimates:
-                    snapshot = _estimated(estimation, estimates)
+                with estimates, _usual_cost(estimation, estimates):
+                    snapshot = estimation.snapshot()
                     observer.snapshot(snapshot, estimation.settings)
                 uncounted.take(recording.path, snapshot)
+                estimation.choose_again()
             memory.give_back()
             longest = MAX_INTERVAL if sensors is None else STATUS_INTERVAL
             interval = min(max(_until_segment(estimation), looks.remaining), longest)
@@ -258,12 +261,12 @@ def follow(
         return _result(again, observer, cancelled)
 
 
-def _estimated(estimation: Estimation, estimates: Throttle) -> Snapshot:
-    """Return an estimate; what is not usual in its cost delays no later estimate."""
+@contextlib.contextmanager
+def _usual_cost(estimation: Estimation, throttle: Throttle) -> Generator[None]:
+    """Count only what is usual in the cost of work: the rest delays no later work."""
     before = estimation.occasional_cost
-    snapshot = estimation.snapshot()
-    estimates.deduct(estimation.occasional_cost - before)
-    return snapshot
+    yield
+    throttle.deduct(estimation.occasional_cost - before)
 
 
 def _with_target(settings: Settings | None, recording: Recording) -> Settings | None:

@@ -5,13 +5,18 @@ They are at hand one by one, as far as they are kept.
 
 from __future__ import annotations
 
+import threading
+import time
 from collections import Counter
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daq.clocks.sensor_reader import main_columns
+from daq.estimation.blas_threads import one_blas_thread
 from daq.estimation.contributions import with_contributions
 from daq.estimation.diagnosis import (
     Findings,
@@ -27,6 +32,7 @@ from daq.estimation.noise_estimates import (
     Estimates,
     averages,
     channel_sets,
+    chosen_dimensions,
     in_units,
     known_gains,
     known_positions,
@@ -45,7 +51,7 @@ from estimator.checks.stability import SegmentCourse
 from estimator.spectra.segment_rejection import Reason
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -117,11 +123,50 @@ DIAGNOSIS_SHARE = 0.01
 """Of the time, that diagnoses of a growing recording may cost, if not stated."""
 
 
+class _Beside:
+    """A choice of the dimension in a thread of its own."""
+
+    def __init__(self) -> None:
+        self._executor = ThreadPoolExecutor(1, thread_name_prefix="dimension")
+        self.future: Future[Dimensions] | None = None
+        """The choice that nobody has taken yet."""
+        self._clock: int | None = None  # of the processor time of the thread
+
+    def begin(self, choose: Callable[[], Dimensions]) -> None:
+        """Begin."""
+        self.future = self._executor.submit(self._run, choose)
+
+    @one_blas_thread()
+    def _run(self, choose: Callable[[], Dimensions]) -> Dimensions:
+        if hasattr(time, "pthread_getcpuclockid"):  # not on macOS and Windows
+            self._clock = time.pthread_getcpuclockid(threading.get_ident())
+        with np.errstate(invalid="ignore", divide="ignore"):  # responses vanish at 0 Hz
+            return choose()
+
+    def taken(self) -> Dimensions | None:
+        """Return the choice if it has been made since."""
+        if self.future is None or not self.future.done():
+            return None
+        future, self.future = self.future, None
+        return future.result()
+
+    @property
+    def cost(self) -> float:
+        """Seconds of processor time that choices took so far."""
+        return 0.0 if self._clock is None else time.clock_gettime(self._clock)
+
+    def close(self) -> None:
+        """Wait for the end of the thread."""
+        self._executor.shutdown()
+        self._clock = None
+
+
 class SnapshotBuilder:
     """Makes the snapshots of one estimate.
 
     A growing recording is diagnosed only as often as the cost allows, and the dimension of its
-    motion is chosen again only after it has grown; in between, the last results are kept.
+    motion is chosen again only after it has grown (`choose_again`); in between, the last results
+    are kept.
 
     Parameters
     ----------
@@ -154,12 +199,13 @@ class SnapshotBuilder:
         counts = Counter(sensor for sensor, _ in channels)
         self._axes = settings.axis_tolerances(list(counts), tuple(counts.values()))
         self._dimensions: Dimensions | None = None
+        self._outgrown: Callable[[], Dimensions] | None = None
+        self._choice = _Beside()
         self._findings = Findings()
         self._diagnoses = Throttle(diagnosis_share)
         self._choices = Throttle(1.0)  # limited by `_RECHOICE`
-        self.occasional_cost = 0.0
-        """Seconds that diagnoses, and estimates with a choice of the dimension, cost so far."""
-        self._chosen_at = 0
+        self._occasional_cost = 0.0
+        self._chosen_at = self._grown_to = self._grows_to = 0
 
     def build(
         self, recordings: Sequence[ReadableRecording], passes: Sequence[Pass], *, final: bool
@@ -217,7 +263,7 @@ class SnapshotBuilder:
             with self._diagnoses:
                 bands_of_all = bands if raw else ()
                 self._findings = self._diagnose(recordings, passes, raw, bands_of_all, estimates)
-            self.occasional_cost += self._diagnoses.cost
+            self._occasional_cost += self._diagnoses.cost
         if self._findings.fits(frequency):
             diagnostics = self._findings.added_to(diagnostics)
         snapshot = Snapshot(
@@ -309,24 +355,54 @@ class SnapshotBuilder:
         *,
         final: bool,
     ) -> Estimates:
-        """Estimate; while following, the dimension is chosen again after growth by `_RECHOICE`."""
+        """Estimate; while following, the dimension of the motion is the one chosen before."""
         if not bands:
             return Estimates({}, {}, None)
-        keep = not final and n_segments < _RECHOICE * self._chosen_at
+        dims = first.aligned.dims
+        positions = known_positions(recording, first.aligned.channels)
+        taken = self._choice.taken()
+        if taken is not None:
+            self._dimensions, self._chosen_at = taken, self._grown_to
+        keep = not final and self._fits(bands)
         with self._choices:
             estimates = noise_estimates(
                 bands,
                 self._settings,
-                dims=first.aligned.dims,
+                dims=dims,
                 gains=self._gains,
-                dimensions=self._dimensions if keep and self._fits(bands) else None,
-                positions=known_positions(recording, first.aligned.channels),
+                dimensions=self._dimensions if keep else None,
+                positions=positions,
                 known=self._known(bands, raw),
             )
         if estimates.dimensions is not self._dimensions:
             self._dimensions, self._chosen_at = estimates.dimensions, n_segments
-            self.occasional_cost += self._choices.cost
+            self._occasional_cost += self._choices.cost
+        self._outgrown = None
+        if self._dimensions is not None and n_segments >= _RECHOICE * self._chosen_at:
+            settings, self._grows_to = self._settings.for_sensors(dims), n_segments
+            self._outgrown = partial(chosen_dimensions, bands, settings, dims, positions)
         return estimates
+
+    @property
+    def occasional_cost(self) -> float:
+        """Seconds that diagnoses and choices of the dimension cost so far."""
+        return self._occasional_cost + self._choice.cost
+
+    def choose_again(self) -> Future[Dimensions] | None:
+        """Begin to choose the dimension of the motion again, if the recording has grown enough.
+
+        It takes seconds, in a thread of its own: snapshots go on with the last one meanwhile.
+        Returns the choice that the next snapshot has once it is made.
+        """
+        if self._outgrown is not None and self._choice.future is None:
+            self._grown_to = self._grows_to
+            self._choice.begin(self._outgrown)
+            self._outgrown = None
+        return self._choice.future
+
+    def close(self) -> None:
+        """Wait for a choice that is being made."""
+        self._choice.close()
 
     def _known(
         self, bands: tuple[Band, ...], raw: tuple[Band, ...]

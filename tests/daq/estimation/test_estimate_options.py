@@ -268,7 +268,7 @@ def test_while_live_the_dimension_is_chosen_anew_when_segments_have_doubled(
     )
     settings = replace(SETTINGS, methods=("maximum-likelihood",), dimension="auto")
     chosen_at: list[int] = []
-    last: object = None
+    last, n_before = None, 0
     with Estimation([tmp_path / "r.h5"], settings) as live:
         for number, block in enumerate(arriving[:480]):  # 80 s, 160 segments
             writer.append(block)
@@ -277,8 +277,11 @@ def test_while_live_the_dimension_is_chosen_anew_when_segments_have_doubled(
                 live.update()
                 choices = live.snapshot().diagnostics.dimensions
                 if choices and choices is not last:
-                    chosen_at.append(live.n_segments)
+                    chosen_at.append(n_before if chosen_at else live.n_segments)
                     last = choices
+                n_before = live.n_segments
+                if (choice := live.choose_again()) is not None:
+                    choice.result()
         writer.close()
     assert len(chosen_at) >= 3
     assert all(later >= 2 * earlier for earlier, later in pairwise(chosen_at))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import sys
+import threading
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ import pytest
 
 from daq.estimation import estimation as memory
 from daq.estimation import follow as following
+from daq.estimation import noise_estimates, snapshot_builder
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.follow import (
     COMMIT_INTERVAL,
@@ -34,6 +36,7 @@ from tests.daq.estimation.follow_observer import Goes, Noted, Process
 from tests.daq.recording.sending_bench import Bench
 from tests.known_clocks import Scene
 from tests.tui.example_snapshot import SETTINGS, growing
+from tests.waiting import limit
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -51,6 +54,40 @@ def test_an_estimate_is_made_only_when_a_segment_has_come(tmp_path: Path) -> Non
         assert follow(path, SETTINGS, noted, cancelled=noted.cancelled) is None
     assert noted.calls == ["look", "look", "snapshot", "look", "look"]
     assert noted.seen[-1].elapsed >= 6
+
+
+def test_the_dimension_is_chosen_again_beside_the_looks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It takes seconds: estimates with new segments do not wait for it."""
+    path = tmp_path / "run.h5"
+    settings = replace(SETTINGS, methods=("maximum-likelihood",), dimension="auto")
+    choose, is_seen = noise_estimates.chosen_dimensions, threading.Event()
+    chosen: list[bool] = []
+
+    def counted(*arguments: Any) -> noise_estimates.Dimensions:  # noqa: ANN401
+        is_beside = threading.current_thread() is not threading.main_thread()
+        chosen.append(is_beside)
+        if is_beside:  # as long as it takes: until a segment has come after it was begun
+            assert is_seen.wait(limit())
+        return choose(*arguments)
+
+    class Waiting(Noted):
+        def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
+            super().snapshot(snapshot, settings)
+            if len(self.snapshots) == 3:
+                is_seen.set()
+            if len(self.snapshots) == 4:
+                self.cancelled.set()
+
+    for module in (noise_estimates, snapshot_builder):
+        monkeypatch.setattr(module, "chosen_dimensions", counted)
+    with growing(path) as writer:
+        bench, seconds = Bench(writer), iter((41, 43, 45, 47))
+        bench.send("ABC", 20)
+        noted = Waiting(cancelled=Goes(lambda: bench.send("ABC", next(seconds))))
+        follow(path, settings, noted, cancelled=noted.cancelled, share=1e6)
+    assert chosen == [False, True]
 
 
 def test_the_end_is_one_result(tmp_path: Path) -> None:
@@ -258,8 +295,8 @@ def test_more_sensors_than_memory_allows_wait_for_the_result(
 def test_an_observer_that_decides_by_the_estimate_gets_all_sensors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for limit in ("LARGE", "PART_BYTES", "MIN_SENSORS"):
-        monkeypatch.setattr(memory, limit, 0)
+    for name in ("LARGE", "PART_BYTES", "MIN_SENSORS"):
+        monkeypatch.setattr(memory, name, 0)
     with growing(tmp_path / "run.h5") as writer:
         noted = Noted()
         Bench(writer).send("ABC", 30)
