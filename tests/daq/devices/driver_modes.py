@@ -85,6 +85,8 @@ CASES: dict[str, dict[str, Any]] = {
     "text tcp": {"driver": "text", "port": "tcp", "settings": {"time_column": 3}},
     "text udp": {"driver": "text", "port": "udp", "settings": {"preset": "raspberry-shake"}},
 }
+MOVING = {"cycle": {"ppm": 30.0, "period": 20.0}}
+"""Clock of every sensor: its rate moves with the temperature."""
 OFFSETS = {"labjack": 33523}
 """Counts where a sensor feels nothing."""
 RANGES = {"labjack": (0, 65535), "fifo": (-32768, 32767), "registers": (-32768, 32767)}
@@ -197,16 +199,20 @@ def world_clock(world: dict[str, Any]) -> WorldClock:
 
 @contextlib.contextmanager
 def serving_all(*, speed: float, faults: list[dict[str, Any]] | None = None) -> Iterator[Served]:
-    """Serve the devices of all modes, with a fault script."""
+    """Serve the devices of all modes, with a fault script.
+
+    Rates move with the temperature, and stated UTC comes in steps of 0.1 ms.
+    """
     tables = [table(mode) for mode in CASES]
     world = spec(*tables, speed=speed)
     for one in tables:
         for name in one["sensors"]:
-            world["scenario"]["sensors"][name]["sampling_rate"] = one["sampling_rate"]
+            sensor = world["scenario"]["sensors"][name]
+            sensor["sampling_rate"], sensor["clock"] = one["sampling_rate"], MOVING
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "sent"
         world |= {
-            "faults": faults or [],
+            "faults": [{"kind": "coarse", "at": 0.0, "level": 1e-4}, *(faults or [])],
             "sent_log": str(log),
             "fault_log": str(log.with_name("faults")),
         }

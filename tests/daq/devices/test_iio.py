@@ -69,7 +69,7 @@ async def test_another_device_is_refused(settings: dict[str, Any], said: str) ->
 
 
 def decoded(
-    *buffers: list[float], jitter: float = 0.0, arrivals: Sequence[float] | None = None
+    *buffers: Sequence[float], jitter: float = 0.0, arrivals: Sequence[float] | None = None
 ) -> list[DeviceItem]:
     """Return what becomes of scans at these numbers of a sample, their values.
 
