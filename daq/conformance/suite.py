@@ -106,6 +106,11 @@ class Served:
     pause : callable or None
         Lets the wire hold everything for some seconds and then deliver it. Not needed where the
         port is ``socket://``.
+    slip : callable or None
+        Takes a number of samples, which the device leaves out without counting them. Of a negative
+        number it sends its last samples again and counts them as new ones.
+    restart : callable or None
+        Restarts the device: nothing is sampled for a second, then its counter begins again.
     """
 
     sensors: Sequence[Sensor]
@@ -113,6 +118,8 @@ class Served:
     truth: Callable[[str], Sent] | None = None
     drop: Callable[[], object] | None = None
     pause: Callable[[], object] | None = None
+    slip: Callable[[int], object] | None = None
+    restart: Callable[[], object] | None = None
 
 
 class DriverConformance:
@@ -205,6 +212,35 @@ class DriverConformance:
                 found = await self._read(served.sensors, first=served.drop)
                 for sensor in served.sensors:
                     check_truth(sensor, found, truth(sensor.name), gaps=True)
+
+        _run(run())
+
+    @pytest.mark.parametrize("n_samples", [3, -3], ids=["left out", "counted twice"])
+    def test_samples_that_no_counter_shows_change_nothing(self, n_samples: int) -> None:
+        """Rows are numbered as the device counts: estimates find the step in the motion."""
+
+        async def run() -> None:
+            async with self.serve() as served:
+                truth, slip = _truth(served), served.slip
+                if slip is None:
+                    pytest.skip("the simulated device counts right")
+                found = await self._read(served.sensors, first=lambda: slip(n_samples))
+                for sensor in served.sensors:
+                    check_truth(sensor, found, truth(sensor.name), steady=False)
+
+        _run(run())
+
+    def test_a_restart_of_the_device_is_flagged(self) -> None:
+        """Rows before and after are right, and the length of the gap follows from host time."""
+
+        async def run() -> None:
+            async with self.serve() as served:
+                truth = _truth(served)
+                if served.restart is None:
+                    pytest.skip("the simulated device does not restart")
+                found = await self._read(served.sensors, first=served.restart)
+                for sensor in served.sensors:
+                    check_restart(sensor, found, truth(sensor.name))
 
         _run(run())
 
@@ -366,6 +402,7 @@ def check_truth(
     sent: Sent,
     *,
     gaps: bool = False,
+    steady: bool = True,
     latency: float = LATENCY,
 ) -> int:
     """See that rows, host times and rate of a session are those of the device.
@@ -374,6 +411,8 @@ def check_truth(
     ----------
     gaps
         Whether samples may, and must, be missing.
+    steady
+        Whether the device samples at its rate throughout.
     latency
         Seconds by which host time may be later than the last sample of a block.
 
@@ -412,9 +451,25 @@ def check_truth(
         drift = halves[1].min() - halves[0].min()
         assert abs(drift) <= MAX_DRIFT, f"{name}: host time runs away by {drift:.3f} s"
     elapsed = sent.due[place[-1]] - sent.due[place[0]]
-    if elapsed > 0:
+    if elapsed > 0 and steady:
         check_rate(sensor, (place[-1] - place[0]) / elapsed, source="measured")
     return int(place[-1]) + 1
+
+
+def check_restart(sensor: Sensor, found: Sequence[DeviceItem], sent: Sent) -> None:
+    """See that a session has one restart of the device, and that rows on both sides are right."""
+    name, rate = sensor.name, sensor.sampling_rate
+    blocks = [b for b in found if isinstance(b, Block) and b.sensor == name]
+    anew = [k for k, b in enumerate(blocks) if BlockFlag.CLOCK_RESTART in b.flags]
+    assert len(anew) == 2, f"{name}: {len(anew)} blocks with CLOCK_RESTART; expected 2"
+    before, after = blocks[: anew[1]], blocks[anew[1] :]
+    assert BlockFlag.MISSING_ESTIMATED in after[0].flags, f"{name}: the gap is not exact"
+    end = check_truth(sensor, before, sent, steady=False)
+    last = check_truth(sensor, after, sent, steady=False)
+    first = last - (after[-1].end_sample - after[0].first_sample)
+    missing = (sent.due[first] - sent.due[end - 1]) * rate - 1
+    off = after[0].first_sample - before[-1].end_sample - missing
+    assert abs(off) <= 2 * LATENCY * rate, f"{name}: the gap is off by {off:.0f} samples"
 
 
 def _same(sent: NDArray[Any], counts: NDArray[Any]) -> NDArray[np.bool_]:

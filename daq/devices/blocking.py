@@ -27,6 +27,7 @@ import numpy as np
 from daq.devices.port_rules import port_label
 from daq.errors import DeviceError, NotConnectedError
 from daq.protocols.block import Block, BlockFlag
+from daq.protocols.sample_counter import SLACK
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Sequence
@@ -55,7 +56,7 @@ class Samples:
         Columns are the channels of all sensors of the port, in the order of the bench file.
     position : int or None
         Number of the first sample by the device's own counter, which does not wrap. Gaps follow
-        from it; a counter that goes back was restarted.
+        from it; a counter that goes back, or further than host time allows, was restarted.
     missing : int
         Samples lost before these, if there is no position.
     reason : str
@@ -115,6 +116,7 @@ class BlockingSource:
         self._next = 0
         self._origin: int | None = None  # position of sample 0
         self._began_ns: int | None = None
+        self._least_lag = 0.0  # s; of host time behind the numbers of the samples
 
     async def read(self) -> AsyncIterator[Block]:
         """Start the thread and yield blocks, until closed.
@@ -186,10 +188,11 @@ class BlockingSource:
         if self._began_ns is None:
             flags |= BlockFlag.CLOCK_RESTART
             self._began_ns, first, reason = at.monotonic_ns, 0, ""
+            self._least_lag = self._lag(n_samples, at)
         position = samples.position
         if position is not None:
             origin = position - first if self._origin is None else self._origin
-            if position - origin < self._next:  # the counter was restarted
+            if position - origin < self._next or self._is_early(position - origin + n_samples, at):
                 elapsed = (at.monotonic_ns - self._began_ns) * 1e-9
                 by_time = round(elapsed * self._sensors[0].sampling_rate) - n_samples
                 first = max(self._next, by_time)
@@ -198,6 +201,7 @@ class BlockingSource:
             self._origin, first = origin, position - origin
         reason = reason or "samples lost by the device" if first > self._next else ""
         self._next = first + n_samples
+        self._least_lag = min(self._lag(self._next, at), self._least_lag)
         blocks, column = [], 0
         for sensor in self._sensors:
             columns = slice(column, column + len(sensor.channels))
@@ -205,6 +209,13 @@ class BlockingSource:
             counts = np.ascontiguousarray(samples.counts[:, columns])
             blocks.append(Block(sensor.name, first, counts, at, position, flags, reason))
         return blocks
+
+    def _lag(self, end: int, at: HostTime) -> float:
+        return at.monotonic_ns * 1e-9 - end / self._sensors[0].sampling_rate
+
+    def _is_early(self, end: int, at: HostTime) -> bool:
+        """Whether samples up to this number cannot have been taken: the counter was restarted."""
+        return self._lag(end, at) < self._least_lag - SLACK
 
     def _error(self) -> Exception:
         """Return the error that ended the thread."""

@@ -65,8 +65,10 @@ class Simulator:
     def __init__(self, number: int) -> None:
         self.number = number
         self.rate = 100.0
-        self.began = self.sent = 0
-        """Numbers of the first sample since START, and of the next one."""
+        self.sent = 0
+        """Number of the next sample."""
+        self._counter = 0  # of the next frame
+        self._counted: list[tuple[range, float]] = []  # samples since START; the delay of each
         self._send: Callable[[bytes], object] = lambda _: None
         self._line = b""
         self._n_to_lose = 0
@@ -93,11 +95,29 @@ class Simulator:
         """Let the line lose the next samples: they are counted and not sent."""
         self._n_to_lose = n_samples
 
+    def slip(self, n_samples: int) -> None:
+        """Leave out the next samples, or count the last ones again: no counter shows it."""
+        if n_samples > 0:
+            self.sent += n_samples
+        else:
+            again = range(self.sent + n_samples, self.sent)
+            self._counted.append((again, -n_samples / self.rate))
+            self._send(encode(self._counter, self._samples(again)))
+            self._counter += len(again)
+
+    def restart(self) -> None:
+        """Restart: nothing is sampled for a second, and the counter begins again."""
+        self.sent += round(self.rate)
+        self._counter = 0
+
     def truth(self) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
         """Return all samples since START, and the time of each by the clock of the event loop."""
-        n_samples = self.sent - self.began
-        index = np.arange(self.began, self.sent)
-        return samples(self.number, self.rate, self.began, n_samples), index / self.rate
+        counts = [self._samples(taken) for taken, _ in self._counted]
+        due = [np.array(taken) / self.rate + delay for taken, delay in self._counted]
+        return np.concatenate(counts), np.concatenate(due)
+
+    def _samples(self, taken: range) -> NDArray[np.int32]:
+        return samples(self.number, self.rate, taken.start, len(taken))
 
     def _answer(self, words: Sequence[str]) -> None:
         match words:
@@ -118,15 +138,18 @@ class Simulator:
     async def _stream(self) -> None:
         # All devices sample at the same instants: sample n is taken at n / rate of the clock.
         now = asyncio.get_running_loop().time
-        self.began = self.sent = int(now() * self.rate)
+        self.sent = self._counter = int(now() * self.rate)
+        self._counted.clear()
         while True:
             await asyncio.sleep(SEND_INTERVAL)
             lost, self._n_to_lose = self._n_to_lose, 0
-            due = int(now() * self.rate) + 1 - self.sent
-            first, n_samples = self.sent + lost, due - lost
-            self.sent += max(due, lost)
-            if n_samples > 0:
-                self._send(encode(first, samples(self.number, self.rate, first, n_samples)))
+            taken = range(self.sent, max(int(now() * self.rate) + 1, self.sent + lost))
+            if taken:
+                self._counted.append((taken, 0.0))
+            if taken[lost:]:
+                self._send(encode(self._counter + lost, self._samples(taken[lost:])))
+            self._counter += len(taken)
+            self.sent = taken.stop
 
 
 class TcpPort:

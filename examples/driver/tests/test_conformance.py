@@ -23,6 +23,7 @@ class TestAX3(DriverConformance):
     """Every test of the suite."""
 
     driver: ClassVar[DriverType] = DRIVER
+    seconds: ClassVar[float] = 1.0
 
     @contextlib.asynccontextmanager
     async def serve(self) -> AsyncIterator[Served]:
@@ -41,6 +42,8 @@ class TestAX3(DriverConformance):
             vanish=one.close,
             truth=lambda _: Sent(*one.device.truth()),
             drop=lambda: one.device.lose(20),
+            slip=one.device.slip,
+            restart=one.device.restart,
         )
         one.close()
 
