@@ -205,9 +205,8 @@ def follow(
     ) as estimation:
 
         def seen(recording: Recording) -> tuple[Recorder, _Sensors | None]:
-            remote = _RemoteRecorder(recording, cancelled, silence)
             sensors = _Sensors(recording, observer, first, look) if watch_sensors else None
-            return remote if recorder is None else recorder, sensors
+            return recorder or _RemoteRecorder(recording, cancelled, silence), sensors
 
         known, sensors = seen(recording)
         looks, states, estimates = Throttle(LOOK_SHARE), Throttle(LOOK_SHARE), Throttle(share)

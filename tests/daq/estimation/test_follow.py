@@ -60,6 +60,7 @@ def test_the_dimension_is_chosen_again_beside_the_looks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It takes seconds: estimates with new segments do not wait for it."""
+    monkeypatch.setattr(following, "LOOK_SHARE", 1e9)  # nobody waits here
     path = tmp_path / "run.h5"
     settings = replace(SETTINGS, methods=("maximum-likelihood",), dimension="auto")
     choose, is_seen = noise_estimates.chosen_dimensions, threading.Event()
