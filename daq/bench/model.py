@@ -22,6 +22,7 @@ from pydantic import (
 )
 
 from daq.bench.channel import Certificate, Channel
+from daq.bench.end_condition import EndCondition
 from daq.bench.estimate_settings import OPTIONS, EstimateSettings, table_keys, to_table
 from daq.bench.masks.mask import NOISE_MODELS, Mask, check_points
 from daq.bench.response import PolesZeros, Response
@@ -269,6 +270,13 @@ def estimate_settings(table: object) -> EstimateSettings:
     )
 
 
+def _until(value: str) -> str:
+    end = EndCondition.of_text(value)
+    if end.duration is not None:
+        raise ValueError('expected "decided", or a precision such as "5 %"; a time as duration')
+    return end.text
+
+
 class RecordingSettings(Table):
     """Where recordings go, and for how long."""
 
@@ -276,6 +284,8 @@ class RecordingSettings(Table):
     """Relative to the bench file."""
     duration: Duration | None = None
     """Of a recording; until it is stopped, if not given."""
+    until: Annotated[str, AfterValidator(_until)] | None = None
+    """``decided``, ``5 %`` or both: a test ends by then, at the latest after ``duration``."""
     retention: Duration | None = None
     """The same as ``keep_for`` of ``[storage]``."""
     report: Literal["html", "pdf"] | None = None
@@ -421,6 +431,19 @@ class Bench(Table):
     def has_limits(self) -> bool:
         """Whether there are limits to judge by."""
         return bool(self.limits)
+
+    @property
+    def end(self) -> EndCondition:
+        """When a test ends, by the bench file: ``until`` and ``duration``, the first of them."""
+        until = EndCondition.of_text(self.recording.until or "")
+        return replace(until, duration=self.recording.duration)
+
+    @property
+    def usual_end(self) -> EndCondition:
+        """What is suggested as the end of a test: that of the file, decided where it has limits."""
+        if self.recording.until is None and self.has_limits:
+            return replace(self.end, decided=True)
+        return self.end
 
     @property
     def runs_simulated(self) -> bool:

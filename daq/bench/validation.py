@@ -234,6 +234,10 @@ def _estimate_faults(
 def _limit_faults(table: Mapping[str, Any], sensors: Sequence[Sensor]) -> Iterator[FileFault]:
     entries = table.get("limits")
     limits = [_valid(Limit, entry) for entry in entries] if isinstance(entries, list) else []
+    recording = _valid(RecordingSettings, table.get("recording", {}))
+    until = "" if recording is None else recording.until or ""
+    if "decided" in until and not entries:
+        yield FileFault("recording.until", "expected [[limits]] to be decided", until)
     known_sensors = tuple(sensor.name for sensor in sensors)
     known_channels = tuple(dict.fromkeys(c.name for s in sensors for c in s.channels))
     for limit in limits:

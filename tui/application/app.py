@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 from textual import work
 from textual.binding import Binding, BindingType
 
-from daq.bench.end_condition import EndCondition
+from daq.bench.end_condition import NEVER, EndCondition
 from tui.application.dialogs import MarkScreen, QuestionScreen, StopScreen
 from tui.application.following import FollowingApp
 from tui.application.forms.form import Field, Form
@@ -54,12 +54,12 @@ class StartForm(Form[TestPlan]):
 
     def __init__(self, bench: Bench | None, kept: str) -> None:
         self._operator = "" if bench is None else bench.operator
-        duration = None if bench is None else bench.recording.duration
+        usual = NEVER if bench is None else bench.usual_end
         self._has_limits = bench is not None and bench.has_limits
         fields = (
             Field("operator", "operator", self._operator),
             Field("note", "note"),
-            Field("end", "ends", EndCondition(duration).text, "when x stops it"),
+            Field("end", "ends", usual.text, "when x stops it"),
         )
         title = f"start a test; {kept} is kept" if kept else "start a test"
         super().__init__(title, fields, does="starts")

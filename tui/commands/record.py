@@ -103,7 +103,7 @@ def record(
     if condition.decided and not bench.limits:
         raise WrongSettingError(f"until decided: {path} has no limits; expected [[limits]]")
     if duration is None and not until_stopped and not condition.is_estimated:
-        duration = bench.recording.duration
+        condition, duration = bench.end.estimated, bench.recording.duration
     if out is None:
         out = recording_path(bench, SystemClock().now())
     if check:

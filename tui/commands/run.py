@@ -114,13 +114,12 @@ def run(
 
     end = EndCondition(duration, until_cov, until_decided)
     bench = load(path)
+    end = bench.end if end == EndCondition() else end
     settings = chosen(Settings.of(bench), **wanted)
     check_fit(settings, bench.sensors)
     check_places(json, csv)
     if end.cov is not None:
         settings = replace(settings, target_cov=end.cov)
-    if end == EndCondition():
-        end = EndCondition(bench.recording.duration)
     refuse_hopeless(bench, settings, end)
     out = recording_path(bench, SystemClock().now()) if out is None else out
     if report is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import shlex
 import subprocess
@@ -13,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from daq.bench.editing import replace_file
+from daq.bench.durations import format_duration
+from daq.bench.editing import replace_file, with_values
 from daq.devices.bench_file import parse
-from daq.errors import HuddleError, RecordingError
+from daq.errors import BenchFileError, HuddleError, RecordingError
 from daq.host_clock import SystemClock
 from daq.preflight.device_check import discover
 from daq.preflight.findings import Outcome
@@ -52,6 +54,7 @@ if TYPE_CHECKING:
     from tui.application.controls import Preview
     from tui.application.plan import TestPlan
 
+_LOGGER = logging.getLogger(__name__)
 LATEST = 16
 """How many of the newest recordings are looked at: several benches may have one folder."""
 
@@ -210,7 +213,23 @@ class BenchControls(_Controls):
             )
         self.started.append(recorder)
         recorder.wait_for_file()
+        try:
+            self.remember(plan)
+        except (BenchFileError, OSError) as error:  # a file that only root may write, say
+            _LOGGER.warning("operator and end of this test are not remembered: %s", error)
         return out
+
+    def remember(self, plan: TestPlan) -> None:
+        """Write operator and end of a test into the bench file, where they differ from it."""
+        values: dict[str, Any] = {}
+        if plan.operator is not None:
+            values["operator"] = plan.operator
+        if plan.end != self.bench.usual_end:
+            kept = plan.end.duration
+            duration = None if kept is None else format_duration(kept)
+            values["recording"] = {"duration": duration, "until": plan.end.estimated.text}
+        if values:
+            self.save_bench(with_values(self.read_bench(), values))
 
     def stop(self, path: Path) -> None:
         """Ask the recorder of a file of this bench to stop."""

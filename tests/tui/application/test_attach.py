@@ -61,6 +61,7 @@ async def test_closing_leaves_the_recorder_running_and_it_is_found_again(bench: 
         await until(pilot, lambda: first.snapshot is not None and first.snapshot.n_segments > 2)
         assert first.now is not None
         assert first.now.until.duration is None
+        assert load(bench).recording.duration is None  # remembered
         await pilot.press("q")
     (recorder,) = controls.started
     assert not recorder.ended

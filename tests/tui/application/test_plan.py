@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING
 import pytest
 from textual.events import Key
 
+from daq.bench.editing import with_values
 from daq.bench.end_condition import EndCondition
 from daq.bench.model import Limit
-from daq.errors import HuddleError
+from daq.devices.bench_file import load, parse
+from daq.errors import BenchFileError, HuddleError
 from daq.recording.sensor_state import SensorState
 from daq.results.decision.end import is_reached
 from daq.results.decision.limits import judge
@@ -27,7 +29,8 @@ from tests.tui.example_snapshot import (
 )
 from tui.application.app import HuddleApp
 from tui.application.messages import StatusUpdated
-from tui.commands.tui_controls import announce
+from tui.application.plan import TestPlan
+from tui.commands.tui_controls import BenchControls, announce
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -84,6 +87,42 @@ async def test_the_form_takes_operator_note_and_end(told: ProgressCallback) -> N
     assert told.plan.operator is not None
     assert told.plan.operator.endswith("ann")
     assert told.told == ["start", "mark run.h5 hot"]
+
+
+async def test_with_limits_a_test_usually_ends_when_they_are_decided(
+    told: ProgressCallback,
+) -> None:
+    told.bench = demo_bench().model_copy(update={"limits": (LIMIT,)})
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await pilot.press("s")
+        await shown(pilot, app)
+        (line,) = [line for line in screen_text(app).splitlines() if " ends " in line]
+        assert "decided" in line
+
+
+def test_operator_and_end_are_remembered_in_the_bench_file(tmp_path: Path) -> None:
+    path = tmp_path / "lab.toml"
+    limits = "[[limits]]\nname = 'x'\nmodel = 'nlnm'\n"
+    path.write_text(f"# mine\n{demo_bench().text}\n{limits}", encoding="utf-8")
+    bench = load(path)
+    controls = BenchControls(path, bench, SETTINGS)
+    before = path.read_text(encoding="utf-8")
+    controls.remember(TestPlan(end=bench.usual_end))
+    assert path.read_text(encoding="utf-8") == before
+    for end in (EndCondition(5400.0, 0.1), EndCondition(decided=True), EndCondition(7200.0)):
+        controls.remember(TestPlan("ann", "", end))
+        again = load(path)
+        assert (again.operator, again.usual_end, again.end) == ("ann", end, end)
+    assert path.read_text(encoding="utf-8").startswith("# mine\n")
+
+
+def test_decided_needs_limits_in_the_bench_file_too() -> None:
+    text = with_values(demo_bench().text, {"recording": {"until": "decided"}})
+    with pytest.raises(BenchFileError, match=r"recording.until = .*: expected \[\[limits\]\]"):
+        parse(text)
+    with pytest.raises(BenchFileError, match="a time as duration"):
+        parse(text.replace("decided", "3h"))
 
 
 def test_a_test_ends_on_a_verdict_only_if_it_is_surer_than_a_verdict_must_be() -> None:
