@@ -50,13 +50,7 @@ def load(path: str | Path, drivers: Mapping[str, DriverRules] | None = None) -> 
             found = f"byte {error.start} is not UTF-8 text"
         fault = FileFault("", f"{found}; expected a bench file (.toml)")
         raise BenchFileError(fault, source=source) from None
-    table = _table(text, source)
-    embedded, faults = embed_masks(text, table, source.parent)
-    if faults:
-        raise BenchFileError(*faults, source=source)
-    if embedded != text:
-        table = _table(embedded, source)
-    return _check(table, embedded, source, drivers)
+    return parse(text, source, drivers)
 
 
 def parse(
@@ -71,7 +65,7 @@ def parse(
     text : str
         TOML.
     source : path or str
-        Name of the text in messages; recordings go beside it if it is a path.
+        Name of the text in messages; recordings and files of limits are beside it if it is a path.
     drivers : mapping, optional
         The drivers of this computer. With them the bench is also checked as a huddle test on this
         computer. The bench in a recording is not: its drivers may be on another computer.
@@ -81,7 +75,14 @@ def parse(
     BenchFileError
         With every error in the file, one per line.
     """
-    return _check(_table(text, source), text, source, drivers)
+    table = _table(text, source)
+    if isinstance(source, Path):
+        embedded, faults = embed_masks(text, table, source.parent)
+        if faults:
+            raise BenchFileError(*faults, source=source)
+        if embedded != text:
+            text, table = embedded, _table(embedded, source)
+    return _check(table, text, source, drivers)
 
 
 def _check(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ipaddress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, cast
 
@@ -41,6 +42,11 @@ TEXT_BAUD_RATES = (115200, 9600, 57600, 38400, 19200, 230400)
 TEXT_ROWS, LISTEN, LISTEN_ON = 12, 1.0, 2.5
 """Rows of text to guess a format from; seconds to listen for the first row, and for later ones."""
 MODBUS_BAUD_RATES = (9600, 115200, 19200, 38400, 57600)
+MODBUS_PORT = 502
+TCP_PORTS = (MODBUS_PORT, 4001, 4002, 4003, 4004, 2101, 10001)
+"""Modbus, and serial servers as their makers set them: Moxa, Digi, Lantronix."""
+MOST_HOSTS, MOST_CONNECTIONS, CONNECT = 1024, 256, 1.0
+"""Hosts of a network to search, connections at a time, seconds to wait for one."""
 MODBUS_DEVICES = (1, 2, 3, 4, 5, 0x50)
 
 
@@ -340,6 +346,52 @@ async def _text_rows(port: str, clock: HostClock, baud_rate: int) -> list[bytes]
                 if rows and rows[-1].isascii():  # a slow device: wait longer for its next rows
                     deadline = max(deadline, loop.time() + LISTEN_ON)
     return rows[1:]
+
+
+async def network_ports(target: str, *, numbers: Sequence[int] | None = None) -> list[str]:
+    """Return the ports of hosts that accept connections, to be searched by `discover`.
+
+    Parameters
+    ----------
+    target : str
+        A host, a network such as ``192.168.0.0/24``, or a port, which is returned itself.
+    numbers : sequence of int, optional
+        TCP ports to try: by default those of Modbus and of common serial servers.
+
+    Raises
+    ------
+    NotConnectedError
+        If the network has too many hosts.
+    """
+    if "://" in target or target.startswith(("/", "COM")):
+        return [target]
+    hosts = [target]
+    with contextlib.suppress(ValueError):
+        network = ipaddress.ip_network(target, strict=False)
+        if network.num_addresses > MOST_HOSTS:
+            raise NotConnectedError(f"{target}: expected a network of at most {MOST_HOSTS} hosts")
+        hosts = [str(host) for host in network.hosts()]
+    few = asyncio.Semaphore(MOST_CONNECTIONS)
+
+    async def accepts(host: str, number: int) -> bool:
+        async with few:
+            try:
+                async with asyncio.timeout(CONNECT):
+                    _, writer = await asyncio.open_connection(host, number)
+            except OSError:  # also that of a time limit
+                return False
+            writer.close()
+            with contextlib.suppress(OSError):
+                await writer.wait_closed()
+            return True
+
+    pairs = [(host, number) for host in hosts for number in numbers or TCP_PORTS]
+    found = await asyncio.gather(*(accepts(*pair) for pair in pairs))
+    return [
+        f"{TCP}{host}" if number == MODBUS_PORT else f"socket://{host}:{number}"
+        for (host, number), is_there in zip(pairs, found, strict=True)
+        if is_there
+    ]
 
 
 def search_description(port: str) -> str:

@@ -7,10 +7,8 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
-from rich.segment import Segment
 from textual import on, work
-from textual.app import App, SystemCommand
-from textual.filter import LineFilter, Monochrome
+from textual.app import SystemCommand
 from textual.reactive import var
 
 from daq.errors import HuddleError
@@ -41,14 +39,7 @@ from tui.application.state import BENCH, RESULT, TEST, TITLES, VIEWS, State
 from tui.application.test_view.panels import note
 from tui.application.test_view.recent_motion import RecentMotion, with_advice
 from tui.application.test_view.view import TestView
-from tui.application.themes import (
-    COLOUR_BLIND,
-    NO_COLOUR,
-    THEMES,
-    USUAL,
-    PlainMonochrome,
-    SafeColours,
-)
+from tui.application.themes import ThemedApp
 from tui.application.view import View
 from tui.runs.catalogue import delete_recording
 from tui.wording.alerts import alert
@@ -56,10 +47,9 @@ from tui.wording.findings import Names
 from tui.wording.verdict_text import WORDS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable
     from pathlib import Path
 
-    from textual.color import Color
     from textual.driver import Driver
     from textual.screen import Screen
 
@@ -69,41 +59,12 @@ if TYPE_CHECKING:
     from daq.recording.monitor import RecordingStatus
     from tui.application.controls import Controls
 
-_CONTROLS = dict.fromkeys((*range(32), *range(127, 160)))
-
-
-class HarmlessLines(LineFilter):
-    """Removes control characters, which terminals obey and which take no cell of the screen.
-
-    Parameters
-    ----------
-    filters : sequence of LineFilter
-        What each line goes through afterwards; Textual makes a new line for each filter of its own.
-    """
-
-    def __init__(self, filters: Sequence[LineFilter]) -> None:
-        super().__init__()
-        self._filters = filters
-
-    def apply(self, segments: list[Segment], background: Color) -> list[Segment]:
-        """Return the segments without them."""
-        segments = [
-            segment
-            if segment.control or segment.text.isprintable()
-            else Segment(segment.text.translate(_CONTROLS), segment.style)
-            for segment in segments
-        ]
-        for each in self._filters:
-            segments = each.apply(segments, background)
-        return segments
-
-
 Outcome = TypeVar("Outcome")
 CURVE_GROWTH = 0.01  # of the segments, from which on curves change to the eye
 DIAGNOSES = 0.4  # of the cost of estimates: five triaxial sensors are diagnosed within a minute
 
 
-class FollowingApp(App[None]):
+class FollowingApp(ThemedApp[None]):
     """Views of one recording at a time, of a bench or by itself.
 
     Parameters
@@ -114,8 +75,6 @@ class FollowingApp(App[None]):
 
     DEFAULT_MODE = BENCH
 
-    _filters_for: tuple[str, Sequence[LineFilter]] = "", ()
-    _line_filters: Sequence[LineFilter] = ()
     state: var[State] = var(partial(State, ""), always_update=True)
 
     def __init__(
@@ -125,11 +84,6 @@ class FollowingApp(App[None]):
         driver: type[Driver] | None = None,
     ) -> None:
         super().__init__(driver)
-        for theme in THEMES.values():
-            self.register_theme(theme)
-        self.theme = USUAL
-        for name in self.available_themes.keys() - THEMES.keys():
-            self.unregister_theme(name)
         self._models = models
         self._controls = controls
         self._ended = threading.Event()
@@ -164,24 +118,6 @@ class FollowingApp(App[None]):
         """Stop following the recording; its recorder continues."""
         self._quitting.set()
         self._ended.set()
-
-    def get_line_filters(self) -> Sequence[LineFilter]:
-        """Return what lines go through: harmless, and in the colours of the theme.
-
-        The same object until something changes: Textual keeps what it made of a line.
-        """
-        filters = super().get_line_filters()
-        if self._filters_for != (self.theme, filters):
-            self._filters_for = self.theme, filters
-            shown = [
-                PlainMonochrome() if isinstance(each, Monochrome) else each for each in filters
-            ]
-            if self.theme == COLOUR_BLIND:  # before names of colours become numbers
-                shown.insert(0, SafeColours())
-            elif self.theme == NO_COLOUR:
-                shown.append(PlainMonochrome())
-            self._line_filters = [HarmlessLines(shown)]
-        return self._line_filters
 
     # ---------------------------------------------------------------------- views
 

@@ -8,18 +8,20 @@ symbol and a word, and each curve a mark.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from rich.segment import Segment
 from rich.style import Style
+from textual.app import App
 from textual.filter import LineFilter, Monochrome
 from textual.theme import Theme
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from rich.color import Color as RichColor
     from textual.color import Color
+    from textual.driver import Driver
 
 ANSI: Mapping[int | None, str] = {1: "red", 2: "green", 3: "yellow"}
 """Names of the first colours of a terminal, by number."""
@@ -87,3 +89,66 @@ def _name(colour: RichColor) -> str:
     if colour.triplet is not None:
         return colour.triplet.hex
     return ANSI.get(colour.number, colour.name)
+
+
+Outcome = TypeVar("Outcome")
+_CONTROLS = dict.fromkeys((*range(32), *range(127, 160)))
+
+
+class HarmlessLines(LineFilter):
+    """Removes control characters, which terminals obey and which take no cell of the screen.
+
+    Parameters
+    ----------
+    filters : sequence of LineFilter
+        What each line goes through afterwards; Textual makes a new line for each filter of its own.
+    """
+
+    def __init__(self, filters: Sequence[LineFilter]) -> None:
+        super().__init__()
+        self._filters = filters
+
+    def apply(self, segments: list[Segment], background: Color) -> list[Segment]:
+        """Return the segments without them."""
+        segments = [
+            segment
+            if segment.control or segment.text.isprintable()
+            else Segment(segment.text.translate(_CONTROLS), segment.style)
+            for segment in segments
+        ]
+        for each in self._filters:
+            segments = each.apply(segments, background)
+        return segments
+
+
+class ThemedApp(App[Outcome]):
+    """An application in these themes, whose lines are harmless to a terminal."""
+
+    _filters_for: tuple[str, Sequence[LineFilter]] = "", ()
+    _line_filters: Sequence[LineFilter] = ()
+
+    def __init__(self, driver: type[Driver] | None = None) -> None:
+        super().__init__(driver)
+        for theme in THEMES.values():
+            self.register_theme(theme)
+        self.theme = USUAL
+        for name in self.available_themes.keys() - THEMES.keys():
+            self.unregister_theme(name)
+
+    def get_line_filters(self) -> Sequence[LineFilter]:
+        """Return what lines go through: harmless, and in the colours of the theme.
+
+        The same object until something changes: Textual keeps what it made of a line.
+        """
+        filters = super().get_line_filters()
+        if self._filters_for != (self.theme, filters):
+            self._filters_for = self.theme, filters
+            shown = [
+                PlainMonochrome() if isinstance(each, Monochrome) else each for each in filters
+            ]
+            if self.theme == COLOUR_BLIND:  # before names of colours become numbers
+                shown.insert(0, SafeColours())
+            elif self.theme == NO_COLOUR:
+                shown.append(PlainMonochrome())
+            self._line_filters = [HarmlessLines(shown)]
+        return self._line_filters

@@ -59,6 +59,15 @@ def tui(
             " a serial port, otherwise unlimited).",
         ),
     ] = None,
+    port: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--port",
+            metavar="PORT",
+            help="Without a bench file: search this port (default: all serial ports); may be"
+            " repeated.",
+        ),
+    ] = None,
     models: ModelsOption = "",
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
@@ -66,16 +75,17 @@ def tui(
 
     Closing the application does not stop a recording. Opening it again shows
     the running recording. Without a bench file, or with an empty or missing
-    one, the ports are searched and a bench file is written first.
+    one, the first bench opens: it searches the serial ports, and the network
+    on request, shows what answers live, and writes the bench file.
     """
-    is_first = source is None and not any(Path().glob("*.toml"))
-    if source is not None and source.suffix == ".toml":
-        is_first = not source.exists() or source.stat().st_size == 0
-    if is_first and sys.stdin.isatty() and sys.stdout.isatty():
-        from tui.commands.init import write_discovered
+    from tui.runs.first_bench import is_first
 
-        source = Path("bench.toml") if source is None else source
-        write_discovered(source, (), force=True)
+    wanted_first = source is None and (bool(port) or not any(Path().glob("*.toml")))
+    wanted_first |= source is not None and source.suffix == ".toml" and is_first(source)
+    if wanted_first and _has_terminal():
+        source = first_bench(Path("bench.toml") if source is None else source, port or (), baud)
+        if source is None:
+            return
     if source is None:
         there = sorted(path.name for path in Path().glob("*.toml"))
         here = f"; this folder has {', '.join(there)}" if there else ""
@@ -163,14 +173,35 @@ def _driver(baud: int | None = None) -> type[Driver] | None:
     return driver_for(baud=speed, is_ascii=is_ascii_only(os.environ))
 
 
+def first_bench(path: Path, ports: Sequence[str], baud: int | None = None) -> Path | None:
+    """Find sensors and write a bench file; None if that was left."""
+    from daq.transport.serial_ports import serial_ports
+    from tui.application.first_bench import FirstBenchApp
+    from tui.commands.tui_controls import FirstBenchControls
+    from tui.output.console import check_places
+    from tui.output.logs.lines import screen_taken
+    from tui.runs.first_bench import draft
+
+    check_places(str(path))
+    searched = list(ports) or [each.path for each in serial_ports()]
+    app = FirstBenchApp(FirstBenchControls(path, searched, draft(path)), _driver(baud))
+    app.theme = _theme()
+    with screen_taken():
+        return app.run()
+
+
+def _has_terminal() -> bool:
+    return BROWSER in os.environ or all(
+        stream.isatty() for stream in (sys.stdin, sys.stdout, sys.stderr)
+    )
+
+
 def _run(app: HuddleApp, *, again: Path) -> None:
     """Run the application; print the name of its recording, and whether it continues."""
     from tui.output.console import notices
     from tui.output.logs.lines import screen_taken
 
-    if BROWSER not in os.environ and not all(
-        stream.isatty() for stream in (sys.stdin, sys.stdout, sys.stderr)
-    ):
+    if not _has_terminal():
         raise typer.BadParameter(
             "the application needs a terminal, for standard input, output and error; huddle watch"
             " RECORDING and huddle run BENCH need none"

@@ -19,7 +19,7 @@ from daq.bench.editing import replace_file, with_values
 from daq.devices.bench_file import parse
 from daq.errors import BenchFileError, HuddleError, RecordingError
 from daq.host_clock import SystemClock
-from daq.preflight.device_check import discover
+from daq.preflight.device_check import discover, network_ports
 from daq.preflight.findings import Outcome
 from daq.preflight.preview import preview
 from daq.recording.control import ask
@@ -311,6 +311,40 @@ class BenchControls(_Controls):
         """Release the recorders, which continue."""
         for recorder in self.started:
             recorder.close()
+
+
+@dataclass
+class FirstBenchControls:
+    """What the first bench asks of this computer."""
+
+    path: Path
+    ports: Sequence[str]
+    text: str
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    """Held by who reads the ports."""
+
+    def network_ports(self, target: str) -> Sequence[str]:
+        """Return the ports to search for a port, a host or a network."""
+        return asyncio.run(network_ports(target))
+
+    def find_devices(self, port: str) -> Sequence[DiscoveredDevice]:
+        """Look for devices on a port that nobody reads."""
+        return asyncio.run(discover(port, SystemClock()))
+
+    def read(
+        self,
+        bench: Bench,
+        show: Callable[[tuple[SensorPreview, ...]], None],
+        ended: threading.Event,
+    ) -> None:
+        """Read the sensors until `ended` is set."""
+        read_sensors(bench, self.lock, show, ended)
+
+    def save(self, text: str) -> None:
+        """Write the bench file, if it has no errors."""
+        parse(text, self.path)
+        self.path.touch()
+        replace_file(self.path, text)
 
 
 @dataclass(frozen=True)

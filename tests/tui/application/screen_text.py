@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
 from rich.console import Console
@@ -17,7 +17,7 @@ FOLDER = Path(__file__).parent / "pictures"
 TURNS = 100
 
 
-def screen_text(app: App[None]) -> str:
+def screen_text(app: App[Any]) -> str:
     """Return what is on the screen, line by line, without colours."""
     # As text and not as SVG, which takes most of the time of a picture.
     with patch.object(Console, "export_svg", lambda console, **_: console.export_text()):
@@ -29,7 +29,7 @@ AT_REST = 4
 """Turns in which a screen at rest does not change."""
 
 
-async def assert_looks_as_before(pilot: Pilot[None], name: str) -> None:
+async def assert_looks_as_before(pilot: Pilot[Any], name: str) -> None:
     """Compare the screen with the picture kept of it; HUDDLE_NEW_PICTURES=1 keeps a new one.
 
     On a busy machine a layout may still be on its way: the screen has some turns to come to rest.
@@ -46,7 +46,7 @@ async def assert_looks_as_before(pilot: Pilot[None], name: str) -> None:
     assert screen_text(pilot.app) == expected
 
 
-async def resized(pilot: Pilot[None], size: tuple[int, int]) -> None:
+async def resized(pilot: Pilot[Any], size: tuple[int, int]) -> None:
     """Resize the terminal, and wait until the screen has that size and comes to rest.
 
     On a busy machine the new layout comes some turns later.

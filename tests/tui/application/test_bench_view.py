@@ -13,11 +13,12 @@ import pytest
 from rich.console import Console
 from textual.widgets import Input
 
+from daq.devices.bench_file import load
 from daq.devices.interface import DeviceInformation
 from daq.preflight.preview import SensorPreview
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
 from tests.tui.application.test_app import NARROW, WIDE, shown
-from tests.tui.example_snapshot import ProgressCallback, demo_bench
+from tests.tui.example_snapshot import SETTINGS, ProgressCallback, demo_bench
 from tests.waiting import limit
 from tui.application.app import HuddleApp
 from tui.application.bench_view.sensors import (
@@ -30,6 +31,7 @@ from tui.application.bench_view.sensors import (
 )
 from tui.application.bench_view.view import SITES
 from tui.application.state import State
+from tui.commands.tui_controls import BenchControls
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -90,6 +92,29 @@ async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]
         reading.is_over.wait(limit())
         await shown(pilot, app)
         assert "last 10 s" not in screen_text(app)
+
+
+async def test_limits_are_changed_in_a_form_also_those_of_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "lab.toml"
+    path.write_text(f"# mine\n{demo_bench().text}", encoding="utf-8")
+    (tmp_path / "sheet.csv").write_text("frequency (Hz), noise (µg/√Hz)\n1, 3\n30, 2\n")
+    bench = load(path)
+    app = HuddleApp(BenchControls(path, bench, SETTINGS))
+    async with app.run_test(size=NARROW) as pilot:
+        await pilot.press("l", "tab", "tab", *"sheet.csv")
+        await shown(pilot, app)
+        assert "decided, " in screen_text(app)
+        await pilot.press("enter")
+        await app.workers.wait_for_complete()
+        await shown(pilot, app)
+        assert app.state.bench is not None
+        assert [limit.name for limit in app.state.bench.limits] == ["sheet"]
+        await pilot.press("l", "tab", "tab", "end", *";nlnm", "enter")
+        await app.workers.wait_for_complete()
+    changed = load(path)
+    assert [limit.name for limit in changed.limits] == ["sheet", "nlnm"]
+    assert changed.limits[0].psd == (9.0, 4.0)
+    assert path.read_text(encoding="utf-8").startswith("# mine\n")
 
 
 def test_channels_of_several_units_have_each_its_own() -> None:

@@ -167,14 +167,14 @@ def sensor_states(sensors: Sequence[SensorPreview], *, width: int, chosen: str =
     return columns(
         (*titles, "port"),
         [
-            (*row, Text(_tail(each.sensor.port, room)))
+            (*row, Text(tail(each.sensor.port, room)))
             for row, each in zip(rows, sensors, strict=True)
         ],
         right=NUMBERS,
     )
 
 
-def _tail(text: str, room: int) -> str:
+def tail(text: str, room: int) -> str:
     """Return the end of a text: that of a port says more than its start."""
     return text if len(text) <= room else f"…{text[1 - room :]}"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from rich.text import Text
@@ -22,6 +23,7 @@ from tui.application.bench_view.sensors import (
     spectra,
 )
 from tui.application.dialogs import QuestionScreen
+from tui.application.forms.bench import BenchForm
 from tui.application.forms.certificate import CertificateForm
 from tui.application.forms.sensor import PortForm, SensorForm, sensor_table
 from tui.application.messages import BenchEdited, ErrorReported, PreviewUpdated
@@ -31,12 +33,13 @@ from tui.application.test_view.units import SpectrumUnit
 from tui.application.view import BAD, MUTED, View
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from textual.app import ComposeResult
 
     from daq.preflight.preview import SensorPreview
     from tui.application.controls import Controls, Preview
+    from tui.application.forms.form import Form
     from tui.application.state import State
 
 
@@ -61,6 +64,7 @@ class BenchView(View):
         Binding("up", "choose_next(-1)", "Choose", show=False),
         Binding("a", "add", "Add"),
         Binding("e", "edit", "Edit"),
+        Binding("l", "limits", "Limits", show=False),
         Binding("c", "certificate", "Certificate", show=False),
         Binding("delete", "remove", "Remove", key_display="del", show=False),
         Binding("x", "app.stop", "Stop"),
@@ -75,6 +79,7 @@ class BenchView(View):
         ("Add a sensor", "add"),
         ("Change the chosen sensor", "edit"),
         ("Remove the chosen sensor", "remove"),
+        ("Change limits, end of a test, operator, and what else the bench file says", "limits"),
     )
     KEYS = (
         ("p", "check the sensors: read them live without recording; p again ends it"),
@@ -84,6 +89,7 @@ class BenchView(View):
         ("a", "add a sensor: huddle looks what is on its port, if you do not name a driver"),
         ("e", "change the chosen sensor in the bench file; comments there stay"),
         ("del", "remove the chosen sensor from the bench file; asked before"),
+        ("l", "limits, end of a test, operator, axes, unit of results; kept in the bench file"),
         ("c", "what certificates say of laboratory, customer and order; kept in the bench file"),
         ("s", "start a test: operator, note, and when it ends by itself"),
     )
@@ -149,7 +155,7 @@ class BenchView(View):
             frozen = "frozen: f goes on · " if self._is_frozen else ""
             return f"{frozen}reading the sensors, nothing is recorded · p ends it"
         if self.check_action("preview", ()):
-            return "p checks the sensors · s starts a test · ? helps"
+            return "p checks the sensors · s starts a test · l limits and end · ? helps"
         if self.state.can_start and not self.state.is_recording:
             return "s starts a test · ? helps"
         return "2 shows the test · ? helps"
@@ -159,7 +165,7 @@ class BenchView(View):
         del parameters
         state = self.state
         is_busy = state.is_recording or state.is_starting
-        if action in {"add", "edit", "remove", "certificate"}:
+        if action in {"add", "edit", "remove", "certificate", "limits"}:
             return state.can_start and not is_busy and state.bench is not None
         if action == "preview":
             return self._controls.preview is not None and state.can_start and not is_busy
@@ -236,10 +242,18 @@ class BenchView(View):
         known = sensor_table(text, replaces) if values is None else values
         self.app.push_screen(SensorForm(text, driver, known, replaces=replaces), self._save)
 
+    def action_limits(self) -> None:
+        """Ask for limits, and what else is common to all sensors."""
+        path = self.state.bench.source if self.state.bench is not None else None
+        self._fill_in(lambda text: BenchForm(text, path or Path("bench.toml")))
+
     def action_certificate(self) -> None:
         """Ask for what certificates say."""
+        self._fill_in(CertificateForm)
+
+    def _fill_in(self, form_of: Callable[[str], Form[str]]) -> None:
         try:
-            form = CertificateForm(self._controls.read_bench())
+            form = form_of(self._controls.read_bench())
         except (HuddleError, OSError, ValueError) as error:
             self.app.post_message(ErrorReported(str(error)))
             return

@@ -119,7 +119,8 @@ class Form(ModalScreen[Result | None], Generic[Result]):
 
     @on(Input.Changed)
     def _on_change(self, event: Input.Changed) -> None:
-        self.explain(str(event.input.id))
+        if event.input.has_focus:  # not a field that follows another one
+            self.explain(str(event.input.id))
 
     def on_descendant_focus(self) -> None:
         """Explain the field at the cursor."""

@@ -172,7 +172,13 @@ class SensorForm(Form[str]):
 
     def submit(self) -> None:
         """Save, unless the file would have errors that it had not before."""
-        new = [fault for fault in self._faults() if fault not in self._faults_before]
+        # Of too few sensors there is one more now.
+        known = {fault.key for fault in self._faults_before} & {"sensors"}
+        new = [
+            fault
+            for fault in self._faults()
+            if fault not in self._faults_before and fault.key not in known
+        ]
         if new:
             self.show_message(str(new[0]), is_wrong=True)
         else:

@@ -1,0 +1,230 @@
+"""The first bench: what answers on ports, live, until it is a bench file and a test runs."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import threading
+import time
+from dataclasses import dataclass, field, replace
+from importlib import resources
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from daq.bench.tables.toml_text import to_toml
+from daq.devices.bench_file import load, parse
+from daq.devices.interface import DeviceInformation
+from daq.errors import NotConnectedError
+from daq.estimation.settings import Settings
+from daq.preflight.device_check import DiscoveredDevice, network_ports
+from daq.preflight.preview import SensorPreview
+from tests.tui.application.screen_text import assert_looks_as_before, screen_text
+from tests.tui.example_snapshot import demo_bench
+from tests.waiting import limit
+from tui.application.app import HuddleApp
+from tui.application.first_bench import FirstBenchApp, tapped
+from tui.commands.tui_controls import BenchControls, FirstBenchControls
+from tui.runs.first_bench import draft
+from tui.simulation.devices import simulated
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from textual.pilot import Pilot
+
+    from daq.bench.model import Bench
+
+SIZES = {"small": (80, 24), "middle": (120, 36), "wide": (200, 60)}
+PORTS = tuple(f"/dev/ttyUSB{n}" for n in range(4))
+
+
+def motion(seed: int, *, tap: float = 0.0) -> np.ndarray:
+    """10 s of three channels at 200 Hz; a tap is a short burst half a second ago."""
+    values = np.random.default_rng(seed).normal(size=(2000, 3)) * 1e-5
+    values[1900:1910] += tap * 1e-5
+    values[:, 2] += 9.8
+    return values
+
+
+@dataclass
+class Prepared:
+    """A computer with four ports: three with devices, of which B is tapped."""
+
+    path: Path
+    text: str = ""
+    ports: Sequence[str] = PORTS
+    taps: tuple[float, ...] = (8.0, 40.0, 10.0)
+    is_shown: threading.Event = field(default_factory=threading.Event)
+    is_late: threading.Event = field(default_factory=threading.Event)
+    targets: list[str] = field(default_factory=list)
+
+    def network_ports(self, target: str) -> Sequence[str]:
+        """Note it."""
+        self.targets.append(target)
+        return ()
+
+    def find_devices(self, port: str) -> Sequence[DiscoveredDevice]:
+        """Return a device on any port but the last; the first one answers after the others."""
+        if port == PORTS[-1]:
+            self.is_late.set()
+            return ()
+        if port == PORTS[0]:
+            self.is_late.wait(limit())
+        about = DeviceInformation("", "A352AD10", f"S{port[-1]}", "1.4", 200.0, 25.0)
+        return [DiscoveredDevice("epson", port, {"baud_rate": 460800}, about)]
+
+    def read(
+        self,
+        bench: Bench,
+        show: Callable[[tuple[SensorPreview, ...]], None],
+        ended: threading.Event,
+    ) -> None:
+        """Show all sensors once."""
+        show(
+            tuple(
+                SensorPreview(sensor, None, motion(n, tap=tap))
+                for n, (sensor, tap) in enumerate(zip(bench.sensors, self.taps, strict=False))
+            )
+        )
+        self.is_shown.set()
+        ended.wait(limit())
+
+    def save(self, text: str) -> None:
+        """Write it."""
+        parse(text, self.path)
+        self.path.write_text(text, encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", SIZES)
+async def test_pictures(tmp_path: Path, name: str) -> None:
+    controls = Prepared(tmp_path / "lab.toml", draft(tmp_path / "lab.toml"))
+    controls.path = controls.path.relative_to(tmp_path)
+    app = FirstBenchApp(controls)
+    async with app.run_test(size=SIZES[name]) as pilot:
+        await until(pilot, controls.is_shown.is_set)
+        await until(pilot, lambda: "◀ tapped" in screen_text(app))
+        await assert_looks_as_before(pilot, f"{name}-first-bench")
+        await pilot.press("enter", "tab", "tab", "tab", "3")
+        await assert_looks_as_before(pilot, f"{name}-first-bench-form")
+
+
+async def test_two_names_two_limits_and_the_file_is_written(tmp_path: Path) -> None:
+    path = tmp_path / "lab.toml"
+    controls = Prepared(path, draft(path))
+    app = FirstBenchApp(controls)
+    async with app.run_test(size=SIZES["small"]) as pilot:
+        await until(pilot, controls.is_shown.is_set)
+        await pilot.press("n", *"quiet", "enter")
+        await until(pilot, lambda: "quiet: no host answers" in screen_text(app))
+        assert controls.targets == ["quiet"]
+        await pilot.press("enter", *"Ann", "tab", "end", "backspace", "L", "tab", "tab")
+        await pilot.press(*"nl", "enter")
+        await until(pilot, lambda: "expected one of nlnm" in screen_text(app))
+        await pilot.press(*"nm;3", "enter")
+        await until(pilot, lambda: app.return_value is not None)
+    assert app.return_value == path
+    bench = load(path)
+    assert bench.operator == "Ann"
+    assert [sensor.name for sensor in bench.sensors] == ["A", "B", "L"]
+    assert [each.name for each in bench.limits] == ["nlnm", "limit"]
+    assert bench.usual_end.decided
+
+
+async def test_two_sensors_are_no_bench_and_a_third_is_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "lab.toml"
+    controls = Prepared(path, draft(path), ports=PORTS[1:], taps=(0.0, 0.0))
+    app = FirstBenchApp(controls)
+    async with app.run_test(size=SIZES["small"]) as pilot:
+        await until(pilot, controls.is_shown.is_set)
+        await pilot.press("enter", "enter")
+        await until(pilot, lambda: "expected at least 3" in screen_text(app))
+        await pilot.press("escape", "down", "delete")
+        await until(pilot, lambda: "a huddle test takes three" in screen_text(app))
+    assert not path.exists()
+
+
+def test_a_row_lights_up_for_the_sensor_that_is_tapped_and_for_no_other() -> None:
+    felt = {"A": 9.0, "B": 30.0, "C": 12.0}
+    bench = demo_bench()
+    sensors = [
+        SensorPreview(bench.sensor(name), None, motion(seed, tap=tap))
+        for seed, (name, tap) in enumerate(felt.items())
+    ]
+    assert tapped(sensors) == "B"
+    quiet = [SensorPreview(bench.sensors[0], None, motion(seed)) for seed in range(100)]
+    assert [tapped([each]) for each in quiet] == [""] * 100
+    dead = replace(quiet[0], samples=np.zeros((2000, 3)))
+    assert tapped([dead, replace(quiet[1], samples=quiet[1].samples[:100])]) == ""
+
+
+async def test_hosts_that_accept_connections_are_searched() -> None:
+    async def hang_up(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.close()
+
+    async with await asyncio.start_server(hang_up, "127.0.0.1", 0) as server:
+        there = server.sockets[0].getsockname()[1]
+        async with await asyncio.start_server(hang_up, "127.0.0.1", 0) as other:
+            gone = other.sockets[0].getsockname()[1]
+        found = await network_ports("127.0.0.1/32", numbers=(there, gone))
+        assert found == [f"socket://127.0.0.1:{there}"]
+        assert await network_ports("/dev/pts/3") == ["/dev/pts/3"]
+    with pytest.raises(NotConnectedError, match="at most 1024 hosts"):
+        await network_ports("10.0.0.0/8")
+
+
+MOST_KEYS = 25
+
+
+@pytest.mark.long
+@pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals")
+async def test_from_cables_to_a_running_test_in_few_keys(tmp_path: Path) -> None:
+    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
+    path = tmp_path / "bench.toml"
+    keys: list[str] = []
+
+    async def press(pilot: Pilot[Any], *some: str) -> None:
+        keys.extend(some)
+        await pilot.press(*some)
+
+    with simulated(parse(text), speed=8.0) as reachable:
+        clock = {"speed": 8.0, "clock": reachable.simulated_clock}
+        path.write_text(to_toml({"simulation": clock}), encoding="utf-8")
+        ports = [sensor.port for sensor in reachable.sensors]
+        first = FirstBenchApp(FirstBenchControls(path, ports, draft(path)))
+        async with first.run_test(size=SIZES["small"]) as pilot:
+            await until(pilot, lambda: screen_text(first).count("● live") == 3)
+            for size in reversed(SIZES.values()):
+                await pilot.resize_terminal(*size)
+                await until(pilot, lambda: screen_text(first).count("● live") == 3)
+                assert "q Quit" in screen_text(first)
+            await press(pilot, "enter", *"Ann", "tab", "tab", *"E N U", "tab", "3", "enter")
+            await until(pilot, lambda: first.return_value is not None)
+        bench = load(path)
+        assert [sensor.port for sensor in bench.sensors] == ports
+        assert all(sensor.serial_number for sensor in bench.sensors)
+        controls = BenchControls(path, bench, Settings.of(bench))
+        app = HuddleApp(controls)
+        async with app.run_test(size=SIZES["small"]) as opened:
+            await press(opened, "s", "enter")
+            await until(opened, lambda: app.now is not None and app.now.elapsed > 0)
+            assert app.now is not None
+            assert app.now.until.decided
+            for size in SIZES.values():
+                await opened.resize_terminal(*size)
+                await until(opened, lambda: "● recording" in screen_text(app))
+            assert app.state.judged_by is None or app.state.judged_by.operator == "Ann"
+            controls.stop(controls.started[0].out)
+            await until(opened, lambda: app.snapshot is not None and app.snapshot.closed)
+        controls.release()
+    assert len(keys) <= MOST_KEYS, keys
+
+
+async def until(pilot: Pilot[Any], reached: Callable[[], bool]) -> None:
+    """Let the application run until something is the case."""
+    deadline = time.monotonic() + limit()
+    while not reached():
+        assert time.monotonic() < deadline, screen_text(pilot.app)
+        await pilot.pause(0.05)
