@@ -6,7 +6,6 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
-import numpy as np
 from rich.style import Style
 from rich.text import Text
 from textual import work
@@ -18,7 +17,15 @@ from textual.widgets import Static
 from daq.bench.editing import without_sensor
 from daq.bench.loading import parse
 from daq.errors import BenchFileError, HuddleError
-from tui.application.bench_view.sensors import LEAST_TRACE, columns, tail, trace, width_of
+from tui.application.bench_view.sensors import (
+    LEAST_TRACE,
+    columns,
+    motion_of,
+    tail,
+    tapped,
+    trace,
+    width_of,
+)
 from tui.application.forms.bench import BenchForm
 from tui.application.forms.form import Field, Form
 from tui.application.forms.sensor import PortForm, SensorForm, sensor_table
@@ -37,10 +44,6 @@ if TYPE_CHECKING:
     from daq.preflight.device_check import DiscoveredDevice
     from daq.preflight.preview import SensorPreview
 
-TAP = 6.0
-"""How far the motion of the last second must exceed the usual one for its row to light up."""
-LEAST_RECORD = 2.0
-"""Seconds of samples from which a tap is seen."""
 WIDEST_PORT = 24
 """Columns for the name of a port."""
 
@@ -452,30 +455,3 @@ def _state(now: SensorPreview | None, *, is_hit: bool) -> Text:
     if now.trouble:
         return Text("▲ trouble", BAD)
     return Text("● live", "green") if len(now.samples) else Text("○ waiting", "yellow")
-
-
-def motion_of(sensor: SensorPreview) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return how far the channels are from their means, as one length for each sample."""
-    main = [n for n, channel in enumerate(sensor.sensor.channels) if not channel.auxiliary]
-    if len(sensor.samples) == 0:
-        return np.zeros(0)
-    values = sensor.samples[:, main]
-    away: np.ndarray[Any, np.dtype[np.float64]] = np.linalg.norm(values - values.mean(0), axis=1)
-    return away
-
-
-def tapped(sensors: Sequence[SensorPreview]) -> str:
-    """Return the sensor whose motion in the last second most exceeds its usual one; or none.
-
-    All sensors feel a tap on one of them: only the one that feels it most.
-    """
-    best, name = TAP, ""
-    for each in sensors:
-        rate = each.sensor.sampling_rate
-        motion, second = motion_of(each), max(1, round(rate))
-        if len(motion) < LEAST_RECORD * rate:
-            continue
-        usual = float(np.median(motion[:-second]))
-        if usual > 0 and (ratio := float(motion[-second:].max()) / usual) > best:
-            best, name = ratio, each.sensor.name
-    return name

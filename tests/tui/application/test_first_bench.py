@@ -24,7 +24,8 @@ from tests.tui.application.screen_text import assert_looks_as_before, screen_tex
 from tests.tui.example_snapshot import demo_bench
 from tests.waiting import limit
 from tui.application.app import HuddleApp
-from tui.application.first_bench import FirstBenchApp, tapped
+from tui.application.bench_view.sensors import tapped
+from tui.application.first_bench import FirstBenchApp
 from tui.commands.tui_controls import BenchControls, FirstBenchControls
 from tui.runs.first_bench import draft
 from tui.simulation.devices import simulated

@@ -37,6 +37,10 @@ SPECTRUM_SEGMENT, SPECTRUM_POINTS = 2.0, 120
 """Seconds of a segment of the spectra before a test, and points of a curve at most."""
 GAP = 2
 """Blanks between columns."""
+TAP = 6.0
+"""How far the motion of the last second must exceed the usual one for its row to light up."""
+LEAST_RECORD = 2.0
+"""Seconds of samples from which a tap is seen."""
 
 
 def columns(
@@ -315,3 +319,30 @@ def checks(bench: Bench, sensors: Sequence[SensorPreview]) -> list[Text]:
         left = listed([each.value for each in Check if each in unknown])
         return [Text(f"? nothing wrong is seen; not checked: {left}", DOUBTFUL)]
     return [Text("✓ ready: s starts a test", f"bold {GOOD}")]
+
+
+def motion_of(sensor: SensorPreview) -> NDArray[np.float64]:
+    """Return how far the channels are from their means, as one length for each sample."""
+    main = [n for n, channel in enumerate(sensor.sensor.channels) if not channel.auxiliary]
+    if len(sensor.samples) == 0:
+        return np.zeros(0)
+    values = sensor.samples[:, main]
+    away: NDArray[np.float64] = np.linalg.norm(values - values.mean(0), axis=1)
+    return away
+
+
+def tapped(sensors: Sequence[SensorPreview]) -> str:
+    """Return the sensor whose motion in the last second most exceeds its usual one; or none.
+
+    All sensors feel a tap on one of them: only the one that feels it most.
+    """
+    best, name = TAP, ""
+    for each in sensors:
+        rate = each.sensor.sampling_rate
+        motion, second = motion_of(each), max(1, round(rate))
+        if len(motion) < LEAST_RECORD * rate:
+            continue
+        usual = float(np.median(motion[:-second]))
+        if usual > 0 and (ratio := float(motion[-second:].max()) / usual) > best:
+            best, name = ratio, each.sensor.name
+    return name
