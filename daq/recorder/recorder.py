@@ -284,6 +284,7 @@ class _Recorder:
                         sampling_rate=found.sampling_rate or layout.sampling_rate,
                         model=found.model or layout.model,
                         serial_number=found.serial_number or layout.serial_number,
+                        firmware=found.firmware,
                         temperature=found.temperature,
                     )
                 layouts[sensor.name] = layout

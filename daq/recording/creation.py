@@ -78,6 +78,8 @@ def make_datasets(file: h5py.File, sensors: Sequence[SensorLayout], chunk_second
         group = groups.create_group(sensor.name)
         for key in ("model", "serial_number", "driver", "port", "clock", "sampling_rate"):
             group.attrs[key] = file_format.fixed(getattr(sensor, key))
+        if sensor.firmware:
+            group.attrs["firmware"] = file_format.fixed(sensor.firmware)
         if sensor.temperature is not None:
             group.attrs["temperature"] = float(sensor.temperature)
         n_channels = len(sensor.channels)

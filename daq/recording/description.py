@@ -33,7 +33,10 @@ _FILE = (
     *("software", "bench", "operator", "location", "duration", "until", "estimate", "origin"),
     "simulated",
 )
-_SENSOR = ("model", "serial_number", "driver", "port", "clock", "sampling_rate", "temperature")
+_SENSOR = (
+    *("model", "serial_number", "driver", "port", "clock", "sampling_rate", "temperature"),
+    "firmware",
+)
 _SAMPLES = ("channels", "sensitivity", "unit", "direction", "auxiliary", "response", "absent")
 
 

@@ -99,6 +99,8 @@ class SensorLayout:
         Type of the raw counts.
     clock : str
         Name of the sampling clock; sensors with one clock share the name.
+    firmware : str
+        As the device reported; empty if it reports none.
     temperature : float or None
         In °C, as the device reported at the start; None if it reports none.
     absent : int64, shape (n, 3), optional
@@ -115,6 +117,7 @@ class SensorLayout:
     serial_number: str = ""
     driver: str = ""
     port: str = ""
+    firmware: str = ""
     temperature: float | None = None
     absent: NDArray[np.int64] | None = None
 

@@ -68,6 +68,7 @@ class SensorRecord:
         """Name of the sampling clock; sensors with one clock share the name."""
         self.sampling_rate = float(number(attributes, "sampling_rate"))
         """In Hz, as reported by the device; otherwise nominal."""
+        self.firmware = text(attributes, "firmware") if "firmware" in attributes else ""
         self.temperature = (
             float(number(attributes, "temperature")) if "temperature" in attributes else None
         )

@@ -39,6 +39,7 @@ def _band(text: str) -> tuple[float, float]:
     "huddle history lab.toml",
     "huddle history lab.toml --band 1:10 --since 2026-01-01 --out noise.png",
     "huddle history --sensor S4254475 --band 1:2   (its tests on all benches)",
+    "huddle history --sensor S4254475 --label S4254475.svg   (a label to print)",
     "huddle history lab/recordings office/recordings --csv -   (sensors by serial number)",
 )
 def history(
@@ -93,6 +94,15 @@ def history(
     ] = 0.01,
     json: JsonOption = None,
     csv: CsvOption = None,
+    label: Annotated[
+        Path | None,
+        typer.Option(
+            "--label",
+            metavar="FILE",
+            help="With --sensor: a label to print (.svg, 62 × 29 mm) with its serial number as QR"
+            " code, and its last noise.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", metavar="FILE", help="Picture: .png, .svg or .pdf."),
@@ -104,8 +114,16 @@ def history(
     allows for the uncertainty of each run; its false-alarm rate holds for the whole history.
     """
     from tui.output.console import check_places, for_people, write_json, write_text
+    from tui.service.history.ledger import sensor_tests
     from tui.service.history.series import bands_of, history
-    from tui.service.history.shown import history_figure, history_lines, history_table
+    from tui.service.history.shown import (
+        history_figure,
+        history_lines,
+        history_table,
+        label_lines,
+        label_svg,
+        tests_table,
+    )
 
     wanted = None if band is None else _band(band)
     since = None if since is None else since.replace(tzinfo=UTC)
@@ -114,6 +132,11 @@ def history(
         require("matplotlib")
         if out.suffix.lower() not in PICTURES:
             raise typer.BadParameter(f"{out}: expected a name that ends in {', '.join(PICTURES)}")
+    if label is not None:
+        require("segno")
+        check_places(str(label))
+        if not sensor or label.suffix.lower() != ".svg":
+            raise typer.BadParameter(f"--label {label}: expected --sensor, and a name in .svg")
     noise = _noise(sources or [], sensor, since)
     found = history(noise, band=wanted, scatter=scatter, false_alarms=false_alarms)
     if wanted is not None and not found:
@@ -123,6 +146,10 @@ def history(
             " [history] bands in the bench file adds bands"
         )
     screen = for_people(json, csv)
+    tests = sensor_tests(sensor) if sensor and not sources else []
+    if tests:
+        screen.print(tests_table(tests))
+        screen.print()
     screen.print(history_table(found))
     for line in history_lines(found, scatter=scatter, false_alarms=false_alarms):
         screen.print(line, soft_wrap=True)
@@ -132,10 +159,13 @@ def history(
             "false_alarms": false_alarms,
             "scatter_db": scatter,
             "series": [series.document() for series in found],
+            "tests": [each.document() for each in tests],
         },
     )
     if csv is not None:
         write_text(csv, csv_text(_COLUMNS, _rows(found)))
+    if label is not None:
+        write_text(str(label), label_svg(sensor, label_lines(found)))
     if out is not None:
         history_figure(found).savefig(out, dpi=150)
 

@@ -20,6 +20,7 @@ _EXTRA = {
     "matplotlib": "report",
     "jinja2": "report",
     "fpdf": "report",
+    "segno": "report",
     "prometheus_client": "metrics",
     "distributed": "cluster",
     "pyhanko": "sign",

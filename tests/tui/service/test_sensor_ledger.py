@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import sqlite3
+from contextlib import closing
 from typing import TYPE_CHECKING
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from daq.protocols.block import HostTime
 from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
 from tui.commands.main import app
-from tui.service.history.ledger import ledger_path, noise_of, noted, record_test
+from tui.service.history.ledger import ledger_path, noise_of, noted, record_test, sensor_tests
 from tui.web.months import Months
 
 if TYPE_CHECKING:
@@ -59,6 +61,8 @@ def recorded(
             np.dtype("<f8"),
             clock="one",
             serial_number=f"S{serials[n]}" if serials else "",
+            firmware=f"1.{day}",
+            temperature=20.0 + day,
         )
         for n, s in enumerate(about.sensors)
     ]
@@ -103,10 +107,35 @@ def test_history_shows_a_sensor_over_all_benches(tmp_path: Path) -> None:
     series = json.loads(told.stdout)["series"]
     assert {(each["channel"], len(each["runs"])) for each in series} == {("X", 2), ("Y", 2)}
     assert [run["bench"] for run in series[0]["runs"]] == ["lab", "office"]
+    tests = json.loads(told.stdout)["tests"]
+    assert [(t["bench"], t["firmware"], t["temperature"]) for t in tests] == [
+        ("lab", "1.0", 20.0),
+        ("office", "1.1", 21.0),
+    ]
+    assert tests[0]["sensitivities"] == {"X": 1.0, "Y": 1.0}
+    shown = CliRunner().invoke(app, ["history", "--sensor", "S2"]).output
+    assert "1.1" in shown
+    assert "21.0" in shown
+    label = tmp_path / "S2.svg"
+    made = CliRunner().invoke(app, ["history", "--sensor", "S2", "--label", str(label)])
+    assert made.exit_code == 0, made.output
+    drawn = ET.parse(label)  # noqa: S314 - our own
+    words = [each.text for each in drawn.iter("{http://www.w3.org/2000/svg}text")]
+    assert words[:2] == ["S2", "2026-10-26, 1 to 16 Hz"]
+    assert len(words) == 4  # two channels
     unknown = CliRunner().invoke(app, ["history", "--sensor", "S9"])
     assert unknown.exit_code == 2
     assert "no test in the ledger" in unknown.output
     assert CliRunner().invoke(app, ["history"]).exit_code == 2
+
+
+def test_a_ledger_without_firmware_takes_further_tests(tmp_path: Path, ledger: Path) -> None:
+    recorded_test(recorded(tmp_path, bench="lab", day=0))
+    with closing(sqlite3.connect(ledger)) as old, old:
+        old.execute("ALTER TABLE sensors DROP COLUMN firmware")
+    assert [each.firmware for each in sensor_tests("S1")] == [""]
+    recorded_test(recorded(tmp_path, bench="lab", day=1))
+    assert [each.firmware for each in sensor_tests("S1")] == ["", "1.1"]
 
 
 def test_the_page_of_sensors_shows_their_tests_on_other_benches(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import math
 import os
 import sqlite3
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,11 +23,11 @@ from daq.errors import HuddleError
 from daq.recording.reader import Recording
 from daq.results.band_summary import band_of, channel_means, judged_method
 from estimator.errors import BandError
-from tui.service.records.run_state import BandNoise
+from tui.service.records.run_state import BandNoise, utc_text
 from tui.wording.differences import drift_line
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Mapping, Sequence
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
@@ -44,7 +44,7 @@ CREATE TABLE IF NOT EXISTS tests (
     run_id TEXT PRIMARY KEY, recording TEXT, bench TEXT, started REAL, simulated INTEGER);
 CREATE TABLE IF NOT EXISTS sensors (
     run_id TEXT, serial_number TEXT, sensor TEXT, model TEXT, temperature REAL,
-    sensitivities TEXT, limits TEXT, PRIMARY KEY (serial_number, run_id));
+    sensitivities TEXT, limits TEXT, firmware TEXT, PRIMARY KEY (serial_number, run_id));
 CREATE TABLE IF NOT EXISTS noise (
     run_id TEXT, started REAL, simulated INTEGER, sensor TEXT, model TEXT, serial_number TEXT,
     channel TEXT, unit TEXT, method TEXT, low_hz REAL, high_hz REAL, psd REAL, low REAL, high REAL);
@@ -68,6 +68,12 @@ _ENDS = (
 _OF_SENSOR = (
     f"SELECT bench, noise.started, noise.simulated, {_NOISE} FROM noise JOIN tests"  # noqa: S608
     " USING (run_id) WHERE serial_number = ? ORDER BY noise.started"
+)
+
+_TESTS = (
+    "SELECT started, bench, recording, sensor, model, {firmware}, temperature, sensitivities,"
+    " limits, simulated FROM sensors JOIN tests USING (run_id) WHERE serial_number = ?"
+    " ORDER BY started"
 )
 
 
@@ -94,6 +100,42 @@ class Drift:
     n_tests: int
     low_hz: float
     high_hz: float
+
+
+@dataclass(frozen=True, slots=True)
+class SensorTest:
+    """One test of a sensor, on any bench.
+
+    Attributes
+    ----------
+    started : datetime
+    bench, recording, sensor, model, firmware : str
+    temperature : float or None
+        In °C at the start.
+    sensitivities : mapping of str to float
+        Counts per unit, by channel.
+    limits : sequence of (str, str, str, float or None)
+        Channel, limit, verdict and margin in dB.
+    simulated : bool
+    """
+
+    started: datetime
+    bench: str
+    recording: str
+    sensor: str
+    model: str
+    firmware: str
+    temperature: float | None
+    sensitivities: Mapping[str, float]
+    limits: Sequence[tuple[str, str, str, float | None]]
+    simulated: bool
+
+    def document(self) -> dict[str, Any]:
+        """Return the test for JSON."""
+        own = {each.name: getattr(self, each.name) for each in fields(self)}
+        keys = ("channel", "limit", "verdict", "margin_db")
+        limits = [dict(zip(keys, each, strict=True)) for each in self.limits]
+        return own | {"started": utc_text(self.started), "limits": limits}
 
 
 def ledger_path() -> Path | None:
@@ -170,10 +212,13 @@ def record_test(
     place.parent.mkdir(parents=True, exist_ok=True)
     with closing(sqlite3.connect(place, timeout=10.0)) as ledger:
         ledger.executescript(_TABLES)
+        columns = [row[1] for row in ledger.execute("PRAGMA table_info(sensors)")]
+        if "firmware" not in columns:  # of an earlier version
+            ledger.execute("ALTER TABLE sensors ADD COLUMN firmware TEXT")
         with ledger:  # all of a test, or nothing
             added = ledger.execute("INSERT OR IGNORE INTO tests VALUES (?, ?, ?, ?, ?)", test)
             if added.rowcount:
-                ledger.executemany("INSERT INTO sensors VALUES (?, ?, ?, ?, ?, ?, ?)", rows)
+                ledger.executemany("INSERT INTO sensors VALUES (?, ?, ?, ?, ?, ?, ?, ?)", rows)
                 ledger.executemany(_ADD_NOISE, noise)
         found = [
             _drift(ledger, name, serial, started, snapshot.simulated)
@@ -190,7 +235,7 @@ def _sensor_row(run_id: str, each: SensorRecord, verdict: TestVerdict | None) ->
     ]
     sensitivities = {c.name: c.sensitivity for c in each.channels if not c.auxiliary}
     own = run_id, each.serial_number, each.name, each.model, each.temperature
-    return (*own, json.dumps(sensitivities), json.dumps(limits))
+    return (*own, json.dumps(sensitivities), json.dumps(limits), each.firmware)
 
 
 def _values(noise: BandNoise) -> tuple[Any, ...]:
@@ -225,6 +270,37 @@ def _drift(
 def _error_db(psd: float, low: float, high: float) -> float:
     """Return half of the 95 % interval in dB, of its wider side."""
     return max(decibels(high) - decibels(psd), decibels(psd) - decibels(low))
+
+
+def sensor_tests(serial_number: str) -> list[SensorTest]:
+    """Return the tests of a sensor, oldest first; real ones, if there are any.
+
+    Raises
+    ------
+    sqlite3.Error
+        If the ledger cannot be read.
+    """
+    place = ledger_path()
+    if place is None or not place.exists():
+        return []
+    with closing(sqlite3.connect(f"{place.resolve().as_uri()}?mode=ro", uri=True)) as ledger:
+        columns = [row[1] for row in ledger.execute("PRAGMA table_info(sensors)")]
+        firmware = "firmware" if "firmware" in columns else "NULL"
+        rows = ledger.execute(_TESTS.format(firmware=firmware), (serial_number,)).fetchall()
+    found = [
+        SensorTest(
+            datetime.fromtimestamp(row[0], UTC),
+            *(row[1], row[2], row[3], row[4]),
+            firmware=row[5] or "",
+            temperature=row[6],
+            sensitivities=json.loads(row[7]),
+            limits=tuple(tuple(each) for each in json.loads(row[8])),
+            simulated=bool(row[9]),
+        )
+        for row in rows
+    ]
+    is_simulated = all(each.simulated for each in found)
+    return [each for each in found if each.simulated is is_simulated]
 
 
 def noise_of(serial_number: str) -> list[Found]:

@@ -1,24 +1,33 @@
-"""The history of the noise as a table, sentences and a picture."""
+"""The history of the noise as tables, sentences, a picture and a label."""
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING
+from xml.sax.saxutils import escape
 
 from rich.table import Table
+from rich.text import Text
 
 from daq.bench.units import decibels
 from daq.results.change_test import DECIBEL, NORMAL_95
 from tui.service.history.series import FALSE_ALARMS, SCATTER
+from tui.service.records.run_state import utc_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from matplotlib.figure import Figure
 
+    from tui.service.history.ledger import SensorTest
     from tui.service.history.series import Series
 
 _WIDTH, _HEIGHT = 8.0, 2.4
 """Inches, of one sensor."""
+LABEL, LABEL_HEIGHT, QR, EDGE = 62.0, 29.0, 23.0, 3.0
+"""Millimetres: of a common continuous roll, of the code, and of the white edge."""
+LINE = 3.6
+"""Millimetres from one line to the next."""
 
 
 def history_figure(found: Sequence[Series]) -> Figure:
@@ -80,6 +89,74 @@ def history_table(found: Sequence[Series]) -> Table:
             f"{len(series.changes)} ×" if series.changes else "no",
         )
     return table
+
+
+def tests_table(tests: Sequence[SensorTest]) -> Table:
+    """Return a row for each test of a sensor: when, where, firmware, temperature, verdict."""
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for name in ("test of", "bench", "as", "model", "firmware"):
+        table.add_column(name)
+    table.add_column("°C", justify="right")
+    table.add_column("limits")
+    for each in tests:
+        verdicts = Counter(verdict for _, _, verdict, _ in each.limits)
+        temperature = "-" if each.temperature is None else f"{each.temperature:.1f}"
+        table.add_row(
+            utc_text(each.started),
+            *map(Text, (each.bench, each.sensor, each.model or "-", each.firmware or "-")),
+            temperature,
+            ", ".join(f"{n} {verdict}" for verdict, n in verdicts.items()) or "none",
+        )
+    return table
+
+
+def label_lines(found: Sequence[Series]) -> list[str]:
+    """Return what a label says of a sensor: model, last test, and noise in its widest band."""
+    if not found:
+        return []
+    latest = max(series.runs[-1][1] for series in found)
+    own = [series.last for series in found if series.runs[-1][1] == latest]
+    widest = max(own, key=lambda each: each.high_hz / each.low_hz)
+    band = widest.low_hz, widest.high_hz
+    same = [each for each in own if (each.low_hz, each.high_hz) == band]
+    noise = [f"{each.channel} {level(each.psd, each.low, each.high)} dB" for each in same[:3]]
+    test = f"{latest:%Y-%m-%d}, {band[0]:.3g} to {band[1]:.3g} Hz"
+    return [*filter(None, [widest.model]), test, *noise]
+
+
+def label_svg(serial_number: str, lines: Sequence[str]) -> str:
+    """Return a label as SVG of its real size.
+
+    Parameters
+    ----------
+    serial_number : str
+        What the QR code says: a scanner types it, as after ``huddle history --sensor``.
+    lines : sequence of str
+        Below it; as many as fit.
+    """
+    import segno  # noqa: PLC0415 - of an extra
+
+    code = segno.make(serial_number, error="m", micro=False)
+    picture = code.svg_inline(omitsize=True, border=4).replace(
+        "<svg ", f'<svg x="{EDGE:g}" y="{EDGE:g}" width="{QR:g}" height="{QR:g}" ', 1
+    )
+    left, room = 2 * EDGE + QR, LABEL - 3 * EDGE - QR
+    size = min(5.0, 1.6 * room / max(1, len(serial_number)))
+    text = [(EDGE + 4.5, size, "bold", serial_number)]
+    text += [
+        (EDGE + 9.5 + n * LINE, min(2.8, 1.75 * room / max(1, len(line))), "normal", line)
+        for n, line in enumerate(lines[:5])
+    ]
+    written = "".join(
+        f'<text x="{left:g}" y="{y:g}" font-size="{height:.3g}" font-weight="{weight}"'
+        f' font-family="sans-serif">{escape(line)}</text>'
+        for y, height, weight, line in text
+    )
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{LABEL:g}mm" height="{LABEL_HEIGHT:g}mm"'
+        f' viewBox="0 0 {LABEL:g} {LABEL_HEIGHT:g}">'
+        f'<rect width="100%" height="100%" fill="white"/>{picture}{written}</svg>\n'
+    )
 
 
 def _ends(series: Series, position: int) -> tuple[float, float]:
