@@ -209,27 +209,19 @@ def follow(
             return recorder or _RemoteRecorder(recording, cancelled, silence), sensors
 
         known, sensors = seen(recording)
-        looks, states, estimates = Throttle(LOOK_SHARE), Throttle(LOOK_SHARE), Throttle(share)
+        looks = Throttle(LOOK_SHARE, longest=MAX_INTERVAL)
+        states, estimates = Throttle(LOOK_SHARE, longest=2 * STATUS_INTERVAL), Throttle(share)
         wanted, uncounted, memory = 0.0, _Uncounted(), FreedMemory()
         _look(sensors)
-
-        def catch_up(done: int, total: int) -> None:
-            if cancelled.is_set():
-                raise _CancelledError
-            if estimation.n_seen == 0 or done < total:  # not of the one new segment
-                observer.progress(done, total)
 
         while not recording.closed:
             # Asked before: what it wrote last is seen below.
             left_open = known.ended and not is_continued(recording)
             recording.refresh()
             if looks.is_due or recording.closed:
-                try:
-                    with looks, _usual_cost(estimation, looks):
-                        if estimation.update(catch_up):
-                            observer.segments(estimation.n_segments, estimation.elapsed)
-                except _CancelledError:
-                    return None
+                with looks, _usual_cost(estimation, looks):
+                    if not _is_updated(estimation, observer, cancelled):
+                        return None
                 newest = estimation.recordings[-1]
                 if newest is not recording and isinstance(newest, Recording):
                     recording = newest  # the disk refused the one before
@@ -237,20 +229,20 @@ def follow(
             if recording.closed:
                 break
             _check_left(path, is_open=left_open)
-            is_due = estimation.n_seen >= wanted and estimates.is_due
-            with states:
-                _look(sensors, closely=is_due)
-            if is_due:  # beside the looks, which go on at their own pace
+            if estimation.n_seen < wanted or not estimates.is_due:
+                with states:
+                    _look(sensors)
+            else:  # beside the looks, which go on at their own pace
                 wanted = max(estimation.n_seen + 1, estimation.n_seen * (1 + growth))
                 with estimates, _usual_cost(estimation, estimates):
+                    _look(sensors, closely=True)
                     snapshot = estimation.snapshot()
                     observer.snapshot(snapshot, estimation.settings)
                 uncounted.take(recording.path, snapshot)
                 estimation.choose_again()
             memory.give_back()
-            longest = MAX_INTERVAL if sensors is None else STATUS_INTERVAL
-            interval = min(max(_until_segment(estimation), looks.remaining), longest)
-            known.ends_within(min(max(interval, states.remaining), MAX_INTERVAL))
+            longest = MAX_INTERVAL if sensors is None else max(STATUS_INTERVAL, states.remaining)
+            known.ends_within(min(max(_until_segment(estimation), looks.remaining), longest))
             if cancelled.is_set():
                 return None
         _look(sensors, closely=True)
@@ -258,6 +250,23 @@ def follow(
             return _result(estimation, observer, cancelled)
     with Estimation([path], estimation.settings) as again:
         return _result(again, observer, cancelled)
+
+
+def _is_updated(estimation: Estimation, observer: Observer, cancelled: threading.Event) -> bool:
+    """Take new segments; return False if the following was cancelled meanwhile."""
+
+    def catch_up(done: int, total: int) -> None:
+        if cancelled.is_set():
+            raise _CancelledError
+        if estimation.n_seen == 0 or done < total:  # not of the one new segment
+            observer.progress(done, total)
+
+    try:
+        if estimation.update(catch_up):
+            observer.segments(estimation.n_segments, estimation.elapsed)
+    except _CancelledError:
+        return False
+    return True
 
 
 @contextlib.contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import TYPE_CHECKING, Self
 
@@ -19,12 +20,20 @@ class Throttle:
     ----------
     share : float
         Of the time, at most, that the work may cost.
+    longest : float
+        Seconds after which the work is due, whatever it cost.
     now : callable
         Seconds of a clock that never goes back.
     """
 
-    def __init__(self, share: float, now: Callable[[], float] = time.monotonic) -> None:
-        self._share, self._now = share, now
+    def __init__(
+        self,
+        share: float,
+        *,
+        longest: float = math.inf,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._share, self._longest, self._now = share, longest, now
         self._began = self._next = now()
         self._used_before = self._elsewhere = 0.0
         self.cost = 0.0
@@ -52,4 +61,4 @@ class Throttle:
     def __exit__(self, *_: object) -> None:
         cost = max(self._now() - self._began, time.process_time() - self._used_before)
         self.cost = max(0.0, cost - self._elsewhere)
-        self._next = self._began + self.cost / self._share
+        self._next = min(self._began + self.cost / self._share, self._now() + self._longest)

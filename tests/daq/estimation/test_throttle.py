@@ -9,7 +9,7 @@ from daq.estimation.throttle import Throttle
 
 def test_work_that_takes_long_makes_the_next_wait() -> None:
     at = 100.0
-    throttle = Throttle(0.1, lambda: at)
+    throttle = Throttle(0.1, now=lambda: at)
     assert throttle.is_due  # the first
     taken, times = 0.0, 0
     for second in range(1000):
@@ -26,7 +26,7 @@ def test_work_that_takes_long_makes_the_next_wait() -> None:
 
 def test_quick_work_is_done_every_time() -> None:
     at = 0.0
-    throttle = Throttle(0.1, lambda: at)
+    throttle = Throttle(0.1, now=lambda: at)
     for second in range(0, 100, 5):
         at = float(second)
         assert throttle.is_due
@@ -36,7 +36,7 @@ def test_quick_work_is_done_every_time() -> None:
 
 def test_work_that_is_limited_elsewhere_delays_nothing() -> None:
     at = 0.0
-    throttle = Throttle(0.1, lambda: at)
+    throttle = Throttle(0.1, now=lambda: at)
     with throttle:
         at += 1.3
         throttle.deduct(0.9)
@@ -46,3 +46,11 @@ def test_work_that_is_limited_elsewhere_delays_nothing() -> None:
     with throttle:
         at += 1.3
     assert throttle.cost == pytest.approx(1.3)  # deducted once
+
+
+def test_what_is_due_after_a_time_waits_no_longer() -> None:
+    at = 0.0
+    throttle = Throttle(0.1, longest=2.0, now=lambda: at)
+    with throttle:
+        at += 5.0
+    assert throttle.remaining == 2.0
