@@ -35,6 +35,8 @@ class Entry:
     bench : str
         Name of the bench; empty for an imported recording.
     operator : str
+    is_simulated : bool
+        Whether a sensor was simulated.
     length : float
         Of the longest sensor, in seconds.
     is_growing : bool
@@ -61,6 +63,7 @@ class Entry:
     created: datetime | None = None
     bench: str = ""
     operator: str = ""
+    is_simulated: bool = False
     length: float = 0.0
     is_growing: bool = False
     is_closed: bool = False
@@ -72,6 +75,11 @@ class Entry:
     continues: str = ""
     part_of: str = ""
     goes_on_in: str = ""
+
+    @property
+    def place(self) -> str:
+        """The bench, and whether its sensors are simulated."""
+        return ", ".join(filter(None, (self.bench, "simulated" if self.is_simulated else "")))
 
 
 def catalogue(
@@ -161,6 +169,7 @@ def _entry(path: Path, size: int, modified_ns: int) -> Entry:
                 created=recording.created,
                 bench="" if bench is None else bench.name,
                 operator=recording.operator,
+                is_simulated=recording.simulated,
                 length=max(lengths),
                 is_growing=not recording.closed and is_being_written(path),
                 is_closed=recording.closed,

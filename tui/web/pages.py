@@ -32,6 +32,7 @@ def about_test(state: State, settings_table: Mapping[str, Any]) -> dict[str, Any
     differences = None if state.reference is None else _differences(state)
     return {
         "title": state.name,
+        "is_simulated": state.is_simulated,
         "verdict": verdict,
         "headline": "" if verdict is None else headline(verdict),
         "todo": [] if verdict is None else [*what_to_do(verdict), *not_judged(verdict)],

@@ -16,7 +16,7 @@ import pytest
 from daq.bench.loading import dump
 from daq.devices.bench_file import parse
 from daq.recording.reader import Recording
-from tests.tui.web.conftest import opened
+from tests.tui.web.conftest import SIZES, opened
 from tests.tui.web.pages import READER, SECRETS, STEERER, Server, serving
 from tests.waiting import limit, wait_until
 from tui.simulation.devices import simulated
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from axe_playwright_python.sync_playwright import Axe
     from playwright.sync_api import Browser, Page
 
 pytestmark = [
@@ -55,6 +56,7 @@ def test_a_test_is_started_seen_marked_and_stopped(
         _log_in(page, server)
         assert "No test is running." in page.locator("#state").inner_text()
         page.locator("a:text('Start a test')").click()
+        assert _barriers(page, axe) == []
         page.locator("input[name=operator]").fill("Ada <i>")
         page.locator("input[name=duration]").fill("")
         page.locator("main button").click()
@@ -63,7 +65,11 @@ def test_a_test_is_started_seen_marked_and_stopped(
         page.wait_for_selector("#chart[data-drawn*=three-sensor]")
         page.wait_for_selector("#noise >> text=A.X")
         assert page.locator(".traces li").count() == 9
-        assert axe.run(page).response["violations"] == []
+        assert page.locator("#state >> text=SIMULATED").is_visible()
+        assert _barriers(page, axe) == []
+        page.set_viewport_size({"width": SIZES["phone"][0], "height": SIZES["phone"][1]})
+        assert page.evaluate("document.documentElement.scrollWidth") <= SIZES["phone"][0]
+        assert _barriers(page, axe) == []
         before = page.locator("#at").inner_text()
         wait_until(lambda: page.locator("#at").inner_text() != before, "the page goes on")
 
@@ -73,11 +79,14 @@ def test_a_test_is_started_seen_marked_and_stopped(
         page.locator("button:text('Mark')").click()
         page.wait_for_selector("#events >> text=door <b>slammed</b> (Ada, 127.0.0.1)")
         page.locator("a:text('Stop the test')").click()
+        assert _barriers(page, axe) == []
         page.locator("main button").click()
         page.wait_for_selector("#state >> text=its result")
         page.locator("#state a").click()
         page.wait_for_selector("#chart[data-drawn*=three-sensor]")
         log = server.log.read_text()
+        page.goto(f"{server.url}tests")
+        assert page.locator("td:text-is('demo, simulated')").is_visible()
         assert re.search(r"Ada \(127\.0\.0\.1\) started \S+\.h5 in the browser", log)
         assert re.search(r"Ada \(127\.0\.0\.1\) stopped \S+\.h5 in the browser", log)
     (path,) = (bench.parent / "recordings").glob("*.h5")
@@ -91,6 +100,10 @@ def test_a_test_is_started_seen_marked_and_stopped(
         "door <b>slammed</b>",
         "stopped in the browser by Ada",
     ]
+
+
+def _barriers(page: Page, axe: Axe) -> list[str]:
+    return [each["id"] for each in axe.run(page).response["violations"]]
 
 
 def _log_in(page: Page, server: Server) -> None:

@@ -47,7 +47,7 @@ def row(entry: Entry, *, shown: bool = False, is_reference: bool = False) -> tup
         Text(f"{mark} {started}"),
         verdict(entry),
         Text(clock_time(entry.length) if entry.length else "–", justify="right"),
-        Text(entry.bench or "–", "bold"),
+        Text(entry.place or "–", "bold"),
         Text(size(entry.size), justify="right"),
         Text(entry.path.name, MUTED),
     )
