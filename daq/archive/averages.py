@@ -125,7 +125,7 @@ class Estimator:
             dimensions=() if estimates.dimensions is None else estimates.dimensions.chosen,
         )
         names = list(dict.fromkeys(sensor for sensor, _ in self.channels))
-        axes = self.settings.axis_tolerances(names, self.dims)
+        axes = self.settings.across_axes(names, self.dims)
         edges = None
         if not curves_only:
             edges = self._equalisation.leakage((raw,), self.channels, self.unit)
@@ -167,7 +167,7 @@ class Estimator:
             closed=average.closed,
             left_out={reason: average.left_out[reason] for reason in Reason},
             diagnostics=diagnostics,
-            axis_tolerances=axes,
+            across_axes=axes,
         )
         return with_contributions(snapshot)
 

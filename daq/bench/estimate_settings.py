@@ -221,6 +221,21 @@ class EstimateSettings:
             repeated=True,
         ),
     ] = field(default_factory=dict)
+    lean: Annotated[
+        Mapping[str, tuple[float, float]],
+        Option(
+            "Known lean of a sensor with one or two channels, in degrees: of its axis or plane,"
+            " towards two directions that all sensors have in common; may be repeated. What remains"
+            " is its axis tolerance (default then: 0.1).",
+            check=values.lean,
+            flags=("--lean",),
+            metavar="SENSOR=A,B",
+            read=values.to_lean,
+            show=lambda leans: {name: list(angles) for name, angles in leans.items()},
+            text=lambda leans: [f"{n}={a!r},{b!r}" for n, (a, b) in leans.items()],
+            repeated=True,
+        ),
+    ] = field(default_factory=dict)
     unit: Annotated[
         str | None,
         Option(

@@ -70,6 +70,14 @@ def misfits(settings: EstimateSettings, sensors: Sequence[_Sensor]) -> Iterator[
         except ValueError as error:
             yield Misfit("gains", f"{name}={gain:g}", str(error))
 
+    names = [sensor.name for sensor in sensors]
+    for option, given in (("axis_tolerance", settings.axis_tolerance), ("lean", settings.lean)):
+        for name in filter(None, given):
+            try:
+                one_of(name, names)
+            except ValueError as error:
+                yield Misfit(option, name, str(error))
+
 
 def max_dimension(n_channels: int) -> int:
     """Return the largest dimension q of motion that p channels identify: (p - q)² ≥ p."""

@@ -219,6 +219,36 @@ def to_axis_tolerance(texts: Sequence[str]) -> dict[str, float]:
     return {"" if name == "*" else name: angle for name, angle in found.items()}
 
 
+def lean(value: object) -> dict[str, tuple[float, float]]:
+    """Return two angles in degrees by sensor."""
+    found = {}
+    for name, angles in value.items() if isinstance(value, Mapping) else ((None, None),):
+        if not isinstance(angles, (list, tuple)) or len(angles) != 2:
+            raise ValueError("expected two angles by sensor, such as {B = [0.3, -0.1]}")
+        first, second = map(number, angles)
+        if max(abs(first), abs(second)) > _LARGEST_ANGLE:
+            raise ValueError("expected angles from -45 to 45 degrees")
+        found[str(name)] = (first, second)
+    return found
+
+
+def to_lean(texts: Sequence[str]) -> dict[str, list[float]]:
+    """Return the angles in texts such as B=0.3,-0.1."""
+    found: dict[str, list[float]] = {}
+    for text in texts:
+        name, _, angles = text.rpartition("=")
+        try:
+            numbers = [float(each) for each in angles.split(",")]
+        except ValueError:
+            numbers = []
+        if not name or len(numbers) != 2:
+            raise ValueError("expected a sensor and two angles as in B=0.3,-0.1")
+        if name in found:
+            raise ValueError(f"{name} is given twice; expected it once")
+        found[name] = numbers
+    return found
+
+
 def number_or_table(angles: Mapping[str, float]) -> object:
     """Return one angle if it is that of all sensors, or angles by sensor."""
     return angles[""] if set(angles) == {""} else dict(angles)

@@ -10,7 +10,7 @@ import numpy as np
 
 from daq.estimation.settings import DIMENSIONS
 from estimator.checks.advice import Level, ModelMisfit, SharedNoise, TooFewDimensions
-from estimator.levels.contributions import Contribution, Source, across, contribution, widened
+from estimator.levels.contributions import Contribution, Source, contribution, widened
 from estimator.levels.interval import NORMAL_95
 from estimator.likelihood.dimension import most_testable
 from estimator.likelihood.gradients import misfit
@@ -46,9 +46,9 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
         below, above = (np.clip(part, 0.0, 1.0) * psd for part in (leakage, -leakage))
         found.append(contribution(Source.GAPS, shape, below=below, above=above))
     dimensions, explained = _dimensions(snapshot, method)
-    if any(snapshot.axis_tolerances):
+    if any(snapshot.across_axes):
         motion = np.maximum(np.nan_to_num(snapshot.data_psd) - psd, 0.0)
-        share = np.repeat(across(snapshot.axis_tolerances), snapshot.dims)
+        share = np.repeat(snapshot.across_axes, snapshot.dims)
         fitted = _all_dimensions(snapshot, method)
         most = np.where(fitted[:, None], 0.0, share * motion)
         found.append(contribution(Source.AXES, shape, below=most, above=most))

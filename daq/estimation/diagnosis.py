@@ -22,7 +22,6 @@ from daq.estimation.snapshot_diagnostics import (
 from estimator.checks.advice import Advice, Delay, Gain, Level, ModelMisfit, SharedNoise, Untested
 from estimator.checks.diagnose import Diagnostics, diagnose
 from estimator.errors import InsufficientDataError
-from estimator.levels.contributions import across
 from estimator.responses.equalisation import leakage_advice
 
 if TYPE_CHECKING:
@@ -248,8 +247,8 @@ def diagnosis(
     The tested model has the dimensions of the settings; where `dimensions` were chosen by the
     motion, as many as the largest sensor has channels. `faulty` channels, by column, are clipped or
     were dead for a while: their sensitivities are not reported as wrong.
-    Noise that channels seem to share is motion across `axes` that are off by these angles (radians,
-    of each sensor), if it is no more than that.
+    Noise that channels seem to share is motion across `axes` that are off, if it is no more than
+    this share of the motion, of each sensor.
     Delays between sensors that are `aligned` by their motion or by arrival times are not known.
     `course` is that of the segments of the only band.
 
@@ -350,7 +349,7 @@ def _is_across(
     low, high = advice.band
     # NaN, which explains nothing, of channels without a signal
     snr = np.fmax.reduce([b.snr for b in bands if b.low <= high and b.high >= low])
-    most = snr * np.repeat(across(axes), dims)
+    most = snr * np.repeat(axes, dims)
     return all(
         abs(amount) <= max(most[one], most[other])
         for (one, other), amount in zip(advice.channels, advice.amounts, strict=True)

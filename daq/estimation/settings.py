@@ -7,11 +7,14 @@ from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from daq.bench.durations import parse_duration
 from daq.bench.estimate_settings import EstimateSettings
 from daq.bench.option_fit import misfits
 from daq.errors import WrongSettingError
 from estimator.errors import EstimatorError
+from estimator.levels.contributions import across
 from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:
@@ -26,8 +29,8 @@ ROOM, ROOM_OF_ONE_CHANNEL = 4, 6
 """Sensors from which ``auto`` looks for more dimensions of motion than a sensor has channels."""
 DIMENSIONS = 3
 """Of the motion of a floor."""
-AXIS_TOLERANCE = 1.0
-"""Degrees, rms, if nothing else is given."""
+AXIS_TOLERANCE, OF_KNOWN_LEAN = 1.0, 0.1
+"""Degrees, rms, if nothing else is given: of any lean, and of what remains of a known one."""
 MAX_CHANNELS = 96
 """Channels up to which ``auto`` is maximum likelihood, to limit its cost."""
 _NEEDED = {"dimension": "maximum-likelihood", "gains": "two-channel"}
@@ -70,16 +73,21 @@ class Settings(EstimateSettings):
     def axis_tolerances(self, sensors: Sequence[str], dims: tuple[int, ...]) -> tuple[float, ...]:
         """Return the angle by which axes of each sensor may be off, rms, in radians.
 
-        Zero for sensors whose partners sense all three dimensions of motion.
+        Beyond a known lean. Zero for sensors whose partners sense all three dimensions of motion.
         """
-        usual = self.axis_tolerance.get("", AXIS_TOLERANCE)
         found = []
-        for number, name in enumerate(sensors):
-            others = sorted((*dims[:number], *dims[number + 1 :]), reverse=True)[:2]
-            seen = min(others, default=DIMENSIONS) >= DIMENSIONS
-            angle = self.axis_tolerance.get(name, usual)
+        for name, seen in zip(sensors, _seen(dims), strict=True):
+            usual = OF_KNOWN_LEAN if name in self.lean else AXIS_TOLERANCE
+            angle = self.axis_tolerance.get(name, self.axis_tolerance.get("", usual))
             found.append(0.0 if seen else math.radians(angle))
         return tuple(found)
+
+    def across_axes(self, sensors: Sequence[str], dims: tuple[int, ...]) -> tuple[float, ...]:
+        """Return the share of the motion's PSD by which the noise of each sensor may be off."""
+        leans = np.radians([self.lean.get(name, (0.0, 0.0)) for name in sensors])
+        tolerances = np.array(self.axis_tolerances(sensors, dims))
+        share = across(tolerances, leans if self.lean else None)
+        return tuple(np.where(_seen(dims), 0.0, share).tolist())
 
     @classmethod
     def of(cls, bench: Bench | BenchOutline | None) -> Settings:
@@ -93,6 +101,12 @@ class Settings(EstimateSettings):
             **{each.name: getattr(bench.estimate, each.name) for each in fields(EstimateSettings)}
         )
         return replace(found, target_cov=None, target_cov_bin=None) if bench.has_limits else found
+
+
+def _seen(dims: tuple[int, ...]) -> list[bool]:
+    """Return of which sensors the partners sense all dimensions of motion."""
+    others = (sorted((*dims[:n], *dims[n + 1 :]), reverse=True)[:2] for n in range(len(dims)))
+    return [min(each, default=DIMENSIONS) >= DIMENSIONS for each in others]
 
 
 class ConflictingOptionError(WrongSettingError):

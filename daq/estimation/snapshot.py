@@ -196,8 +196,9 @@ class Snapshot:
         None where no segment with gaps counts.
     not_estimated : tuple of str
         Sensors that a live estimate leaves out, because all would take too much memory.
-    axis_tolerances : tuple of float
-        Angle by which axes of each sensor may be off, rms, in radians; empty: not at all.
+    across_axes : tuple of float
+        Share of the motion's PSD, across axes that may be off, by which the noise of each sensor
+        may be off; empty: not at all.
     simulated : bool
         Whether a sensor was simulated: the noise is that of no real one.
     channel_segments : tuple of int
@@ -228,7 +229,7 @@ class Snapshot:
     quantisation_psd: FloatArray | None = None
     bridged: Bridged | None = None
     not_estimated: tuple[str, ...] = ()
-    axis_tolerances: tuple[float, ...] = ()
+    across_axes: tuple[float, ...] = ()
     simulated: bool = False
     channel_segments: tuple[int, ...] = ()
 

@@ -197,7 +197,7 @@ class SnapshotBuilder:
         self._settings, self._unit, self._equalisation = settings, unit, equalisation
         self._gains = known_gains(settings, channels)
         counts = Counter(sensor for sensor, _ in channels)
-        self._axes = settings.axis_tolerances(list(counts), tuple(counts.values()))
+        self._axes = settings.across_axes(list(counts), tuple(counts.values()))
         self._dimensions: Dimensions | None = None
         self._outgrown: Callable[[], Dimensions] | None = None
         self._choice = _Beside()
@@ -292,7 +292,7 @@ class SnapshotBuilder:
             no_segment=None if sets else _no_segment(passes, self._settings.segment),
             bridged=_bridged(passes, estimates.results),
             not_estimated=left,
-            axis_tolerances=self._axes,
+            across_axes=self._axes,
             simulated=any(recording.simulated for recording in recordings),
             quantisation_psd=(
                 quantisation_psd(frequency, channels, self._unit, _counting_rates(latest))

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Sequence
+    from collections.abc import Collection, Iterable
 
     from numpy.typing import NDArray
 
@@ -147,24 +147,33 @@ def widened(
     return np.where(unknown, -np.inf, lower), np.where(unknown, np.inf, upper)
 
 
-_WIDEST = 1.15
+_OWN, _OTHERS = 3.5, 1.79
+"""What 97.5 % of leans do not exceed, over the square of their rms: of a lean's own square, and of
+the product of two others."""
 
 
-def across(tolerances: Sequence[float]) -> FloatArray:
+def across(tolerances: FloatArray, leans: FloatArray | None = None) -> FloatArray:
     """Return the share of the motion's PSD by which the noise of each sensor may be off.
 
     Parameters
     ----------
-    tolerances : sequence of float, length n_sensors
-        Lean of each sensor, rms, in radians; 0 where it is known, or changes nothing.
+    tolerances : float64, shape (n_sensors,)
+        Lean of each sensor, or what of it is not known, rms, in radians.
+    leans : float64, shape (n_sensors, 2), optional
+        Known leans, in radians, towards two directions across that all sensors have in common.
 
     Returns
     -------
     float64, shape (n_sensors,)
-        ``(2.3 θ)**2`` for equal tolerances θ, which 97.5 % of normal leans do not exceed; 0 where
-        the own tolerance is 0.
+        ``(2.3 θ)**2`` for equal tolerances θ, which 97.5 % of normal leans do not exceed. The
+        direction of the motion across is not known, so that known leans only bound its effect: by
+        the product of the differences from the two sensors that lean otherwise the most.
     """
-    own = np.asarray(tolerances, np.float64)
-    n_others = max(len(own) - 1, 1)
-    others = np.sqrt(np.maximum(np.sum(own**2) - own**2, 0.0) / n_others)
-    return np.where(own > 0, (_WIDEST * (own + others)) ** 2, 0.0)
+    square = np.square(tolerances)
+    others = (np.sum(square) - square) / max(len(square) - 1, 1)
+    residual = _OWN * square + _OTHERS * others
+    if leans is None:
+        return np.asarray(residual)
+    apart = np.sort(np.linalg.norm(leans[:, None] - leans[None], axis=2), axis=1)
+    reach = np.sqrt(residual)
+    return np.asarray((apart[:, -1] + reach) * (apart[:, max(-2, -len(square))] + reach))

@@ -19,7 +19,6 @@ from daq.estimation.settings import ROOM, ROOM_OF_ONE_CHANNEL, Settings
 from daq.results.band_summary import correlation_of
 from estimator import planning
 from estimator.levels.bands import third_octaves
-from estimator.levels.contributions import across
 from estimator.levels.interval import worth
 from estimator.responses.edge_leakage import slope_factor
 from estimator.responses.equalisation import THRESHOLD
@@ -33,7 +32,7 @@ from tui.wording.formatting import percent, signed
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from daq.bench.model import Bench
     from estimator.planning import Plan
@@ -237,6 +236,7 @@ def plan_bench(path: Path, *, snr: float, cov: float) -> RecordingPlan:
         cov=cov,
         leakage=_leakage(bench, settings, snr),
         positions=_positions(bench),
+        names=[sensor.name for sensor in bench.sensors],
     )
 
 
@@ -357,6 +357,7 @@ def _planned(
     cov: float,
     leakage: Leakage | None = None,
     positions: FloatArray | None = None,
+    names: Sequence[str] = (),
 ) -> RecordingPlan:
     welch = WelchSettings(
         sampling_rate=sampling_rate,
@@ -377,7 +378,7 @@ def _planned(
         settings=welch,
         waves=waves_across(directions, dims, positions, snr=snr),
         leakage=leakage,
-        axes=_axes(dims, settings, snr),
+        axes=_axes(dims, names or [""] * len(dims), settings, snr),
     )
 
 
@@ -390,10 +391,12 @@ def _worth_of_worst(welch: WelchSettings, settings: Settings, low: float, high: 
     return float(worth(least, correlation_of(settings))[least])
 
 
-def _axes(dims: tuple[int, ...], settings: Settings, snr: float) -> Axes | None:
+def _axes(
+    dims: tuple[int, ...], names: Sequence[str], settings: Settings, snr: float
+) -> Axes | None:
     """Return what axes that are off leave in doubt; None below 1 % of the noise."""
-    tolerances = settings.axis_tolerances([""] * len(dims), dims)
-    share = snr * float(across(tolerances).max(initial=0.0))
+    tolerances = settings.axis_tolerances(names, dims)
+    share = snr * max(settings.across_axes(names, dims), default=0.0)
     if share < THRESHOLD or settings.for_sensors(dims).dimension == "auto":
         return None
     each = min(dims)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -71,8 +73,44 @@ def test_tolerances_are_by_sensor_and_nothing_to_triaxial_ones() -> None:
     assert settings.axis_tolerances("ABC", (3, 3, 3)) == (0.0, 0.0, 0.0)
     # a single channel beside two triaxial sensors is known, whatever its axis
     np.testing.assert_allclose(np.degrees(settings.axis_tolerances("ABC", (3, 3, 1))), [1, 0.5, 0])
-    np.testing.assert_allclose(across([0.1, 0.1, 0.1]), 0.0529)
-    assert across([0.0, 0.1, 0.1])[0] == 0.0
+    assert settings.across_axes("ABC", (3, 3, 1))[2] == 0.0
+
+
+@pytest.mark.parametrize("tolerances", [(1, 1, 1), (0, 1, 1), (1, 0, 0), (1, 0.3, 0.3)])
+@pytest.mark.parametrize("known", [0.0, 1.0])
+def test_the_share_bounds_what_leaning_sensors_add(
+    tolerances: tuple[float, ...], known: float
+) -> None:
+    rng = np.random.default_rng(3)
+    leans = known * rng.standard_normal((3, 2))
+    a = leans + np.array(tolerances)[:, None] / np.sqrt(2) * rng.standard_normal((20_000, 3, 2))
+    most = across(np.array(tolerances, float), leans if known else None)
+    for i, j, k in ((0, 1, 2), (1, 0, 2), (2, 0, 1)):
+        added = np.sum((a[:, i] - a[:, j]) * (a[:, i] - a[:, k]), axis=1)
+        assert np.mean(added <= most[i]) >= 0.965
+        assert np.mean(added >= -most[i]) >= 0.965
+
+
+def test_known_leans_leave_their_difference_and_what_remains() -> None:
+    lean = {"A": (1.0, 0.5), "B": (1.0, 0.5), "C": (1.0, 0.5)}
+    same = Settings(lean=lean).across_axes("ABC", (1, 1, 1))
+    rest = Settings(axis_tolerance={"": 0.1}).across_axes("ABC", (1, 1, 1))
+    np.testing.assert_allclose(same, rest)
+    other = Settings(lean=lean | {"C": (-1.0, 0.5)}, axis_tolerance={"": 0.0})
+    found = other.across_axes("ABC", (1, 1, 1))
+    np.testing.assert_allclose(found, np.radians(2.0) ** 2 * np.array([0, 0, 1]), atol=1e-12)
+
+
+def test_intervals_with_known_leans_are_narrower_and_hold_the_truth() -> None:
+    samples = leaning(3, 1.0, 4)
+    rng = np.random.default_rng(4)
+    rng.standard_normal((30_000, 3))
+    exact = np.degrees(np.radians(1.0) / np.sqrt(2) * rng.standard_normal((3, 2)))
+    lean = {f"s{n:02}": tuple(map(float, exact[n])) for n in range(3)}
+    settings = Settings(segment=2.0)
+    usual, known = (covered(samples, each) for each in (settings, replace(settings, lean=lean)))
+    assert usual[0] == known[0] == 1.0
+    assert known[1] <= usual[1]
 
 
 def test_tolerances_as_text_and_in_the_bench_file() -> None:
@@ -80,6 +118,10 @@ def test_tolerances_as_text_and_in_the_bench_file() -> None:
     assert to_table(Settings(axis_tolerance={"": 0.2}))["axis_tolerance"] == 0.2
     table = to_table(Settings(axis_tolerance={"": 0.2, "B": 0.05}))["axis_tolerance"]
     assert table == {"": 0.2, "B": 0.05}
+    assert from_text("lean", ["B=0.3,-0.1"]) == {"B": (0.3, -0.1)}
+    for wrong in ("B=0.3", "0.3,0.1", "B=a,b"):
+        with pytest.raises(ValueError, match="two angles"):
+            from_text("lean", [wrong])
     with pytest.raises(ValueError, match="from 0 to 45 degrees"):
         from_text("axis_tolerance", ["-1"])
 
