@@ -49,8 +49,9 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
     if any(snapshot.across_axes):
         motion = np.maximum(np.nan_to_num(snapshot.data_psd) - psd, 0.0)
         share = np.repeat(snapshot.across_axes, snapshot.dims)
-        fitted = _all_dimensions(snapshot, method)
-        most = np.where(fitted[:, None], 0.0, share * motion)
+        unseen = _unseen(snapshot, method)[:, None]
+        with np.errstate(invalid="ignore"):
+            most = np.fmin(share * motion, unseen * psd)
         found.append(contribution(Source.AXES, shape, below=most, above=most))
     if dimensions.any():
         found.append(contribution(Source.DIMENSIONS, shape, share=dimensions[:, None]))
@@ -115,14 +116,24 @@ def _dimensions(snapshot: Snapshot, method: str) -> tuple[FloatArray, BoolArray]
     return share, explained
 
 
-def _all_dimensions(snapshot: Snapshot, method: str) -> BoolArray:
-    """Return where the fitted model has room for all dimensions of motion, shape (n_freqs,)."""
-    fitted = np.zeros(len(snapshot.frequency), np.bool_)
-    if method == "maximum-likelihood":
-        for choice in snapshot.diagnostics.dimensions:
-            if choice.accepted and most_testable(snapshot.dims) >= DIMENSIONS:
-                fitted |= (snapshot.frequency >= choice.low) & (snapshot.frequency <= choice.high)
-    return fitted
+def _unseen(snapshot: Snapshot, method: str) -> FloatArray:
+    """Return how much motion in further dimensions a test of the fitted model leaves unseen.
+
+    As a share of the noise, shape (n_freqs,): infinite where no test has room for all dimensions
+    of motion, and zero where the model has them.
+    """
+    unseen = np.full(len(snapshot.frequency), math.inf)
+    if method != "maximum-likelihood" or most_testable(snapshot.dims) < DIMENSIONS:
+        return unseen
+    for choice in snapshot.diagnostics.dimensions:
+        if choice.accepted:
+            inside = (snapshot.frequency >= choice.low) & (snapshot.frequency <= choice.high)
+            unseen[inside] = (
+                0.0
+                if choice.n_factors >= DIMENSIONS
+                else misfit(choice.test, sum(snapshot.dims), snapshot.n_effective, NORMAL_95)
+            )
+    return unseen
 
 
 def _misfits(snapshot: Snapshot, explained: BoolArray) -> dict[Source, FloatArray]:

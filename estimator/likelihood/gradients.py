@@ -47,6 +47,8 @@ if TYPE_CHECKING:
     from estimator.likelihood.dimension import BandDimension
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
+DIMENSIONS = 3
+"""Of motion at one point: axes of fewer channels that lean feel all of them."""
 MAX_ITERATIONS = 60
 DECREMENT = 1e-6
 """Newton decrement, per average, at which a frequency has arrived."""
@@ -424,6 +426,9 @@ def _chosen(
 ) -> BandDimension:
     """Return the choice for a band, by gradients if they explain it best."""
     n_factors = 3 * choice.usual
+    if choice.accepted and choice.usual < choice.n_factors <= DIMENSIONS:
+        # axes that lean look like gradients; free directions have no error that all bins share
+        return choice
     test = known_loadings_test(fit, n_factors=n_factors, n_effective=n_effective)
     pooled = pool(test, np.ones(len(csm), np.bool_), neighbours=neighbours)
     enough = choice.n_sensors >= MIN_DETERMINED_SENSORS
@@ -445,13 +450,15 @@ def _chosen(
     )
 
 
-def misfit(test: BandTest, n_channels: int, n_effective: float) -> float:
-    """Return what gradients leave unexplained in a band, as a fraction of the noise.
+def misfit(test: BandTest, n_channels: int, n_effective: float, quantile: float = 0.0) -> float:
+    """Return what a model leaves unexplained in a band, as a fraction of the noise.
 
     A model that is off by D of the noise of each of p channels raises the statistic of one
     frequency by ``n p D**2``. Bent waves, simulated, bias the noise by half of this to as much.
+    `quantile` standard deviations of the statistic above give what it cannot tell from zero.
     """
-    excess = max(0.0, test.statistic - test.degrees) / max(1, test.n_frequencies)
+    scatter = quantile * np.sqrt(2 * test.degrees * test.spread)
+    excess = max(0.0, test.statistic - test.degrees + scatter) / max(1, test.n_frequencies)
     return float(np.sqrt(excess / (n_effective * n_channels)))
 
 
