@@ -6,6 +6,7 @@ import math
 import re
 from dataclasses import replace
 from typing import TYPE_CHECKING
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
@@ -22,11 +23,15 @@ from estimator.levels.bands import band_edges
 from estimator.levels.contributions import Source
 from tests.tui.example_snapshot import SETTINGS, demo_bench, made_snapshot
 from tui.application.test_view.curves import noise_curve
+from tui.application.test_view.units import units_of
+from tui.certificate.dcc import SI, _mean
 from tui.notebook.result import Result
 from tui.output.json_document import _band_means
 from tui.output.results import result_table
 from tui.report.noise import noise_section
 from tui.report.parts import Table
+from tui.report.uncertainty import uncertainties
+from tui.web.chart import _numbers
 from tui.wording.facts import known
 
 if TYPE_CHECKING:
@@ -51,7 +56,7 @@ def _snapshot(request: pytest.FixtureRequest) -> Snapshot:
     )
 
 
-def test_table_report_json_notebook_curve_verdict_and_budget_have_the_same_ends(
+def test_table_report_certificate_json_page_curve_verdict_and_budget_have_the_same_ends(
     snapshot: Snapshot,
 ) -> None:
     (method,) = snapshot.results
@@ -81,6 +86,19 @@ def test_table_report_json_notebook_curve_verdict_and_budget_have_the_same_ends(
         assert curve.high_db[0] == pytest.approx(decibels(float(high[column])), rel=1e-12)
         if low[column] > 0:
             assert curve.low_db[0] == pytest.approx(decibels(float(low[column])), rel=1e-12)
+        page = _numbers(curve, units_of(snapshot.unit)[0], floor=-200.0)
+        assert page["high"][0] == pytest.approx(curve.high_db[0], rel=1e-5)
+        assert page["low"][0] == pytest.approx(np.nan_to_num(curve.low_db[0], nan=-200.0), rel=1e-5)
+
+    for column, total in enumerate(uncertainties(snapshot, THIRD)):
+        certified = ET.Element("data")
+        _mean(certified, total, "mean", 1.0, "one")
+        ends = [
+            float(each.text or "")
+            for end in ("Min", "Max")
+            for each in certified.iter(f"{{{SI}}}interval{end}")
+        ]
+        np.testing.assert_allclose(ends, [low[column], high[column]], rtol=1e-7)
 
     console = Console(width=200, no_color=True)
     with console.capture() as capture:
