@@ -49,8 +49,9 @@ coarse     stated UTC is rounded down to steps of ``level`` s, for the whole run
 ========== ==========================================================================
 
 Others: ``spike`` adds ``level`` counts to one sample; ``reset`` restarts the device; ``wrap`` makes
-its counter wrap ``at`` seconds after the start of sampling; ``overflow`` overflows the buffer of
-the device for ``duration``. The last three apply only to devices with this function.
+its counter wrap ``at`` seconds after the start of sampling (of SeedLink: its sequence numbers);
+``overflow`` overflows the buffer of the device for ``duration``. The last three apply only to
+devices with this function.
 
 Random numbers depend only on ``seed``: a script has the same effect in every run. A wandering or
 wrong clock is not a fault but a property of the sensor: ``clock`` in the scenario.

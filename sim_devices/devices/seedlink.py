@@ -70,6 +70,9 @@ class Station:
         self._turn: int | None = None
         self.began = 0
         """First turn in the ring; in each turn every channel sends one record."""
+        count = int(settings.get("first_count", 0))  # of the fault `wrap`, as of a 16-bit counter
+        n_left = (65536 - count) // RECORD_SAMPLES * self.n_channels if count else WRAP
+        self._first_sequence = WRAP - n_left + 1
 
     @property
     def n_channels(self) -> int:
@@ -98,7 +101,7 @@ class Station:
         current = self.turn_at(now) * self.n_channels
         if sequence is None:
             return current
-        index = sequence - 1 + self.began * self.n_channels
+        index = sequence - self._first_sequence + self.began * self.n_channels
         if version == 3:
             ahead = (index - current + WRAP // 2) % WRAP - WRAP // 2
             index = current + ahead
@@ -124,7 +127,7 @@ class Station:
             counts[:, column].astype(np.int32),
         )
         (payload,) = encode_record(made)
-        sequence = index - self.began * self.n_channels + 1
+        sequence = index - self.began * self.n_channels + self._first_sequence
         return Packet(sequence, payload, f"{self.network}_{self.station}")
 
     def is_selected(self, index: int, selectors: Sequence[str]) -> bool:

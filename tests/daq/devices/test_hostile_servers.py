@@ -43,7 +43,7 @@ FAULTS: dict[str, dict[str, dict[str, Any]]] = {
     "fifo tcp": {"duplicate": {}, "corrupt": {"count": 3}, "drop": {}},
     "seedlink 4": {"duplicate": {"count": 2}, "drop": {}, "late": {"duration": 0.6}},
     "seedlink tls": {"duplicate": {"count": 2}, "drop": {}, "late": {"duration": 0.6}},
-    "seedlink 3": {"duplicate": {"count": 2}, "drop": {}, "late": {"duration": 0.6}},
+    "seedlink 3": {"duplicate": {"count": 2}, "drop": {}, "late": {"duration": 0.6}, "wrap": {}},
     "text tcp": {"duplicate": {}, "drop": {}},
 }
 """What the device does meanwhile."""
