@@ -21,12 +21,12 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, Strict
 
 from daq.devices.blocking import BlockingSource, Samples
 from daq.devices.interface import DeviceInformation, PresentPort
-from daq.devices.port_rules import port_label
+from daq.devices.port_rules import inputs_of, package, port_label
 from daq.errors import BenchFileError, FileFault, NotConnectedError
 from daq.protocols.block import BlockFlag
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator, Sequence
+    from collections.abc import AsyncIterator, Collection, Iterator, Sequence
 
     from daq.bench.model import Sensor
     from daq.host_clock import HostClock
@@ -247,10 +247,7 @@ def _opened(
 @contextlib.contextmanager
 def _errors(label: str) -> Iterator[None]:
     """Raise what NI-DAQmx raises as an error of the port."""
-    try:
-        from nidaqmx import errors  # noqa: PLC0415 -- an extra
-    except ImportError as error:
-        raise NotConnectedError(f"{label}: {error}; pip install 'huddle-bench[ni]'") from error
+    errors = package("nidaqmx.errors", "ni", label)
     try:
         yield
     except errors.Error as error:
@@ -268,30 +265,20 @@ def _quietly(call: Any) -> None:  # noqa: ANN401
 
 def _inputs(sensors: Sequence[Sensor]) -> dict[str, _Inputs]:
     """Return the inputs of each sensor."""
-    found: dict[str, _Inputs] = {}
-    used: dict[str, str] = {}
-    for sensor in sensors:
+
+    def given(sensor: Sensor, used: Collection[str]) -> Sequence[str]:
         device = sensor.port.removeprefix(SCHEME)
         if not sensor.port.startswith(SCHEME) or not device or "/" in device:
             expected = (
                 "expected ni:// and the name of a device or chassis in NI MAX, such as ni://cDAQ1"
             )
             raise BenchFileError(FileFault("port", expected, sensor.port, sensor.name))
-        settings = NiSettings.model_validate(sensor.settings)
-        n_channels = len(sensor.channels)
-        names = settings.inputs or tuple(f"ai{len(used) + k}" for k in range(n_channels))
-        fault = FileFault("settings.inputs", "", list(names), sensor.name)
-        if len(names) != n_channels:
-            expected = f"expected {n_channels} inputs, one for each channel"
-            raise BenchFileError(FileFault(fault.key, expected, fault.value, sensor.name))
-        names = tuple(f"{device}{'' if '/' in name else '/'}{name}" for name in names)
-        for name in names:
-            if name in used:
-                expected = f"{name} is an input of {used[name]!r} already"
-                raise BenchFileError(FileFault(fault.key, expected, fault.value, sensor.name))
-            used[name] = sensor.name
-        found[sensor.name] = _Inputs(names, settings)
-    return found
+        names = NiSettings.model_validate(sensor.settings).inputs
+        names = names or tuple(f"ai{len(used) + k}" for k in range(len(sensor.channels)))
+        return [f"{device}{'' if '/' in name else '/'}{name}" for name in names]
+
+    names = inputs_of(sensors, given)
+    return {s.name: _Inputs(names[s.name], NiSettings.model_validate(s.settings)) for s in sensors}
 
 
 DRIVER = NiDriver()

@@ -1,19 +1,21 @@
-"""Checks of a bench file: addresses of ports, and common settings of the sensors of a port."""
+"""What drivers share: checks of ports and settings of a bench file, and optional packages."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from daq.errors import BenchFileError, FileFault, toml_value
+from daq.errors import BenchFileError, FileFault, NotConnectedError, toml_value
 from daq.transport.address import check_serial, host_and_port
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
+    from collections.abc import Callable, Collection, Mapping, Sequence
 
     from pydantic import BaseModel
 
     from daq.bench.model import Sensor
 
+_Input = TypeVar("_Input")
 NETWORK = ("socket://", "tcp://", "udp://", "modbus-tcp://")
 
 
@@ -32,6 +34,44 @@ def only(sensors: Sequence[Sensor], why: str) -> Sensor:
         raise BenchFileError(FileFault("port", expected, sensor.port, sensor.name))
     require_address(sensor)
     return sensor
+
+
+def inputs_of(
+    sensors: Sequence[Sensor], given: Callable[[Sensor, Collection[_Input]], Sequence[_Input]]
+) -> dict[str, tuple[_Input, ...]]:
+    """Return the inputs of each sensor of a device.
+
+    ``given`` takes a sensor and the inputs of the sensors before it.
+
+    Raises
+    ------
+    BenchFileError
+        If a sensor does not have one input for each channel, or an input is used twice.
+    """
+    found: dict[str, tuple[_Input, ...]] = {}
+    used: dict[_Input, str] = {}
+    for sensor in sensors:
+        inputs, expected = tuple(given(sensor, used.keys())), ""
+        if len(inputs) != len(sensor.channels):
+            expected = f"expected {len(sensor.channels)} inputs, one for each channel"
+        for one in inputs:
+            if one in used and not expected:
+                expected = f"{one} is an input of {used[one]!r} already"
+            used[one] = sensor.name
+        if expected:
+            fault = FileFault("settings.inputs", expected, list(inputs), sensor.name)
+            raise BenchFileError(fault)
+        found[sensor.name] = inputs
+    return found
+
+
+def package(name: str, extra: str, label: str, further: str = "") -> Any:  # noqa: ANN401 -- module
+    """Import a package of an extra, or raise NotConnectedError that says how to install it."""
+    try:
+        return import_module(name)
+    except (ImportError, OSError) as error:  # OSError: a library that the package loads
+        how = f"pip install 'huddle-bench[{extra}]'{further}"
+        raise NotConnectedError(f"{label}: {error}; {how}") from error
 
 
 def port_label(sensors: Sequence[Sensor]) -> str:

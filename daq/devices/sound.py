@@ -23,12 +23,12 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from daq.devices.blocking import BlockingSource, Samples
 from daq.devices.interface import DeviceInformation, PresentPort
-from daq.devices.port_rules import port_label
+from daq.devices.port_rules import inputs_of, package, port_label
 from daq.errors import BenchFileError, FileFault, NotConnectedError, WrongDeviceError
 from daq.protocols.block import BlockFlag
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Sequence
+    from collections.abc import AsyncIterator, Collection, Sequence
 
     from numpy.typing import NDArray
 
@@ -226,13 +226,8 @@ _n_open = 0
 def _portaudio(label: str) -> Any:  # noqa: ANN401
     """Return PortAudio, with the list of the present devices if no other stream is open."""
     global _n_open  # noqa: PLW0603 -- PortAudio has one list for the process
-    try:
-        import sounddevice  # noqa: PLC0415 -- an extra, and it loads PortAudio
-    except (ImportError, OSError) as error:
-        raise NotConnectedError(
-            f"{label}: {error}; pip install 'huddle-bench[audio]', and on Linux the package"
-            " libportaudio2"
-        ) from error
+    further = ", and on Linux the package libportaudio2"
+    sounddevice = package("sounddevice", "audio", label, further)  # it loads PortAudio
     with _lock:
         if not _n_open:  # PortAudio lists the devices when it is initialised
             sounddevice._terminate()  # noqa: SLF001 -- the library has no other way
@@ -269,27 +264,16 @@ def _card(library: Any, wanted: str, n_inputs: int, label: str) -> dict[str, Any
 
 def _inputs(sensors: Sequence[Sensor]) -> dict[str, tuple[int, ...]]:
     """Return the inputs of each sensor."""
-    found: dict[str, tuple[int, ...]] = {}
-    used: dict[int, str] = {}
-    for sensor in sensors:
+
+    def given(sensor: Sensor, used: Collection[int]) -> Sequence[int]:
         if not sensor.port.startswith(SCHEME):
             expected = "expected audio:// and a part of the card's name; audio:// is the default"
             raise BenchFileError(FileFault("port", expected, sensor.port, sensor.name))
-        given = SoundSettings.model_validate(sensor.settings).inputs
         first = max(used, default=0) + 1
-        numbers = given or tuple(range(first, first + len(sensor.channels)))
-        if len(numbers) != len(sensor.channels):
-            expected = f"expected {len(sensor.channels)} inputs, one for each channel"
-            raise BenchFileError(FileFault("settings.inputs", expected, list(numbers), sensor.name))
-        for number in numbers:
-            if number in used:
-                expected = f"input {number} is one of {used[number]!r} already"
-                raise BenchFileError(
-                    FileFault("settings.inputs", expected, list(numbers), sensor.name)
-                )
-            used[number] = sensor.name
-        found[sensor.name] = numbers
-    return found
+        following = range(first, first + len(sensor.channels))
+        return SoundSettings.model_validate(sensor.settings).inputs or following
+
+    return inputs_of(sensors, given)
 
 
 DRIVER = SoundDriver()

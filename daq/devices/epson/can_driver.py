@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
 from daq.devices.epson import canopen as protocol
 from daq.devices.epson.commands import COUNTS_PER_G, FILTERS, USUAL_FILTER
 from daq.devices.interface import DeviceInformation, PresentPort
-from daq.devices.port_rules import port_label, require_alike
+from daq.devices.port_rules import package, port_label, require_alike
 from daq.errors import (
     BenchFileError,
     FileFault,
@@ -107,14 +107,7 @@ class _Bus:
 
     async def open(self, channel: str, settings: EpsonCanSettings) -> None:
         """Open the adapter."""
-        try:
-            import can  # noqa: PLC0415 -- an extra
-            import canopen  # noqa: PLC0415
-        except ImportError as error:
-            raise NotConnectedError(
-                f"{self.label}: the packages for CAN are not installed;"
-                " pip install 'huddle-bench[can]'"
-            ) from error
+        can, canopen = (package(name, "can", self.label) for name in ("can", "canopen"))
         loop = asyncio.get_running_loop()
 
         def connect() -> None:
@@ -138,7 +131,7 @@ class _Bus:
                 f"{self.label}: {error}; check the adapter, settings.interface and the channel"
             ) from error
         for node in self._nodes:
-            dictionary = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]
+            dictionary = canopen.ObjectDictionary()
             self._network.add_node(node, dictionary)
 
     def _receive(self, cob_id: int, data: bytes, at: HostTime) -> None:
@@ -233,10 +226,7 @@ class EpsonCanDriver:
                 if int((network / "type").read_text(encoding="utf-8")) == ARPHRD_CAN:
                     state = (network / "operstate").read_text(encoding="utf-8").strip()
                     found.append(PresentPort(f"{SCHEME}{network.name}", f"socketcan, {state}"))
-        try:
-            import can  # noqa: PLC0415 -- an extra
-        except ImportError as error:
-            raise NotConnectedError(f"{error}; pip install 'huddle-bench[can]'") from error
+        can = package("can", "can", "CAN buses")
         logger = logging.getLogger("can")
         level = logger.level
         logger.setLevel(logging.ERROR)  # it warns of each library that is not installed

@@ -160,7 +160,7 @@ def test_clipping_is_flagged() -> None:
     [
         ("/dev/snd", None, "expected audio://"),
         ("audio://", (1,), "expected 2 inputs"),
-        ("audio://", (1, 1), "is one of 'A' already"),
+        ("audio://", (1, 1), "1 is an input of 'A' already"),
     ],
 )
 def test_impossible_settings_are_refused(
