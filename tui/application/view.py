@@ -143,17 +143,6 @@ class View(Screen[None]):
 
 def status_line(state: State, view: str, *, width: int) -> Text:
     """Return the line at the top: views, bench, what the recording does, verdict, file."""
-    line = Text()
-    for number, name in enumerate(VIEWS, start=1):
-        if name == view:
-            line.append(f" {number} {TITLES[name]} ", "bold reverse")
-        elif width >= ALL_TABS:
-            opens = Style(color=MUTED, meta={"@click": f"app.view('{name}')"})
-            line.append(f" {number} {TITLES[name]} ", opens)
-    line.append(" ")
-    if state.is_simulated:
-        line.append(" SIMULATED ", f"{BAD} reverse")
-        line.append(" ")
     now, path = state.now, state.path
     doing = _doing(state)
     if now is not None:
@@ -162,6 +151,13 @@ def status_line(state: State, view: str, *, width: int) -> Text:
         if width < ALL_TABS:  # its sign says the same as its word
             doing = Text.assemble(doing[:1], doing[doing.plain.find("  ") + 1 :])
         doing.append(f"  {WORDS[state.verdict.verdict]}", STYLES[state.verdict.verdict])
+    simulated = Text(" SIMULATED ", f"{BAD} reverse") if state.is_simulated else Text()
+    line = _tabs(view, has_titles=width >= ALL_TABS)
+    if line.cell_len + simulated.cell_len + doing.cell_len > width - 4 >= ALL_TABS - 4:
+        line = _tabs(view, has_titles=False, has_numbers=True)
+    line.append(" ")
+    if simulated:
+        line.append_text(simulated).append(" ")
     room = width - 2 - line.cell_len - doing.cell_len
     if len(state.name) + 2 <= room:
         line.append(f"{state.name}  ", "bold")
@@ -169,6 +165,20 @@ def status_line(state: State, view: str, *, width: int) -> Text:
     line.append_text(doing)
     if path is not None and len(path.name) + 2 <= room:
         line.append(f"  {path.name}", MUTED)
+    return line
+
+
+def _tabs(view: str, *, has_titles: bool, has_numbers: bool = False) -> Text:
+    """Return the views: the one that is shown, and titles or numbers of the others."""
+    line = Text()
+    for number, name in enumerate(VIEWS, start=1):
+        opens = Style(color=MUTED, meta={"@click": f"app.view('{name}')"})
+        if name == view:
+            line.append(f" {number} {TITLES[name]} ", "bold reverse")
+        elif has_titles:
+            line.append(f" {number} {TITLES[name]} ", opens)
+        elif has_numbers:
+            line.append(f" {number} ", opens)
     return line
 
 

@@ -30,7 +30,10 @@ from tests.tui.example_snapshot import (
 from tui.application.app import HuddleApp
 from tui.application.messages import StatusUpdated
 from tui.application.plan import TestPlan
+from tui.application.state import TEST, State
+from tui.application.view import status_line
 from tui.commands.tui_controls import BenchControls, announce
+from tui.wording.verdict_text import WORDS
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -87,6 +90,19 @@ async def test_the_form_takes_operator_note_and_end(told: ProgressCallback) -> N
     assert told.plan.operator is not None
     assert told.plan.operator.endswith("ann")
     assert told.told == ["start", "mark run.h5 hot"]
+
+
+def test_the_line_at_the_top_of_a_small_terminal_has_the_whole_verdict() -> None:
+    bench = demo_bench().model_copy(update={"limits": (LIMIT,)})
+    verdict = judge(bench, made_snapshot(), SETTINGS)
+    assert verdict is not None
+    now = replace(made_now(), simulated=True)
+    for decision in Verdict:
+        state = State("pier", now=now, verdict=replace(verdict, verdict=decision))
+        line = status_line(state, TEST, width=80).plain
+        assert len(line) <= 78
+        assert WORDS[decision] in line
+        assert "2 Test" in line
 
 
 async def test_with_limits_a_test_usually_ends_when_they_are_decided(
