@@ -114,8 +114,10 @@ async def test_a_recorder_that_is_gone_leaves_no_sensor_live(told: ProgressCallb
     async with app.run_test(size=NARROW) as pilot:
         await shown(pilot, app, *running())
         assert "● live" in screen_text(app)
+        assert "Waits for C." in screen_text(app)
         await shown(pilot, app, ErrorReported("run.h5: the recorder ended", ended=True))
         text = screen_text(app)
+    assert "Waits" not in text
     assert "● live" not in text
     assert text.count("■ not recorded") == 3
 

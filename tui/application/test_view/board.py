@@ -111,7 +111,14 @@ class Board(Vertical):
         if choice.clocks or choice.cursor is None:  # the answer to a key, before the curves
             self._write_title(self._frozen or shown)
         self._write("#clocks", clocks.clock_line(snapshot, settings, width=width))
-        progress = panels.progress_line(now, snapshot, settings, shown.verdict, width=width)
+        progress = panels.progress_line(
+            now,
+            snapshot,
+            settings,
+            shown.verdict,
+            width=width,
+            is_followed=not shown.trouble,
+        )
         self._write("#progress", Text(shown.note, MUTED) if shown.note else progress)
         self._write("#advice", panels.advice(snapshot, choice, shown.verdict))
 

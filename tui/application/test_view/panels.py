@@ -218,8 +218,12 @@ def progress_line(
     verdict: TestVerdict | None,
     *,
     width: int,
+    is_followed: bool = True,
 ) -> Text:
-    """Return how long the test takes, after a bar, segments and c.o.v. where there is room."""
+    """Return how long the test takes, after a bar, segments and c.o.v. where there is room.
+
+    Nothing of an end where the recording `is_followed` no longer: its recorder may be gone.
+    """
     if snapshot.n_segments == 0:
         text = f"waits for the first {settings.segment:g} s segment"
         if snapshot.n_dropped:
@@ -236,6 +240,8 @@ def progress_line(
         return Text(" · ".join(parts))
     if not math.isnan(reached.cov):
         parts.append(known_to(replace(reached, target=None)))
+    if not is_followed:
+        return Text(" · ".join(parts))
     left = remaining(now.until, verdict, snapshot, settings, elapsed=now.elapsed)
     if left.seconds is not None and left.goal is not Goal.END:
         left = replace(left, seconds=max(0.0, left.seconds - _gone_on(now, snapshot)))
