@@ -47,6 +47,8 @@ TCP_PORTS = (MODBUS_PORT, 4001, 4002, 4003, 4004, 2101, 10001)
 """Modbus, and serial servers as their makers set them: Moxa, Digi, Lantronix."""
 MOST_HOSTS, MOST_CONNECTIONS, CONNECT = 1024, 256, 1.0
 """Hosts of a network to search, connections at a time, seconds to wait for one."""
+FREED = 1.0
+"""Seconds in which a serial server frees its line after a connection: it serves one at a time."""
 MODBUS_DEVICES = (1, 2, 3, 4, 5, 0x50)
 
 
@@ -387,6 +389,8 @@ async def network_ports(target: str, *, numbers: Sequence[int] | None = None) ->
 
     pairs = [(host, number) for host in hosts for number in numbers or TCP_PORTS]
     found = await asyncio.gather(*(accepts(*pair) for pair in pairs))
+    if any(found):
+        await asyncio.sleep(FREED)
     return [
         f"{TCP}{host}" if number == MODBUS_PORT else f"socket://{host}:{number}"
         for (host, number), is_there in zip(pairs, found, strict=True)

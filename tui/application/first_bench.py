@@ -277,8 +277,10 @@ class FirstBenchScreen(Screen[None]):
         self.query_one("#status", Static).update(title)
         shown = Text("\n\n", no_wrap=True).join(self._parts(width - 4))
         self.query_one("#table", Static).update(shown)
-        self.set_class(bool(self._note), "-alert")
-        self.query_one("#alert", Static).update(Text(self._note, BAD))
+        said = [self._note, *(each.trouble for each in self._live.values())]
+        lines = "\n".join(f"▲ {line}" for line in said if line)
+        self.set_class(bool(lines), "-alert")
+        self.query_one("#alert", Static).update(Text(lines, BAD))
         self.query_one("#progress", Static).update(Text(self._todo(), MUTED))
 
     def _parts(self, width: int) -> list[Text]:

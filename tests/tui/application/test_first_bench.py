@@ -60,6 +60,8 @@ class Prepared:
     taps: tuple[float, ...] = (8.0, 40.0, 10.0)
     is_shown: threading.Event = field(default_factory=threading.Event)
     is_late: threading.Event = field(default_factory=threading.Event)
+    trouble: str = ""
+    asked: list[str] = field(default_factory=list)
     targets: list[str] = field(default_factory=list)
 
     def network_ports(self, target: str) -> Sequence[str]:
@@ -69,6 +71,7 @@ class Prepared:
 
     def find_devices(self, port: str) -> Sequence[DiscoveredDevice]:
         """Return a device on any port but the last; the first one answers after the others."""
+        self.asked.append(port)
         if port == PORTS[-1]:
             self.is_late.set()
             return ()
@@ -86,7 +89,7 @@ class Prepared:
         """Show all sensors once."""
         show(
             tuple(
-                SensorPreview(sensor, None, motion(n, tap=tap))
+                SensorPreview(sensor, None, motion(n, tap=tap), trouble="" if n else self.trouble)
                 for n, (sensor, tap) in enumerate(zip(bench.sensors, self.taps, strict=False))
             )
         )
@@ -132,6 +135,17 @@ async def test_two_names_two_limits_and_the_file_is_written(tmp_path: Path) -> N
     assert [sensor.name for sensor in bench.sensors] == ["A", "B", "L"]
     assert [each.name for each in bench.limits] == ["nlnm", "limit"]
     assert bench.usual_end.decided
+
+
+async def test_a_sensor_in_trouble_says_why_and_ports_are_searched_again(tmp_path: Path) -> None:
+    path = tmp_path / "lab.toml"
+    controls = Prepared(path, draft(path), trouble="sensor 'A' on /dev/ttyUSB0: no answer")
+    app = FirstBenchApp(controls)
+    async with app.run_test(size=SIZES["small"]) as pilot:
+        await until(pilot, lambda: "▲ sensor 'A' on /dev/ttyUSB0: no answer" in screen_text(app))
+        controls.asked.clear()
+        await pilot.press("r")
+        await until(pilot, lambda: controls.asked == [PORTS[-1]])  # the others are known
 
 
 async def test_two_sensors_are_no_bench_and_a_third_is_asked_for(tmp_path: Path) -> None:
