@@ -273,7 +273,9 @@ class FirstBenchScreen(Screen[None]):
         if not self._is_ready:
             return
         width = self.app.size.width
-        title = Text(" first bench ", "bold reverse").append(f" {self._controls.path}", "bold")
+        title = Text.assemble(
+            (" first bench ", "bold reverse"), (f" {self._controls.path}", "bold")
+        )
         self.query_one("#status", Static).update(title)
         shown = Text("\n\n", no_wrap=True).join(self._parts(width - 4))
         self.query_one("#table", Static).update(shown)
