@@ -2,7 +2,8 @@
 
 The application is photographed while it looks at a recording simulated from the demo's bench; the
 figure is made from the real recording (USGS, public domain) in $HUDDLE_DATA or ../shared/data.
-Needs rsvg-convert (Debian: librsvg2-bin) for the first, ObsPy for the second.
+Needs rsvg-convert (Debian: librsvg2-bin) for the first, ObsPy for the second. The page in the
+browser is that of a running simulated test.
 """
 
 from __future__ import annotations
@@ -11,14 +12,20 @@ import asyncio
 import html
 import os
 import re
+import shutil
+import signal
 import subprocess
 import tempfile
+import time
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
+from playwright.sync_api import sync_playwright
 
+from daq.bench.loading import dump
+from daq.devices.bench_file import parse
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.importer import import_files
@@ -31,6 +38,7 @@ from tui.application.app import HuddleApp
 from tui.commands.tui_controls import RecordingControls
 from tui.report.contents import report_of
 from tui.report.paper import write_paper
+from tui.simulation.devices import simulated
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
@@ -172,9 +180,45 @@ def report(folder: Path) -> None:
     picture.quantize(96, Image.Quantize.MAXCOVERAGE).save(HERE / "report.png", optimize=True)
 
 
+def pages(folder: Path) -> None:
+    """Photograph the page of a running test on the demo's bench, with a limit, in Chromium.
+
+    Takes four minutes: a simulated test goes on meanwhile. Needs the extra `dev`, and Chromium.
+    """
+    bench, told = folder / "bench.toml", folder / "told"
+    demo = (ROOT / "tui" / "resources" / "demo.toml").read_text(encoding="utf-8")
+    with simulated(parse(demo + LIMIT), speed=1.0) as reachable:
+        bench.write_text(dump(reachable), encoding="utf-8")
+        run = subprocess.Popen(python_command("tui", "run", str(bench)), stdout=subprocess.DEVNULL)
+        with told.open("wb") as out:
+            command = python_command("tui", "web", str(bench), "--port", "0")
+            served = subprocess.Popen(
+                command, stdout=out, env=os.environ | {"PYTHONUNBUFFERED": "1"}
+            )
+        time.sleep(200)
+        with sync_playwright() as playwright:
+            browser = playwright.chromium.launch(
+                executable_path=os.environ.get("HUDDLE_CHROMIUM") or shutil.which("chromium"),
+                args=["--no-sandbox"],
+            )
+            page = browser.new_page(viewport={"width": 1100, "height": 940})
+            page.goto(told.read_text(encoding="utf-8").split()[-1])
+            page.wait_for_selector("#chart[data-drawn]")
+            page.hover(".u-over", position={"x": 420, "y": 150})
+            page.screenshot(path=folder / "web.png")
+            browser.close()
+        for process in (served, run):
+            process.send_signal(signal.SIGINT)
+            process.wait()
+    with Image.open(folder / "web.png") as drawn:
+        few = drawn.convert("RGB").quantize(128, Image.Quantize.MAXCOVERAGE)
+        few.save(HERE / "web.png", optimize=True)
+
+
 def main() -> None:
     """Make all pictures."""
     with tempfile.TemporaryDirectory() as folder:
+        pages(Path(folder))
         application(Path(folder))
         report(Path(folder))
         real_recording(Path(folder))
