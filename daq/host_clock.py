@@ -40,6 +40,10 @@ class HostClock(Protocol):
         """Return the present instant."""
         ...
 
+    def utc_ns(self) -> int:
+        """Return UTC in ns since 1970 as its source has it, which may be set during a run."""
+        ...
+
 
 class SystemClock:
     """The system's monotonic clock and UTC, both ``speed`` times as fast from construction on.
@@ -71,6 +75,7 @@ class SystemClock:
     ) -> None:
         self.speed = speed
         self._now_ns, self._always_ns = monotonic_ns, always_ns
+        self._read_utc_ns = utc_ns
         self._monotonic_ns, self._began_ns, self._utc_ns = monotonic_ns(), always_ns(), utc_ns()
 
     @property
@@ -85,3 +90,7 @@ class SystemClock:
         if self.speed != 1.0:
             elapsed = round(elapsed * self.speed)
         return HostTime(self._monotonic_ns + elapsed, self._utc_ns + elapsed)
+
+    def utc_ns(self) -> int:
+        """Return UTC in ns since 1970 as its source has it, which may be set during a run."""
+        return self._read_utc_ns()

@@ -105,20 +105,17 @@ class ClockWatch:
     ----------
     clock : HostClock
         Clock of the recording.
-    utc_ns : callable
-        The system's clock, in ns since 1970.
     state : callable
-        Returns its state.
+        Returns the state of the system's clock.
     """
 
     def __init__(
         self,
         clock: HostClock,
         *,
-        utc_ns: Callable[[], int] = time.time_ns,
         state: Callable[[], ClockState | None] = clock_state,
     ) -> None:
-        self._clock, self._utc_ns, self._state = clock, utc_ns, state
+        self._clock, self._state = clock, state
         self._ahead = 0.0
         self._reported = -math.inf
 
@@ -126,7 +123,7 @@ class ClockWatch:
         """Return an event if there is something to report; call it every few seconds."""
         now = self._clock.now()
         at = now.monotonic_ns * 1e-9
-        ahead = (self._utc_ns() - now.utc_ns) * 1e-9
+        ahead = (self._clock.utc_ns() - now.utc_ns) * 1e-9
         step = ahead - self._ahead if self._clock.speed == 1.0 else 0.0
         self._ahead = ahead
         is_step = abs(step) > STEP

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from daq.host_clock import SystemClock
+from daq.recorder.clock_trust import ClockWatch
 from sim_devices.server.paced_clock import LONGEST, NS, PacedClock, PacedLoop
 
 if TYPE_CHECKING:
@@ -78,6 +80,18 @@ def test_the_clock_stops_while_a_participant_is_behind(clock: PacedClock, system
     system.ns += NS
     assert clock.now_ns() == began + 70 * MS + NS
     assert clock.left_out == pytest.approx(2.0 - 0.05)
+
+
+def test_a_computer_that_waits_for_its_simulators_has_not_set_its_clock(
+    clock: PacedClock, system: System
+) -> None:
+    host = SystemClock(monotonic_ns=clock.now_ns, always_ns=clock.now_ns, utc_ns=clock.utc_ns)
+    watch = ClockWatch(host)
+    assert watch.look() is not None  # the state at the start
+    with clock.participate() as behind:
+        behind.let_run_until(clock.now_ns())
+        system.ns += 5 * NS
+        assert watch.look() is None
 
 
 def test_the_clock_never_decreases(clock: PacedClock, system: System) -> None:

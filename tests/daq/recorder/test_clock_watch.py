@@ -27,7 +27,7 @@ class Computer:
             always_ns=lambda: self.monotonic_ns,
             utc_ns=lambda: self.utc_ns,
         )
-        self.watch = ClockWatch(clock, utc_ns=lambda: self.utc_ns, state=lambda: self.state)
+        self.watch = ClockWatch(clock, state=lambda: self.state)
 
     def after(self, seconds: float, *, step: float = 0.0) -> Event | None:
         """Return what is reported after some seconds, in which the clock was set."""
