@@ -80,10 +80,10 @@ FAULTS: dict[str, dict[str, dict[str, Any]]] = {
     "seedlink 4": _RESET | _GARBAGE,
     "seedlink 3": _RESET | _GARBAGE,
     "seedlink tls": _RESET | _GARBAGE,
-    "iio": {
+    "iio": {  # the reply that a stall takes is waited for until the end
+        "late": {"duration": 0.6},
         "overflow": {"duration": 1.5},
         "stall": {"duration": 1.6},
-        "late": {"duration": 0.6},
         "disconnect": {"duration": 4.0},
     },
     "text serial": _RESET | _XOR,
