@@ -35,7 +35,9 @@ N_CUTS = 6
 """Of each connection."""
 FEWEST, MOST = 300, 9000
 """Bytes that a connection passes before it is cut."""
-SECONDS = 12.0
+FEW = {"registers tcp": 3000}
+"""Instead of ``MOST``, where few bytes pass in a second."""
+SECONDS = 6.0
 """Of samples wanted after the last cut, of host time."""
 FAULTS: dict[str, dict[str, dict[str, Any]]] = {
     "registers tcp": {"duplicate": {"count": 2}, "late": {"duration": 0.6}},
@@ -52,11 +54,12 @@ FAULTS: dict[str, dict[str, dict[str, Any]]] = {
 class HostileProxy:
     """Passes bytes between a driver and a device; hangs up after a random number of them."""
 
-    def __init__(self, port: str, seed: int) -> None:
+    def __init__(self, port: str, seed: int, most: int) -> None:
         self._scheme, _, address = port.partition("://")
         host, _, number = address.partition(":")
         self._device = host, int(number)
         self._rng = np.random.default_rng(seed)
+        self._most = most
         self.n_cuts = 0
         self.is_armed = False
         """Whether it hangs up."""
@@ -98,7 +101,7 @@ class HostileProxy:
             with contextlib.suppress(ConnectionError):
                 while received := await there.read(4096):
                     if left is None and self.is_armed and self.n_cuts < N_CUTS:
-                        left = int(self._rng.integers(FEWEST, MOST))
+                        left = int(self._rng.integers(FEWEST, self._most))
                     if left is not None and len(received) >= left:
                         writer.write(received[:left])
                         await writer.drain()
@@ -152,7 +155,10 @@ def test_each_sample_is_in_its_place(
     ]
     path = tmp_path / "hostile.h5"
     with serving_all(speed=SPEED, faults=script) as served:
-        proxies = [HostileProxy(served.device(mode).port, k) for k, mode in enumerate(FAULTS)]
+        proxies = [
+            HostileProxy(served.device(mode).port, k, FEW.get(mode, MOST))
+            for k, mode in enumerate(FAULTS)
+        ]
 
         async def main() -> None:
             async with contextlib.AsyncExitStack() as stack:
