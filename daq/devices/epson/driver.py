@@ -147,7 +147,7 @@ class EpsonSession:
         return received, HostTime(last.monotonic_ns + passed_ns, last.utc_ns + passed_ns)
 
     async def _ask_device(self) -> tuple[bytes, HostTime]:
-        """Request the ID of a silent device, and return the next frames.
+        """Request the ID of a silent device until something comes, and return the next frames.
 
         Raises
         ------
@@ -155,8 +155,14 @@ class EpsonSession:
             If the device replies: it was restarted and no longer streams. A device whose frames are
             only delayed does not reply.
         """
-        await self._device.ask(commands.ID)
-        received, at = await self._stream.read()
+        while True:
+            await self._device.ask(commands.ID)
+            try:
+                async with asyncio.timeout(ASK_AFTER):
+                    received, at = await self._stream.read()
+            except TimeoutError:  # the line can lose a reply
+                continue
+            break
         answer = commands.find_reply(received, commands.ID.address)
         if answer == commands.DEVICE_ID and len(received) < self._configuration.burst.size:
             raise NoAnswerError(f"{self._stream.label}: the device was restarted")

@@ -120,8 +120,9 @@ class Restarted:
 
     label = "restarted"
 
-    def __init__(self, frames: bytes, size: int) -> None:
+    def __init__(self, frames: bytes, size: int, n_lost: int) -> None:
         self._pieces = [frames[: 50 * size], frames[50 * size :]]
+        self._n_lost = n_lost
         self._wanted = 0
         self._answer = asyncio.Event()
 
@@ -130,9 +131,11 @@ class Restarted:
         self._wanted = n_frames * size - n_pending
 
     async def write(self, payload: bytes) -> None:
-        """Hear a question."""
+        """Hear a question; the line loses the first answers."""
         if payload == Read(commands.ID.address).encode():
-            self._answer.set()
+            self._n_lost -= 1
+            if self._n_lost < 0:
+                self._answer.set()
 
     async def read(self) -> tuple[bytes, HostTime]:
         """Return frames if enough are there, then the answer."""
@@ -148,12 +151,16 @@ class Restarted:
         return 0
 
 
-async def test_frames_before_a_restart_have_their_arrival_time() -> None:
+@pytest.mark.parametrize("n_lost", [0, 2])
+async def test_frames_before_a_restart_have_their_arrival_time(
+    n_lost: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Seven of fifty wait in the kernel until the device is found to be silent."""
+    monkeypatch.setattr("daq.devices.epson.driver.ASK_AFTER", 0.3)
     configuration = Configuration.of(SENSOR)
     zeros = np.zeros(57, np.int32)
     frames = commands.encode_bursts(configuration.burst, x=zeros, count=np.arange(57))
-    stream = cast("ByteStream", Restarted(frames, configuration.burst.size))
+    stream = cast("ByteStream", Restarted(frames, configuration.burst.size, n_lost))
     decoder = configuration.decoder("A")
     device = Device(SENSOR, stream)
     session = EpsonSession(device, configuration, DeviceInformation("A"), decoder, host_clock())
