@@ -31,7 +31,7 @@ from tui.application.forms.form import Field, Form
 from tui.application.forms.sensor import PortForm, SensorForm, sensor_table
 from tui.application.themes import ThemedApp
 from tui.application.view import BAD, MUTED, KeyLine
-from tui.runs.first_bench import is_open, with_device
+from tui.runs.first_bench import is_open, with_device, with_rate
 from tui.wording.formatting import listed, several
 
 if TYPE_CHECKING:
@@ -339,7 +339,10 @@ class FirstBenchScreen(Screen[None]):
         if name not in self._names():
             self.action_choose_next(1)
             return
-        table = sensor_table(self._text, name)
+        table, now = sensor_table(self._text, name), self._live.get(name)
+        if is_open(table) and now is not None and now.measured_rate is not None:
+            self._text = with_rate(self._text, name, float(f"{now.measured_rate:.3g}"))
+            table = sensor_table(self._text, name)
         form = SensorForm(self._text, str(table["driver"]), table, replaces=name)
         self.app.push_screen(form, self._edited)
 

@@ -234,16 +234,13 @@ def check_port(port: str, *, json: str | None) -> None:
 
 def _sensor_table(device: DiscoveredDevice) -> str:
     """Return a device that sends text as a table of the bench file."""
-    places = device.settings.get("columns") or device.settings.get("channel_names") or ()
-    channels = [
-        {"name": place if isinstance(place, str) else f"column {place}", "sensitivity": 1.0}
-        for place in places
-    ]
+    from tui.runs.first_bench import channels_of
+
     sensor = {
         "name": "text",
         "driver": device.driver,
         "port": device.port,
-        "channels": channels,
+        "channels": channels_of(device),
         "settings": device.settings,
     }
     return to_toml({"sensors": [sensor]})

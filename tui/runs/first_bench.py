@@ -73,7 +73,7 @@ def channels_of(device: DiscoveredDevice) -> list[dict[str, Any]]:
         ]
     places = device.settings.get("columns") or device.settings.get("channel_names") or ()
     return [
-        {"name": place if isinstance(place, str) else f"column {place}", "sensitivity": UNKNOWN}
+        {"name": place if isinstance(place, str) else f"c{place}", "sensitivity": UNKNOWN}
         for place in places
     ]
 
@@ -109,6 +109,27 @@ def with_device(text: str, device: DiscoveredDevice) -> str:
     before, mark, rest = text.partition(_ESTIMATE)
     sensor = f"{comment}{to_toml({'sensors': [table]})}\n"
     return f"{before}{sensor}{mark}{rest}" if mark else f"{text}\n{sensor}"
+
+
+def with_rate(text: str, name: str, rate: float) -> str:
+    """Return a text with the sampling rate of a sensor, by which the bench may be slower.
+
+    The estimate has the rate of the slowest sensor, and no frequency above 0.4 of it; the other
+    sensors keep theirs.
+    """
+    document = tomlkit.parse(text)
+    usual = float(document["sampling_rate"])
+    for table in document["sensors"]:
+        if str(table["name"]) == name:
+            table["sampling_rate"] = rate
+        elif rate < usual and "sampling_rate" not in table:
+            table["sampling_rate"] = usual
+    if rate < usual:
+        document["sampling_rate"] = rate
+        band = document.get("estimate", {}).get("band")
+        if band and band[1] > 0.4 * rate:
+            document["estimate"]["band"] = [min(float(band[0]), 0.1 * rate), 0.4 * rate]
+    return tomlkit.dumps(document)
 
 
 def limit_table(text: str, *, band: Sequence[float] = BAND) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from textual.widgets import Input
 
 from daq.bench.tables.toml_text import to_toml
 from daq.devices.bench_file import load, parse
@@ -61,6 +62,7 @@ class Prepared:
     is_shown: threading.Event = field(default_factory=threading.Event)
     is_late: threading.Event = field(default_factory=threading.Event)
     trouble: str = ""
+    writes_text: bool = False
     asked: list[str] = field(default_factory=list)
     targets: list[str] = field(default_factory=list)
 
@@ -77,6 +79,9 @@ class Prepared:
             return ()
         if port == PORTS[0]:
             self.is_late.wait(limit())
+        if self.writes_text:
+            columns = {"delimiter": ",", "columns": [0, 1, 2], "baud_rate": 9600}
+            return [DiscoveredDevice("text", port, columns, remark="'1,2,3'")]
         about = DeviceInformation("", "A352AD10", f"S{port[-1]}", "1.4", 200.0, 25.0)
         return [DiscoveredDevice("epson", port, {"baud_rate": 460800}, about)]
 
@@ -89,7 +94,13 @@ class Prepared:
         """Show all sensors once."""
         show(
             tuple(
-                SensorPreview(sensor, None, motion(n, tap=tap), trouble="" if n else self.trouble)
+                SensorPreview(
+                    sensor,
+                    None,
+                    motion(n, tap=tap),
+                    measured_rate=100.02 if self.writes_text else None,
+                    trouble="" if n else self.trouble,
+                )
                 for n, (sensor, tap) in enumerate(zip(bench.sensors, self.taps, strict=False))
             )
         )
@@ -146,6 +157,32 @@ async def test_a_sensor_in_trouble_says_why_and_ports_are_searched_again(tmp_pat
         controls.asked.clear()
         await pilot.press("r")
         await until(pilot, lambda: controls.asked == [PORTS[-1]])  # the others are known
+
+
+async def test_what_a_device_does_not_state_is_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "lab.toml"
+    controls = Prepared(path, draft(path), writes_text=True)
+    app = FirstBenchApp(controls)
+    async with app.run_test(size=SIZES["middle"]) as pilot:
+        for name in "ABC":
+            await until(pilot, lambda n=name: f"{n}: state its sensitivity" in screen_text(app))  # type: ignore[misc]
+            await until(pilot, lambda: screen_text(app).count("● live") >= 2)
+            await pilot.press("enter")
+            await until(pilot, lambda n=name: f"sensor {n}, driver text" in screen_text(app))  # type: ignore[misc]
+            app.screen.query_one("#sensitivity", Input).value = "1e6"
+            await pilot.press("enter")
+        await until(pilot, lambda: "enter goes on" in screen_text(app))
+        await pilot.press("enter", "enter")
+        await until(pilot, lambda: app.return_value is not None)
+    assert load(path).sampling_rate == 100.0
+    assert load(path).estimate.band == (1.0, 40.0)
+    for sensor in load(path).sensors:
+        assert sensor.sampling_rate == 100.0
+        assert [(c.name, c.sensitivity) for c in sensor.channels] == [
+            ("c0", 1e6),
+            ("c1", 1e6),
+            ("c2", 1e6),
+        ]
 
 
 async def test_two_sensors_are_no_bench_and_a_third_is_asked_for(tmp_path: Path) -> None:
