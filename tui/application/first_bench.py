@@ -58,6 +58,10 @@ class FirstBenchControls(Protocol):
     ports: Sequence[str]
     """The serial ports."""
 
+    def listed_ports(self) -> Sequence[tuple[str, str]]:
+        """Return ports that drivers list, such as CAN buses, and what they are. Blocks."""
+        ...
+
     def network_ports(self, target: str) -> Sequence[str]:
         """Return the ports to search for a port, a host or a network. Blocks."""
         ...
@@ -144,6 +148,7 @@ class FirstBenchScreen(Screen[None]):
         self._is_ready = True
         self._use(self._text)
         self.action_search()
+        self._list()
 
     def on_unmount(self) -> None:
         """Release the ports."""
@@ -175,6 +180,16 @@ class FirstBenchScreen(Screen[None]):
                 self._expand(targets)
 
         self.app.push_screen(NetworkForm(), search)
+
+    @work(thread=True, group="list")
+    def _list(self) -> None:
+        listed = self._controls.listed_ports()
+        if listed and self.app.is_running:
+            self.app.call_from_thread(self._show_listed, listed)
+
+    def _show_listed(self, ports: Sequence[tuple[str, str]]) -> None:
+        self._searched |= {port: f"{about}; a adds it" for port, about in ports}
+        self._draw()
 
     @work(thread=True, group="network")
     def _expand(self, targets: Sequence[str]) -> None:

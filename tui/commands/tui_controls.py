@@ -17,6 +17,7 @@ import typer
 from daq.bench.durations import format_duration
 from daq.bench.editing import replace_file, with_values
 from daq.devices.bench_file import parse
+from daq.devices.registry import present_ports
 from daq.errors import BenchFileError, HuddleError, RecordingError
 from daq.host_clock import SystemClock
 from daq.preflight.device_check import discover, network_ports
@@ -322,6 +323,11 @@ class FirstBenchControls:
     text: str
     lock: threading.Lock = field(default_factory=threading.Lock)
     """Held by who reads the ports."""
+
+    def listed_ports(self) -> Sequence[tuple[str, str]]:
+        """Return ports that drivers list, such as CAN buses, and what they are."""
+        found, _ = present_ports()
+        return [(one.port, f"{driver}: {one.description}") for driver, one in found]
 
     def network_ports(self, target: str) -> Sequence[str]:
         """Return the ports to search for a port, a host or a network."""

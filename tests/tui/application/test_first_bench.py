@@ -62,9 +62,14 @@ class Prepared:
     is_shown: threading.Event = field(default_factory=threading.Event)
     is_late: threading.Event = field(default_factory=threading.Event)
     trouble: str = ""
+    listed: tuple[tuple[str, str], ...] = ()
     writes_text: bool = False
     asked: list[str] = field(default_factory=list)
     targets: list[str] = field(default_factory=list)
+
+    def listed_ports(self) -> Sequence[tuple[str, str]]:
+        """Return what was prepared."""
+        return self.listed
 
     def network_ports(self, target: str) -> Sequence[str]:
         """Note it."""
@@ -151,9 +156,11 @@ async def test_two_names_two_limits_and_the_file_is_written(tmp_path: Path) -> N
 async def test_a_sensor_in_trouble_says_why_and_ports_are_searched_again(tmp_path: Path) -> None:
     path = tmp_path / "lab.toml"
     controls = Prepared(path, draft(path), trouble="sensor 'A' on /dev/ttyUSB0: no answer")
+    controls.listed = (("can://can0", "epson-can: socketcan, up"),)
     app = FirstBenchApp(controls)
     async with app.run_test(size=SIZES["small"]) as pilot:
         await until(pilot, lambda: "▲ sensor 'A' on /dev/ttyUSB0: no answer" in screen_text(app))
+        await until(pilot, lambda: "epson-can: socketcan, up; a adds it" in screen_text(app))
         controls.asked.clear()
         await pilot.press("r")
         await until(pilot, lambda: controls.asked == [PORTS[-1]])  # the others are known
