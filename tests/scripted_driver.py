@@ -37,6 +37,10 @@ class ManualClock:
         """Return the present instant."""
         return HostTime(self.ns, self.ns + 10**18)
 
+    def utc_ns(self) -> int:
+        """Return UTC of the present instant."""
+        return self.now().utc_ns
+
     def advance(self, seconds: float) -> None:
         """Move it."""
         self.ns += round(seconds * 1e9)

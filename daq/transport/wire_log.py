@@ -116,6 +116,10 @@ class ReplayClock:
         """Return the time of the last line."""
         return self.at
 
+    def utc_ns(self) -> int:
+        """Return UTC of the last line."""
+        return self.now().utc_ns
+
 
 class ReplayedStream(ByteStream):
     """One opening of a port or a socket for datagrams, from a log.
