@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 
 import pytest
+
+from sim_devices.server.serve import FAMILIES
 
 
 def modules_after(statement: str) -> set[str]:
@@ -26,6 +30,17 @@ def test_package_roots_import_nothing(package: str) -> None:
     bare = modules_after("pass")
     loaded = modules_after(f"import {package}") - bare
     assert {name for name in loaded if not name.startswith(("_", "encodings"))} <= {package}
+
+
+def test_simulated_devices_need_no_extra() -> None:
+    requirements = metadata.requires("huddle-bench") or []
+    names = [re.split(r"[^\w.-]", each, maxsplit=1)[0].lower() for each in requirements]
+    needed = {n for n, each in zip(names, requirements, strict=True) if "extra ==" not in each}
+    modules = {place.partition(":")[0] for name, place in FAMILIES.items() if name != "seedlink"}
+    loaded = modules_after(f"import sim_devices.server.fork_server, {', '.join(sorted(modules))}")
+    assert {"numpy", "pymodbus"} <= loaded & needed
+    assert "canopen" in set(names) - needed
+    assert not loaded & (set(names) - needed)
 
 
 def test_estimator_loads_no_input_or_output() -> None:

@@ -28,9 +28,7 @@ import time
 import zlib
 from typing import TYPE_CHECKING, Any
 
-import canopen
 import numpy as np
-from canopen import objectdictionary
 
 from daq.devices.epson import canopen as protocol
 from daq.devices.epson import commands
@@ -347,6 +345,8 @@ MAPPING = {
     (0x1A01, 2): 0x21000010,
 }
 """What the two messages hold."""
+UNSIGNED, VISIBLE_STRING = {1: 0x5, 2: 0x6, 4: 0x7}, 0x9
+"""Data types of CiA 301, numbers by their bytes."""
 IDLE = 0.005
 """Interval at which the bus looks whether it is to start, in s."""
 
@@ -367,6 +367,8 @@ class SimulatedBus:
         self.lost: set[tuple[int, int, int]] = set()
         """Messages that the bus loses: node, number of TPDO (0, 1), number of the SYNC."""
         self._samples = dict(samples)
+        import canopen  # noqa: PLC0415 -- an extra, which the other devices do not need
+
         self._network = canopen.Network(bus)
         self._network.connect()
         self.nodes = {node: self._node(node) for node in samples}
@@ -395,6 +397,9 @@ class SimulatedBus:
             (HEARTBEAT, 0): bytes(2),
             **{place: value.to_bytes(4, "little") for place, value in MAPPING.items()},
         }
+        import canopen  # noqa: PLC0415
+        from canopen import objectdictionary  # noqa: PLC0415
+
         dictionary: Any = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]
         for (index, subindex), value in objects.items():
             entry: Any = objectdictionary.ODVariable("", index, subindex)
@@ -461,9 +466,5 @@ class SimulatedBus:
 
 def _type_of(index: int, value: bytes) -> int:
     if index in {protocol.DEVICE_NAME, protocol.HARDWARE, protocol.SOFTWARE}:
-        return objectdictionary.VISIBLE_STRING
-    return {
-        1: objectdictionary.UNSIGNED8,
-        2: objectdictionary.UNSIGNED16,
-        4: objectdictionary.UNSIGNED32,
-    }[len(value)]
+        return VISIBLE_STRING
+    return UNSIGNED[len(value)]
