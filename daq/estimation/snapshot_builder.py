@@ -47,6 +47,7 @@ from daq.estimation.segments.segment_pass import still_for_a_while
 from daq.estimation.snapshot import Bridged, ChannelLabel, NoSegment, Octave, SensorTotals, Snapshot
 from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics
 from daq.estimation.throttle import Throttle
+from estimator.checks.advice import Untested
 from estimator.checks.stability import SegmentCourse
 from estimator.spectra.segment_rejection import Reason
 
@@ -236,7 +237,7 @@ class SnapshotBuilder:
             csm = np.full(shape, np.nan, dtype=np.complex128)
         n_segments = sum(each.n_segments for each in passes)
         estimates = self._estimates(bands, raw, recordings[0], first, n_segments, final=final)
-        sets = self._sets(passes) if final else ()
+        sets = self._sets(passes)
         if sets:
             estimates, sets = with_sets(
                 estimates, sets, self._settings, dims=dims, gains=self._gains
@@ -266,6 +267,8 @@ class SnapshotBuilder:
             self._occasional_cost += self._diagnoses.cost
         if self._findings.fits(frequency):
             diagnostics = self._findings.added_to(diagnostics)
+        if sets and not raw:
+            diagnostics = replace(diagnostics, untested=Untested.INCOMPLETE)
         snapshot = Snapshot(
             frequency=frequency,
             csm=csm,
@@ -483,6 +486,7 @@ def _left_out(passes: Sequence[Pass], n_partial: int = 0) -> dict[Reason, int]:
     for each in passes:
         counts.update(each.left_out)
         counts[Reason.GAP] -= each.n_bridged
+        counts[Reason.GAP] -= 0 if each.sets is None else each.sets.n_disturbed
     dropped = sum(each.n_seen - each.n_segments for each in passes) - n_partial
     counts[Reason.TRANSIENT] = dropped - counts.total()
     return {reason: counts[reason] for reason in Reason}

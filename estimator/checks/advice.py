@@ -79,6 +79,8 @@ class Untested(enum.StrEnum):
     """The recording has just started; the test follows with the first segments."""
     NO_SEGMENTS = "no-segments"
     """There are no averages."""
+    INCOMPLETE = "incomplete"
+    """In no segment do all channels have samples."""
     TOO_FEW_SENSORS = "too-few-sensors"
     """Fewer than three sensors have a signal of their own."""
     TOO_FEW_AVERAGES = "too-few-averages"

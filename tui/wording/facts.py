@@ -507,6 +507,8 @@ def _above(fact: NoEstimateAbove, names: Names) -> Wording:
 _WHY_UNTESTED = {
     Untested.UNFINISHED: "The diagnosis follows with the first segments.",
     Untested.NO_SEGMENTS: "The model test needs averages, and the recording has no segment.",
+    Untested.INCOMPLETE: "The model test needs segments in which all channels have samples, and "
+    "there are none.",
     Untested.TOO_FEW_SENSORS: "The model test needs three sensors with a signal of their own.",
     Untested.TOO_FEW_AVERAGES: "The model test needs more averages ({n:.0f} so far) than channels "
     "({channels}).",

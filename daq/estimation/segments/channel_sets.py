@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimator.spectra.segment_rejection import SelectedSpectra
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 
 if TYPE_CHECKING:
@@ -32,16 +33,32 @@ class ChannelSets:
     welch : WelchSettings
     short : float
         Share of a segment up to which missing samples are a short gap, and no concern here.
+    reject : bool
+        Whether segments with transients are left out, each set by segments of its own.
     """
 
-    def __init__(self, welch: WelchSettings, *, short: float) -> None:
-        self._welch, self._short = welch, short
-        self.spectra: dict[tuple[int, ...], CrossSpectra] = {}
+    def __init__(self, welch: WelchSettings, *, short: float, reject: bool = False) -> None:
+        self._welch, self._short, self._reject = welch, short, reject
+        self._sums: dict[tuple[int, ...], CrossSpectra | SelectedSpectra] = {}
+
+    @property
+    def spectra(self) -> dict[tuple[int, ...], CrossSpectra]:
+        """Spectra by columns, of the segments that count."""
+        return {
+            columns: each if isinstance(each, CrossSpectra) else each.spectra()
+            for columns, each in self._sums.items()
+        }
 
     @property
     def n_segments(self) -> int:
-        """Segments taken."""
-        return sum(each.n_segments for each in self.spectra.values())
+        """Segments taken, with those that transients are found in."""
+        return sum(each.n_segments for each in self._sums.values())
+
+    @property
+    def n_disturbed(self) -> int:
+        """Segments left out for transients."""
+        tested = (each for each in self._sums.values() if isinstance(each, SelectedSpectra))
+        return sum(each.counts.total() for each in tested)
 
     def take(
         self, samples: FloatArray, present: BoolArray, clipped: BoolArray | None, starts: IntArray
@@ -58,11 +75,15 @@ class ChannelSets:
             here = present[span]
             if np.mean(~here.all(axis=1)) > self._short:
                 columns = tuple(np.flatnonzero(here.all(axis=0)).tolist())
-                if columns and (columns in self.spectra or len(self.spectra) < MOST_SETS):
+                if columns and (columns in self._sums or len(self._sums) < MOST_SETS):
                     groups.setdefault(columns, []).append(start)
-                    self.spectra.setdefault(
-                        columns, CrossSpectra(self._welch, len(columns), threads=1)
-                    )
+                    if columns not in self._sums:
+                        self._sums[columns] = self._new(len(columns))
         for columns, at in groups.items():
-            self.spectra[columns].add(np.ascontiguousarray(samples[:, columns]), np.array(at))
+            self._sums[columns].add(np.ascontiguousarray(samples[:, columns]), np.array(at))
         return np.sort(np.array([start for at in groups.values() for start in at], np.int64))
+
+    def _new(self, n_channels: int) -> CrossSpectra | SelectedSpectra:
+        if self._reject:
+            return SelectedSpectra(self._welch, n_channels)
+        return CrossSpectra(self._welch, n_channels, threads=1)

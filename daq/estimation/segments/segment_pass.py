@@ -224,8 +224,9 @@ class Pass:
         if wanted.bridge > 0 and self._undisturbed is None and self.octaves is None:
             self._bridge = GapBridge(self.welch, self.n_channels, most=wanted.bridge)
         self.sets: ChannelSets | None = None
-        if self._undisturbed is None and self.octaves is None:
-            self.sets = ChannelSets(self.welch, short=wanted.bridge)
+        if self.octaves is None:
+            short = 0.0 if wanted.reject else wanted.bridge
+            self.sets = ChannelSets(self.welch, short=short, reject=bool(wanted.reject))
         self.n_seen = self._n_taken = 0
         self._fed = 0  # grid samples that the octaves have had
         self.left_out: Counter[Reason] = Counter()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import h5py
@@ -10,14 +11,16 @@ import pytest
 
 import huddle
 from daq.errors import NotARecordingError
-from daq.estimation.estimation import estimate
+from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.segments.clipping import clipped_shares
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
 from daq.formats.importer import import_files
 from daq.recording.reader import Recording
+from estimator.checks.advice import Untested
 from estimator.levels.pooled import blocks_of
 from estimator.self_noise.result import Flag, SelfNoise, combined
+from estimator.spectra.segment_rejection import Reason
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -49,9 +52,11 @@ def sensors(names: str, lacking: dict[str, list[int]], seed: int) -> dict[str, N
     return found
 
 
-def estimated(names: str, lacking: dict[str, list[int]], seed: int = 1) -> Snapshot:
+def estimated(
+    names: str, lacking: dict[str, list[int]], seed: int = 1, settings: Settings = SETTINGS
+) -> Snapshot:
     arrays = sensors(names, lacking, seed)
-    return estimate([recording_of_arrays(arrays, RATE)], SETTINGS)
+    return estimate([recording_of_arrays(arrays, RATE)], settings)
 
 
 def deviations(snapshot: Snapshot) -> NDArray[np.float64]:
@@ -88,6 +93,37 @@ def test_noise_is_right_where_channels_lack_samples(
         snapshot.channel_segments, np.array(expected) * per_part, atol=N_PARTS
     )
     assert snapshot.n_dropped < 2 * N_PARTS
+
+
+def test_segments_with_transients_are_left_out_of_every_set() -> None:
+    arrays = sensors("ABC", NEVER_TOGETHER, 1)
+    for second in range(5, 800, 40):  # on 5 % of the segments, of each set
+        at = int(second * RATE)
+        for each in arrays.values():
+            each[at : at + 3] += 3e4
+    recording = recording_of_arrays(arrays, RATE)
+    with_them = deviations(estimate([recording], SETTINGS))
+    snapshot = estimate([recording], replace(SETTINGS, reject=True))
+    assert np.abs(with_them).max() > 20
+    off = deviations(snapshot)
+    assert np.abs(off).max() < 4
+    assert snapshot.diagnostics.untested is Untested.INCOMPLETE
+    n_all = sum(snapshot.left_out.values())
+    assert snapshot.left_out[Reason.TRANSIENT] >= 40
+    assert snapshot.left_out[Reason.GAP] < 2 * N_PARTS
+    assert n_all == snapshot.n_dropped
+
+
+def test_a_live_estimate_has_them_too(tmp_path: Path) -> None:
+    path = imported(tmp_path, DAYS)
+    with Estimation([path], SETTINGS) as live:
+        live.update()
+        growing = live.snapshot()
+        final = live.finish()
+    assert growing.channel_segments == final.channel_segments != ()
+    np.testing.assert_array_equal(
+        growing.results["three-sensor"].noise_psd, final.results["three-sensor"].noise_psd
+    )
 
 
 def test_a_part_without_any_channel_missing_gives_the_same_as_alone() -> None:
