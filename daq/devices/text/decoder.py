@@ -23,8 +23,8 @@ channel
 
 A counter gives the exact index of a sample (:mod:`daq.protocols.sample_counter`), and so does a
 time of sufficient resolution (:mod:`daq.protocols.sample_times`): repeated rows are dropped and
-counted, missing rows become a gap. With neither, an unreadable message counts as one missing
-sample, and lost bytes are not detected.
+counted, missing rows become a gap. With neither, an unreadable message after the first
+readable one counts as one missing sample, and lost bytes are not detected.
 """
 
 from __future__ import annotations
@@ -267,9 +267,13 @@ class TextDecoder:
             yield self._block(counts[run.start : run.stop], device, at)
 
     def _unreadable(self) -> None:
-        """Count an unreadable message as missing, if neither a counter nor a time shows this."""
+        """Count an unreadable message as missing, if neither a counter nor a time shows this.
+
+        Before the first sample nothing can be missing: other hosts send to a UDP port, too.
+        """
         format_ = self._format
-        if format_.layout != "channel" and format_.counter_column is format_.time_column is None:
+        is_shown = format_.counter_column is not None or format_.time_column is not None
+        if self._has_read and format_.layout != "channel" and not is_shown:
             self._skip(1, "unreadable row", is_exact=False)
 
     # --- packets -----------------------------------------------------------------------------

@@ -89,6 +89,16 @@ def test_unreadable_rows_are_counted() -> None:
     assert "4,five,6" in events[0].text
 
 
+def test_nothing_is_missing_before_the_first_row() -> None:
+    """What another host sent to the port, or a line before the device was ready."""
+    decoder = TextDecoder("A", ROWS, sampling_rate=10.0)
+    found = [item for _ in range(3) for item in decoder.receive_datagram(b"x", at(1))]
+    found += decoder.receive_datagram(b"1,2,3\nx\n4,5,6", at(2))
+    index, _, events = split(found)
+    assert index == [0, 2]
+    assert [event.kind for event in events] == ["checksum"] * 4
+
+
 def test_nmea_checksum() -> None:
     """Of a sentence known to everybody."""
     sentence = "GPGLL,5300.97914,N,00259.98174,E,125926,A"
@@ -167,7 +177,7 @@ def test_memory_stays_bounded() -> None:
     assert "without the terminator '\\n': dropped (1 so far)" in event.text
     assert len(decoder._finder._buffer) <= text_format.MAX_MESSAGE  # noqa: SLF001 -- the claim
     index, rows, events = split(decoder.receive(b"1\n1,2,3\n", at(0)))
-    assert (index, rows, len(events)) == ([1], [[1, 2, 3]], 0)
+    assert (index, rows, len(events)) == ([0], [[1, 2, 3]], 0)
     shake = TextDecoder("A", SHAKE, sampling_rate=100.0)
     for packet in range(500):
         shake.receive_datagram(datacast("ENZ", packet), at(0))
