@@ -218,10 +218,10 @@ def test_record_says_what_is_safe(bench: Path, tmp_path: Path) -> None:
     assert code == 0, err
     status = json.loads(said)
     assert status["closed"]
-    for name in "ABC":
-        assert status["sensors"][name]["samples"] >= 900  # connecting takes part of the duration
     with Recording.open(out) as recording:
         assert recording.duration == 5
+        for name in "ABC":  # how many is up to the load: connecting takes part of the duration
+            assert status["sensors"][name]["samples"] == recording.sensor(name).n_samples > 0
     again = huddle("record", str(bench), "--duration", "5s", "--out", str(out), code=3)
     assert "exists already" in again.stderr
 
