@@ -19,7 +19,7 @@ _Result = TypeVar("_Result")
 _Arguments = TypeVarTuple("_Arguments")
 
 
-class _Jumping(selectors.DefaultSelector):
+class Jumping(selectors.DefaultSelector):
     """Waits for I/O only where there is no timer to jump to."""
 
     def __init__(self) -> None:
@@ -42,8 +42,8 @@ class _Jumping(selectors.DefaultSelector):
 class VirtualTimeLoop(asyncio.SelectorEventLoop):
     """Begins at time 0."""
 
-    def __init__(self) -> None:
-        self._jumping = _Jumping()
+    def __init__(self, selector: Jumping | None = None) -> None:
+        self._jumping = selector or Jumping()
         super().__init__(self._jumping)
 
     def time(self) -> float:

@@ -150,7 +150,7 @@ def _history(share: float, folder: Path) -> Iterator[Row]:
     found, remark = command_faults(folder / "history")
     yield Row(f"commands with {n} runs of a service", 3, found, f" ({remark})")
     found, remark = loop_faults(bench)
-    yield Row(f"start of a service with {n} runs", 1, found, f" ({remark})")
+    yield Row(f"hours of a service with {n} runs", 1, found, f" ({remark})")
 
 
 def _clocks(share: float, _: Path) -> Iterator[Row]:

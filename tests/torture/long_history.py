@@ -7,23 +7,29 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import resource
 import shutil
 import sqlite3
 import subprocess
 import sys
+import time
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tests.tui.service.bench_files import HOURLY, SENSORS, FakeSteps, bench_of
-from tui.service.clock import SystemTime
+from tests.tui.service.bench_files import HOURLY, SENSORS, FakeSteps, VirtualClock, bench_of
+from tests.virtual_time import Jumping, VirtualTimeLoop
+from tui.service.processes.finish import Outcome
+from tui.service.records.run_state import BandNoise
 from tui.service.records.store import RunStore
 from tui.service.service import Service
 
 if TYPE_CHECKING:
+    from selectors import SelectorKey
+
     from daq.bench.model import Bench
 
 N_RUNS = 100_000
@@ -117,37 +123,65 @@ def command_faults(folder: Path) -> tuple[list[str], str]:
     return faults, "; ".join(costs)
 
 
-def _starved() -> float:
-    """Return for how many seconds other processes kept this thread from a processor."""
-    return int(SCHEDULING.read_text(encoding="ascii").split()[1]) * 1e-9
+class _Watched(Jumping):
+    """Notes for how long the loop did not come back to it, by its own work."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.longest = 0.0
+        self._left: float | None = None
+
+    def select(self, timeout: float | None = None) -> list[tuple[SelectorKey, int]]:
+        """Return what is ready."""
+        if self._left is not None:
+            self.longest = max(self.longest, _worked() - self._left)
+        found = super().select(timeout)
+        self._left = _worked()
+        return found
 
 
-async def longest_pause(bench: Bench, seconds: float) -> float:
-    """Return for how long the event loop of a service stood still at most, by its own work."""
+def _worked() -> float:
+    """Return a time in s, less that for which others kept this thread from a processor."""
+    waited = SCHEDULING.read_text(encoding="ascii").split()[1]
+    return time.perf_counter() - int(waited) * 1e-9
+
+
+def longest_pause(bench: Bench, hours: float) -> tuple[float, int]:
+    """Serve for hours; return for how long the loop stood still at most, and the runs done."""
+    rng = np.random.default_rng(8)
+    steps = FakeSteps(bench.recording_directory, check_takes=5.0)
+    for _ in range(math.ceil(hours)):
+        noise = tuple(
+            BandNoise(f"S{k // 3}", "M", "7", "xyz"[k % 3], "m/s²", "three-sensor", 1.0, 10.0, *psd)
+            for k, psd in enumerate(rng.uniform(1e-12, 2e-12, (N_CHANNELS, 3)).tolist())
+        )
+        steps.outcomes.append(Outcome(noise=noise, verdict="pass"))
+    store = RunStore(bench.recording_directory)
     service = Service(
         bench,
-        steps=lambda _: FakeSteps(bench.recording_directory),
-        store=RunStore(bench.recording_directory),
-        clock=SystemTime(),
+        steps=lambda _: steps,
+        store=store,
+        clock=VirtualClock(datetime.now(UTC)),
         options={},
         reload=lambda: bench,
     )
-    loop = asyncio.get_running_loop()
-    longest, begin = 0.0, loop.time()
-    serving = asyncio.create_task(service.run())
-    while loop.time() - begin < seconds:
-        before = loop.time() - _starved()
-        await asyncio.sleep(0)  # one turn of the loop
-        longest = max(longest, loop.time() - _starved() - before)
-    service.request_stop()
-    await serving
-    return longest
+
+    async def serve() -> None:
+        serving = asyncio.create_task(service.run())
+        await asyncio.wait({serving}, timeout=hours * 3600)
+        service.request_stop()
+        await serving
+
+    watched = _Watched()
+    with asyncio.Runner(loop_factory=lambda: VirtualTimeLoop(watched)) as runner:
+        runner.run(serve())
+    return watched.longest, len(steps.finished)
 
 
 def loop_faults(bench: Bench) -> tuple[list[str], str]:
-    """Return whether a service stands still at its start with a history, and what it needs."""
+    """Return whether a service with a history stands still for long, and what it needs."""
     shutil.rmtree(bench.recording_directory / ".runs-copies", ignore_errors=True)
-    pause = asyncio.run(longest_pause(bench, 20.0))
+    pause, n_done = longest_pause(bench, 4.0)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    remark = f"longest step of the loop {1e3 * pause:.0f} ms, {memory:.0f} MB with the tests"
-    return ([] if pause <= LOOP_LIMIT else [remark]), remark
+    remark = f"{n_done} runs, longest step of the loop {1e3 * pause:.0f} ms, {memory:.0f} MB"
+    return ([] if pause <= LOOP_LIMIT and n_done >= 3 else [remark]), remark
