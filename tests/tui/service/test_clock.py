@@ -34,10 +34,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
+    from daq.bench.model import Bench
     from tui.service.records.run_state import Run
 
 DEMO = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
-SECONDS = 12
+SECONDS = 8
 """Length of a window."""
 DAY = timedelta(days=1)
 
@@ -80,6 +81,17 @@ class Computer:
         new.write_text(f"{self._offset.total_seconds():+.3f}\n", encoding="ascii")
         new.replace(self.folder / "clock")
 
+    def trust(self, moment: datetime) -> None:
+        """Set its clock, and let it be synchronised, once the service waits for that.
+
+        So a run is due after this moment, however long a busy computer takes to start the service.
+        """
+        log = self.folder / "log"
+        self.until(lambda _: "runs wait for it" in log.read_text("utf-8"))
+        assert self.store.runs() == []
+        self.set_to(moment)
+        self.trusted.touch()
+
     def until(self, has_come: Callable[[list[Run]], bool]) -> list[Run]:
         """Wait for a state of the runs."""
         deadline = time.monotonic() + limit(90.0)
@@ -91,9 +103,18 @@ class Computer:
         raise TimeoutError([f"{run.name} {run.state} {run.reason}" for run in self.store.runs()])
 
 
+@pytest.fixture(scope="module")
+def devices() -> Iterator[Bench]:
+    """Serve simulated sensors in real time, as if they were real: clocks matter then."""
+    with simulated(parse(DEMO), speed=1.0) as reachable:
+        yield reachable.model_copy(update={"simulation": {}})
+
+
 @contextmanager
-def service(folder: Path, cron: str, zone: str, starts: datetime) -> Iterator[Computer]:
-    """Serve simulated sensors in real time, the clock showing a time at the start."""
+def service(
+    folder: Path, devices: Bench, cron: str, zone: str, starts: datetime
+) -> Iterator[Computer]:
+    """Serve sensors, the clock showing a time at the start, and not yet synchronised."""
     library = subprocess.run(
         ["faketime", "-f", "+0", "sh", "-c", "echo $LD_PRELOAD"],
         check=True,
@@ -101,32 +122,30 @@ def service(folder: Path, cron: str, zone: str, starts: datetime) -> Iterator[Co
         text=True,
     ).stdout.strip()
     path = folder / "bench.toml"
-    with simulated(parse(DEMO), speed=1.0) as reachable:
-        text = dump(reachable.model_copy(update={"simulation": {}}))
-        entry = f'cron = "{cron}"\ntime_zone = "{zone}"\nduration = "{SECONDS}s"\n'
-        path.write_text(f'{text}\n[[schedule]]\nname = "t"\n{entry}', encoding="utf-8")
-        computer = Computer(folder, path)
-        computer.set_to(starts)
-        environment = os.environ | {
-            "LD_PRELOAD": library,
-            "FAKETIME_TIMESTAMP_FILE": str(folder / "clock"),
-            "FAKETIME_NO_CACHE": "1",
-            "FAKETIME_DONT_FAKE_MONOTONIC": "1",
-        }
-        command = [sys.executable, "-m", "tests.tui.service.faked_service"]
-        command += [str(path), str(computer.trusted)]
-        log = folder / "log"
-        with (
-            log.open("wb") as written,
-            subprocess.Popen(command, env=environment, stdout=written, stderr=written) as child,
-        ):
-            try:
-                yield computer
-            finally:
-                child.terminate()
-                code = child.wait(limit(30.0))
-                print(log.read_text(encoding="utf-8"))
-        assert code == 0
+    entry = f'cron = "{cron}"\ntime_zone = "{zone}"\nduration = "{SECONDS}s"\n'
+    path.write_text(f'{dump(devices)}\n[[schedule]]\nname = "t"\n{entry}', encoding="utf-8")
+    computer = Computer(folder, path)
+    computer.set_to(starts)
+    environment = os.environ | {
+        "LD_PRELOAD": library,
+        "FAKETIME_TIMESTAMP_FILE": str(folder / "clock"),
+        "FAKETIME_NO_CACHE": "1",
+        "FAKETIME_DONT_FAKE_MONOTONIC": "1",
+    }
+    command = [sys.executable, "-m", "tests.tui.service.faked_service"]
+    command += [str(path), str(computer.trusted)]
+    log = folder / "log"
+    with (
+        log.open("wb") as written,
+        subprocess.Popen(command, env=environment, stdout=written, stderr=written) as child,
+    ):
+        try:
+            yield computer
+        finally:
+            child.terminate()
+            code = child.wait(limit(30.0))
+            print(log.read_text(encoding="utf-8"))
+    assert code == 0
 
 
 pytest_faketime = pytest.mark.skipif(shutil.which("faketime") is None, reason="needs faketime")
@@ -147,14 +166,11 @@ def others(runs: list[Run]) -> list[tuple[datetime, RunState]]:
 @pytest.mark.long
 @pytest_faketime
 @pytest.mark.parametrize("wrong_by", [-3 * DAY, 3 * DAY])
-def test_a_wrong_clock_at_the_start(tmp_path: Path, wrong_by: timedelta) -> None:
+def test_a_wrong_clock_at_the_start(tmp_path: Path, devices: Bench, wrong_by: timedelta) -> None:
     """It is set right while the service waits: the run of today is recorded, none is missed."""
-    today = datetime(2026, 12, 3, 21, 59, 50, tzinfo=UTC)
-    with service(tmp_path, "0 22 * * *", "UTC", today + wrong_by) as computer:
-        computer.until(lambda _: "runs wait for it" in (tmp_path / "log").read_text("utf-8"))
-        assert computer.store.runs() == []
-        computer.set_to(today)
-        computer.trusted.touch()
+    today = datetime(2026, 12, 3, 21, 59, 57, tzinfo=UTC)
+    with service(tmp_path, devices, "0 22 * * *", "UTC", today + wrong_by) as computer:
+        computer.trust(today)
         runs = computer.until(is_recorded)
     assert [run.due for run in recorded(runs)] == [datetime(2026, 12, 3, 22, tzinfo=UTC)]
     assert others(runs) == [(datetime(2026, 12, 4, 22, tzinfo=UTC), RunState.DUE)]
@@ -163,10 +179,10 @@ def test_a_wrong_clock_at_the_start(tmp_path: Path, wrong_by: timedelta) -> None
 @pytest.mark.long
 @pytest_faketime
 @pytest.mark.parametrize("step", [-timedelta(hours=1), timedelta(days=2)])
-def test_a_clock_that_jumps_within_a_run(tmp_path: Path, step: timedelta) -> None:
-    starts = datetime(2026, 12, 3, 21, 59, 55, tzinfo=UTC)
-    with service(tmp_path, "0 22 * * *", "UTC", starts) as computer:
-        computer.trusted.touch()
+def test_a_clock_that_jumps_within_a_run(tmp_path: Path, devices: Bench, step: timedelta) -> None:
+    starts = datetime(2026, 12, 3, 21, 59, 57, tzinfo=UTC)
+    with service(tmp_path, devices, "0 22 * * *", "UTC", starts) as computer:
+        computer.trust(starts)
         recordings = load(computer.bench).recording_directory
         computer.until(lambda _: "block_writer: clock: " in (tmp_path / "log").read_text("utf-8"))
         computer.set_to(computer.now() + step)
@@ -187,11 +203,11 @@ def test_a_clock_that_jumps_within_a_run(tmp_path: Path, step: timedelta) -> Non
 
 @pytest.mark.long
 @pytest_faketime
-def test_the_hour_that_comes_twice_has_two_runs(tmp_path: Path) -> None:
+def test_the_hour_that_comes_twice_has_two_runs(tmp_path: Path, devices: Bench) -> None:
     """02:00 in Berlin comes at 00:00 and 01:00 UTC on 2026-10-25: the second has its run."""
-    starts = datetime(2026, 10, 25, 0, 59, 55, tzinfo=UTC)
-    with service(tmp_path, "0 * * * *", "Europe/Berlin", starts) as computer:
-        computer.trusted.touch()
+    starts = datetime(2026, 10, 25, 0, 59, 57, tzinfo=UTC)
+    with service(tmp_path, devices, "0 * * * *", "Europe/Berlin", starts) as computer:
+        computer.trust(starts)
         runs = computer.until(is_recorded)
     assert [run.due for run in recorded(runs)] == [datetime(2026, 10, 25, 1, tzinfo=UTC)]
     assert others(runs) == [(datetime(2026, 10, 25, 2, tzinfo=UTC), RunState.DUE)]
@@ -199,11 +215,12 @@ def test_the_hour_that_comes_twice_has_two_runs(tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest_faketime
-def test_a_leap_second_causes_one_run(tmp_path: Path) -> None:
+def test_a_leap_second_causes_one_run(tmp_path: Path, devices: Bench) -> None:
     """As Linux does it: after 23:59:59 the clock is set back by one second."""
     midnight = datetime(2027, 1, 1, tzinfo=UTC)
-    with service(tmp_path, "0 0 * * *", "UTC", midnight - timedelta(seconds=5)) as computer:
-        computer.trusted.touch()
+    starts = midnight - timedelta(seconds=3)
+    with service(tmp_path, devices, "0 0 * * *", "UTC", starts) as computer:
+        computer.trust(starts)
         computer.until(lambda runs: any(run.state is RunState.RECORDING for run in runs))
         computer.set_to(computer.now() - timedelta(seconds=1))
         runs = computer.until(is_recorded)
