@@ -3,10 +3,10 @@
 Theory of operation
 -------------------
 The database is copied once a day. A damaged one is moved away, never repaired: SQLite may find some
-of its rows wrong without a sign. Runs that the copy does not have are read from their recordings.
-The last recording of a run that is done has the run and its noise as an attribute of ``/results``.
-A run that is not done has a mark beside its recording; its entry is the one that was due when the
-recording began.
+of its rows wrong without a sign. Runs that the copy does not have, or not as done, are read from
+their recordings. The last recording of a run that is done has the run and its noise as an attribute
+of ``/results``. A run that is not done has a mark beside its recording; its entry is the one that
+was due when the recording began.
 """
 
 from __future__ import annotations
@@ -48,9 +48,10 @@ def heal(store: RunStore, bench: Bench, now: datetime) -> bool:
         return False
     is_lost = damage == EMPTIED
     moved, copy = (None, None) if is_lost else store.restore(now)
-    known = store.parts()
+    begun = RunState.RECORDING, RunState.ESTIMATING
+    unfinished = {part for run in store.runs(None, *begun) for part in run.parts}
     n_found = 0
-    for run in _runs_of_recordings(bench, known):
+    for run in _runs_of_recordings(bench, store.parts() - unfinished, unfinished):
         store.save(run)
         n_found += 1
     if is_lost and not n_found:  # a new one
@@ -71,8 +72,8 @@ def damage_of(store: RunStore) -> str:
     return store.damage() or ("" if store.runs(last=1) else EMPTIED)
 
 
-def _runs_of_recordings(bench: Bench, known: set[str]) -> Iterator[Run]:
-    """Yield the runs of recordings that no run has, the newest first."""
+def _runs_of_recordings(bench: Bench, known: set[str], unfinished: set[str]) -> Iterator[Run]:
+    """Yield the runs of recordings that no run has, or that are done, the newest first."""
     for path in sorted(bench.recording_directory.glob("*.h5"), reverse=True):
         if path.name not in known:
             try:
@@ -80,7 +81,7 @@ def _runs_of_recordings(bench: Bench, known: set[str]) -> Iterator[Run]:
             except (HuddleError, OSError, KeyError, TypeError, ValueError) as error:
                 _LOGGER.warning("%s: no run can be read from it: %s", path, error)
                 continue
-            if run is not None:
+            if run is not None and (run.is_over or path.name not in unfinished):
                 known.update(run.parts)
                 yield run
 

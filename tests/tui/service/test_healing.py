@@ -28,7 +28,7 @@ from tui.service.planning import next_runs
 from tui.service.processes.finish import Request, finish
 from tui.service.records.parts import mark_of
 from tui.service.records.run_state import Run, RunState
-from tui.service.records.store import COPIES
+from tui.service.records.store import COPIES, RunStore
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -126,6 +126,41 @@ def test_all_runs_are_there_again(tmp_path: Path, damage: object, *, copied: boo
     assert found.noise == run.noise
     assert not math.isnan(found.noise[0].psd)
     assert not heal(place.store, place.bench, START)
+
+
+@pytest.mark.parametrize("copied", [True, False])
+def test_rows_that_are_lost_are_there_again(tmp_path: Path, *, copied: bool) -> None:
+    """Also where others are left: of the copy, or of what this process has written since."""
+    place = Place(tmp_path)
+    run = done_run(place)
+    later = replace(run, due=run.due + timedelta(hours=1), state=RunState.DUE, parts=(), noise=())
+    place.store.save(later)
+    if not copied:
+        place.store.copy(START.date())
+    place.store.save(run)
+    if copied:
+        place.store.copy(START.date())
+        (place.bench.recording_directory / "r.h5").unlink()
+    with contextlib.closing(sqlite3.connect(place.store.path)) as database:
+        database.execute("DELETE FROM runs WHERE key = ?", (run.key,))
+        database.commit()
+    store = RunStore(place.bench.recording_directory) if copied else place.store
+    assert "1 run is missing" in store.damage()
+    assert heal(store, place.bench, START)
+    assert run in map(store.with_noise, store.runs())
+    store.forget_planned(later)
+    assert not heal(store, place.bench, START)
+
+
+def test_a_copy_that_is_older_than_a_result_gives_way_to_it(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    run = done_run(place)
+    place.store.save(replace(run, state=RunState.RECORDING, verdict="", noise=(), ended=None))
+    place.store.copy(START.date())
+    place.store.save(run)
+    overwritten(place.store.path)
+    assert heal(place.store, place.bench, START)
+    assert list(map(place.store.with_noise, place.store.runs())) == [run]
 
 
 def test_a_damaged_text_hides_no_other(tmp_path: Path) -> None:

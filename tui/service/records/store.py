@@ -80,6 +80,13 @@ _WRONG_ROWS = (
     " OR NOT json_valid(untold) OR typeof(duration) NOT IN ('real', 'integer')"
 )
 """Rows of which SQLite does not know that they are damaged: it has no checksums."""
+_MISSING_SAVED = (
+    "SELECT value FROM json_each(?) WHERE NOT EXISTS (SELECT 1 FROM runs WHERE key = value)"
+)
+_MISSING_COPIED = (
+    "SELECT key FROM copied.runs AS old WHERE state != ?"
+    " AND NOT EXISTS (SELECT 1 FROM main.runs WHERE key = old.key)"
+)
 _OVER = tuple(state for state in RunState if not NEXT[state])
 
 
@@ -99,6 +106,8 @@ class RunStore:
         self.path = folder / NAME
         self._known: tuple[int, int, bytes] | None = (-1, -1, b"")  # not checked yet
         """State of the file that was checked, with the changes made here since."""
+        self._saved: set[str] = set()
+        """Keys of the runs that this object has written."""
 
     def save(self, run: Run) -> None:
         """Write a run in its present state, with the noise that it has found.
@@ -125,6 +134,7 @@ class RunStore:
                     f" VALUES (?{', ?' * len(_NOISE)})",
                     [(run.key, *astuple(each)) for each in run.noise],
                 )
+        self._saved.add(run.key)
 
     def pin(self, keys: Sequence[str], *, pinned: bool) -> None:
         """Keep these runs whatever the limits of storage, or no longer."""
@@ -163,6 +173,7 @@ class RunStore:
 
     def forget_planned(self, run: Run) -> None:
         """Remove a run that is no longer in the schedule, unless it has begun."""
+        self._saved.discard(run.key)
         with self._changed() as database:
             database.execute(
                 "DELETE FROM runs WHERE key = ? AND state = ?", (run.key, RunState.DUE)
@@ -306,11 +317,12 @@ class RunStore:
     def damage(self) -> str:
         """Return what is wrong with the database; empty if nothing is, or it cannot be asked now.
 
-        An empty database is damaged if its newest copy is not: runs are never removed from it.
+        Runs that have begun are never removed: a database without those of its newest copy, or
+        without those that this object has written, is damaged.
         """
         newest, state = next(iter(self.copies()), None), self._state()
         try:
-            found = _check(self.path)
+            found = _check(self.path) or self._missing(newest)
         except FileNotFoundError:
             found = "" if newest is None else "it is missing"
         except (sqlite3.Error, OSError) as error:
@@ -321,6 +333,20 @@ class RunStore:
         if not found:
             self._known = state
         return found
+
+    def _missing(self, copy: Path | None) -> str:
+        """Return how many runs of its copy, and of those written here, the database has not."""
+        saved = json.dumps(list(self._saved))
+        missing = set()
+        with contextlib.closing(sqlite3.connect(self.path, timeout=_BUSY)) as database:
+            missing.update(database.execute(_MISSING_SAVED, (saved,)))
+            missing = {key for key in missing if key[0] in self._saved}  # not forgotten meanwhile
+            if copy is not None:
+                with contextlib.suppress(sqlite3.Error):  # a damaged copy says nothing
+                    database.execute("ATTACH ? AS copied", (f"{copy.absolute()}",))
+                    missing.update(database.execute(_MISSING_COPIED, (RunState.DUE,)))
+        n = len(missing)
+        return f"{n} {'run is' if n == 1 else 'runs are'} missing" if n else ""
 
     @property
     def is_changed(self) -> bool:
@@ -384,6 +410,7 @@ class RunStore:
             If the disk refuses it.
         """
         moved = None
+        self._saved.clear()
         try:
             if self.path.exists():
                 moved = self.path.with_name(f"{NAME}.damaged-{now:%Y%m%dT%H%M%S}")
