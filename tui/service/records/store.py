@@ -337,7 +337,7 @@ class RunStore:
     def _missing(self, copy: Path | None) -> str:
         """Return how many runs of its copy, and of those written here, the database has not."""
         saved = json.dumps(list(self._saved))
-        missing = set()
+        missing: set[tuple[str]] = set()
         with contextlib.closing(sqlite3.connect(self.path, timeout=_BUSY)) as database:
             missing.update(database.execute(_MISSING_SAVED, (saved,)))
             missing = {key for key in missing if key[0] in self._saved}  # not forgotten meanwhile
