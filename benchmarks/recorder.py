@@ -13,6 +13,7 @@ import json
 import os
 import pty
 import resource
+import signal
 import subprocess
 import sys
 import tempfile
@@ -193,6 +194,7 @@ def live(n_sensors: int, sampling_rate: float, *, begin: float, duration: float)
                 100 * (_work_of(pid) - work) / passed
                 for pid, work in zip(processes, before, strict=True)
             ]
+            huddle.send_signal(signal.SIGINT)  # the rest of the recording shows nothing
             huddle.wait()
     what = f"{n_sensors} triaxial sensors × {sampling_rate:g} Hz, recorded and estimated"
     note = f"huddle run {share[0]:.2f} %, its recorder {share[1]:.2f} %"
