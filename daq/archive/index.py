@@ -50,6 +50,8 @@ class Entry:
     """Months of UTC with stretches, each with the hash of what the recording gives to it."""
     daily: bool
     """Whether its matrices have become those of days."""
+    single: bool
+    """Whether these are in single precision."""
 
     @property
     def order(self) -> tuple[bool, int, str]:
@@ -67,7 +69,9 @@ class Entry:
             months = {month_of(s): f"{about.st_size} {about.st_mtime_ns}" for s in starts}
         n_segments = int(file.stretches["n_segments"].sum())
         start = starts[0] if starts else None
-        return cls(file.path, file.described, start, n_segments, months, file.is_daily)
+        return cls(
+            file.path, file.described, start, n_segments, months, file.is_daily, file.is_single
+        )
 
 
 class Index:
@@ -150,6 +154,7 @@ class Index:
             "n_segments": entry.n_segments,
             "months": dict(entry.months),
             "daily": entry.daily,
+            "single": entry.single,
         }
         name = str(entry.path.relative_to(self._folder))
         self._new.append((name, about.st_size, about.st_mtime_ns, json.dumps(document)))

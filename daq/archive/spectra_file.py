@@ -3,7 +3,7 @@
 A file has its name when it is complete and on the disk; before, it is hidden and ends in ``.part``.
 Rows hold cross-spectral matrices in unit²/Hz, packed: real parts on and below the diagonal,
 imaginary parts of the elements above the diagonal. The matrices are Hermitian, so nothing is lost.
-`thin` replaces them by the means of days in single precision, and leaves summaries
+`thin` stores them in single precision, as they are or as means of days, and leaves summaries
 (`daq.archive.rollup`) as they are.
 """
 
@@ -160,11 +160,21 @@ class SpectraWriter:
     path : Path
     n_freqs, n_channels : int
     daily : bool
-        Whether stretches are days in single precision, of spectra that were finer.
+        Whether stretches are days of spectra that were finer; always in single precision.
+    single : bool
+        Whether matrices are in single precision.
     """
 
-    def __init__(self, path: Path, *, n_freqs: int, n_channels: int, daily: bool = False) -> None:
-        self._daily = daily
+    def __init__(
+        self,
+        path: Path,
+        *,
+        n_freqs: int,
+        n_channels: int,
+        daily: bool = False,
+        single: bool = False,
+    ) -> None:
+        self._daily, self._single = daily, daily or single
         self._path = path
         self._part = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
         self._file = h5py.File(self._part, "w")
@@ -174,7 +184,7 @@ class SpectraWriter:
             shape=(0, *shape),
             maxshape=(None, *shape),
             chunks=(1, *shape),
-            dtype="<f4" if daily else "<f8",
+            dtype="<f4" if self._single else "<f8",
             fletcher32=True,
         )
         self._stretches: list[tuple[int, int]] = []
@@ -238,6 +248,7 @@ class SpectraWriter:
                 "clipped": json.dumps(dict(described.clipped)),
                 "stood_still": json.dumps(dict(described.stood_still)),
                 "daily": int(self._daily),
+                "single": int(self._single),
             }
         )
         file.close()
@@ -308,7 +319,9 @@ class SpectraFile:
         self.stretches: NDArray[np.void] = dataset(file, "stretches", STRETCH_DTYPE)[...]
         self.is_daily = bool(attributes.get("daily", 0))
         """Whether the matrices of stretches have become those of days."""
-        self._csm = dataset(file, "csm", np.dtype("<f4" if self.is_daily else "<f8"))
+        self.is_single = bool(attributes.get("single", self.is_daily))
+        """Whether the matrices are in single precision."""
+        self._csm = dataset(file, "csm", np.dtype("<f4" if self.is_single else "<f8"))
         self.months: dict[str, str] = {}
         """SHA-256 of the summary of each month; empty in files of format version 1."""
         if version > 1 and "months" in file:
@@ -375,11 +388,12 @@ class SpectraFile:
         self.close()
 
 
-def thin(path: Path) -> bool:
+def thin(path: Path, *, single: bool = False) -> bool:
     """Replace the matrices of a file by the means of days, in single precision; whether it did.
 
-    The estimate of other settings than the archive's is then one of days. Files without summaries,
-    or of days already, stay as they are.
+    The estimate of other settings than the archive's is then one of days. Where `single`, matrices
+    of all stretches are kept, in single precision. Files without summaries, or that are as small
+    already, stay as they are.
 
     Raises
     ------
@@ -387,17 +401,27 @@ def thin(path: Path) -> bool:
         If the file is damaged: it stays as it is.
     """
     with SpectraFile(path) as file:
-        if file.is_daily or not file.months:
+        if file.is_daily or not file.months or (single and file.is_single):
             return False
         n_channels = len(file.described.channels)
-        with SpectraWriter(path, n_freqs=file.n_freqs, n_channels=n_channels, daily=True) as writer:
-            for day, some in itertools.groupby(file.rows(), lambda row: row[0] // DAY_NS * DAY_NS):
-                total, count = np.zeros(1, np.complex128), 0
-                for _, n_segments, csm in some:
-                    total, count = total + n_segments * csm, count + n_segments
-                writer.append(day, count, total / count)
+        with SpectraWriter(
+            path, n_freqs=file.n_freqs, n_channels=n_channels, daily=not single, single=True
+        ) as writer:
+            for row in file.rows() if single else _of_days(file.rows()):
+                writer.append(*row)
             writer.commit(file.described, ((m, file.summary(m)) for m in file.months))
     return True
+
+
+def _of_days(
+    rows: Iterable[tuple[int, int, ComplexArray]],
+) -> Iterator[tuple[int, int, ComplexArray]]:
+    """Yield the means of days."""
+    for day, some in itertools.groupby(rows, lambda row: row[0] // DAY_NS * DAY_NS):
+        total, count = np.zeros(1, np.complex128), 0
+        for _, n_segments, csm in some:
+            total, count = total + n_segments * csm, count + n_segments
+        yield day, count, total / count
 
 
 def packed(csm: ComplexArray) -> NDArray[np.float64]:

@@ -155,10 +155,11 @@ class Store:
                 found.append(entry)
         return tuple(sorted(found, key=lambda entry: entry.order)), tuple(bad)
 
-    def thin(self, days: int) -> int:
+    def thin(self, days: int, *, single: bool = False) -> int:
         """Keep of recordings that begin so many days before the last one the matrices of days only.
 
-        Returns how many files have been made smaller.
+        Where `single`, keep those of all stretches, in single precision. Returns how many files
+        have been made smaller.
         """
         entries, _ = self.entries()
         starts = [entry.start_utc_ns for entry in entries if entry.start_utc_ns is not None]
@@ -166,9 +167,11 @@ class Store:
         old = [
             entry
             for entry in entries
-            if entry.start_utc_ns is not None and entry.start_utc_ns < last and not entry.daily
+            if entry.start_utc_ns is not None
+            and entry.start_utc_ns < last
+            and not (entry.single if single else entry.daily)
         ]
-        return sum(thin(entry.path) for entry in old)
+        return sum(thin(entry.path, single=single) for entry in old)
 
     def _check(self, file: SpectraFile) -> None:
         """Refuse spectra of other sensors or settings than the archive's."""

@@ -91,6 +91,13 @@ def archive(
             " ones those of days, in single precision.",
         ),
     ] = None,
+    thin_hours: Annotated[
+        bool,
+        typer.Option(
+            "--thin-hours",
+            help="With --thin-after: keep also the matrices of older hours, in single precision.",
+        ),
+    ] = False,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -153,12 +160,9 @@ def archive(
     check_places(json, csv)
     if stretch not in {None, *STRETCHES}:
         raise typer.BadParameter(f"--stretch {stretch}: expected hour or day")
-    try:
-        zone = zoneinfo.ZoneInfo(time_zone)
-    except (zoneinfo.ZoneInfoNotFoundError, ValueError):
-        raise typer.BadParameter(
-            f"--time-zone {time_zone}: expected a name such as Europe/London"
-        ) from None
+    zone = _zone(time_zone)
+    if thin_hours and thin_after is None:
+        raise typer.BadParameter("--thin-hours: give --thin-after DAYS also")
     if out is not None:
         require("matplotlib")
     if scheduler is not None:
@@ -186,7 +190,7 @@ def archive(
     settings = checked(archive.plan)
 
     failures = _take_new(archive, paths, jobs=jobs, scheduler=scheduler) if paths else []
-    _thin(archive, thin_after)
+    _thin(archive, thin_after, single=thin_hours)
     entries, bad = archive.entries()
     found = _answered(archive, entries, settings, zone=zone, false_alarm=false_alarm)
     screen = for_people(json, csv)
@@ -205,6 +209,16 @@ def archive(
         notices().print(line, style="red", soft_wrap=True)
     if wrong:
         raise typer.Exit(ExitCode.TROUBLE)
+
+
+def _zone(name: str) -> zoneinfo.ZoneInfo:
+    """Return a time zone by its name."""
+    try:
+        return zoneinfo.ZoneInfo(name)
+    except (zoneinfo.ZoneInfoNotFoundError, ValueError):
+        raise typer.BadParameter(
+            f"--time-zone {name}: expected a name such as Europe/London"
+        ) from None
 
 
 def _answered(
@@ -288,7 +302,7 @@ def _take_new(
     return failures
 
 
-def _thin(archive: Store, days: int | None) -> None:
+def _thin(archive: Store, days: int | None, *, single: bool) -> None:
     """Reduce the matrices of old recordings."""
     from tui.output.console import notices
     from tui.wording.formatting import several
@@ -296,8 +310,9 @@ def _thin(archive: Store, days: int | None) -> None:
     if days is None:
         return
     with archive.writing():
-        n_thinned = archive.thin(days)
-    notices().print(f"matrices of {several(n_thinned, 'recording')} reduced to those of days")
+        n_thinned = archive.thin(days, single=single)
+    kept = "single precision" if single else "those of days"
+    notices().print(f"matrices of {several(n_thinned, 'recording')} reduced to {kept}")
 
 
 def _with_progress(

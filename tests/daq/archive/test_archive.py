@@ -445,3 +445,30 @@ def test_thinned_files_answer_as_before_and_other_settings_by_day(copy: Store) -
     daily = answer(copy, copy.entries()[0], replace(SETTINGS, unit="g"))
     np.testing.assert_allclose(daily.levels.mean, other.levels.mean, rtol=1e-2)  # at SNR 625
     assert 0 < daily.density.n_stretches < other.density.n_stretches
+
+
+def test_hours_in_single_precision_answer_as_before_in_half_of_the_room(copy: Store) -> None:
+    wanted = {path: rows_of(path) for path in copy.files()}
+    other = answer(copy, copy.entries()[0], replace(SETTINGS, unit="g"))
+    n_old = len(copy.files()) - 1
+    assert copy.thin(0, single=True) == n_old
+    assert copy.thin(0, single=True) == 0
+    n_bytes = []
+    for path, rows in wanted.items():
+        with h5py.File(path) as file:
+            n_bytes.append(file["csm"].dtype.itemsize)
+        for (start, n, csm), (start_kept, n_kept, kept) in zip(rows, rows_of(path), strict=True):
+            assert (start_kept, n_kept) == (start, n)
+            largest = np.abs(csm).max(axis=(1, 2), keepdims=True)
+            assert np.all(np.abs(kept - csm) <= 1e-7 * largest)
+    assert sorted(n_bytes) == [4] * n_old + [8]
+    found = answer(copy, copy.entries()[0], replace(SETTINGS, unit="g"))
+    np.testing.assert_allclose(found.levels.mean, other.levels.mean, rtol=1e-6 * SNR)
+    assert found.density.n_stretches == other.density.n_stretches
+    assert copy.thin(0) == n_old  # days of these
+
+
+def rows_of(path: Path) -> list[tuple[int, int, NDArray[np.complex128]]]:
+    """Return the stretches of a file."""
+    with SpectraFile(path) as file:
+        return list(file.rows())

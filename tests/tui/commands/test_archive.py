@@ -134,6 +134,7 @@ def test_what_is_wrong_is_named_and_the_rest_is_shown(folder: Path, tmp_path: Pa
         (["--equalise", "auto"], "--equalise auto (the archive: off)"),
         (["--stretch", "week"], "expected hour or day"),
         (["--time-zone", "Mars"], "Europe/London"),
+        (["--thin-hours"], "give --thin-after DAYS"),
     ],
 )
 def test_wrong_options_are_refused(folder: Path, arguments: list[str], message: str) -> None:
