@@ -234,6 +234,8 @@ def mask_edges(
     if high <= low:
         return np.empty(0, dtype=np.int64)
     edges = third_octaves(frequency, low, high)
+    if len(points) <= 2:
+        return edges  # straight in log-log
     bent = _is_bent(np.log(frequency[edges[0] : edges[-1]]), np.log(mask), edges)
     inner = np.searchsorted(frequency, points[1:-1])
     inner = inner[(inner >= edges[0]) & (inner < edges[-1])]

@@ -213,8 +213,9 @@ class Bands:
             mask = mask_psd(bench, limit, snapshot.channels[columns[0]], frequency)
             edges = mask_edges(frequency, mask, points, known=known)
         alone = np.zeros((max(len(edges) - 1, 0), len(snapshot.channels)), np.bool_)
-        for band, centre in enumerate(_centres(frequency, edges).tolist()):
-            alone[band, list(without_partners(snapshot, (centre, centre)))] = True
+        if len(alone) and without_partners(snapshot, (frequency[edges[0]], frequency[edges[-1]])):
+            for band, centre in enumerate(_centres(frequency, edges).tolist()):
+                alone[band, list(without_partners(snapshot, (centre, centre)))] = True
         return cls(limit, edges, _judged_range(frequency, points, edges, known), columns, alone)
 
     @property
