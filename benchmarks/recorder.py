@@ -47,8 +47,13 @@ SEND_INTERVAL = 0.05
 AXES = tuple(Channel(name=axis, sensitivity=commands.COUNTS_PER_UNIT) for axis in "xyz")
 
 
+PERIOD = 1 << 16
+"""Samples after which the played motion and noise repeat: more than an estimate has here, for of
+averages of the same segments no dimension is right, and all are tried."""
+
+
 class Noise:
-    """What the played sensors read: motion of a million counts, repeated after 8000 samples.
+    """What the played sensors read: motion of a million counts.
 
     Each sensor adds noise of its own, a hundredth of the motion.
     """
@@ -56,7 +61,7 @@ class Noise:
     def __init__(self, sampling_rate: float) -> None:
         self.sampling_rate = sampling_rate
         rng = np.random.default_rng(1)
-        self._motion = rng.normal(0, 1e6, (8000, 3))
+        self._motion = rng.normal(0, 1e6, (PERIOD, 3))
         self._counts: dict[str, NDArray[np.float64]] = {}
 
     def at_rate(self, sampling_rate: float) -> Noise:
