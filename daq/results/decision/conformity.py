@@ -68,11 +68,6 @@ class Conformity:
     risk: float
     frequency: float
 
-    @property
-    def is_within(self) -> bool:
-        """Whether the statement is that the limit is kept."""
-        return self.statement in {Statement.PASS, Statement.CONDITIONAL_PASS}
-
 
 def conformity(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> list[Conformity]:
     """Return the statement on every channel beside every limit, by the rule of the bench file.
