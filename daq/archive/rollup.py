@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import reduce
 from operator import add
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -156,9 +156,10 @@ class Grid:
         spans : sequence of slice
             Bands: they take the place of the fine ones.
         """
-        own = np.asarray(days, np.float64)
+        # Fine bands first: sums over them then run through the memory in order.
+        own = np.ascontiguousarray(np.moveaxis(days, -2, 1), np.float64)
         known = np.isfinite(own[MEAN]) & np.isfinite(own[DEVIATION])
-        bins = np.where(known, self.n_bins[:, None], 0)
+        bins = np.where(known, _along_first(self.n_bins, known), 0)
         own = np.where(known, own, 0.0)
         unbounded = ~(own[BOUND] > 0)
         deviation = own[DEVIATION] * bins
@@ -170,16 +171,15 @@ class Grid:
                 np.where(by > 0, own[field] * by, 0.0)
                 for field, by in ((BELOW, bins), (ABOVE, bins), (SHARE, size))
             )
-        parts = np.stack(
-            [
-                *(bins, mean, square, own[SKEWNESS] * deviation**3, own[TAIL] * square**2),
-                *(below, above, size, share, np.where(unbounded, 0.0, own[BOUND]) * bins),
-                *(of_bound**2, ~known, unbounded),
-            ]
+        parts = (
+            *(bins, mean, square, own[SKEWNESS] * (square * deviation), own[TAIL] * square**2),
+            *(below, above, size, share, np.where(unbounded, 0.0, own[BOUND]) * bins),
+            *(of_bound**2, ~known, unbounded),
         )
         total, mean, t2, t3, t4, below, above, size, share, bound, spread, n_unknown, n_open = (
-            np.stack([parts[..., span, :].sum(axis=-2) for span in spans], axis=-2)
-        ).astype(np.float64)
+            np.stack([part[span].sum(axis=0, dtype=np.float64) for span in spans], axis=-2)
+            for part in parts
+        )
         with np.errstate(invalid="ignore", divide="ignore"):
             more = self._pairs(deviation, spans)
             excess = 1 + np.where(t2 > 0, more / t2, 0.0)
@@ -201,14 +201,16 @@ class Grid:
         )
 
     def _pairs(self, deviation: FloatArray, spans: Sequence[slice]) -> FloatArray:
-        """Return what the correlation of bins adds to the variance of sums over fine bands."""
-        shape = (*deviation.shape[:-2], len(spans), deviation.shape[-1])
-        total = np.zeros(shape)
+        """Return what the correlation of bins adds to the variance of sums over fine bands.
+
+        `deviation` has these first.
+        """
+        total = np.zeros((*deviation.shape[1:-1], len(spans), deviation.shape[-1]))
         for lag, factor in enumerate(self._factors(), 1):
-            pairs = deviation[..., lag:, :] * deviation[..., :-lag, :] * factor[:, None]
+            pairs = deviation[lag:] * deviation[:-lag] * _along_first(factor, deviation)
             for number, span in enumerate(spans):
                 inside = slice(span.start, max(span.stop - lag, span.start))
-                total[..., number, :] += pairs[..., inside, :].sum(axis=-2)
+                total[..., number, :] += pairs[inside].sum(axis=0)
         return total
 
     def _factors(self) -> list[FloatArray]:
@@ -228,6 +230,11 @@ class Grid:
                     break
                 self._known.append(2 * shared / np.sqrt(inner[lag:] * inner[:-lag]))
         return self._known
+
+
+def _along_first(values: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:
+    """Return one value for each item of the first axis of another array."""
+    return values.reshape(-1, *(1 for _ in other.shape[1:]))
 
 
 def _usual(frequency: FloatArray) -> tuple[float, float]:
