@@ -275,6 +275,10 @@ def _draw_days(axes: Axes, answer: Answer, column: int) -> None:
     axes.yaxis.set_major_formatter(
         FuncFormatter(lambda value, _: f"{value:.3f}".rstrip("0").rstrip(".").replace("-", "−"))
     )
+    if len(days):
+        axes.set_xlim(days[0] - 1, days[-1] + 1)
+    if np.isnan(mean).all():
+        axes.set_yticks([])
 
 
 def _date_axis(axes: Axes) -> None:

@@ -42,7 +42,11 @@ def history_figure(found: Sequence[Series]) -> Figure:
         sensor = f"{last.sensor} {last.serial_number}".strip()
         panels.setdefault((sensor, last.low_hz, last.high_hz, last.unit), []).append(series)
     with look():
-        figure = Figure(figsize=(_WIDTH, 0.8 + _HEIGHT * max(1, len(panels))), layout="constrained")
+        figure = Figure(
+            figsize=(_WIDTH, 0.8 + _HEIGHT * max(1, len(panels))),
+            layout="constrained",
+            facecolor="white",  # also where a dark page shows it
+        )
         axes = figure.subplots(max(1, len(panels)), squeeze=False, sharex=True)[:, 0]
         for panel, ((sensor, low, high, unit), own) in zip(axes, panels.items(), strict=False):
             for number, series in enumerate(own):
