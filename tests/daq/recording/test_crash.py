@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import h5py
@@ -16,7 +15,7 @@ import numpy as np
 import pytest
 
 from daq.bench.channel import Channel
-from daq.errors import NotARecordingError, RecordingError
+from daq.errors import RecordingError
 from daq.protocols.block import Block, HostTime
 from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording, control_address
@@ -31,7 +30,7 @@ NOW = HostTime(1_000_000_000, 1_790_000_000_000_000_000)
 
 # Writes noise for ever, or until it fails; acknowledges on standard output.
 WRITER = """
-import json, resource, sys
+import json, os, resource, sys
 import numpy as np
 from daq.bench.channel import Channel
 from daq.errors import RecordingError
@@ -65,6 +64,7 @@ except RecordingError as error:
         writer.close()
     except RecordingError:
         pass
+    os._exit(0)  # HDF5 crashes where Python frees what it could not close
 """
 
 
@@ -194,13 +194,11 @@ def test_a_full_disk_is_reported_and_loses_no_committed_rows(tmp_path: Path) -> 
         *lines, last = map(json.loads, writer.stdout)
     assert last["error"] == f"{path}: cannot be written: File too large"
     assert len(lines) > 5
-    with suppress(NotARecordingError):  # where the end of the file was refused, it says how to:
-        verify(path)
-    report = repair(path)
+    report = verify(path)
     assert report.intact
     for sensor in report.sensors:
         assert sensor.n_samples >= lines[-1][sensor.name] > 0
-    assert verify(path).intact
+    assert repair(path).intact
 
 
 @pytest.mark.skipif(sys.platform != "linux" or os.getuid() != 0, reason="mounts a small disk")
