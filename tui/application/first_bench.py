@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
@@ -132,6 +133,7 @@ class FirstBenchScreen(Screen[None]):
         self._live: dict[str, SensorPreview] = {}
         self._ended: threading.Event | None = None
         self._chosen, self._note = "", ""
+        self._stated: set[str] = set()
         self._is_ready = False
 
     def compose(self) -> ComposeResult:
@@ -333,8 +335,8 @@ class FirstBenchScreen(Screen[None]):
         return [] if self._bench is None else [each.name for each in self._bench.sensors]
 
     def _open(self) -> str | None:
-        """Return the first sensor whose sensitivity is not known."""
-        names = self._names()
+        """Return the first sensor whose sensitivity nobody has stated: 1 may be the right one."""
+        names = (name for name in self._names() if name not in self._stated)
         return next((name for name in names if is_open(sensor_table(self._text, name))), None)
 
     def action_choose(self, name: str) -> None:
@@ -359,7 +361,7 @@ class FirstBenchScreen(Screen[None]):
             self._text = with_rate(self._text, name, float(f"{now.measured_rate:.3g}"))
             table = sensor_table(self._text, name)
         form = SensorForm(self._text, str(table["driver"]), table, replaces=name)
-        self.app.push_screen(form, self._edited)
+        self.app.push_screen(form, partial(self._edited, name=name))
 
     def action_add(self) -> None:
         """Ask for a sensor that does not answer by itself."""
@@ -381,8 +383,12 @@ class FirstBenchScreen(Screen[None]):
                     self._devices.pop(port)
             self._use(without_sensor(self._text, self._chosen))
 
-    def _edited(self, text: str | None) -> None:
+    def _edited(self, text: str | None, *, name: str = "") -> None:
+        """Take what was typed for a sensor; it may have another name now."""
+        before = set(self._names()) - {name}
         self._use(self._text if text is None else text)
+        if text is not None:
+            self._stated |= set(self._names()) - before
 
     def action_go_on(self) -> None:
         """Ask for the sensitivity of a sensor, or for all that is common; then write the file."""
