@@ -3,12 +3,11 @@
 Theory of operation
 -------------------
 One loop looks at the file again and again. Each look takes what the recorder has committed since;
-where a new segment is complete, the estimate is made again. The
-choice of the dimension of the motion takes seconds: it is made again beside the looks, in a thread.
-Looks and estimates are throttled, so
-that a bench box stays free to record. When the recording is closed, the whole of it is estimated
-once more: that is the result. A recorder that ends without closing its file ends the loop with
-`RecordingLeftOpenError`.
+where a new segment is complete, the estimate is made again. The choice of the dimension of the
+motion takes seconds: it is made again beside the looks, in a thread. Looks and estimates are
+throttled, so that a bench box stays free to record. When the recording is closed, the whole of it
+is estimated once more: that is the result. A recorder that ends without closing its file ends the
+loop with `RecordingLeftOpenError`.
 """
 
 from __future__ import annotations

@@ -49,6 +49,7 @@ from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics
 from daq.estimation.throttle import Throttle
 from estimator.checks.advice import Untested
 from estimator.checks.stability import SegmentCourse
+from estimator.errors import InsufficientDataError
 from estimator.spectra.segment_rejection import Reason
 
 if TYPE_CHECKING:
@@ -144,11 +145,16 @@ class _Beside:
         with np.errstate(invalid="ignore", divide="ignore"):  # responses vanish at 0 Hz
             return choose()
 
-    def taken(self) -> Dimensions | None:
-        """Return the choice if it has been made since."""
-        if self.future is None or not self.future.done():
-            return None
+    @property
+    def is_made(self) -> bool:
+        """Whether there is a choice to take."""
+        return self.future is not None and self.future.done()
+
+    def taken(self, before: Dimensions | None) -> Dimensions | None:
+        """Return the choice that was made; the one before where the data were insufficient."""
         future, self.future = self.future, None
+        if future is None or isinstance(future.exception(), InsufficientDataError):
+            return before
         return future.result()
 
     @property
@@ -363,9 +369,8 @@ class SnapshotBuilder:
             return Estimates({}, {}, None)
         dims = first.aligned.dims
         positions = known_positions(recording, first.aligned.channels)
-        taken = self._choice.taken()
-        if taken is not None:
-            self._dimensions, self._chosen_at = taken, self._grown_to
+        if self._choice.is_made:
+            self._dimensions, self._chosen_at = self._choice.taken(self._dimensions), self._grown_to
         keep = not final and self._fits(bands)
         with self._choices:
             estimates = noise_estimates(

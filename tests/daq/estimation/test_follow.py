@@ -91,6 +91,38 @@ def test_the_dimension_is_chosen_again_beside_the_looks(
     assert chosen == [False, True]
 
 
+def test_a_choice_that_is_refused_ends_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A sensor may have become a copy of another one: the dimension stays the last one."""
+    monkeypatch.setattr(following, "LOOK_SHARE", 1e9)  # nobody waits here
+    settings = replace(SETTINGS, methods=("maximum-likelihood",), dimension="auto")
+    refused = threading.Event()
+
+    def refuses(*arguments: object) -> noise_estimates.Dimensions:
+        del arguments
+        refused.set()
+        raise InsufficientDataError("2 sensors have a signal of their own; expected at least 3")
+
+    monkeypatch.setattr(snapshot_builder, "chosen_dimensions", refuses)
+    with growing(tmp_path / "run.h5") as writer:
+        bench, seconds = Bench(writer), iter((41, 43, 45, 47))
+        bench.send("ABC", 20)
+
+        class Waiting(Noted):
+            def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
+                super().snapshot(snapshot, settings)
+                if len(self.snapshots) == 3:
+                    assert refused.wait(limit())
+                if len(self.snapshots) == 4:
+                    self.cancelled.set()
+
+        noted = Waiting(cancelled=Goes(lambda: bench.send("ABC", next(seconds))))
+        follow(writer.path, settings, noted, cancelled=noted.cancelled, share=1e6)
+    assert len(noted.snapshots) == 4
+    assert "maximum-likelihood" in noted.snapshots[-1].results
+
+
 def test_the_end_is_one_result(tmp_path: Path) -> None:
     path = tmp_path / "run.h5"
     with growing(path) as writer:
