@@ -51,9 +51,16 @@ channels = [
 
 
 def record(
-    path: Path, *, psd: float = 2e-9, before_end: Callable[[], object] = lambda: None
+    path: Path,
+    *,
+    psd: float = 2e-9,
+    more: str = "",
+    before_end: Callable[[], object] = lambda: None,
 ) -> Path:
-    """Four biaxial sensors: B misses samples, and Y of the last is dead."""
+    """Four biaxial sensors: B misses samples, and Y of the last is dead.
+
+    `more` is added to the bench file.
+    """
     rng = np.random.default_rng(8)
     motion = 4000 * rng.standard_normal((N_SAMPLES, 2))
     sensors = {}
@@ -64,7 +71,7 @@ def record(
         gaps = ((1000, 1130), (4000, 4001)) if number == 1 else ()
         sensors[name] = Sensor(counts.round().astype(np.int32), rate=RATE, gaps=gaps)
     tables = "".join(SENSOR.format(name=n, number=i) for i, n in enumerate(sensors))
-    bench = parse(BENCH.format(sensors=tables, psd=psd), "bench.toml")
+    bench = parse(BENCH.format(sensors=tables, psd=psd) + more, "bench.toml")
     layouts = [
         SensorLayout(
             each.name, each.channels, RATE, np.dtype("<i4"), clock="one", model=each.model,

@@ -26,11 +26,12 @@ from datetime import UTC, datetime
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
+from daq.bench.tables.certificate import CertificateTable
 from daq.errors import HuddleError
 from daq.recording.storage.names import sync_directory
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from daq.bench.model import Bench
@@ -405,5 +406,25 @@ def _sha256(path: Path) -> str:
 
 def ledger_of(recording: Path, about: Bench | None) -> Ledger:
     """Return the ledger for a recording: in the folder that the bench file names."""
-    folder = "certificates" if about is None else about.certificate.folder.expanduser()
-    return Ledger(recording.resolve().parent / folder)
+    table = CertificateTable() if about is None else about.certificate
+    return Ledger(recording.resolve().parent / table.folder.expanduser())
+
+
+def ledgers_of(recording: Path, folders: Iterable[Path]) -> list[Ledger]:
+    """Return the ledgers that may have a recording.
+
+    That of its own bench file, that in the usual folder, and those in other folders.
+
+    Raises
+    ------
+    RecordingError
+        If the recording cannot be read.
+    """
+    from daq.recording.reader import Recording  # noqa: PLC0415 - not where it only writes
+
+    with Recording.open(recording, tried=True) as opened:
+        own = ledger_of(recording, opened.bench)
+    others = (Ledger(recording.resolve().parent / each.expanduser()) for each in folders)
+    every = (own, ledger_of(recording, None), *others)
+    found = {each.folder.resolve(): each for each in every if each.exists}
+    return [found[folder] for folder in sorted(found)]

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from tui.certificate.ledger import Ledger, LedgerError, ledger_of
+from tui.certificate.ledger import Ledger, LedgerError, ledger_of, ledgers_of
 from tui.commands.estimate import estimated, exit_with
 from tui.commands.options import (
     EndOption,
@@ -125,6 +125,9 @@ def issue(
             sign=signer,
         )
     console().print(f"certificate {entry.name}: {path}", soft_wrap=True)
+    if ledger.folder.resolve() not in {each.folder.resolve() for each in ledgers_of(files[0], ())}:
+        text = f"huddle verify --certificates {ledger.folder} compares recordings with it"
+        console().print(text, soft_wrap=True)
     exit_with(judge(recorded.bench, snapshot, settings))
 
 

@@ -11,7 +11,7 @@ import typer
 
 from daq.errors import RecordingError
 from daq.recording.storage.trial import trials
-from tui.certificate.ledger import Ledger
+from tui.certificate.ledger import Ledger, ledgers_of
 from tui.commands.options import JsonOption, examples
 
 if TYPE_CHECKING:
@@ -37,12 +37,20 @@ def verify(
             "--key", metavar="FILE", help="Public key that must have signed every recording."
         ),
     ] = None,
+    ledgers: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--certificates",
+            metavar="FOLDER",
+            help="Folder of certificates that no bench file names; may be repeated.",
+        ),
+    ] = None,
     json: JsonOption = None,
 ) -> None:
     """Verify the checksums and signatures of recordings, or of all recordings of a service.
 
-    Recordings that were certified are compared with the ledger of the
-    certificates beside them.
+    Recordings that were certified are compared with the ledger of their
+    certificates: beside them, or where their bench file says.
 
     A certificate (.pdf) is compared with the ledger in its folder, and with
     the recordings named with it, or those beside that folder.
@@ -58,6 +66,7 @@ def verify(
         return
     found = []
     paths, known, folders = _recordings(sources)
+    folders |= {each.absolute() for each in ledgers or ()}
     # In children: a file that hangs or crashes HDF5 is damaged, and the others are verified.
     for path, report in trials(paths, "verify"):
         damaged = ", ".join(report.get("damaged", ()))
@@ -69,7 +78,7 @@ def verify(
             state = "exchanged: not the recording that the service has made under this name"
         names: list[str] = []
         if state == "intact":
-            for ledger in _ledgers(path, folders):
+            for ledger in ledgers_of(path, folders):
                 name, wrong = ledger.certified(path, *own)
                 names += [name] if name else []
                 state = wrong or state
@@ -133,11 +142,10 @@ def _recordings(
 
     And the folders of certificates that bench files name.
     """
-    from daq.bench.tables.certificate import CertificateTable
     from tui.service.records.places import NoServiceError, Place
 
     found: list[Path] = []
-    folders = {CertificateTable().folder}
+    folders: set[Path] = set()
     known: dict[Path, tuple[str, str]] = {}
     for source in sources:
         if source.suffix.lower() in {".h5", ".hdf5"}:
@@ -156,9 +164,3 @@ def _recordings(
         found += [place.folder / part for run in runs for part in run.parts]
         known |= {place.folder / part: own for part, own in place.store.identities().items()}
     return list(dict.fromkeys(found)), known, folders
-
-
-def _ledgers(path: Path, folders: set[Path]) -> list[Ledger]:
-    """Return the ledgers in the folders of a recording's certificates."""
-    found = [Ledger(path.absolute().parent / folder) for folder in sorted(folders)]
-    return [ledger for ledger in found if ledger.exists]

@@ -149,7 +149,7 @@ class Laboratory:
         assert found.exit_code == 4, found.output
         return found.output
 
-    def verify(self, *files: Path) -> tuple[int, str]:
+    def verify(self, *files: Path | str) -> tuple[int, str]:
         """Verify files; return exit code and all that was said."""
         found = CliRunner().invoke(app, ["verify", *map(str, files)])
         return found.exit_code, " ".join((found.output + found.stderr).split())
@@ -183,6 +183,7 @@ def issued(tmp_path_factory: pytest.TempPathFactory) -> Laboratory:
 
 
 def laboratory(folder: Path) -> Laboratory:
+    folder.mkdir(exist_ok=True)
     recording = record(folder / "night.h5")
     sensors = "".join(
         SENSOR.format(name=name, number=number).replace(
@@ -346,6 +347,26 @@ def test_recordings_are_compared_with_their_certificates(copied: Laboratory) -> 
     code, said = copied.verify(recording)
     assert code == 3
     assert "exchanged: certificate PIER-" in said
+
+
+def test_the_ledger_of_a_recording_is_found_wherever_it_is(tmp_path: Path) -> None:
+    """In the folder that its bench names, behind a link; that of another bench is named."""
+    made = laboratory(tmp_path / "lab")
+    made.recording.unlink()
+    record(made.recording, more='[certificate]\nfolder = "papers"\n')
+    made.issue("--folder", str(made.folder / "papers"))
+    link = tmp_path / "link.h5"
+    link.symlink_to(made.recording)
+    for path in (made.recording, link):
+        code, said = made.verify(path)
+        assert code == 0
+        assert "certified by PIER-" in said, path
+    elsewhere = tmp_path / "elsewhere"
+    said = made.issue("--folder", str(elsewhere), "--reason", "another place")
+    assert f"huddle verify --certificates {elsewhere}" in " ".join(said.split())
+    code, said = made.verify(made.recording, "--certificates", elsewhere)
+    assert code == 0
+    assert said.count("PIER-") == 2
 
 
 def key(file: Path, passphrase: bytes) -> Path:
