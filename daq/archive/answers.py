@@ -5,7 +5,7 @@ The whole is the average of all spectra, a day that of its own; densities count 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC
 from functools import reduce
 from operator import add
@@ -162,7 +162,8 @@ def answer(
         tally.take(file)
     for entry in known:
         if entry.described.origin.run_id not in years.damaged:
-            pooled.add_segments(entry.described, entry.start_utc_ns or 0, entry.n_segments)
+            about = replace(entry.described, rounded=years.is_rounded(entry))
+            pooled.add_segments(about, entry.start_utc_ns or 0, entry.n_segments)
             pooled.add_totals(entry.described)
     if not tally.days:
         raise ArchiveError("\n".join(years.problems))

@@ -130,7 +130,7 @@ class Index:
                 clipped={int(k): v for k, v in found.pop("clipped").items()},
                 stood_still={int(k): v for k, v in found.pop("stood_still").items()},
                 not_understood=tuple(found.pop("not_understood")),
-                **{name: found.pop(name) for name in ("usable", "elapsed", "residual")},
+                **{name: found.pop(name) for name in ("usable", "elapsed", "residual", "rounded")},
             )
             return Entry(path, described, **found)
         except (OSError, AttributeError, KeyError, ValueError, TypeError):

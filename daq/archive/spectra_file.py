@@ -91,6 +91,8 @@ class Described:
         Sensors whose clock is not understood.
     clipped, stood_still : mapping of int to float
         As in `daq.estimation.snapshot.SnapshotDiagnostics`.
+    rounded : bool
+        Whether estimates are made of matrices that were kept in single precision.
     """
 
     origin: Origin
@@ -102,6 +104,7 @@ class Described:
     not_understood: tuple[str, ...] = ()
     clipped: Mapping[int, float] = field(default_factory=dict)
     stood_still: Mapping[int, float] = field(default_factory=dict)
+    rounded: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -178,6 +178,10 @@ class Years:
             hours=plan.stretch == "hour",
         )
 
+    def is_rounded(self, entry: Entry) -> bool:
+        """Whether the sum of a recording's matrices is one of single precision."""
+        return entry.daily or (entry.single and not self._own)
+
     def _summary(self, entry: Entry, month: str) -> Summary:
         """Return the summary of a recording, its total in the units of the archive."""
         described = entry.described
@@ -186,7 +190,8 @@ class Years:
                 found = file.summary(month)
             else:
                 rows = (row for row in file.rows() if month_of(row[0]) == month)
-                made = summaries(rows, described, self._plan, self._settings)
+                about = replace(described, rounded=file.is_single)
+                made = summaries(rows, about, self._plan, self._settings)
                 found = next(summary for _, summary in made)
                 if file.is_daily:
                     found = found.of_days

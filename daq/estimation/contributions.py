@@ -53,6 +53,9 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
         with np.errstate(invalid="ignore"):
             most = np.fmin(share * motion, unseen * psd)
         found.append(contribution(Source.AXES, shape, below=most, above=most))
+    if snapshot.rounding:
+        most = snapshot.rounding * np.nan_to_num(snapshot.data_psd)
+        found.append(contribution(Source.ROUNDING, shape, below=most, above=most))
     if dimensions.any():
         found.append(contribution(Source.DIMENSIONS, shape, share=dimensions[:, None]))
     for source, share in _misfits(snapshot, explained).items():

@@ -199,6 +199,8 @@ class Snapshot:
     across_axes : tuple of float
         Share of the motion's PSD, across axes that may be off, by which the noise of each sensor
         may be off; empty: not at all.
+    rounding : float
+        Share of the data's PSD by which the noise may be off, because cross-spectra were rounded.
     simulated : bool
         Whether a sensor was simulated: the noise is that of no real one.
     channel_segments : tuple of int
@@ -230,6 +232,7 @@ class Snapshot:
     bridged: Bridged | None = None
     not_estimated: tuple[str, ...] = ()
     across_axes: tuple[float, ...] = ()
+    rounding: float = 0.0
     simulated: bool = False
     channel_segments: tuple[int, ...] = ()
 

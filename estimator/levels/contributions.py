@@ -45,6 +45,8 @@ class Source(enum.StrEnum):
     """Sensors of one or two channels lean, and feel motion across their axes."""
     DIMENSIONS = "dimensions"
     """The number of dimensions of the motion is in doubt."""
+    ROUNDING = "rounding"
+    """Cross-spectra were kept in single precision, as fine as their largest part: the motion."""
     FAULTY = "faulty"
     """The channel is clipped, or was dead for a while: its noise is lower than the estimate."""
 

@@ -111,6 +111,7 @@ SOURCE_WORDS: Mapping[Source, str] = {
     Source.SHARED_NOISE: "shared noise",
     Source.AXES: "axes that may be off",
     Source.DIMENSIONS: "the number of dimensions",
+    Source.ROUNDING: "matrices in single precision",
     Source.FAULTY: "a faulty channel",
 }
 """What widens an interval beyond its scatter."""

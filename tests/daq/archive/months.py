@@ -42,6 +42,7 @@ def record(
     begin_ns: int = START_NS,
     seed: int = 1,
     noise: float = 20.0,
+    motion_counts: float = 500.0,
     names: str = "ABC",
     free: bool = False,
     unit: str = "m/s²",
@@ -52,7 +53,7 @@ def record(
     """
     rng = np.random.default_rng(seed)
     n = round(hours * 3600 * RATE)
-    motion = rng.normal(size=(n, 2)) * 500
+    motion = rng.normal(size=(n, 2)) * motion_counts
     channels = tuple(Channel(name=c, sensitivity=1e6, unit=unit) for c in "XY")
     layouts = [
         SensorLayout(name, channels, RATE, np.dtype("<i4"), clock=name if free else "")

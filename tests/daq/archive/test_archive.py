@@ -23,12 +23,16 @@ from daq.archive.sources import recordings_in, sort
 from daq.archive.spectra_file import SpectraFile, SpectraWriter
 from daq.archive.store import PLAN_FILE, Store
 from daq.archive.task import Task
+from daq.bench.units import STANDARD_GRAVITY
 from daq.errors import ArchiveError, RecordingError, WrongArchiveError, WrongSettingError
+from daq.estimation.contributions import contributions
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from estimator.levels.contributions import Source
 from tests import known_clocks
 from tests.daq.archive.months import (
     HOUR_NS,
+    RATE,
     SETTINGS,
     START_NS,
     assert_same,
@@ -466,6 +470,39 @@ def test_hours_in_single_precision_answer_as_before_in_half_of_the_room(copy: St
     np.testing.assert_allclose(found.levels.mean, other.levels.mean, rtol=1e-6 * SNR)
     assert found.density.n_stretches == other.density.n_stretches
     assert copy.thin(0) == n_old  # days of these
+
+
+@pytest.mark.parametrize("single", [True, False], ids=["hours", "days"])
+def test_intervals_know_what_matrices_in_single_precision_cannot_tell(
+    tmp_path: Path, *, single: bool
+) -> None:
+    """Noise 80 dB below the motion is as small as the rounding."""
+    settings = replace(SETTINGS, axis_tolerance={"": 0.0})
+    paths = [
+        record(tmp_path / f"{n}.h5", begin_ns=START_NS + n * 30 * HOUR_NS, seed=n,
+               noise=1e4, motion_counts=1e8)
+        for n in range(2)
+    ]  # fmt: skip
+    store = store_for(tmp_path / "store", paths[0], settings)
+    assert fill(store, paths) == []
+    truth = 2 / RATE * (1e4 / 1e6) ** 2 / STANDARD_GRAVITY**2
+    exact, off = [], []
+    for unit, scale in (("g", 1.0), ("mg", 1e6)):  # nothing is kept yet of the second
+        if unit == "mg":
+            assert store.thin(0, single=single) == 1
+        pooled = answer(store, store.entries()[0], replace(settings, unit=unit)).pooled
+        noise = pooled.results["three-sensor"]
+        low, high, found = (
+            each[2:-2] / (scale * truth) for each in (noise.low, noise.high, noise.noise_psd)
+        )
+        known = np.isfinite(found)  # where rounding leaves no matrix of noise and motion
+        assert np.mean((low <= 1) & (high >= 1), where=known) > 0.9
+        assert np.mean(known) > (0.9 if unit == "g" else 0.2)
+        sources = {each.source for each in contributions(pooled, "three-sensor")}
+        exact.append(Source.ROUNDING not in sources)
+        off.append(np.sqrt(np.mean((found - 1) ** 2, where=known)))
+    assert exact == [True, False]
+    assert off[1] > 2 * off[0]
 
 
 def rows_of(path: Path) -> list[tuple[int, int, NDArray[np.complex128]]]:
