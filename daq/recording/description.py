@@ -33,10 +33,9 @@ _FILE = (
     *("software", "bench", "operator", "location", "duration", "until", "estimate", "origin"),
     "simulated",
 )
-_SENSOR = (
-    *("model", "serial_number", "driver", "port", "clock", "sampling_rate", "temperature"),
-    "firmware",
-)
+_SENSOR = ("model", "serial_number", "driver", "port", "clock", "sampling_rate", "temperature")
+"""Not the firmware, which came later: programs that do not know it would see damage. It is in the
+manifest."""
 _SAMPLES = ("channels", "sensitivity", "unit", "direction", "auxiliary", "response", "absent")
 
 

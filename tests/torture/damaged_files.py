@@ -52,7 +52,9 @@ def make_recording(path: Path, names: str = "ab") -> None:
     """Write a closed recording that has something of everything; sensor b is polled."""
     rng = np.random.default_rng(1)
     channels = tuple(Channel(name=name, sensitivity=1e6) for name in "xyz")
-    sensors = [SensorLayout(name, channels, 100.0, np.dtype("i4")) for name in names]
+    sensors = [
+        SensorLayout(name, channels, 100.0, np.dtype("i4"), firmware="1.4") for name in names
+    ]
     writer = RecordingWriter.create(path, sensors=sensors, created=CREATED)
     for number, first in enumerate(range(0, 3000, 50)):
         at = HostTime(CREATED.monotonic_ns + first * 10**7, CREATED.utc_ns + first * 10**7)

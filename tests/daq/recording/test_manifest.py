@@ -76,6 +76,10 @@ def change_an_unused_row(file: h5py.File) -> None:
     file["checksums"].attrs["columns"] = np.array([b"x", b"y", b"z"])
 
 
+def change_the_firmware(file: h5py.File) -> None:
+    file["sensors/a"].attrs["firmware"] = np.bytes_("9.9")
+
+
 def test_the_root_is_that_of_the_documented_program(closed: Path) -> None:
     report = verify(closed)
     assert report.intact
@@ -110,6 +114,7 @@ def test_results_are_covered_and_leave_the_root_as_it_was(closed: Path) -> None:
         empty_the_manifest,
         remove_the_manifest,
         change_an_unused_row,
+        change_the_firmware,
     ],
 )
 def test_a_change_is_found(closed: Path, change: Callable[[h5py.File], None]) -> None:
