@@ -195,14 +195,16 @@ def pages(folder: Path) -> None:
             served = subprocess.Popen(
                 command, stdout=out, env=os.environ | {"PYTHONUNBUFFERED": "1"}
             )
-        time.sleep(200)
         with sync_playwright() as playwright:
             browser = playwright.chromium.launch(
                 executable_path=os.environ.get("HUDDLE_CHROMIUM") or shutil.which("chromium"),
                 args=["--no-sandbox"],
             )
             page = browser.new_page(viewport={"width": 1100, "height": 940})
-            page.goto(told.read_text(encoding="utf-8").split()[-1])
+            while not (address := told.read_text(encoding="utf-8").split()):
+                time.sleep(0.2)
+            page.goto(address[-1])
+            page.wait_for_selector("#state:has-text('3:20 long')", timeout=600_000)
             page.wait_for_selector("#chart[data-drawn]")
             page.hover(".u-over", position={"x": 420, "y": 150})
             page.screenshot(path=folder / "web.png")

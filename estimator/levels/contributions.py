@@ -150,8 +150,8 @@ def widened(
 
 
 _OWN, _OTHERS = 3.5, 1.79
-"""What 97.5 % of leans do not exceed, over the square of their rms: of a lean's own square, and of
-the product of two others."""
+"""What 97 % of leans do not exceed, over the square of their rms: of a lean's own square, and of
+the product of two others. The sum of both is exceeded by 2.5 % of equal leans."""
 
 
 def across(tolerances: FloatArray, leans: FloatArray | None = None) -> FloatArray:

@@ -212,8 +212,7 @@ def record_test(
     place.parent.mkdir(parents=True, exist_ok=True)
     with closing(sqlite3.connect(place, timeout=10.0)) as ledger:
         ledger.executescript(_TABLES)
-        columns = [row[1] for row in ledger.execute("PRAGMA table_info(sensors)")]
-        if "firmware" not in columns:  # of an earlier version
+        if "firmware" not in _columns(ledger):  # of an earlier version
             ledger.execute("ALTER TABLE sensors ADD COLUMN firmware TEXT")
         with ledger:  # all of a test, or nothing
             added = ledger.execute("INSERT OR IGNORE INTO tests VALUES (?, ?, ?, ?, ?)", test)
@@ -272,6 +271,19 @@ def _error_db(psd: float, low: float, high: float) -> float:
     return max(decibels(high) - decibels(psd), decibels(psd) - decibels(low))
 
 
+def _opened() -> sqlite3.Connection | None:
+    """Return the ledger for reading, if there is one."""
+    place = ledger_path()
+    if place is None or not place.exists():
+        return None
+    return sqlite3.connect(f"{place.resolve().as_uri()}?mode=ro", uri=True)
+
+
+def _columns(ledger: sqlite3.Connection) -> list[str]:
+    """Return the columns of the table of sensors, which earlier versions had fewer of."""
+    return [row[1] for row in ledger.execute("PRAGMA table_info(sensors)")]
+
+
 def sensor_tests(serial_number: str) -> list[SensorTest]:
     """Return the tests of a sensor, oldest first; real ones, if there are any.
 
@@ -280,12 +292,11 @@ def sensor_tests(serial_number: str) -> list[SensorTest]:
     sqlite3.Error
         If the ledger cannot be read.
     """
-    place = ledger_path()
-    if place is None or not place.exists():
+    ledger = _opened()
+    if ledger is None:
         return []
-    with closing(sqlite3.connect(f"{place.resolve().as_uri()}?mode=ro", uri=True)) as ledger:
-        columns = [row[1] for row in ledger.execute("PRAGMA table_info(sensors)")]
-        firmware = "firmware" if "firmware" in columns else "NULL"
+    with closing(ledger):
+        firmware = "firmware" if "firmware" in _columns(ledger) else "NULL"
         rows = ledger.execute(_TESTS.format(firmware=firmware), (serial_number,)).fetchall()
     found = [
         SensorTest(
@@ -311,10 +322,10 @@ def noise_of(serial_number: str) -> list[Found]:
     sqlite3.Error
         If the ledger cannot be read.
     """
-    place = ledger_path()
-    if place is None or not place.exists():
+    ledger = _opened()
+    if ledger is None:
         return []
-    with closing(sqlite3.connect(f"{place.resolve().as_uri()}?mode=ro", uri=True)) as ledger:
+    with closing(ledger):
         rows = ledger.execute(_OF_SENSOR, (serial_number,)).fetchall()
     is_simulated = all(row[2] for row in rows)
     return [
