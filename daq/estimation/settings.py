@@ -63,8 +63,7 @@ class Settings(EstimateSettings):
         """
         if "auto" not in self.methods:
             return self
-        least = ROOM_OF_ONE_CHANNEL if 1 in dims else ROOM
-        roomy = len(dims) >= least and len(set(dims)) == 1 and sum(dims) <= MAX_CHANNELS
+        roomy = has_room(dims)
         chosen = "maximum-likelihood" if roomy else "three-sensor"
         methods = (chosen if name == "auto" else name for name in self.methods)
         dimension = "auto" if roomy and self.dimension is None else self.dimension
@@ -101,6 +100,12 @@ class Settings(EstimateSettings):
             **{each.name: getattr(bench.estimate, each.name) for each in fields(EstimateSettings)}
         )
         return replace(found, target_cov=None, target_cov_bin=None) if bench.has_limits else found
+
+
+def has_room(dims: tuple[int, ...]) -> bool:
+    """Whether sensors leave room for more dimensions of motion than one has channels."""
+    least = ROOM_OF_ONE_CHANNEL if 1 in dims else ROOM
+    return len(dims) >= least and len(set(dims)) == 1 and sum(dims) <= MAX_CHANNELS
 
 
 def _seen(dims: tuple[int, ...]) -> list[bool]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import singledispatch
 from typing import TYPE_CHECKING
 
+from daq.estimation.settings import has_room
 from estimator.checks.advice import (
     Advice,
     Copies,
@@ -31,9 +32,6 @@ from estimator.checks.advice import (
 from tui.wording.differences import followers, opposite
 from tui.wording.findings import explain, where
 from tui.wording.formatting import listed, percent
-
-MIN_SENSORS = 3
-"""With more, more dimensions of motion can be fitted."""
 
 if TYPE_CHECKING:
     from tui.wording.findings import Names
@@ -72,7 +70,7 @@ def _reversed(advice: ReversedPolarity, names: Names) -> str:
 
 @alert.register(ModelMisfit)
 def _misfit(advice: ModelMisfit, names: Names) -> str:
-    room = len(names.dims) > MIN_SENSORS and "auto" not in names.in_use
+    room = has_room(names.dims) and "auto" not in names.in_use
     do = "use --method auto" if room else "put the sensors closer together"
     return (
         f"The sensors do not share one motion at {where(advice)}: the noise may be wrong by "

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import singledispatch
 from typing import TYPE_CHECKING
 
+from daq.estimation.settings import has_room
 from estimator.checks.advice import (
     Advice,
     Copies,
@@ -252,7 +253,7 @@ def _remedy_of_misfit(names: Names) -> str:
             f" If the motion has more than {_dimensions(d)}, sensors of {_channels(d)} must point "
             "exactly the same way: align them, or use triaxial data."
         )
-    if n_sensors > 3 and "auto" not in names.in_use:
+    if has_room(names.dims) and "auto" not in names.in_use:
         remedy += f" {n_sensors} sensors allow more dimensions (--dimension auto)."
     return remedy
 

@@ -8,6 +8,7 @@ import pytest
 
 from estimator.checks.advice import AdviceKind
 from tests.tui.wording.advice_examples import EXAMPLES, MISFIT, names
+from tui.wording.alerts import alert
 from tui.wording.findings import explain
 
 if TYPE_CHECKING:
@@ -43,3 +44,6 @@ def test_what_to_do_about_a_misfit_is_for_these_sensors() -> None:
     assert "use triaxial data" in planar
     five = explain(MISFIT, names(*"abcde")).remedy
     assert "5 sensors allow more dimensions (--dimension auto)" in five
+    assert "--method auto" in alert(MISFIT, names(*"abcde"))
+    axes = names(*"abcd", n_channels=1)  # --method auto is three-sensor for them
+    assert "auto" not in explain(MISFIT, axes).remedy + alert(MISFIT, axes)
