@@ -59,25 +59,42 @@ def level(psd: float, digits: int = 2) -> str:
     return "below 0" if psd <= 0 else plain_number(decibels(psd), f".{digits}f")
 
 
-def level_with_error(psd: float, high: float, low: float = math.nan) -> str:
+def level_with_error(
+    psd: float, high: float, low: float = math.nan, *, short: bool = False, bare: bool = False
+) -> str:
     """Return a PSD in dB with half the width of its 95 % interval.
 
     With both halves where the lower one is larger, as by what the clocks may have added. The
     upper end alone where the lower end is at or below zero, or the estimate outside its interval.
+
+    Parameters
+    ----------
+    psd, high, low : float
+        In unit²/Hz.
+    short : bool
+        Whether room is scarce: one decimal, and the wider half alone.
+    bare : bool
+        Whether the width is left out.
     """
+    digits, below = (1, "<") if short else (2, "below ")
     if math.isnan(psd) or math.isnan(high) or high <= 0:
-        return level(psd)
+        return level(psd, digits)
     if math.isinf(high):
         return NOT_KNOWN
     if psd <= 0 or low <= 0 or psd > high:
-        return f"below {level(high)}"
+        return f"{below}{level(high, digits)}"
+    return level(psd, digits) + ("" if bare else _width(psd, high, low, short=short))
+
+
+def _width(psd: float, high: float, low: float, *, short: bool) -> str:
     up = decibels(high) - decibels(psd)
     down = up if math.isnan(low) else decibels(psd) - decibels(low)
+    if short:
+        wider = max(up, down)
+        return f"±{wider:.1f}" if wider >= 0.05 else "±<.1"
     if down < ONE_SIDED * up:
-        return f"{level(psd)} ±{up:.2f}"
-    if down < up + ONE_SIDED_DB:
-        return f"{level(psd)} ±{down:.2f}"
-    return f"{level(psd)} +{up:.2f} −{down:.2f}"
+        return f" ±{up:.2f}"
+    return f" ±{down:.2f}" if down < up + ONE_SIDED_DB else f" +{up:.2f} −{down:.2f}"
 
 
 def interval(low: float, high: float) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -56,10 +57,24 @@ def test_tables_show_both_halves_where_the_lower_one_is_wider() -> None:
     assert level_with_error(1.0, 10**0.01, -1.0) == "below 0.10"
     assert level_with_error(-1.0, 10**0.01, -2.0) == "below 0.10"
     assert level_with_error(-1.0, -0.5, -2.0) == "below 0"
+    assert level_with_error(100.0, 10**0.01, 1.0) == "below 0.10"  # a bound beneath it
+    assert level_with_error(1.0, math.inf, 0.5) == "not known"
     table = result_table(made_snapshot(clock_share=0.05), SETTINGS)
     assert "+" in str(next(iter(table.columns[3].cells)))
     table = result_table(made_snapshot(clock_share=0.0001), SETTINGS)
     assert "±" in str(list(table.columns[3].cells)[-1])  # the first has an uneven scatter
+
+
+def test_short_levels_say_the_same() -> None:
+    """In the tables of the application, for one channel and where there is little room."""
+    assert level_with_error(1.0, 10**0.01, 10**-0.03, short=True) == "0.0±0.3"
+    assert level_with_error(1.0, 10**0.001, 10**-0.001, short=True) == "0.0±<.1"
+    assert level_with_error(1.0, 10**0.01, 10**-0.01, short=True, bare=True) == "0.0"
+    for low in (-math.inf, -1.0):
+        assert level_with_error(1.0, 10**0.01, low, short=True) == "<0.1"
+    assert level_with_error(100.0, 10**0.01, 1.0, short=True, bare=True) == "<0.1"
+    assert level_with_error(1.0, math.inf, 0.5, short=True) == "not known"
+    assert level_with_error(-1.0, -0.5, -2.0, short=True) == "below 0"
 
 
 def test_curves_of_free_running_clocks_carry_it_at_every_frequency(tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from daq.bench.units import decibels
 from daq.recording.sensor_state import SensorState
 from daq.results.band_summary import band_of, channel_means, without_partners
 from daq.results.decision.end import NOT_KNOWN_FROM, Goal, remaining
@@ -19,7 +18,7 @@ from daq.results.facts import Rank, SensorsSimulated
 from daq.results.known_facts import WITHOUT_ESTIMATE
 from daq.results.precision import precision
 from tui.wording.facts import known, known_of_sensors
-from tui.wording.formatting import clock_time, percent, several, signed
+from tui.wording.formatting import clock_time, level_with_error, percent, several
 from tui.wording.verdict_text import STYLES as STYLES_OF_VERDICTS
 from tui.wording.verdict_text import headline, how_long
 from tui.wording.vocabulary import FLAG_WORDS, PARTNER_WORDS
@@ -190,14 +189,11 @@ def _channel_noise(
     elif column in alone:
         value, style = PARTNER_WORDS[alone[column]], "bold #ff6b6b"
     elif means:
-        mean, high = float(means[column].mean[0]), float(means[column].high[0])
-        if mean > 0:
-            value = signed(decibels(mean), ".1f")
-            if with_error:
-                error = decibels(high) - decibels(mean)
-                value += f"±{error:.1f}" if error >= 0.05 else "±<.1"
-        elif not math.isnan(mean):
-            value = f"<{signed(decibels(high), '.1f')}" if high > 0 else "below 0"
+        mean, high, low = (
+            float(each[0]) for each in (means[column].mean, means[column].high, means[column].low)
+        )
+        if not math.isnan(mean):
+            value = level_with_error(mean, high, low, short=True, bare=not with_error)
     return Text(f"{name} {value}", style)
 
 

@@ -13,6 +13,7 @@ from daq.bench.units import decibels
 from daq.results.change_test import DECIBEL, NORMAL_95
 from tui.service.history.series import FALSE_ALARMS, SCATTER
 from tui.service.records.run_state import utc_text
+from tui.wording.formatting import level_with_error
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
     from tui.service.history.ledger import SensorTest
     from tui.service.history.series import Series
+    from tui.service.records.run_state import BandNoise
 
 _WIDTH, _HEIGHT = 8.0, 2.4
 """Inches, of one sensor."""
@@ -89,7 +91,7 @@ def history_table(found: Sequence[Series]) -> Table:
         table.add_row(
             *(last.serial_number or "-", last.sensor, last.channel),
             *(f"{last.low_hz:.3g} to {last.high_hz:.3g}", last.unit, str(len(series.noise))),
-            *(level(series.noise[0].psd, *_ends(series, 0)), level(last.psd, *_ends(series, -1))),
+            *(_level(series.noise[0]), _level(last)),
             f"{len(series.changes)} ×" if series.changes else "no",
         )
     return table
@@ -123,7 +125,7 @@ def label_lines(found: Sequence[Series]) -> list[str]:
     widest = max(own, key=lambda each: each.high_hz / each.low_hz)
     band = widest.low_hz, widest.high_hz
     same = [each for each in own if (each.low_hz, each.high_hz) == band]
-    noise = [f"{each.channel} {level(each.psd, each.low, each.high)} dB" for each in same[:3]]
+    noise = [f"{each.channel} {_level(each)} dB" for each in same[:3]]
     test = f"{latest:%Y-%m-%d}, {band[0]:.3g} to {band[1]:.3g} Hz"
     return [*filter(None, [widest.model]), test, *noise]
 
@@ -163,18 +165,8 @@ def label_svg(serial_number: str, lines: Sequence[str]) -> str:
     )
 
 
-def _ends(series: Series, position: int) -> tuple[float, float]:
-    noise = series.noise[position]
-    return noise.low, noise.high
-
-
-def level(psd: float, low: float, high: float) -> str:
-    """Return a PSD in dB with half the width of its interval."""
-    if not psd > 0:
-        return "below 0"
-    if not 0 < low <= high:
-        return f"below {decibels(high):.2f}"
-    return f"{decibels(psd):.2f} ±{(decibels(high) - decibels(low)) / 2:.2f}".replace("-", "−")
+def _level(noise: BandNoise) -> str:
+    return level_with_error(noise.psd, noise.high, noise.low)
 
 
 def change_lines(series: Series) -> Iterator[str]:
