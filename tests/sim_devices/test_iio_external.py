@@ -27,7 +27,7 @@ from sim_devices.devices.iio import Iiod
 from sim_devices.devices.interface import Source
 from sim_devices.server.serve import device_spec
 from tests.sim_devices.simulated_bench import device, scenario
-from tests.waiting import limit
+from tests.waiting import limit, wait_until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -168,14 +168,16 @@ async def _iiod(uri: str) -> AsyncIterator[str]:
     process = await asyncio.create_subprocess_exec(
         str(IIOD), "-p", str(number), "-u", uri, stdout=nothing, stderr=nothing
     )
-    try:
-        while True:  # it binds its port once it knows the context
-            with contextlib.suppress(ConnectionError):
-                _, writer = await asyncio.open_connection("127.0.0.1", number)
-                writer.close()
-                await writer.wait_closed()
-                break
-            await asyncio.sleep(0.05)
+
+    def is_ready() -> bool:
+        assert process.returncode is None, "iiod has ended"
+        with contextlib.suppress(ConnectionError):
+            socket.create_connection(("127.0.0.1", number)).close()
+            return True
+        return False
+
+    try:  # it binds its port once it knows the context
+        await asyncio.to_thread(wait_until, is_ready, "iiod has its port")
         yield f"iio://127.0.0.1:{number}"
     finally:
         process.kill()  # on SIGTERM it waits a minute for its own client
