@@ -185,7 +185,7 @@ class DriverConformance:
             async with self.serve() as served:
                 truth = _truth(served)
                 found = await self._read(served.sensors)
-                check_counters(found)
+                check_counters(served.sensors, found)
                 for sensor in served.sensors:
                     check_truth(sensor, found, truth(sensor.name))
 
@@ -375,24 +375,38 @@ def check_blocks(
             end, at = block.end_sample, block.received.monotonic_ns
 
 
-_UTC_STEP = 1_000_000
-"""Steps in ns in which devices may state UTC."""
+_TIME_STEP = 1_000_000
+"""Steps in ns in which devices may state the time: text loggers write milliseconds."""
 
 
-def check_counters(found: Sequence[DeviceItem]) -> None:
-    """See that the device's counter of each sensor grows with the index of the samples."""
-    counted = [b for b in found if isinstance(b, Block) and b.device_counter is not None]
-    for name in {block.sensor for block in counted}:
-        blocks = [block for block in counted if block.sensor == name]
+def check_counters(sensors: Sequence[Sensor], found: Sequence[DeviceItem]) -> None:
+    """See that the device's counter of each sensor grows with the index of the samples.
+
+    A counter of samples grows evenly. One that grows by 1e9 a second is a time in ns, and each
+    of its values is rounded by up to half of ``_TIME_STEP``, however few samples a block has.
+    """
+    for sensor in sensors:
+        blocks = [
+            one
+            for one in found
+            if isinstance(one, Block)
+            and one.sensor == sensor.name
+            and one.device_counter is not None
+        ]
         counters = np.array([block.device_counter for block in blocks], np.int64)
         index = np.array([block.first_sample for block in blocks], np.int64)
-        assert np.all(np.diff(counters) > 0), f"device_counter of {name} does not grow"
+        assert np.all(np.diff(counters) > 0), f"device_counter of {sensor.name} does not grow"
         if len(blocks) > 2:
             slope = np.diff(counters) / np.diff(index)
-            states_utc = BlockFlag.DEVICE_UTC in blocks[0].flags
-            rounded = 2 * _UTC_STEP / np.diff(index).min() if states_utc else 0.0
-            uneven = f"device_counter of {name} is uneven"
-            assert np.ptp(slope) <= 0.01 * slope.mean() + rounded, uneven
+            mean = (counters[-1] - counters[0]) / (index[-1] - index[0])
+            rounded = _TIME_STEP / np.diff(index) if _is_time(mean, sensor) else 0.0
+            uneven = f"device_counter of {sensor.name} is uneven"
+            assert np.all(abs(slope - mean) <= 0.01 * mean + rounded), uneven
+
+
+def _is_time(slope: float, sensor: Sensor) -> bool:
+    """Return whether a counter that grows by ``slope`` a sample is the time in ns."""
+    return abs(slope * sensor.sampling_rate / 1e9 - 1) <= 0.05
 
 
 def check_rate(sensor: Sensor, rate: float | None, *, source: str = "stated") -> None:

@@ -98,7 +98,7 @@ async def test_blocks_are_in_order_and_whole(served: Served, mode: str) -> None:
             assert np.median(late) <= LATENCY
             continue
         sent = served.sent(mode, name, clock, speed=SPEED)
-        check_counters(blocks)
+        check_counters([by_name[name]], blocks)
         check_truth(by_name[name], blocks, sent)
 
 

@@ -120,7 +120,7 @@ async def test_devices_on_one_bus_have_one_clock() -> None:
             found = await read(bench, 100)
             due = np.array(simulated.due)
             check_blocks(DRIVER, bench, found)
-            check_counters(found)
+            check_counters(bench, found)
             for one in bench:
                 node = NODES[one.name]
                 check_truth(one, found, Sent(counts(node, 0, len(due)), due))
