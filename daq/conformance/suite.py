@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Sensor
     from daq.devices.interface import DriverType
+    from daq.host_clock import HostClock
     from daq.protocols.block import DeviceItem, HostTime
 
 LIMIT = 60.0
@@ -258,7 +259,7 @@ class DriverConformance:
                     n_sent.update({s.name: len(truth(s.name).due) for s in served.sensors})
                     vanish()
 
-                clock = _CuttingClock(cut)
+                clock = CuttingClock(SystemClock(), cut)
                 found: list[DeviceItem] = []
                 with pytest.raises((NotConnectedError, NoAnswerError)):
                     await self._read(
@@ -318,7 +319,7 @@ class DriverConformance:
         pauses: Callable[[], object] | None = None,
         first: Callable[[], object] | None = None,
         seconds: float | None = None,
-        clock: SystemClock | None = None,
+        clock: HostClock | None = None,
         into: list[DeviceItem] | None = None,
     ) -> list[DeviceItem]:
         """Read until every sensor has enough; ``first`` and ``pauses`` are called once, early."""
@@ -508,24 +509,38 @@ def _truth(served: Served) -> Callable[[str], Sent]:
     return served.truth
 
 
-class _CuttingClock(SystemClock):
-    """Cuts the line at an arrival: when bytes were read, before anything can be sent."""
+class CuttingClock:
+    """A host clock that cuts the line at an arrival: after a read, before anything is sent."""
 
-    def __init__(self, cut: Callable[[], None]) -> None:
-        super().__init__()
+    def __init__(self, clock: SystemClock, cut: Callable[[], object]) -> None:
+        self._clock = clock
         self._cut = cut
         self._is_armed = False
+
+    @property
+    def speed(self) -> float:
+        """Speed of the clock."""
+        return self._clock.speed
+
+    @property
+    def suspended(self) -> float:
+        """Return the time of suspension in s."""
+        return self._clock.suspended
 
     def arm(self) -> None:
         """Cut at the next reading of the clock."""
         self._is_armed = True
 
     def now(self) -> HostTime:
-        """Return the time."""
+        """Cut if armed, and return the time."""
         if self._is_armed:
             self._is_armed = False
             self._cut()
-        return super().now()
+        return self._clock.now()
+
+    def utc_ns(self) -> int:
+        """Return UTC in ns."""
+        return self._clock.utc_ns()
 
 
 @contextlib.asynccontextmanager

@@ -161,8 +161,10 @@ class ReplayedStream(ByteStream):
         """Compare what is sent with what was sent."""
         self._to_send += payload
         while self._to_send:
-            line = next((line for line in self._lines if line.kind in {"out", "end"}), None)
-            if line is None or line.kind == "end":  # the log has only what was sent before
+            line = next((line for line in self._lines if line.kind != "in"), None)
+            if line is not None and line.kind == "lost" and line is self._lines[0]:
+                raise NotConnectedError(f"{self.label}: the port closed ({line.text})")
+            if line is None or line.kind != "out":  # the log has only what was sent before
                 self._to_send = b""
                 return
             expected = bytes.fromhex(line.text)

@@ -13,6 +13,7 @@ import pytest
 
 from daq.bench.channel import Channel
 from daq.bench.model import Sensor
+from daq.conformance.suite import CuttingClock
 from daq.devices.guralp.brp import encode_frame
 from daq.devices.labjack.registers import Adu, AduFinder, encode_adu
 from daq.devices.modbus.rtu import RequestFinder, encode_registers
@@ -20,28 +21,15 @@ from daq.devices.registry import driver_type
 from daq.devices.seedlink.packets import Packet, PacketFinder, encode_packet
 from daq.errors import NotConnectedError
 from daq.host_clock import SystemClock
-from daq.protocols.block import Block, HostTime
+from daq.protocols.block import Block
 from daq.protocols.errors import RemoteProtocolError
 from tests.daq.devices.guralp.sample_blocks import RATE, expected, raw_blocks
 from tests.waiting import limit
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
-
-class CuttingClock(SystemClock):
-    """Cuts the line at an arrival: after the bytes were read, before anything can be sent."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.cut: Callable[[], object] | None = None
-
-    def now(self) -> HostTime:
-        """Cut if told to, and return the time."""
-        cut, self.cut = self.cut, None
-        if cut is not None:
-            cut()
-        return super().now()
+    from daq.host_clock import HostClock
 
 
 @pytest.fixture
@@ -68,7 +56,8 @@ async def test_a_line_that_hangs_up_before_the_reply_loses_no_block(
         settings={"streams": ["DEMOZ2", "DEMON2", "DEMOE2"]},
     )
     frames = [encode_frame(n, block) for n, block in enumerate(raw_blocks(3))]
-    clock, found, loop = CuttingClock(), list[Block](), asyncio.get_running_loop()
+    clock = CuttingClock(SystemClock(), lambda: os.close(master))
+    found, loop = list[Block](), asyncio.get_running_loop()
     async with asyncio.timeout(limit(20)):
         task = asyncio.create_task(_opened(sensor, clock, found))
         await asyncio.sleep(0)  # opening the port flushes it
@@ -79,14 +68,14 @@ async def test_a_line_that_hangs_up_before_the_reply_loses_no_block(
             await acknowledged.wait()
             os.read(master, 4096)
         loop.remove_reader(master)
-        clock.cut = lambda: os.close(master)
+        clock.arm()
         os.write(master, b"".join(frames[6:]))
         with pytest.raises(NotConnectedError):
             await task
     assert np.array_equal(np.concatenate([b.counts for b in found]), expected(0, 3 * RATE))
 
 
-async def _opened(sensor: Sensor, clock: SystemClock, found: list[Block]) -> None:
+async def _opened(sensor: Sensor, clock: HostClock, found: list[Block]) -> None:
     async with driver_type(sensor.driver).open([sensor], clock) as session:
         async for item in session.read():
             found.extend([item] if isinstance(item, Block) else [])
