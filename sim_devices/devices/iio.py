@@ -122,7 +122,9 @@ class Iiod:
                 return [f"{EINVAL}\n".encode()]
 
     def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:
-        """Lose the scans of an overflow."""
+        """Lose the scans of an overflow; a restart closes the buffer and forgets the request."""
+        if kind == "reset":
+            self._forget()
         if kind == "overflow" and self._layout is not None:
             self._next = max(self._next, self._samples.first_after(now + duration))
         return ()

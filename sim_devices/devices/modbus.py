@@ -52,6 +52,10 @@ class Slave(Protocol):
         """Set registers; return an exception code on failure."""
         ...
 
+    def restart(self, now: float) -> None:
+        """Start anew: what was written is lost, and the counter begins at 0."""
+        ...
+
 
 class ModbusEndpoint:
     """Slaves on one line; an :class:`~sim_devices.devices.interface.Endpoint`.
@@ -76,6 +80,14 @@ class ModbusEndpoint:
     def disconnected(self, now: float) -> None:
         """Discard an incomplete request."""
         self._now, self._waiting = now, b""
+
+    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
+        """Restart the slaves, which have one supply; an incomplete request is lost."""
+        if kind == "reset":
+            self._now, self._waiting = now, b""
+            for slave in self._slaves.values():
+                slave.restart(now)
+        return ()
 
     def due(self, now: float) -> Sequence[bytes]:
         """Return nothing: slaves only reply."""
@@ -175,6 +187,7 @@ class RegisterDevice:
         if settings.get("preset") == "witmotion":
             self._at_first = {WITMOTION_RATE: 6, WITMOTION_UNLOCK[0]: 0}
         self._written = dict(self._at_first)
+        self._count_from = 0
         self._first = 0
         self._times = np.empty(0)
         self._counts = np.empty((0, 0))
@@ -185,6 +198,11 @@ class RegisterDevice:
         if off:
             self._written = dict(self._at_first)
         return off
+
+    def restart(self, now: float) -> None:
+        """Lose what was written; the counter of readings begins at 0 again."""
+        self._written = dict(self._at_first)
+        self._count_from = self._source.first_sample_after(self._sensor, now)
 
     def read(self, function: int, address: int, count: int, now: float) -> Sequence[int] | ExcCodes:
         """Return registers of the latest reading."""
@@ -217,7 +235,7 @@ class RegisterDevice:
         counts[self._main] = self._counts[row]
         return self._map.encode(
             counts,
-            counter=self._first + row,
+            counter=max(0, self._first + row - self._count_from),
             time_ns=BEGINNING + round(float(self._times[row]) * 1e9),
         )
 

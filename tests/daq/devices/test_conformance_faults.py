@@ -68,14 +68,14 @@ _RESET: dict[str, dict[str, Any]] = {"reset": {}}
 _LABJACK = {"overflow": {"duration": 1.5}, **_RESET, **_GARBAGE}
 FAULTS: dict[str, dict[str, dict[str, Any]]] = {
     "epson": _RESET | _CHECKED,
-    "registers rtu": {k: _CHECKED[k] for k in ("merge", "corrupt", "garbage", *_PACKETS)},
-    "registers tcp": _PACKETS,
+    "registers rtu": _RESET | {k: _CHECKED[k] for k in ("merge", "corrupt", "garbage", *_PACKETS)},
+    "registers tcp": _RESET | _PACKETS,
     "labjack": _LABJACK,
     "labjack polled": {k: keys for k, keys in _LABJACK.items() if k != "drop"},  # a stall is that
     "guralp serial": _RESET | _CHECKED,
     "scream udp": _RESET | _GARBAGE,
     "scream tcp": _RESET | _GARBAGE,
-    "fifo": _CHECKED,  # what a power failure takes is not always noticed
+    "fifo": _CHECKED,  # what a power failure takes is not always noticed: no "reset"
     "fifo tcp": _CHECKED,
     "seedlink 4": _RESET | _GARBAGE,
     "seedlink 3": _RESET | _GARBAGE,
@@ -84,6 +84,7 @@ FAULTS: dict[str, dict[str, dict[str, Any]]] = {
         "late": {"duration": 0.6},
         "overflow": {"duration": 1.5},
         "stall": {"duration": 1.6},
+        **_RESET,
         "disconnect": {"duration": 4.0},
     },
     "text serial": _RESET | _XOR,

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import struct
 from collections import Counter
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from pymodbus.transaction import TransactionManager
 
 from daq.bench.channel import Channel
 from daq.bench.model import Sensor
@@ -233,3 +235,41 @@ async def test_a_late_reply_is_never_the_reply_to_a_later_request(
             await asyncio.sleep(0.015)
     assert slow.n_late > 20
     assert n_replies > 1600
+
+
+async def test_numbers_of_requests_may_wrap_over_tcp(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each reply comes after a second copy of the one before, which has another number."""
+
+    def connected(manager: TransactionManager) -> None:
+        begun(manager)
+        manager.next_tid = 64_980
+
+    begun = TransactionManager.callback_connected
+    monkeypatch.setattr(TransactionManager, "callback_connected", connected)
+    numbers: list[int] = []
+    ended = asyncio.Event()
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        before = b""
+        with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
+            while True:
+                number, _, _, unit, function, _, n_words = struct.unpack(
+                    ">HHHBBHH", await reader.readexactly(12)
+                )
+                words = np.arange(len(numbers), len(numbers) + n_words, dtype=">u2").tobytes()
+                pdu = struct.pack(">BBB", unit, function, len(words)) + words
+                answer = struct.pack(">HHH", number, 0, len(pdu)) + pdu
+                numbers.append(number)
+                writer.write(before + answer)
+                before = answer
+        writer.close()
+        ended.set()
+
+    async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
+        port = f"modbus-tcp://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+        async with open_bus(port, host_clock(), label="A") as bus:
+            for n in range(50):
+                answer = await bus.read(3, 1, 0, 2)
+                assert answer.registers == [n, n + 1]
+        await ended.wait()
+    assert numbers == [*range(64_981, 65_001), *range(1, 31)]
