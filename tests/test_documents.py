@@ -54,6 +54,20 @@ def test_links_resolve() -> None:
     assert missing == []
 
 
+def test_files_and_names_that_contributors_read_of_exist() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    paths = re.findall(r"`([a-z_./]+/[\w./-]*)`", text.replace("NAME.py", ""))
+    assert len(paths) > 40
+    assert [each for each in paths if not (ROOT / each).exists()] == []
+    named = re.findall(r"`(\w+)` in `([\w/]+\.(?:py|toml|md))`", text)
+    assert len(named) > 5
+    assert [
+        (word, path)
+        for word, path in named
+        if not re.search(rf"\b{word}\b", (ROOT / path).read_text(encoding="utf-8"))
+    ] == []
+
+
 def test_documents_that_code_names_exist() -> None:
     missing = []
     for source in chain.from_iterable((ROOT / folder).rglob("*.py") for folder in SOURCES):
