@@ -14,16 +14,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.archive.averages import Average, Estimator
-from daq.archive.changes import courses
+from daq.archive.changes import MIN_CONTRAST_DAYS, MIN_DAYS, courses
 from daq.archive.density import MIN_BINS
 from daq.archive.rollup import MEAN
 from daq.archive.spectra_file import unpacked
 from daq.archive.years import Years, density_of
 from daq.errors import ArchiveError
 from daq.results.band_summary import band_within, judged_method
+from daq.results.facts import (
+    ChangesUndecided,
+    NightsNotCompared,
+    Rank,
+    RecordingsLeftOut,
+    SpectraUnreadable,
+    StretchesLeftOut,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from datetime import tzinfo
 
     import h5py
@@ -37,6 +45,7 @@ if TYPE_CHECKING:
     from daq.archive.store import Store
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from daq.results.facts import Fact
 
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
@@ -189,6 +198,26 @@ def answer(
         problems=tuple(years.problems),
         doubted=doubted,
     )
+
+
+def facts_of_archive(found: Answer) -> Iterator[Fact]:
+    """Yield what is known of an archive beside the facts of its pooled estimate, worst first."""
+    if found.problems:
+        yield SpectraUnreadable(rank=Rank.DELAYS, files=found.problems)
+    if found.doubted:
+        yield RecordingsLeftOut(
+            rank=Rank.DELAYS,
+            sensors=tuple(sorted({one for each in found.doubted for one in each.not_understood})),
+            recordings=tuple(each.origin.path for each in found.doubted),
+        )
+    if not any(each.decided for each in found.courses):
+        n_days = len(found.days_utc_ns)
+        yield ChangesUndecided(rank=Rank.DELAYS, n_days=n_days, needed=MIN_DAYS)
+    if n_short := found.density.n_short:
+        yield StretchesLeftOut(rank=Rank.TO_KNOW, n_stretches=n_short)
+    segments = [segment for course in found.courses for segment in course.segments]
+    if all(each.contrast_days < MIN_CONTRAST_DAYS for each in segments):
+        yield NightsNotCompared(rank=Rank.TO_KNOW, needed=MIN_CONTRAST_DAYS)
 
 
 class _Tally:

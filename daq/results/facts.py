@@ -612,3 +612,50 @@ class SensorClipping(Fact):
 
     name: ClassVar[str] = "sensor-clipping"
     are_kept: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingsLeftOut(Fact):
+    """An archive leaves out `recordings`, in which the clocks of `sensors` are not understood."""
+
+    name: ClassVar[str] = "recordings-left-out"
+    recordings: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpectraUnreadable(Fact):
+    """Files of an archive cannot be read, and are left out; a sentence for each."""
+
+    name: ClassVar[str] = "spectra-unreadable"
+    files: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChangesUndecided(Fact):
+    """An archive has too few days for drift and changes.
+
+    Attributes
+    ----------
+    n_days, needed : int
+        Days of the archive, and those with an estimate that a channel needs.
+    """
+
+    name: ClassVar[str] = "changes-undecided"
+    n_days: int
+    needed: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StretchesLeftOut(Fact):
+    """Stretches with less than half of their segments are not in the probability density."""
+
+    name: ClassVar[str] = "stretches-left-out"
+    n_stretches: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NightsNotCompared(Fact):
+    """No channel has `needed` days with working hours and nights, which are not compared."""
+
+    name: ClassVar[str] = "nights-not-compared"
+    needed: int

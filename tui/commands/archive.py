@@ -204,10 +204,10 @@ def archive(
         with notices().status("drawing"):
             written = write_figures(found, out, masks)
         screen.print(", ".join(map(str, written)) + " written", soft_wrap=True)
-    wrong = [*failures, *bad, *found.problems]
+    wrong = [*failures, *bad]
     for line in wrong:
         notices().print(line, style="red", soft_wrap=True)
-    if wrong:
+    if wrong or found.problems:
         raise typer.Exit(ExitCode.TROUBLE)
 
 

@@ -89,7 +89,7 @@ class Months:
             "tables": (result_table(found.pooled, found.settings), course_table(found)),
             "averages": averages_line(found.pooled),
             "facts": [each.line for each in known(found.pooled, found.settings)],
-            "remarks": [*remarks(found, "UTC"), *found.problems],
+            "remarks": list(remarks(found, "UTC")),
         }
 
     def archive_picture(self, name: str) -> bytes:

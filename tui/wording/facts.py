@@ -9,11 +9,13 @@ import math
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import singledispatch
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from daq.protocols.block import UNCOUNTED_CHECK
 from daq.results.facts import (
     BlocksDamaged,
+    ChangesUndecided,
     ChannelsAbsent,
     ChannelsClipped,
     ChannelsStoodStill,
@@ -35,12 +37,14 @@ from daq.results.facts import (
     MethodRefused,
     ModelPasses,
     ModelUntested,
+    NightsNotCompared,
     NoEstimateAbove,
     NoSegmentUsable,
     NotInLiveEstimate,
     OctaveSegments,
     Rank,
     RatesNominal,
+    RecordingsLeftOut,
     SamplesMissing,
     SamplesUncounted,
     SegmentsExcluded,
@@ -49,9 +53,11 @@ from daq.results.facts import (
     SensorOverdue,
     SensorsSimulated,
     SharedNoiseNotSearched,
+    SpectraUnreadable,
     StatedTimesDrift,
     StatedTimesUnchecked,
     SteadinessNotTested,
+    StretchesLeftOut,
     TargetMissed,
     ValuesBelowZero,
     WithoutEstimate,
@@ -69,7 +75,7 @@ from tui.wording.grouped import together
 from tui.wording.vocabulary import CAUSES, FLAG_WORDS, REASONS, SOURCE_WORDS, STATE_ALERTS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
@@ -89,6 +95,8 @@ SIMULATED = "Simulated sensors: the noise is that of a model, not of instruments
 NOTHING_TO_DO = "Nothing to do."
 _NO_NAMES = Names((), (), ())
 """For facts that have names themselves."""
+_MOST_FILES = 8
+"""Recordings that a sentence names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,18 +157,22 @@ def known(
     snapshot: Snapshot, settings: Settings | None = None, verdict: TestVerdict | None = None
 ) -> tuple[Known, ...]:
     """Return all facts of an estimate with their words, the worst rank first."""
-    names = Names.of(snapshot)
-    return tuple(Known(fact, word(fact, names)) for fact in facts_of(snapshot, settings, verdict))
+    return tuple(worded(facts_of(snapshot, settings, verdict), Names.of(snapshot)))
+
+
+def worded(facts: Iterable[Fact], names: Names = _NO_NAMES) -> list[Known]:
+    """Return facts with their words, in their order."""
+    return [Known(fact, word(fact, names)) for fact in facts]
 
 
 def known_of_verdict(found: TestVerdict) -> list[Known]:
     """Return what is known of a verdict."""
-    return [Known(fact, word(fact, _NO_NAMES)) for fact in facts_of_verdict(found)]
+    return worded(facts_of_verdict(found))
 
 
 def known_of_sensors(now: RecordingStatus, settings: Settings | None) -> list[Known]:
     """Return the faults of the sensors of a running or closed recording, the worst first."""
-    return [Known(fact, word(fact, _NO_NAMES)) for fact in facts_of_sensors(now, settings)]
+    return worded(facts_of_sensors(now, settings))
 
 
 def why_no_estimate(snapshot: Snapshot) -> str:
@@ -807,6 +819,59 @@ def _clipping(fact: SensorClipping, names: Names) -> Wording:
     effect = "are kept: do not trust its noise" if fact.are_kept else "are excluded"
     text = f"{listed(fact.sensors)} is clipping: segments with clipped samples {effect}"
     return Wording(text, f"{text}.", "Choose a larger range, or reduce the motion.")
+
+
+@word.register(RecordingsLeftOut)
+def _left_out(fact: RecordingsLeftOut, names: Names) -> Wording:
+    del names
+    n = len(fact.recordings)
+    files = ", ".join(Path(each).name for each in fact.recordings[:_MOST_FILES])
+    files += ", …" * (n > _MOST_FILES)
+    count = several(n, "recording is", "recordings are")
+    clock = f"the clock of {listed(fact.sensors)} is not understood"
+    return Wording(
+        f"{count} left out: {clock}",
+        f"{count} left out: {clock} in {'it' if n == 1 else 'them'} ({files}).",
+        "Check whether samples are lost or repeated without being counted (buffers, cable, the"
+        " logger's software), and the sampling rate.",
+    )
+
+
+@word.register(SpectraUnreadable)
+def _unreadable(fact: SpectraUnreadable, names: Names) -> Wording:
+    del names
+    count = several(len(fact.files), "file")
+    return Wording(f"{count} of the archive cannot be read", " ".join(fact.files))
+
+
+@word.register(ChangesUndecided)
+def _changes(fact: ChangesUndecided, names: Names) -> Wording:
+    del names
+    text = (
+        f"Drift and change are not decided: {several(fact.n_days, 'day')}, and {fact.needed} with"
+        " an estimate are needed"
+    )
+    return Wording(text, f"{text}.")
+
+
+@word.register(StretchesLeftOut)
+def _short(fact: StretchesLeftOut, names: Names) -> Wording:
+    del names
+    text = (
+        f"{several(fact.n_stretches, 'stretch', 'stretches')} with less than half of the segments"
+        " are not in the probability density"
+    )
+    return Wording(text, f"{text}.")
+
+
+@word.register(NightsNotCompared)
+def _nights(fact: NightsNotCompared, names: Names) -> Wording:
+    del names
+    text = "Working hours and nights are not compared"
+    return Wording(
+        text,
+        f"{text}: stretches are days, or fewer than {fact.needed} days between changes have both.",
+    )
 
 
 def _us(seconds: float) -> str:

@@ -74,6 +74,13 @@ def huddle(*arguments: object) -> Any:  # noqa: ANN401 - click's result
     return CliRunner().invoke(app, ["archive", *map(str, arguments)], terminal_width=200)
 
 
+def validate(document: dict[str, Any]) -> None:
+    """Compare a document with the published schema, which has all of its keys."""
+    registry = Registry().with_resource("result-2.schema.json", Resource.from_contents(RESULT))
+    assert document.keys() == SCHEMA["properties"].keys()
+    Draft202012Validator(strict(SCHEMA), registry=registry).validate(document)
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Make a folder of three recordings and their archive."""
@@ -101,9 +108,7 @@ def test_the_archive_beside_the_recordings_answers_what_the_estimate_says(
         for key in ("noise_psd", "noise_psd_low", "noise_psd_high"):
             a, b = (np.array(each[key], dtype=float) for each in (one, other))
             np.testing.assert_allclose(a, b, rtol=1e-9)
-    registry = Registry().with_resource("result-2.schema.json", Resource.from_contents(RESULT))
-    assert found.keys() == SCHEMA["properties"].keys()
-    Draft202012Validator(strict(SCHEMA), registry=registry).validate(found)
+    validate(found)
     assert found["days"]["date"] == ["2026-08-31", "2026-09-01"]
     assert np.shape(found["days"]["noise_psd"]) == (2, len(found["bands_hz"]), 6)
     assert found["archive"] == {
@@ -293,4 +298,15 @@ def test_a_recording_whose_clock_is_not_understood_is_named(tmp_path: Path) -> N
     assert "the clock of B is not understood in it (bad.h5)" in " ".join(said.output.split())
     document = json.loads((tmp_path / "a.json").read_text("utf-8"))
     (left,) = document["archive"]["doubted"]
-    assert left == {"source": str((tmp_path / "bad.h5").resolve()), "clocks": ["B"]}
+    bad = str((tmp_path / "bad.h5").resolve())
+    assert left == {"source": bad, "clocks": ["B"]}
+    validate(document)
+    facts = {each["kind"]: each for each in document["facts"]}
+    assert list(facts) == [
+        "recordings-left-out", "changes-undecided", "stretches-left-out", "nights-not-compared",
+    ]  # fmt: skip
+    fact = facts["recordings-left-out"]
+    assert (fact["rank"], fact["sensors"]) == ("delays", ["B"])
+    assert fact["numbers"] == {"recordings": [bad]}
+    assert fact["action"].startswith("Check whether samples are lost")
+    assert facts["changes-undecided"]["numbers"] == {"n_days": 1, "needed": 8}

@@ -118,6 +118,11 @@ EXAMPLES: tuple[Fact, ...] = (
     ),
     facts.ChannelsStuck(rank=Rank.INVALIDATES, channels=("A.X",), is_now=True),
     facts.SensorClipping(rank=Rank.DELAYS, sensors=A, are_kept=False),
+    facts.RecordingsLeftOut(rank=Rank.DELAYS, sensors=A, recordings=("/archive/night.h5",)),
+    facts.SpectraUnreadable(rank=Rank.DELAYS, files=("Damaged.",)),
+    facts.ChangesUndecided(rank=Rank.DELAYS, n_days=2, needed=8),
+    facts.StretchesLeftOut(rank=Rank.TO_KNOW, n_stretches=6),
+    facts.NightsNotCompared(rank=Rank.TO_KNOW, needed=3),
 )
 
 

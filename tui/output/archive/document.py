@@ -7,11 +7,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from daq.archive.answers import facts_of_archive
 from daq.archive.density import LOWEST_DB
 from tui.output.archive.tables import day_text
 from tui.output.csv_text import csv_text
-from tui.output.json_document import document
+from tui.output.json_document import document, facts_document
 from tui.output.json_values import plain
+from tui.wording.facts import worded
 
 if TYPE_CHECKING:
     from daq.archive.answers import Answer, Levels
@@ -43,6 +45,7 @@ def archive_document(answer: Answer, store: Store, n_recordings: int) -> dict[st
                 for each in answer.doubted
             ],
         },
+        "facts": facts_document(worded(facts_of_archive(answer))),
         "pooled": document(pooled, answer.settings),
         "method": answer.method,
         "unit": pooled.unit,

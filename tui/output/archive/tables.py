@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.table import Table
 from rich.text import Text
 
-from daq.archive.changes import MIN_CONTRAST_DAYS, MIN_DAYS
+from daq.archive.answers import facts_of_archive
 from daq.bench.units import decibels
-from tui.wording.formatting import listed, percent, several, signed, span
+from daq.results.facts import NightsNotCompared
+from tui.wording.facts import worded
+from tui.wording.formatting import percent, several, signed, span
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -76,15 +77,8 @@ def course_table(answer: Answer) -> Table:
 
 def remarks(answer: Answer, zone: str) -> Iterator[str]:
     """Yield sentences below the table; `zone` is that of working hours and nights."""
-    if answer.doubted:
-        whose = listed(sorted({one for each in answer.doubted for one in each.not_understood}))
-        n = len(answer.doubted)
-        yield (
-            f"{several(n, 'recording is', 'recordings are')} left out: the clock of {whose} is not"
-            f" understood in {'it' if n == 1 else 'them'} ({_names(answer)}). Check whether samples"
-            " are lost or repeated without being counted (buffers, cable, the logger's software),"
-            " and the sampling rate."
-        )
+    facts = list(facts_of_archive(answer))
+    yield from map(str, worded(facts))
     n_channels = len(answer.pooled.channels)
     n_decided = sum(each.decided for each in answer.courses)
     if n_decided:
@@ -93,11 +87,6 @@ def remarks(answer: Answer, zone: str) -> Iterator[str]:
             f" ({several(n_channels, 'channel')}, {several(len(answer.bands), 'band')}); without a"
             " change it raises a false alarm in any of them with a probability of"
             f" {percent(answer.false_alarm)} at most, however often one asks."
-        )
-    else:
-        yield (
-            f"Drift and change are not decided: {several(len(answer.days_utc_ns), 'day')}, and"
-            f" {MIN_DAYS} with an estimate are needed."
         )
     for series, course in enumerate(answer.courses[:n_channels]):
         if course.steps:
@@ -117,33 +106,16 @@ def remarks(answer: Answer, zone: str) -> Iterator[str]:
         )
     if len(single) > LARGE:
         yield f"{several(len(single) - LARGE, 'further change')} in single octaves: see --json."
-    density = answer.density
-    if density.n_short:
-        yield (
-            f"{several(density.n_short, 'stretch', 'stretches')} with less than half of the"
-            " segments are not in the probability density."
-        )
     if any(each.steps for each in answer.courses[:n_channels]):
         yield (
             "Drift and difference in the table are those since the last change; no interval of"
             " theirs spans a change. The estimate above is of all days together."
         )
-    if all(each.contrast_days < MIN_CONTRAST_DAYS for c in answer.courses for each in c.segments):
-        yield (
-            "Working hours and nights are not compared: stretches are days, or fewer than"
-            f" {MIN_CONTRAST_DAYS} days between changes have both."
-        )
-    else:
+    if not any(isinstance(each, NightsNotCompared) for each in facts):
         yield (
             "Work: Monday to Friday, 8–18 h; night: 0–6 h and 22–24 h of the same days"
             f" ({zone}). Each ± is half of a 95 % interval."
         )
-
-
-def _names(answer: Answer) -> str:
-    """Return the names of the first recordings that are left out."""
-    names = [Path(each.origin.path).name for each in answer.doubted[:LARGE]]
-    return ", ".join(names) + ", …" * (len(answer.doubted) > LARGE)
 
 
 def _change(answer: Answer, column: int) -> str:
