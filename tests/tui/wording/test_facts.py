@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from dataclasses import replace
+from itertools import chain
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,16 +33,26 @@ from tui.wording.facts import MOST_LINES, Known, brief, known, word
 from tui.wording.findings import Names
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from daq.estimation.snapshot import Snapshot
 
 NAMES = Names.of(made_snapshot())
+ROOT = Path(__file__).parents[3]
 
 
 def test_every_kind_has_an_example_and_a_name_of_its_own() -> None:
     assert {type(each) for each in EXAMPLES} == kinds()
     assert len({each.name for each in kinds()}) == len(kinds())
+
+
+def test_every_kind_has_one_maker() -> None:
+    """Decision 0027: what is made in two places is known in one and missing in another."""
+    made = [
+        each.group(1)
+        for path in chain.from_iterable((ROOT / part).rglob("*.py") for part in ("daq", "tui"))
+        for each in re.finditer(r"\b(\w+)\(\s*rank=", path.read_text("utf-8"))
+    ]
+    assert set(made) == {kind.__name__ for kind in kinds()}
+    assert {kind for kind in made if made.count(kind) > 1} == {"ChannelsStuck"}  # now, and earlier
 
 
 @pytest.mark.parametrize("fact", EXAMPLES, ids=lambda fact: str(fact.name))
