@@ -113,29 +113,6 @@ class SensorCheck:
         return float(-20 * np.log10(2 * np.pi * self.bandwidth * self.jitter))
 
 
-async def probe(
-    sensors: Sequence[Sensor], clock: HostClock, *, duration: float = 1.0
-) -> tuple[SensorCheck, ...]:
-    """Open the sensors of one port, read some samples, and close them again.
-
-    Parameters
-    ----------
-    sensors
-        All sensors of one port.
-    duration
-        Duration of the samples to read from each sensor, in s at its nominal rate.
-
-    Raises
-    ------
-    DeviceError
-        As the driver raises it.
-    """
-    found, _, errors = await _probe(sensors, clock, duration=duration)
-    if errors:
-        raise errors[0]
-    return tuple(found)
-
-
 async def _probe(
     sensors: Sequence[Sensor], clock: HostClock, *, duration: float
 ) -> tuple[list[SensorCheck], list[SensorPreview], list[DeviceError]]:
@@ -237,25 +214,8 @@ async def examine(
     duration : float, optional
         Of the recording that is wanted, in s; default: that of the bench file.
     """
-    found, previews, errors = await _probe_bench(bench, clock, duration=seconds)
-    rows = check_list(bench, previews, duration=duration)
-    return Examination(tuple(found), tuple(errors), rows)
-
-
-async def probe_bench(
-    bench: Bench, clock: HostClock, *, duration: float = 1.0
-) -> tuple[list[SensorCheck], list[DeviceError]]:
-    """Probe all ports of a bench at the same time; return checks and errors."""
-    found, _, errors = await _probe_bench(bench, clock, duration=duration)
-    return found, errors
-
-
-async def _probe_bench(
-    bench: Bench, clock: HostClock, *, duration: float
-) -> tuple[list[SensorCheck], list[SensorPreview], list[DeviceError]]:
-    """Return checks, a preview of every sensor in the order of the bench file, and errors."""
     answers = await asyncio.gather(
-        *(_probe(sensors, clock, duration=duration) for sensors in bench.ports().values()),
+        *(_probe(sensors, clock, duration=seconds) for sensors in bench.ports().values()),
         return_exceptions=True,
     )
     found: list[SensorCheck] = []
@@ -274,10 +234,11 @@ async def _probe_bench(
             found.extend(answer[0])
             previews |= {each.sensor.name: each for each in answer[1]}
             errors.extend(answer[2])
-    return (
-        found,
-        [previews[sensor.name] for sensor in bench.sensors],
-        [with_owner(error, bench.sensors) for error in errors],
+    in_order = [previews[sensor.name] for sensor in bench.sensors]
+    return Examination(
+        tuple(found),
+        tuple(with_owner(error, bench.sensors) for error in errors),
+        check_list(bench, in_order, duration=duration),
     )
 
 

@@ -10,6 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from daq.bench.loading import parse
+from daq.bench.model import Bench
 from daq.devices.registry import driver_names
 from daq.errors import NotConnectedError
 from daq.preflight.arrivals import arrivals
@@ -17,8 +18,7 @@ from daq.preflight.device_check import (
     MODBUS_BAUD_RATES,
     MODBUS_DEVICES,
     discover,
-    probe,
-    probe_bench,
+    examine,
     search_description,
 )
 from daq.protocols.block import Block, HostTime
@@ -58,8 +58,15 @@ def running() -> Iterator[tuple[RunningDevice, ...]]:
         yield devices
 
 
-async def test_probe_reads_one_second_of_samples(running: tuple[RunningDevice, ...]) -> None:
-    (check,) = await probe(sensors(running[0], TABLES[0]), CLOCK)
+def bench_of(running: RunningDevice, table: dict[str, Any], **given: Any) -> Bench:  # noqa: ANN401
+    chosen = tuple(sensors(running, table, **given))
+    return Bench(name="bench", sampling_rate=table["sampling_rate"], sensors=chosen)
+
+
+async def test_an_examination_reads_one_second_of_samples(
+    running: tuple[RunningDevice, ...],
+) -> None:
+    (check,) = (await examine(bench_of(running[0], TABLES[0]), CLOCK, seconds=1.0)).found
     assert check.information.serial_number == "A0000007"
     assert check.n_samples >= 200
     assert check.n_missing == 0
@@ -101,8 +108,8 @@ def test_rate_is_measured_only_if_blocks_arrive_evenly(
 async def test_bandwidth_of_polled_sensors_follows_from_the_longest_interval(
     running: tuple[RunningDevice, ...],
 ) -> None:
-    chosen = sensors(running[1], TABLES[1], settings={"preset": "witmotion"})
-    (check,) = await probe(chosen, CLOCK, duration=2.0)
+    chosen = bench_of(running[1], TABLES[1], settings={"preset": "witmotion"})
+    (check,) = (await examine(chosen, CLOCK, seconds=2.0)).found
     assert check.bandwidth is not None
     assert 0 < check.bandwidth <= RATE / 2 * 1.1  # how far below, a busy host says
     assert check.jitter is not None
@@ -130,9 +137,9 @@ async def test_failing_ports_do_not_hide_the_others(running: tuple[RunningDevice
         """,
         "bench.toml",
     )
-    found, errors = await probe_bench(bench, CLOCK, duration=0.1)
-    assert [check.information.sensor for check in found] == ["A"]
-    assert ["'B' on /dev/ttyNotThere" in str(error) for error in errors] == [True]
+    examined = await examine(bench, CLOCK, seconds=0.1)
+    assert [check.information.sensor for check in examined.found] == ["A"]
+    assert ["'B' on /dev/ttyNotThere" in str(error) for error in examined.errors] == [True]
 
 
 async def test_devices_on_a_port_are_discovered(running: tuple[RunningDevice, ...]) -> None:
@@ -172,9 +179,9 @@ async def test_silent_or_wrong_devices_do_not_hide_others_on_their_port(
         channels = [{{name = "x", sensitivity = 1.7e6}}]
         """
     bench = parse(f'name = "b"\nsampling_rate = {RATE}\n{sensors_}', "bench.toml")
-    found, errors = await probe_bench(bench, CLOCK, duration=0.2)
-    assert "P" in [check.information.sensor for check in found]
-    said = sorted(str(error) for error in errors)
+    examined = await examine(bench, CLOCK, seconds=0.2)
+    assert "P" in [check.information.sensor for check in examined.found]
+    said = sorted(str(error) for error in examined.errors)
     assert len(said) == 2
     assert "'A'" in said[0]
     assert "serial number 'another', got 'A0000007'" in said[0]
