@@ -25,8 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.devices.guralp.gcf import component, serial_number
-from daq.devices.guralp.links import open_link
-from daq.devices.guralp.settings import GuralpSettings
+from daq.devices.guralp.links import GuralpSettings, open_link
 from daq.devices.interface import DeviceInformation
 from daq.devices.port_rules import port_label, require_address, require_alike
 from daq.errors import (
