@@ -42,8 +42,7 @@ from tui.application.test_view.view import TestView
 from tui.application.themes import ThemedApp
 from tui.application.view import View
 from tui.runs.catalogue import delete_recording
-from tui.wording.alerts import alert
-from tui.wording.findings import Names
+from tui.wording.findings import Names, alert
 from tui.wording.verdict_text import WORDS
 
 if TYPE_CHECKING:

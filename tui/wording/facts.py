@@ -68,10 +68,8 @@ from estimator.checks.advice import Untested
 from estimator.decision.comparison import MIN_AVERAGES
 from estimator.decision.verdict import Obstacle
 from estimator.spectra.segment_rejection import Reason
-from tui.wording.alerts import alert
-from tui.wording.findings import Names, explain, model
+from tui.wording.findings import Names, alert, explain, model, together
 from tui.wording.formatting import clock_time, listed, percent, roughly, several, signed, span
-from tui.wording.grouped import together
 from tui.wording.vocabulary import CAUSES, FLAG_WORDS, REASONS, SOURCE_WORDS, STATE_ALERTS
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ from daq.recording.reader import Recording
 from daq.results.band_summary import band_of, channel_means, judged_method
 from estimator.errors import BandError
 from tui.service.records.run_state import BandNoise, utc_text
-from tui.wording.differences import drift_line
+from tui.wording.findings import drift_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
