@@ -25,6 +25,7 @@ from daq.protocols.block import Block, BlockFlag, Event
 from daq.protocols.errors import RemoteProtocolError
 from daq.recorder.connection import patience_of
 from daq.recorder.device_identity import check_identity, with_owner
+from daq.transport.address import USUAL_NUMBERS
 from daq.transport.ports import open_port
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ TEXT_BAUD_RATES = (115200, 9600, 57600, 38400, 19200, 230400)
 TEXT_ROWS, LISTEN, LISTEN_ON = 12, 1.0, 2.5
 """Rows of text to guess a format from; seconds to listen for the first row, and for later ones."""
 MODBUS_BAUD_RATES = (9600, 115200, 19200, 38400, 57600)
-MODBUS_PORT = 502
+(MODBUS_PORT,) = USUAL_NUMBERS["modbus-tcp"]
 TCP_PORTS = (MODBUS_PORT, 4001, 4002, 4003, 4004, 2101, 10001)
 """Modbus, and serial servers as their makers set them: Moxa, Digi, Lantronix."""
 MOST_HOSTS, MOST_CONNECTIONS, CONNECT = 1024, 256, 1.0

@@ -19,14 +19,13 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daq.errors import NotConnectedError
 from daq.transport import wire_log
-from daq.transport.address import check_serial, host_and_port
+from daq.transport.address import check_serial, host_and_port, is_same_port, is_virtual
 from daq.transport.byte_stream import ByteStream
 from daq.transport.port_errors import why
 from daq.transport.serial_tcp import open_serial, open_tcp
@@ -100,9 +99,11 @@ def is_simulated(port: str) -> bool:
     A simulated device speaks the real protocol: nothing in its bytes says that it is simulated.
     So its server lists its ports in a file of its folder (``sim_devices.server.launch``).
     """
+    if is_virtual(port):
+        return True
     for file in Path(tempfile.gettempdir()).glob("huddle-*/simulated-ports.json"):
         with contextlib.suppress(OSError, ValueError):  # of another user, or just removed
             served = json.loads(file.read_text(encoding="utf-8"))
-            if port in served or os.path.realpath(port) in map(os.path.realpath, served):
+            if any(is_same_port(port, each) for each in served):
                 return True
     return False

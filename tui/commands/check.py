@@ -206,11 +206,14 @@ def check_port(port: str, *, json: str | None) -> None:
 
     from daq.host_clock import SystemClock
     from daq.preflight.device_check import discover, search_description
+    from daq.transport.ports import is_simulated
     from tui.output.console import for_people, write_json
     from tui.output.json_values import plain
+    from tui.wording.facts import SIMULATED
 
     found = asyncio.run(discover(port, SystemClock()))
-    write_json(json, {"port": port, "devices": plain(found)})
+    simulated = is_simulated(port)
+    write_json(json, {"port": port, "simulated": simulated, "devices": plain(found)})
     if not found:
         raise NoAnswerError(
             f"port {port}: no reply as {search_description(port)}; check power and cable; for other"
@@ -225,6 +228,8 @@ def check_port(port: str, *, json: str | None) -> None:
         settings = ", ".join(f"{key} = {value}" for key, value in device.settings.items())
         table.add_row(device.driver, settings, remark)
     screen = for_people(json)
+    if simulated:
+        screen.print(SIMULATED)
     screen.print(table)
     for device in found:
         if device.driver == "text":

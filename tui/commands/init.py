@@ -122,6 +122,7 @@ def _search(ports: Sequence[str], *, is_asked: bool) -> tuple[list[str], list[Di
     import asyncio
 
     from daq.preflight.device_check import network_ports
+    from daq.transport.ports import is_simulated
     from daq.transport.serial_ports import serial_ports
     from tui.output.console import console
 
@@ -150,7 +151,8 @@ def _search(ports: Sequence[str], *, is_asked: bool) -> tuple[list[str], list[Di
         for device in answer:
             about = device.information
             what = device.remark if about is None else f"{about.model} {about.serial_number}"
-            screen.print(f"{port}: {device.driver}, {what}")
+            simulated = ", simulated" if is_simulated(port) else ""
+            screen.print(f"{port}: {device.driver}, {what}{simulated}")
         if not answer:
             screen.print(f"{port}: no reply")
         found += answer

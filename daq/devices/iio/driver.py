@@ -21,7 +21,7 @@ from daq.devices.port_rules import only, port_label
 from daq.errors import BenchFileError, FileFault, NoAnswerError, WrongDeviceError
 from daq.protocols.block import Block, BlockFlag, Event, EventKind
 from daq.protocols.errors import RemoteProtocolError
-from daq.transport.address import host_and_port
+from daq.transport.address import USUAL_NUMBERS, host_and_port
 from daq.transport.ports import open_port
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 _Reply = TypeVar("_Reply")
 SCHEME = "iio://"
-PORT = 30431
+(PORT,) = USUAL_NUMBERS["iio"]
 REPLY_TIMEOUT = 5.0
 BLOCK_SECONDS = 0.1
 """Seconds of samples in one buffer."""

@@ -19,7 +19,7 @@ from daq.devices.port_rules import require_alike
 from daq.errors import BenchFileError, FileFault, NoAnswerError, WrongDeviceError
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.sample_counter import CLOCK_TOLERANCE, SLACK
-from daq.transport.address import host_and_port
+from daq.transport.address import USUAL_NUMBERS, host_and_port
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 REPLY_TIMEOUT = 2.0
 PACKETS_PER_SECOND = 10
 PRODUCTS = {7.0: "T7", 8.0: "T8"}
-MODBUS_PORT = 502
+(MODBUS_PORT,) = USUAL_NUMBERS["modbus-tcp"]
 SENSOR_SETTINGS = ("inputs", "range", "negative_inputs")
 """Settings of each sensor; all others belong to the stream and to the port's first sensor."""
 BUFFERS = {"T7": 32768, "T8": 262144}

@@ -33,7 +33,7 @@ from daq.errors import (
     NotConnectedError,
     WrongDeviceError,
 )
-from daq.transport.address import host_and_port
+from daq.transport.address import USUAL_NUMBERS, host_and_port
 from daq.transport.ports import open_port
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from daq.protocols.block import Block, Event, HostTime
     from daq.transport.byte_stream import ByteStream
 
-PORT, TLS_PORT = 18000, 18500
+PORT, TLS_PORT = USUAL_NUMBERS["seedlink"]
 SCHEME = "seedlink"
 REPLY_TIMEOUT = 10.0
 OF_THE_SERVER = ("protocol", "tls", "ca_file", "credentials", "late", "patience")

@@ -54,6 +54,7 @@ def test_what_answers_is_in_the_bench_file_with_its_comments(tmp_path: Path) -> 
         options = [each for port in (*ports, "/dev/ttyNotThere") for each in ("--port", port)]
         said = answered(["init", "--discover", *options, "-o", str(out)], ANSWERS)
     assert "/dev/ttyNotThere" in said
+    assert said.count(", simulated") == len(TABLES)
     assert "2 names for 3 sensors" in said
     bench = load(out)
     assert [(s.name, s.serial_number, s.port) for s in bench.sensors] == [

@@ -19,6 +19,8 @@ from daq.python_process import python_command
 from daq.recording.reader import Recording
 from daq.results.sources import sources
 from daq.transport.ports import is_simulated
+from tests.devices import serving
+from tests.sim_devices.simulated_bench import device, spec
 from tests.waiting import limit
 from tui.commands.main import app
 from tui.simulation.devices import simulated
@@ -57,6 +59,23 @@ def test_help_of_the_demo_says_what_it_does_unless_told() -> None:
     assert "(default 5min)" in said
     assert "real time (default 4)" in said
     assert "bench file" not in said
+
+
+def test_simulated_ports_of_the_network_are_known_by_every_address() -> None:
+    """As bench files have them: with a path for each device of a board, by name, with a slash."""
+    station = {"sensor_settings": {"seedlink": {"station": "XX_A", "streams": ["H_H_X"] * 3}}}
+    tables = [
+        device("iio", "iio", port="tcp"),
+        device("seedlink", "seedlink", port="tcp", **station),
+    ]
+    with serving(spec(*tables)) as running:
+        board, server = (each.port for each in running)
+        here = server.replace("127.0.0.1", "localhost")
+        ports = (board, f"{board}/2", f"{board}/a name", server, here, f"{here}/")
+        assert all(map(is_simulated, ports))
+        elsewhere = board.replace("127.0.0.1", "192.168.0.7")
+        assert not is_simulated(elsewhere)
+    assert not any(map(is_simulated, ports))
 
 
 def test_a_recording_of_simulated_ports_is_simulated_whatever_its_bench_file(

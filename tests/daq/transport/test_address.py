@@ -1,0 +1,48 @@
+"""Addresses of bench files that lead to ports which this computer serves."""
+
+from __future__ import annotations
+
+import pytest
+
+from daq.transport.address import is_same_port
+from daq.transport.ports import is_simulated
+
+
+@pytest.mark.parametrize(
+    ("port", "served"),
+    [
+        ("iio://127.0.0.1:40123/2", "iio://127.0.0.1:40123"),
+        ("iio://localhost", "iio://127.0.0.1:30431"),
+        ("seedlink://localhost:40123/", "seedlink://127.0.0.1:40123"),
+        ("seedlink://localhost", "seedlink://127.0.0.1:18500"),
+        ("tcp://[::1]:40123", "socket://127.0.0.1:40123"),
+        ("127.0.0.1:5020", "modbus-tcp://127.0.0.1:5020"),
+        ("udp://0.0.0.0:40123", "udp://127.0.0.1:40123"),
+        ("/dev/../tmp/tty", "/tmp/tty"),  # noqa: S108 - no file is opened
+    ],
+)
+def test_addresses_of_one_port_are_the_same(port: str, served: str) -> None:
+    assert is_same_port(port, served)
+
+
+@pytest.mark.parametrize(
+    ("port", "served"),
+    [
+        ("iio://192.168.0.7:40123", "iio://127.0.0.1:40123"),
+        ("iio://localhost:40124", "iio://127.0.0.1:40123"),
+        ("socket://localhost", "socket://127.0.0.1:40123"),
+        ("udp://127.0.0.1:40123", "socket://127.0.0.1:40123"),
+        ("/dev/ttyUSB0", "socket://127.0.0.1:40123"),
+        ("COM3", "socket://127.0.0.1:40123"),
+        ("socket://localhost:99999", "socket://127.0.0.1:40123"),
+        ("socket://localhost:40123", "/tmp/tty"),  # noqa: S108
+        ("audio://default", "socket://127.0.0.1:40123"),
+    ],
+)
+def test_other_ports_are_not(port: str, served: str) -> None:
+    assert not is_same_port(port, served)
+
+
+def test_a_can_bus_without_an_adapter_is_simulated() -> None:
+    assert is_simulated("can://vcan0")
+    assert not is_simulated("can://can0")
