@@ -351,6 +351,10 @@ IDLE = 0.005
 """Interval at which the bus looks whether it is to start, in s."""
 
 
+BUS_CELSIUS = 26.5
+"""Temperature of the devices on a bus."""
+
+
 class SimulatedBus:
     """Devices on a bus.
 
@@ -395,6 +399,9 @@ class SimulatedBus:
             (protocol.TPDO2, 1): (0xC0000280 + node_id).to_bytes(4, "little"),
             (protocol.FILTER, 1): b"\x09",
             (HEARTBEAT, 0): bytes(2),
+            protocol.TEMPERATURE: int(temperature_counts(np.array(BUS_CELSIUS))).to_bytes(
+                4, "little", signed=True
+            ),
             **{place: value.to_bytes(4, "little") for place, value in MAPPING.items()},
         }
         import canopen  # noqa: PLC0415

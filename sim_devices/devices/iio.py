@@ -7,7 +7,14 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from daq.devices.iio.protocol import RATE_ATTRIBUTE, TIMESTAMP, ScanElement, ScanLayout, mask_of
+from daq.devices.iio.protocol import (
+    RATE_ATTRIBUTE,
+    TEMPERATURE,
+    TIMESTAMP,
+    ScanElement,
+    ScanLayout,
+    mask_of,
+)
 from sim_devices.devices.interface import NEVER, Line, Samples, whole
 
 if TYPE_CHECKING:
@@ -29,6 +36,9 @@ GRAMMAR = (
     "<!ATTLIST attribute name CDATA #REQUIRED>"
 )
 """Clients of libiio validate the context."""
+OF_TEMPERATURE = ("raw", "offset", "scale")
+COUNTS_AT_25, COUNTS_PER_DEGREE = 1885.0, -9.05
+"""Of an ADXL355 (its data sheet)."""
 EINVAL, ENOENT = -22, -2
 MAX_COMMAND = 4096
 BUFFER_SECONDS = 4.0
@@ -41,6 +51,7 @@ class Iiod:
 
     def __init__(self, device: DeviceSpec, source: Source) -> None:
         (sensor,) = device.sensors
+        self._source, self._sensor = source, sensor
         names = [f"accel_{c.name}" for c in device.channels[sensor] if not c.auxiliary]
         elements = [ScanElement.of(name, k, FORMAT, ()) for k, name in enumerate(names)]
         self._elements = [*elements, ScanElement.of(TIMESTAMP, len(names), TIME_FORMAT, ())]
@@ -95,6 +106,11 @@ class Iiod:
             case ["READ", "iio:device0", name] if name == RATE_ATTRIBUTE:
                 text = f"{self._rate:.6f}"
                 return [f"{len(text)}\n{text}\n".encode()]
+            case ["READ", "iio:device0", "INPUT", channel, name] if (
+                channel == TEMPERATURE and name in OF_TEMPERATURE
+            ):
+                text = self._of_temperature(now)[name]
+                return [f"{len(text)}\n{text}\n".encode()]
             case ["WRITE", "iio:device0", name, size] if name == RATE_ATTRIBUTE:
                 self._to_write = int(size)
                 return []
@@ -120,6 +136,12 @@ class Iiod:
                 return []
             case _:
                 return [f"{EINVAL}\n".encode()]
+
+    def _of_temperature(self, now: float) -> dict[str, str]:
+        celsius = float(self._source.temperature(self._sensor, now))
+        raw = round(COUNTS_AT_25 + (celsius - 25.0) * COUNTS_PER_DEGREE)
+        offset, scale = 25.0 * COUNTS_PER_DEGREE - COUNTS_AT_25, 1000.0 / COUNTS_PER_DEGREE
+        return dict(zip(OF_TEMPERATURE, (f"{raw}", f"{offset:.6f}", f"{scale:.6f}"), strict=True))
 
     def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:
         """Lose the scans of an overflow; a restart closes the buffer and forgets the request."""
@@ -158,6 +180,8 @@ class Iiod:
             f" format={quoteattr(TIME_FORMAT if one.channel == TIMESTAMP else FORMAT)} /></channel>"
             for one in self._elements
         )
+        of_temperature = "".join(f'<attribute name="{name}" />' for name in OF_TEMPERATURE)
+        channels += f'<channel id="{TEMPERATURE}" type="input">{of_temperature}</channel>'
         return (
             f'<?xml version="1.0" encoding="utf-8"?><!DOCTYPE context [{GRAMMAR}]>'
             '<context name="network" description="simulated">'

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
 
 from daq.devices.epson import canopen as protocol
-from daq.devices.epson.commands import COUNTS_PER_G, FILTERS, USUAL_FILTER
+from daq.devices.epson.commands import COUNTS_PER_G, FILTERS, USUAL_FILTER, temperature
 from daq.devices.interface import DeviceInformation, PresentPort
 from daq.devices.port_rules import package, port_label, require_alike
 from daq.errors import (
@@ -26,13 +26,14 @@ from daq.errors import (
     NotConnectedError,
     WrongDeviceError,
 )
+from daq.protocols.block import Quantity, Reading, ReadingTimes
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Sequence
+    from collections.abc import AsyncIterator, Mapping, Sequence
 
     from daq.bench.model import Sensor
     from daq.host_clock import HostClock
-    from daq.protocols.block import Block, Event, HostTime
+    from daq.protocols.block import DeviceItem, HostTime
 
 SCHEME = "can://"
 BLOCK_SECONDS = 0.1
@@ -70,6 +71,7 @@ class EpsonCanSession:
     def __init__(
         self,
         bus: _Bus,
+        nodes: Mapping[str, int],
         decoder: protocol.CanDecoder,
         information: tuple[DeviceInformation, ...],
         n_messages: int,
@@ -77,17 +79,31 @@ class EpsonCanSession:
         self.information = information
         self.hint = "expected SYNC and TPDO messages; check power, termination and bitrate"
         self.patience = 10.0
-        self._bus = bus
+        self._bus, self._nodes = bus, nodes
         self._decoder = decoder
         self._n_messages = n_messages
 
-    async def read(self) -> AsyncIterator[Block | Event]:
-        """Start SYNC and yield blocks and events until closed."""
+    async def read(self) -> AsyncIterator[DeviceItem]:
+        """Start SYNC and yield blocks, events, and the temperatures once a minute, until closed."""
         await self._bus.start()
+        reading_times = ReadingTimes()
         while True:
             messages, at = await self._bus.read(self._n_messages)
             for item in self._decoder.receive(messages, at):
                 yield item
+            if reading_times.is_due(at):
+                for sensor, node in self._nodes.items():
+                    for reading in await self._temperature(sensor, node, at):
+                        yield reading
+
+    async def _temperature(self, sensor: str, node: int, at: HostTime) -> list[Reading]:
+        """Return the temperature of a device; none if it does not reply."""
+        try:
+            octets = await self._bus.ask(node, *protocol.TEMPERATURE)
+        except (NoAnswerError, WrongDeviceError):
+            return []
+        count = int.from_bytes(octets, "little", signed=True)
+        return [Reading(sensor, Quantity.TEMPERATURE, temperature(count), at)]
 
 
 class _Bus:
@@ -208,6 +224,7 @@ class EpsonCanDriver:
     summary = "Epson M-A552 quartz accelerometers on a CAN bus (CANopen), one clock for all"
     settings = EpsonCanSettings
     shares_clock = True
+    states_temperature = True
 
     def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:
         """Return int32."""
@@ -263,7 +280,7 @@ class EpsonCanDriver:
             n_syncs = max(1, round(BLOCK_SECONDS * first.sampling_rate))
             try:
                 yield EpsonCanSession(
-                    bus, decoder, tuple(information), n_syncs * (1 + 2 * len(nodes))
+                    bus, nodes, decoder, tuple(information), n_syncs * (1 + 2 * len(nodes))
                 )
             finally:
                 with contextlib.suppress(NoAnswerError, WrongDeviceError):

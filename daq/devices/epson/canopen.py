@@ -44,6 +44,9 @@ TPDO1, TPDO2 = 0x1800, 0x1801
 PDO_IS_OFF = 0x80000000
 EVERY_SYNC = 1
 SAMPLE_COUNTER = 0x2100
+TEMPERATURE = 0x9130, 4
+"""Object and subindex of the temperature, i32, in the counts of an M-A352 (as Epson's own program
+for a bus reads it)."""
 FILTER = 0x61A1
 RATES = (1000.0, 500.0, 200.0, 100.0, 50.0)
 COUNTER_MODULUS = 65536

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -19,7 +20,7 @@ from daq.devices.iio import protocol
 from daq.devices.interface import DeviceInformation
 from daq.devices.port_rules import only, port_label
 from daq.errors import BenchFileError, FileFault, NoAnswerError, WrongDeviceError
-from daq.protocols.block import Block, BlockFlag, Event, EventKind
+from daq.protocols.block import Block, BlockFlag, Event, EventKind, Quantity, Reading, ReadingTimes
 from daq.protocols.errors import RemoteProtocolError
 from daq.transport.address import USUAL_NUMBERS, host_and_port
 from daq.transport.ports import open_port
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Sensor
     from daq.host_clock import HostClock
-    from daq.protocols.block import HostTime
+    from daq.protocols.block import DeviceItem, HostTime
     from daq.transport.byte_stream import ByteStream
 
 _Reply = TypeVar("_Reply")
@@ -151,8 +152,8 @@ class IioSession:
             [2 ** (limits[name].bits - limits[name].is_signed) - 1 for name in inputs]
         )
 
-    async def read(self) -> AsyncIterator[Block | Event]:
-        """Fill buffers and yield their samples until closed."""
+    async def read(self) -> AsyncIterator[DeviceItem]:
+        """Fill buffers and yield their samples, and the temperature once a minute, until closed."""
         iiod, device = self._iiod, self._device.id
         n_scans = max(1, round(BLOCK_SECONDS * self._sensor.sampling_rate))
         code = await iiod.ask(f"OPEN {device} {n_scans} {self._mask}")
@@ -162,6 +163,7 @@ class IioSession:
                 " its trigger, and that no other program reads it"
             )
         size = n_scans * self._layout.size
+        reading_times = ReadingTimes()
         while True:
             await iiod.stream.write(f"READBUF {device} {size}\r\n".encode())
             scans = await self._buffer(size)
@@ -170,6 +172,22 @@ class IioSession:
             if scans and iiod.at is not None:
                 for item in self._blocks(scans, iiod.at):
                     yield item
+                if reading_times.is_due(iiod.at):
+                    for reading in await self._temperature():
+                        yield reading
+
+    async def _temperature(self) -> list[Reading]:
+        """Return the temperature; none if the device has none, or its scans have it already."""
+        names = [] if protocol.TEMPERATURE in self._inputs else self._device.of_temperature
+        values = {}
+        for name in {"input", "raw", "offset", "scale"}.intersection(names):
+            place = f"{self._device.id} INPUT {protocol.TEMPERATURE} {name}"
+            with contextlib.suppress(WrongDeviceError, ValueError):
+                values[name] = float(await self._iiod.text(f"READ {place}"))
+        celsius, at = protocol.celsius(values), self._iiod.at
+        if celsius is None or at is None or not math.isfinite(celsius):
+            return []
+        return [Reading(self._sensor.name, Quantity.TEMPERATURE, celsius, at)]
 
     async def _buffer(self, size: int) -> bytes:
         """Return the bytes that answer READBUF."""

@@ -29,12 +29,14 @@ import numpy as np
 from daq.protocols.errors import RemoteProtocolError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
 TIMESTAMP = "timestamp"
 RATE_ATTRIBUTE = "sampling_frequency"
+TEMPERATURE = "temp"
+"""Channel of the device's temperature, whose attributes the kernel's IIO interface defines."""
 MAX_CONTEXT = 1 << 22
 _FORMAT = re.compile(r"(le|be):([sSuU])(\d+)/(8|16|32|64)(?:X\d+)?(?:>>(\d+))?")
 
@@ -79,6 +81,8 @@ class Device:
     name: str
     elements: tuple[ScanElement, ...]
     attributes: tuple[str, ...]
+    of_temperature: tuple[str, ...] = ()
+    """Attributes of the channel `TEMPERATURE`."""
 
 
 def parse_context(text: bytes) -> list[Device]:
@@ -98,18 +102,35 @@ def parse_context(text: bytes) -> list[Device]:
     devices = []
     for device in root.iter("device"):
         elements = []
+        of_temperature: tuple[str, ...] = ()
         for channel in device.iter("channel"):
+            names = tuple(one.get("name", "") for one in channel.iter("attribute"))
             scan = channel.find("scan-element")
+            if channel.get("type") == "input" and channel.get("id") == TEMPERATURE:
+                of_temperature = names
             if scan is not None and channel.get("type") == "input":
-                names = [one.get("name", "") for one in channel.iter("attribute")]
                 index, text_ = scan.get("index", ""), scan.get("format", "")
                 if not index.isdigit() or len(index) > 4:
                     raise RemoteProtocolError(f"scan index {index[:20]!r} is no number")
                 elements.append(ScanElement.of(channel.get("id", ""), int(index), text_, names))
         attributes = tuple(one.get("name", "") for one in device.findall("attribute"))
         found = tuple(sorted(elements, key=lambda one: one.index))
-        devices.append(Device(device.get("id", ""), device.get("name", ""), found, attributes))
+        ids = device.get("id", ""), device.get("name", "")
+        devices.append(Device(*ids, found, attributes, of_temperature))
     return devices
+
+
+def celsius(values: Mapping[str, float]) -> float | None:
+    """Return the temperature in °C from the attributes of its channel; None if they are too few.
+
+    They are in millidegrees: ``input``, or ``raw`` plus ``offset``, times ``scale`` (the kernel's
+    ``Documentation/ABI/testing/sysfs-bus-iio``).
+    """
+    if "input" in values:
+        return values["input"] / 1000.0
+    if "raw" in values and "scale" in values:
+        return (values["raw"] + values.get("offset", 0.0)) * values["scale"] / 1000.0
+    return None
 
 
 def mask_of(elements: Sequence[ScanElement], wanted: Sequence[str]) -> str:

@@ -22,8 +22,9 @@ from daq.devices.interface import PresentPort
 from daq.devices.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.host_clock import SystemClock
-from daq.protocols.block import Block, BlockFlag, HostTime
-from sim_devices.devices.epson import SimulatedBus
+from daq.protocols import block
+from daq.protocols.block import Block, BlockFlag, HostTime, Quantity, Reading
+from sim_devices.devices.epson import BUS_CELSIUS, SimulatedBus
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -126,6 +127,29 @@ async def test_devices_on_one_bus_have_one_clock() -> None:
                 check_truth(one, found, Sent(counts(node, 0, len(due)), due))
                 blocks = [b for b in found if isinstance(b, Block) and b.sensor == one.name]
                 np.testing.assert_array_equal(blocks[0].counts[0], counts(node, 0, 1)[0])
+
+
+async def test_the_temperature_is_read_once_a_minute_while_samples_come(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(block, "READING_INTERVAL_NS", 500_000_000)
+    with serving(1, 2) as (_, channel):
+        bench = sensors(channel, "A", "B")
+        found = await read(bench, 150)
+    check_blocks(DRIVER, bench, found)
+    check_counters(bench, found)
+    readings = [item for item in found if isinstance(item, Reading)]
+    assert len(readings) >= 4
+    assert [one.sensor for one in readings[:4]] == ["A", "B", "A", "B"]
+    assert all(one.quantity is Quantity.TEMPERATURE for one in readings)
+    assert all(one.value == pytest.approx(BUS_CELSIUS, abs=0.002) for one in readings)
+
+
+async def test_a_device_without_temperature_sends_samples_all_the_same() -> None:
+    with serving(1) as (simulated, channel):
+        simulated.nodes[1].object_dictionary[protocol.TEMPERATURE[0]].subindices.clear()
+        found = await read(sensors(channel, "A"), 50)
+    assert all(isinstance(item, Block) for item in found)
 
 
 async def test_lost_messages_are_gaps_of_their_sensor() -> None:

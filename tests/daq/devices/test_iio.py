@@ -14,8 +14,8 @@ from daq.devices.iio.protocol import Device, ScanElement, ScanLayout
 from daq.devices.interface import DeviceInformation
 from daq.devices.registry import driver_type
 from daq.errors import WrongDeviceError
-from daq.protocols.block import Block, BlockFlag, Event, HostTime
-from tests.daq.devices.reading import record
+from daq.protocols.block import Block, BlockFlag, Event, HostTime, Quantity, Reading
+from tests.daq.devices.reading import reading, record
 from tests.devices import serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
 
@@ -66,6 +66,20 @@ async def test_any_channels_in_any_order() -> None:
 async def test_another_device_is_refused(settings: dict[str, Any], said: str) -> None:
     with serving(spec(TABLE)) as (running,), pytest.raises(WrongDeviceError, match=said):
         await record(DRIVER, of(running, **settings), 1)
+
+
+async def test_the_temperature_is_read_between_two_buffers() -> None:
+    readings: list[Reading] = []
+    with serving(spec(TABLE, speed=60.0)) as (running,):
+        async with reading(DRIVER, [of(running)], speed=60.0) as items:
+            async for item in items:
+                readings += [item] if isinstance(item, Reading) else []
+                if len(readings) == 2:
+                    break
+    assert all(one.quantity is Quantity.TEMPERATURE for one in readings)
+    assert all(abs(one.value - 25.0) <= 0.6 for one in readings)
+    minutes = [one.received.monotonic_ns // 60_000_000_000 for one in readings]
+    assert minutes[1] == minutes[0] + 1
 
 
 def decoded(

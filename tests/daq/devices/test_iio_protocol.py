@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daq.devices.iio.protocol import ScanElement, ScanLayout, mask_of, parse_context
+from daq.devices.iio.protocol import ScanElement, ScanLayout, celsius, mask_of, parse_context
 from daq.protocols.errors import RemoteProtocolError
 
 ADXL355 = b"""<?xml version="1.0" encoding="utf-8"?><!DOCTYPE context [<!ELEMENT context ANY>]>
@@ -35,8 +35,18 @@ def test_a_context_of_a_board() -> None:
         ("sampling_frequency",),
     )
     assert [one.channel for one in device.elements] == ["accel_x", "accel_y", "timestamp"]
+    assert device.of_temperature == ("raw",)
     assert not trigger.elements
+    assert not trigger.of_temperature
     assert mask_of(device.elements, ["accel_x", "timestamp"]) == "00000005"
+
+
+def test_the_temperature_of_the_kernels_attributes() -> None:
+    assert celsius({"input": 23400.0}) == pytest.approx(23.4)
+    assert celsius({"raw": 1885.0, "offset": -2111.25, "scale": -110.497238}) == pytest.approx(25.0)
+    assert celsius({"raw": 250.0, "scale": 100.0}) == pytest.approx(25.0)
+    assert celsius({"raw": 1885.0}) is None
+    assert celsius({}) is None
 
 
 @pytest.mark.parametrize(
