@@ -7,8 +7,10 @@ imports huddle has numpy already.
 
 from __future__ import annotations
 
+import sys
 import threading
 from contextlib import contextmanager
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from threadpoolctl import ThreadpoolController
@@ -20,6 +22,13 @@ _lock = threading.Lock()
 _limits: list[Any] = []  # of the estimates that run: the process has one number of threads for all
 
 
+@lru_cache(maxsize=1)
+def _libraries(n_modules: int) -> ThreadpoolController:
+    """Find the libraries of BLAS; again where modules have been imported, which may bring one."""
+    del n_modules
+    return ThreadpoolController()
+
+
 @contextmanager
 def one_blas_thread() -> Generator[None]:
     """Limit BLAS to one thread; also a decorator.
@@ -28,7 +37,8 @@ def one_blas_thread() -> Generator[None]:
     that was before.
     """
     with _lock:
-        first = _limits[0] if _limits else ThreadpoolController().limit(limits=1, user_api="blas")
+        libraries = _libraries(len(sys.modules))
+        first = _limits[0] if _limits else libraries.limit(limits=1, user_api="blas")
         _limits.append(first)
     try:
         yield
