@@ -191,6 +191,7 @@ class Estimation:
             self.close()
             raise
         self._next_review = self._next_equalising = _FIRST_REVIEW
+        self._n_taken = [0] * len(self._recordings[-1].sensors)
 
     def close(self) -> None:
         """Close the recordings."""
@@ -232,13 +233,21 @@ class Estimation:
         """Seconds examined so far."""
         return sum(each.elapsed for each in self._passes)
 
-    @property
-    def lacking(self) -> float:
-        """Seconds that the recording, as of the last `update`, lacks to hold one more segment."""
+    def lacking(self, wanted: float = 0.0) -> float:
+        """Return the seconds that the recording lacks to hold so many segments, or one more.
+
+        What has come since the last `update` counts by the sensor that sent most: where it is
+        enough, a segment is likely, and not certain.
+        """
         last = self._passes[-1]
         welch = last.welch
-        end = last.n_seen * welch.hop + welch.segment_length + 2 * last.reach
-        return (end - last.aligned.n_available) / welch.sampling_rate
+        n_more = max(1, math.ceil(wanted) - self.n_seen)
+        end = (last.n_seen + n_more - 1) * welch.hop + welch.segment_length + 2 * last.reach
+        lacked = (end - last.aligned.n_available) / welch.sampling_rate
+        return lacked - max(
+            (sensor.n_samples - before) / sensor.sampling_rate
+            for sensor, before in zip(last.recording.sensors, self._n_taken, strict=True)
+        )
 
     @one_blas_thread()
     def update(self, progress: Progress | None = None) -> bool:
@@ -258,6 +267,7 @@ class Estimation:
         self._continue()
         for each in self._passes:
             each.aligned.refresh()
+        self._n_taken = [sensor.n_samples for sensor in self._recordings[-1].sensors]
         total, done = sum(each.n_complete for each in self._passes), before
 
         def count(n: int) -> None:

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from daq.errors import HuddleError, NotConnectedError, RecordingError
 from daq.estimation.estimation import Estimation
-from daq.estimation.recording_set import is_continued
+from daq.estimation.recording_set import is_continued, is_left
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError
 from daq.estimation.throttle import Throttle
@@ -143,7 +143,7 @@ def follow(
     *,
     recorder: Recorder | None = None,
     cancelled: threading.Event | None = None,
-    watch_sensors: bool = True,
+    states_every: float | None = STATUS_INTERVAL,
     growth: float = 0.0,
     share: float = ESTIMATE_SHARE,
     of_diagnoses: float = 0.1,
@@ -165,8 +165,8 @@ def follow(
         sample has come for `silence` seconds.
     cancelled : threading.Event, optional
         Ends the following early once it is set.
-    watch_sensors : bool
-        Whether the observer takes the state of the sensors.
+    states_every : float, optional
+        Seconds between looks at the sensors, at least; None where nobody watches their state.
     growth : float
         Share by which the number of segments has grown, at least, before the next estimate.
     share : float
@@ -204,12 +204,13 @@ def follow(
     ) as estimation:
 
         def seen(recording: Recording) -> tuple[Recorder, _Sensors | None]:
-            sensors = _Sensors(recording, observer, first, look) if watch_sensors else None
-            return recorder or _RemoteRecorder(recording, cancelled, silence), sensors
+            watched = None if states_every is None else _Sensors(recording, observer, first, look)
+            return recorder or _RemoteRecorder(recording, cancelled, silence), watched
 
         known, sensors = seen(recording)
         looks = Throttle(LOOK_SHARE, longest=MAX_INTERVAL)
-        states, estimates = Throttle(LOOK_SHARE, longest=2 * STATUS_INTERVAL), Throttle(share)
+        pause = MAX_INTERVAL if states_every is None else states_every
+        states, estimates = Throttle(LOOK_SHARE, longest=2 * pause), Throttle(share)
         wanted, uncounted, memory = 0.0, _Uncounted(), FreedMemory()
         _look(sensors)
 
@@ -217,7 +218,8 @@ def follow(
             # Asked before: what it wrote last is seen below.
             left_open = known.ended and not is_continued(recording)
             recording.refresh()
-            if looks.is_due or recording.closed:
+            is_due = looks.is_due and estimates.is_due and estimation.lacking(wanted) <= 0.0
+            if is_due or is_left(recording) or recording.closed:
                 with looks, _usual_cost(estimation, looks):
                     if not _is_updated(estimation, observer, cancelled):
                         return None
@@ -240,8 +242,8 @@ def follow(
                 uncounted.take(recording.path, snapshot)
                 estimation.choose_again()
             memory.give_back()
-            longest = MAX_INTERVAL if sensors is None else max(STATUS_INTERVAL, states.remaining)
-            known.ends_within(min(max(_until_segment(estimation), looks.remaining), longest))
+            until = max(_until_segment(estimation, wanted), looks.remaining, estimates.remaining)
+            known.ends_within(min(until, max(pause, states.remaining)))
             if cancelled.is_set():
                 return None
         _look(sensors, closely=True)
@@ -292,11 +294,11 @@ def _check_left(path: Path, *, is_open: bool) -> None:
         )
 
 
-def _until_segment(estimation: Estimation) -> float:
-    """Return the seconds until there may be a new segment: before, there is nothing to see."""
+def _until_segment(estimation: Estimation, wanted: float) -> float:
+    """Return the seconds until there may be so many segments: before, there is nothing to see."""
     bench = estimation.recordings[0].outline
     speed = 1.0 if bench is None else bench.speed
-    return max(SHORTEST_INTERVAL, (estimation.lacking - COMMIT_INTERVAL) / speed)
+    return max(SHORTEST_INTERVAL, (estimation.lacking(wanted) - COMMIT_INTERVAL) / speed)
 
 
 def _result(

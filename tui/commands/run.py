@@ -215,7 +215,7 @@ def result_of(
                 settings,
                 observer,
                 recorder=recorder,
-                watch_sensors=False,
+                states_every=None,
                 share=LINE_SHARE,
             )
         except RecordingLeftOpenError:

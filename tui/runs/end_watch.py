@@ -76,7 +76,7 @@ def watch_end(path: Path) -> None:
     with Recording.open(path) as recording:
         until, bench = recording.until, recording.bench
     observer = EndObserver(path, until, bench)
-    follow(path, None, observer, cancelled=observer.reached, watch_sensors=False, whole=True)
+    follow(path, None, observer, cancelled=observer.reached, states_every=None, whole=True)
 
 
 def main() -> None:

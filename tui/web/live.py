@@ -57,6 +57,8 @@ if TYPE_CHECKING:
 _LOGGER = logging.getLogger(__name__)
 LOOK = 1.0
 """Seconds between looks for a test that starts."""
+STATES_EVERY = 1.5
+"""Seconds between looks at the sensors: with those between commits, less than 3 s on a page."""
 TICK = 4.0
 """Seconds after which viewers get an update even if nothing has changed: they are connected."""
 STATUS_INTERVAL = 5.0
@@ -65,7 +67,7 @@ LINGERS = 30.0
 """Seconds for which a test is followed after the last viewer has left."""
 NEWEST = 16
 """Recordings that may be the running one: several benches may have one folder."""
-GROWTH, SHARE = 0.02, 0.03
+GROWTH, SHARE = 0.05, 0.003
 """Of segments until the next estimate, and of the time that estimates may cost."""
 EVENTS = 8
 WIDE = 1000
@@ -239,6 +241,7 @@ class Live:
                 cancelled=self._cancelled,
                 growth=GROWTH,
                 share=SHARE,
+                states_every=STATES_EVERY,
                 look=page_.look,
             )
         except (HuddleError, EstimatorError, OSError) as error:

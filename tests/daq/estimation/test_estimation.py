@@ -120,13 +120,15 @@ def test_what_is_shown_live_at_the_end_is_the_estimate_from_the_file(
             writer.append(block)
             if number % 50 == 49:
                 writer.commit()
-                lacked, had = live.lacking, live.n_seen
-                grown = -live.recordings[0].sensors[0].n_samples
+                live.recordings[0].refresh()
+                had, lacked = live.n_seen, [live.lacking(live.n_seen + n) for n in range(1, 4)]
+                assert live.lacking() == lacked[0]
                 live.update()
-                grown += live.recordings[0].sensors[0].n_samples
-                # when to look next: not before it is there, and never long after
-                assert (live.n_seen > had) <= (grown / 100 >= lacked - 1)
-                assert 0 < live.lacking <= (SETTINGS.segment if had else 2 * SETTINGS.segment)
+                # when to take segments: not before they are there, and never long after
+                n_new = live.n_seen - had
+                assert all(each <= 0.0 for each in lacked[:n_new])
+                assert all(each > -SETTINGS.segment for each in lacked[n_new:])
+                assert 0 < live.lacking() <= (SETTINGS.segment if had else 2 * SETTINGS.segment)
                 seen.append(live.snapshot().n_segments)
         writer.close()
         live.update()

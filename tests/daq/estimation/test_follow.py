@@ -236,7 +236,7 @@ def test_a_process_that_ends_without_closing_its_recording_is_an_error(tmp_path:
 
         process = Process(be_killed)
         with pytest.raises(RecordingLeftOpenError, match="huddle repair"):
-            follow(path, SETTINGS, noted, recorder=process, watch_sensors=False)
+            follow(path, SETTINGS, noted, recorder=process, states_every=None)
     assert noted.calls == ["snapshot"]  # of the sensors nothing, as they are not watched
     assert noted.taken == [4]
 
@@ -252,7 +252,7 @@ def test_a_process_that_closes_its_recording_as_it_ends_has_a_result(tmp_path: P
             process.ended = True
 
         process = Process(end)
-        result = follow(path, SETTINGS, noted, recorder=process, watch_sensors=False)
+        result = follow(path, SETTINGS, noted, recorder=process, states_every=None)
     assert result is not None
     assert result.n_segments > 20
 
@@ -405,7 +405,7 @@ def test_without_sensors_to_watch_the_next_look_is_when_a_segment_can_be_there(
         process = Process(go_on)
         settings = replace(SETTINGS, segment=6.0)
         with pytest.raises(InsufficientDataError):
-            follow(path, settings, noted, recorder=process, watch_sensors=False)
+            follow(path, settings, noted, recorder=process, states_every=None)
     # The demo's bench runs at four times real time; each commit adds about a second.
     # Looks, a few milliseconds each, may take 3 % of the time, which can make a wait longer.
     speed = 4.0
