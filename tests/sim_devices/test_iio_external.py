@@ -22,7 +22,7 @@ from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.devices.registry import driver_type
 from daq.host_clock import SystemClock
-from daq.protocols.block import Block
+from daq.protocols.block import Block, Reading
 from sim_devices.devices.iio import Iiod
 from sim_devices.devices.interface import Source
 from sim_devices.server.serve import device_spec
@@ -115,14 +115,18 @@ async def test_pylibiio_reads_every_scan() -> None:
         context = iio.Context(uri)
         board = context.find_device("adxl355")
         assert float(board.attrs["sampling_frequency"].value) == RATE
-        for channel in board.channels:
+        scanned = [channel for channel in board.channels if channel.scan_element]
+        attributes = board.find_channel("temp").attrs
+        raw, offset, scale = (float(attributes[k].value) for k in ("raw", "offset", "scale"))
+        assert abs((raw + offset) * scale - 25_000.0) <= 600.0  # thousandths of a degree
+        for channel in scanned:
             channel.enabled = True
         buffer, scans = iio.Buffer(board, 50), []
         for _ in range(4):
             buffer.refill()
             columns = [
                 np.frombuffer(c.read(buffer), "i8" if c.id == "timestamp" else "i4")
-                for c in board.channels
+                for c in scanned
             ]
             scans.append(np.stack(columns, axis=1).astype(np.int64))
         return np.concatenate(scans)
@@ -145,11 +149,13 @@ async def test_a_real_iiod_serves_our_driver() -> None:
                 (information,) = session.information
                 async for item in session.read():
                     found.append(item)
-                    if len(found) == 10:
+                    if sum(isinstance(item, Block) for item in found) == 10:
                         break
     assert (information.model, information.sampling_rate) == ("adxl355", RATE)
     blocks = [item for item in found if isinstance(item, Block)]
-    assert len(blocks) == len(found)
+    (celsius,) = (item.value for item in found if isinstance(item, Reading))
+    assert abs(celsius - 25.0) <= 0.6
+    assert len(found) == len(blocks) + 1
     assert [b.first_sample for b in blocks] == [20 * k for k in range(10)]
     times = np.array([b.device_counter for b in blocks], np.int64)
     np.testing.assert_allclose(np.diff(times), 20 * 1e9 / RATE, atol=2)
