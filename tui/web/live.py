@@ -57,8 +57,8 @@ if TYPE_CHECKING:
 _LOGGER = logging.getLogger(__name__)
 LOOK = 1.0
 """Seconds between looks for a test that starts."""
-STATES_EVERY = 1.5
-"""Seconds between looks at the sensors: with those between commits, less than 3 s on a page."""
+STATES_EVERY = 1.25
+"""Seconds between looks at the sensors."""
 TICK = 4.0
 """Seconds after which viewers get an update even if nothing has changed: they are connected."""
 STATUS_INTERVAL = 5.0
