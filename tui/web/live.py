@@ -38,6 +38,7 @@ from tui.web.chart import choice_of, drawn
 from tui.web.html import page
 from tui.web.traces import traces
 from tui.wording.facts import known
+from tui.wording.formatting import span
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Sequence
@@ -360,6 +361,7 @@ def _of_estimate(state: State, snapshot: Snapshot, settings: Settings) -> dict[s
         # Without a verdict, what delays it is among the facts.
         advice=Text() if state.verdict is None else advice(snapshot, choice, state.verdict),
         facts=[each for each in known(snapshot) if each.needs_action],
+        band=of_band(snapshot, settings),
         noise=noise,
         clock=clock_line(snapshot, settings, width=WIDE),
         clocks=clocks,
@@ -385,3 +387,8 @@ def band_means(snapshot: Snapshot, settings: Settings) -> tuple[BandMeans, ...]:
         return ()
     band = band_of(settings, snapshot)
     return channel_means(snapshot.results[method], snapshot, settings, band)
+
+
+def of_band(snapshot: Snapshot, settings: Settings) -> str:
+    """Return what the noise of a table is, and its unit."""
+    return f"mean over {span(*band_of(settings, snapshot))}, dB re 1 ({snapshot.unit})²/Hz"

@@ -7,14 +7,12 @@ from typing import TYPE_CHECKING, Any
 from rich.table import Table
 from rich.text import Text
 
-from daq.results.band_summary import band_of
 from daq.results.comparison import compare
 from tui.application.result_view.result_text import difference_text
 from tui.application.test_view.channels import channel_table
 from tui.web.chart import choice_of
-from tui.web.live import WIDE, band_means
+from tui.web.live import WIDE, band_means, of_band
 from tui.wording.facts import MARKS, NOTHING_TO_DO, known
-from tui.wording.formatting import span
 from tui.wording.verdict_text import headline, limit_line, not_judged, what_to_do
 
 if TYPE_CHECKING:
@@ -42,7 +40,7 @@ def about_test(state: State, settings_table: Mapping[str, Any]) -> dict[str, Any
         )
         if has_noise
         else None,
-        "band": f"mean over {span(*band_of(settings, snapshot))}, dB re 1 ({snapshot.unit})²/Hz",
+        "band": of_band(snapshot, settings),
         "differences": differences,
         "comparison": ""
         if state.reference is None or differences is not None

@@ -63,6 +63,7 @@ def test_a_test_is_started_seen_marked_and_stopped(
         page.wait_for_selector("#sensors >> text=live")
         page.wait_for_selector("#chart[data-drawn*=three-sensor]")
         page.wait_for_selector("#noise >> text=A.X")
+        assert "Hz, dB re 1 (m/s²)²/Hz" in page.locator("#noise h2").inner_text()
         assert page.locator(".traces li").count() == 9
         assert page.locator("#state >> text=SIMULATED").is_visible()
         assert _barriers(page, axe) == []
