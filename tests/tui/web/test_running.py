@@ -68,7 +68,10 @@ def test_a_test_is_started_seen_marked_and_stopped(
         assert page.locator("#state >> text=SIMULATED").is_visible()
         assert _barriers(page, axe) == []
         page.set_viewport_size({"width": SIZES["phone"][0], "height": SIZES["phone"][1]})
-        assert page.evaluate("document.documentElement.scrollWidth") <= SIZES["phone"][0]
+        wait_until(
+            lambda: page.evaluate("document.documentElement.scrollWidth") <= SIZES["phone"][0],
+            "the chart has the width of a phone",
+        )
         assert _barriers(page, axe) == []
         before = page.locator("#at").inner_text()
         wait_until(lambda: page.locator("#at").inner_text() != before, "the page goes on")
