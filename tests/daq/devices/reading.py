@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from daq.protocols.block import DeviceItem
 
 
+LEAST_PATIENCE = 5.0
+"""Seconds: what is sent may wait in the system while the clock of the devices goes on."""
+
+
 @contextlib.asynccontextmanager
 async def reading(
     driver: DriverType, sensors: Sequence[Sensor], *, speed: float = 1.0
@@ -33,7 +37,7 @@ async def reading(
 
 async def _patiently(session: Session, speed: float) -> AsyncGenerator[DeviceItem]:
     """Yield what the session yields, until nothing has come for as long as it states."""
-    patience = patience_of(session) / speed
+    patience = max(LEAST_PATIENCE, patience_of(session) / speed)
     loop = asyncio.get_running_loop()
     async with contextlib.aclosing(cast("AsyncGenerator[DeviceItem]", session.read())) as items:
         deadline = loop.time() + patience
