@@ -36,8 +36,7 @@ def change_block(path: Path, row: int, field: str, bit: int) -> None:
 
 
 @pytest.mark.parametrize("field", ["first_row", "n_samples"])
-@pytest.mark.parametrize("bit", [0, 7, 11, 40, 62])
-@pytest.mark.parametrize("row", [0, 17, 59])
+@pytest.mark.parametrize(("bit", "row"), [(0, 17), (7, 0), (11, 59), (40, 17), (62, 0)])
 def test_no_block_of_a_closed_recording_is_left_out_unseen(
     closed: Path, field: str, bit: int, row: int
 ) -> None:

@@ -71,34 +71,43 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record(tmp_path_factory.mktemp("facts") / "night.h5")
 
 
-@pytest.mark.parametrize("fact", EXAMPLES, ids=lambda fact: str(fact.name))
-def test_every_renderer_shows_every_kind(
-    fact: Fact, recorded: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_renderer_shows_every_kind(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Console, application, report, JSON and notebook take their facts from one function."""
     snapshot = diagnosed()
-    monkeypatch.setattr("tui.wording.facts.facts_of", lambda *_: (fact,))
-    words = word(fact, Names.of(snapshot))
+    monkeypatch.setattr("tui.wording.facts.facts_of", lambda *_: tuple(EXAMPLES))
     shown = {
         "console": printed(*details(snapshot, known(snapshot))),
         "application": printed(result(state_of(snapshot), width=160)),
         "report": " ".join(str(report_of(snapshot, SETTINGS, sources([recorded]))).split()),
         "notebook": " ".join(map(str, known(snapshot))),
     }
+    entries = json.loads(json.dumps(finite(document(snapshot, SETTINGS)["facts"])))
+    words_of = {fact.name: word(fact, Names.of(snapshot)) for fact in EXAMPLES}
     for renderer, text in shown.items():
-        assert squeezed(words.explanation) in squeezed(text), renderer
-        assert squeezed(words.action) in squeezed(text), renderer
-    (entry,) = json.loads(json.dumps(finite(document(snapshot, SETTINGS)["facts"])))
-    assert entry["kind"] == fact.name
-    assert entry["rank"] == fact.rank
-    assert (entry["line"], entry["explanation"]) == (words.line, words.explanation)
+        for words in words_of.values():
+            assert squeezed(words.explanation) in squeezed(text), renderer
+            assert squeezed(words.action) in squeezed(text), renderer
+    assert {(entry["kind"], entry["rank"]) for entry in entries} == {
+        (fact.name, fact.rank) for fact in EXAMPLES
+    }
+    for entry in entries:
+        words = words_of[entry["kind"]]
+        assert (entry["line"], entry["explanation"]) == (words.line, words.explanation)
+
+
+@pytest.mark.parametrize("fact", EXAMPLES, ids=lambda fact: str(fact.name))
+def test_below_a_table_is_what_delays_or_invalidates(
+    fact: Fact, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    snapshot = diagnosed()
+    monkeypatch.setattr("tui.wording.facts.facts_of", lambda *_: (fact,))
     live = [line.plain for line in findings(snapshot, width=400)]
     if fact.rank is Rank.TO_KNOW:
         assert len(live) == isinstance(fact, facts.SensorsSimulated)
         assert brief(known(snapshot)) == ["Nothing to do. 1 fact: --details shows all"]
     else:
         (line,) = live
-        assert line.endswith(words.line)
+        assert line.endswith(word(fact, Names.of(snapshot)).line)
         assert brief(known(snapshot)) == [line]
 
 
