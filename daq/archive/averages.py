@@ -174,6 +174,7 @@ class Estimator:
             diagnostics=diagnostics,
             across_axes=axes,
             rounding=ROUNDING if average.is_rounded else 0.0,
+            simulated=average.is_simulated,
         )
         return with_contributions(snapshot)
 
@@ -194,6 +195,8 @@ class Average:
         self.n_segments = 0
         self.is_rounded = False
         """Whether matrices were kept in single precision."""
+        self.is_simulated = False
+        """Whether a sensor of a recording was simulated."""
         self.start_utc_ns = 0
         self.usable = np.inf
         self.elapsed = 0.0
@@ -221,6 +224,7 @@ class Average:
         self._counts[described.origin.run_id] += n_segments
         self.usable = min(self.usable, described.usable)
         self.is_rounded |= described.rounded
+        self.is_simulated |= described.simulated
         for sensor, residual in described.residual.items():
             square = self._squares.get(sensor, 0.0)
             self._squares[sensor] = square + n_segments * residual**2

@@ -35,6 +35,8 @@ CREATE TABLE IF NOT EXISTS recordings
 CREATE TABLE IF NOT EXISTS channels (key TEXT PRIMARY KEY, document TEXT);
 """
 _BUSY_SECONDS = 10.0
+PLAIN = ("usable", "elapsed", "residual", "rounded", "simulated")
+"""Fields of `Described` that a document has as they are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +132,7 @@ class Index:
                 clipped={int(k): v for k, v in found.pop("clipped").items()},
                 stood_still={int(k): v for k, v in found.pop("stood_still").items()},
                 not_understood=tuple(found.pop("not_understood")),
-                **{name: found.pop(name) for name in ("usable", "elapsed", "residual", "rounded")},
+                **{name: found.pop(name) for name in PLAIN},
             )
             return Entry(path, described, **found)
         except (OSError, AttributeError, KeyError, ValueError, TypeError):

@@ -93,6 +93,8 @@ class Described:
         As in `daq.estimation.snapshot.SnapshotDiagnostics`.
     rounded : bool
         Whether estimates are made of matrices that were kept in single precision.
+    simulated : bool
+        Whether a sensor was simulated; earlier versions did not keep it.
     """
 
     origin: Origin
@@ -105,6 +107,7 @@ class Described:
     clipped: Mapping[int, float] = field(default_factory=dict)
     stood_still: Mapping[int, float] = field(default_factory=dict)
     rounded: bool = False
+    simulated: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -250,6 +253,7 @@ class SpectraWriter:
                 "not_understood": json.dumps(dict.fromkeys(described.not_understood, True)),
                 "clipped": json.dumps(dict(described.clipped)),
                 "stood_still": json.dumps(dict(described.stood_still)),
+                "simulated": int(described.simulated),
                 "daily": int(self._daily),
                 "single": int(self._single),
             }
@@ -318,6 +322,7 @@ class SpectraFile:
             not_understood=tuple(_table(attributes, "not_understood", optional=True)),
             clipped={int(k): float(v) for k, v in _table(attributes, "clipped").items()},
             stood_still={int(k): float(v) for k, v in _table(attributes, "stood_still").items()},
+            simulated=bool(attributes.get("simulated", 0)),
         )
         self.stretches: NDArray[np.void] = dataset(file, "stretches", STRETCH_DTYPE)[...]
         self.is_daily = bool(attributes.get("daily", 0))

@@ -133,6 +133,7 @@ def _archived(task: Task) -> Outcome:
                 ),
                 clipped=clipped_columns([recording], channels),
                 stood_still=still_for_a_while([each], settings),
+                simulated=recording.simulated,
             )
             writer.commit(
                 described, summaries(writer.rows(), described, plan, plan.noise_settings(settings))

@@ -12,12 +12,14 @@ import pytest
 from typer.testing import CliRunner
 
 import huddle
+from daq.archive.index import ROLLUP
 from daq.recording.reader import Recording
 from tests.tui.example_snapshot import demo_bench, made_now, made_snapshot
 from tests.tui.report.written_report import Words
 from tui.application.state import VIEWS, State
 from tui.application.view import status_line
 from tui.commands.main import app
+from tui.report.figures.archive import days_figure
 from tui.report.figures.curves import noise_plots
 
 if TYPE_CHECKING:
@@ -60,6 +62,29 @@ def test_exports_and_imports_of_simulated_recordings_keep_the_mark(tmp_path: Pat
     assert "simulated sensors" in repr(huddle.read(out))
     out.with_suffix(".xml").unlink()
     assert "simulated" not in repr(huddle.read(out))  # miniSEED alone cannot say so
+
+
+def test_an_archive_of_simulated_recordings_says_so(tmp_path: Path) -> None:
+    recording, out = tmp_path / "s.h5", tmp_path / "a.json"
+    run = CliRunner()
+    simulate = ["simulate", "fig4", "--duration", "2min", "--out", str(recording)]
+    assert run.invoke(app, simulate).exit_code == 0
+    options = ["--segment", "2s", "--json", str(out)]
+    for _ in range(2):  # from the recording, and from the index alone
+        shown = run.invoke(app, ["archive", str(recording), *options])
+        assert shown.exit_code == 0, shown.output
+        assert "simulated sensors" in shown.output
+        pooled = json.loads(out.read_text(encoding="utf-8"))["pooled"]
+        assert "sensors-simulated" in [each["kind"] for each in pooled["facts"]]
+    store = tmp_path / "huddle-archive"
+    assert days_figure(huddle.archive(store=store)).get_suptitle() == "Simulated sensors"
+    files = store.rglob("*.h5")
+    (kept,) = (each for each in files if not each.name.startswith(ROLLUP))
+    with h5py.File(kept, "r+") as file:
+        del file.attrs["simulated"]
+    earlier = run.invoke(app, ["archive", "--store", str(store)])
+    assert earlier.exit_code == 0, earlier.output
+    assert "simulated" not in earlier.output  # versions before did not keep it
 
 
 def test_estimates_and_figures_of_simulated_samples_say_so() -> None:

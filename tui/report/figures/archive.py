@@ -147,8 +147,7 @@ def days_figure(answer: Answer) -> Figure:
 
 def channel_figure(answer: Answer, column: int, models: Sequence[Mask] = ()) -> Figure:
     """Return the four figures of one channel on a page."""
-    figure = Figure(figsize=(7.2, 5.6), layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = _figure(answer, 7.2, 5.6)
     panels = list(figure.subplots(2, 2).ravel())
     unit, name = f"dB re 1 ({answer.pooled.unit})²/Hz", answer.pooled.channels[column].name
     for axes, recorded in zip(panels[:2], (False, True), strict=True):
@@ -286,17 +285,21 @@ def _date_axis(axes: Axes) -> None:
     axes.xaxis.set_major_formatter(FuncFormatter(lambda day, _: day_text(int(day * DAY_NS))))
 
 
+def _figure(answer: Answer, width: float, height: float) -> Figure:
+    """Return an empty figure, in inches; it says where sensors were simulated."""
+    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    if answer.pooled.simulated:
+        figure.suptitle("Simulated sensors")
+    return figure
+
+
 def _panels(answer: Answer) -> tuple[Figure, list[Axes]]:
     """Return a figure with axes for every channel: a row a sensor, or three to a row."""
     dims, labels = answer.pooled.dims, answer.pooled.channels
     columns = max(dims) if max(dims) > 1 else min(3, len(dims))
     rows = len(dims) if max(dims) > 1 else -(-len(dims) // columns)
-    figure = Figure(
-        figsize=(WIDTH * max(columns, 2) + 0.9, HEIGHT * rows + 0.5),
-        layout="constrained",
-        facecolor="white",
-    )
-    FigureCanvasAgg(figure)
+    figure = _figure(answer, WIDTH * max(columns, 2) + 0.9, HEIGHT * rows + 0.5)
     grid = figure.subplots(rows, columns, squeeze=False)
     if max(dims) > 1:
         places = [grid[row, column] for row, d in enumerate(dims) for column in range(d)]
