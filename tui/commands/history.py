@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 PICTURES = (".png", ".svg", ".pdf")
 _COLUMNS = (
     *("serial_number", "sensor", "channel", "model", "bench", "due", "method", "unit"),
-    *("low_hz", "high_hz", "psd", "low", "high"),
+    *("low_hz", "high_hz", "psd", "low", "high", "simulated"),
 )
 
 
@@ -192,5 +192,5 @@ def _noise(sources: list[Path], sensor: str, since: datetime | None) -> list[Fou
 def _rows(found: Sequence[Series]) -> Iterator[list[object]]:
     for series in found:
         for (bench, due), noise in zip(series.runs, series.noise, strict=True):
-            own = {"bench": bench, "due": utc_text(due)}
+            own = {"bench": bench, "due": utc_text(due), "simulated": series.simulated}
             yield [own[name] if name in own else getattr(noise, name) for name in _COLUMNS]

@@ -24,7 +24,7 @@ PAGE = 100
 """Runs that are listed unless another number is given."""
 _COLUMNS = (
     *("bench", "entry", "due", "state", "verdict", "started", "ended", "duration"),
-    *("recordings", "pinned", "removed", "reason"),
+    *("recordings", "simulated", "pinned", "removed", "reason"),
 )
 
 
@@ -68,7 +68,8 @@ def runs(
         table.add_column(name, overflow="fold")
     for run in runs:
         kept = ", ".join(run.parts) or "-"
-        notes = [*(["pinned"] if run.pinned else []), *(["removed"] if run.removed else [])]
+        marks = {"simulated": run.simulated, "pinned": run.pinned, "removed": run.removed}
+        notes = [name for name, holds in marks.items() if holds]
         table.add_row(
             *(f"{run.due:%Y-%m-%d %H:%M}", run.entry, run.state, run.verdict or "-"),
             kept + (f" ({', '.join(notes)})" if notes else ""),

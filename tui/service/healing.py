@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+from dataclasses import replace
 from datetime import UTC, timedelta
 from typing import TYPE_CHECKING
 
@@ -100,11 +101,11 @@ def _identities(folder: Path, run: Run) -> Iterator[tuple[str, str, str]]:
 def _run_of(bench: Bench, path: Path) -> Run | None:
     """Return the run of a recording; None if the service did not make it."""
     with Recording.open(path) as recording:
-        created = recording.created.astimezone(UTC)
+        created, is_simulated = recording.created.astimezone(UTC), recording.simulated
         about = recording.about_results()
         own = recording.bench
     if RUN in about:
-        run = Run.of_record(json.loads(about[RUN]))
+        run = replace(Run.of_record(json.loads(about[RUN])), simulated=is_simulated)
         return run if path.name in run.parts else None
     if not mark_of(path).exists() or own is None or own.name != bench.name:
         return None

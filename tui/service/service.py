@@ -461,7 +461,11 @@ class Service:
         if outcome.error:
             return self._failed(run, outcome.error)
         return run.to(
-            RunState.DONE, verdict=outcome.verdict, noise=outcome.noise, ended=self._clock.now()
+            RunState.DONE,
+            verdict=outcome.verdict,
+            noise=outcome.noise,
+            simulated=outcome.simulated,
+            ended=self._clock.now(),
         )
 
     def _key(self) -> str | None:

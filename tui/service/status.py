@@ -90,6 +90,7 @@ def status_lines(found: dict[str, Any]) -> Iterator[str]:
         text = "none" if run is None else f"{run['entry']} of {run['due']}"
         if run is not None and key == "last":
             text += f": {run['state']}" + (f", {run['verdict']}" if run["verdict"] else "")
+            text += ", simulated" if run["simulated"] else ""
             text += f" ({run['reason']})" if run["reason"] else ""
         yield f"{key + ' run':<10} {text}"
     disk = found["disk"]

@@ -8,7 +8,7 @@ import json
 import logging
 import math
 import sqlite3
-from dataclasses import replace
+from dataclasses import asdict, replace
 from datetime import timedelta
 from typing import TYPE_CHECKING
 
@@ -25,7 +25,7 @@ from tests.tui.service.test_continuations import record
 from tui.commands.main import app
 from tui.service.healing import heal
 from tui.service.planning import next_runs
-from tui.service.processes.finish import Request, finish
+from tui.service.processes.finish import Outcome, Request, finish
 from tui.service.records.parts import mark_of
 from tui.service.records.run_state import Run, RunState
 from tui.service.records.store import COPIES, RunStore
@@ -46,7 +46,9 @@ def done_run(place: Place, part: str = "r.h5") -> Run:
     assert outcome.error == ""
     assert outcome.noise
     ended = run.due + timedelta(seconds=run.duration)
-    return run.to(RunState.DONE, verdict=outcome.verdict, noise=outcome.noise, ended=ended)
+    assert Outcome.of(json.dumps(asdict(outcome))).simulated  # as its bench says
+    done = run.to(RunState.DONE, verdict=outcome.verdict, noise=outcome.noise, ended=ended)
+    return replace(done, simulated=outcome.simulated)
 
 
 def damage_page(path: Path, page: int, rng: np.random.Generator) -> None:
@@ -176,7 +178,7 @@ def test_a_damaged_text_hides_no_other(tmp_path: Path) -> None:
         database.commit()
     assert not heal(place.store, place.bench, START)  # SQLite has no checksums
     assert place.store.runs() == [replace(run, reason="\ufffdok", noise=())]
-    noise = [each for _, _, each in place.store.noise()]
+    noise = [each for _, _, each, _ in place.store.noise()]
     assert [(each.psd, each.unit) for each in noise] == [(n.psd, "\ufffd") for n in run.noise]
 
 

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import math
+from dataclasses import replace
 from datetime import timedelta
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,7 @@ from daq.results.change_test import BLOCK, DECIBEL, WIDTHS, Evidence, changes
 from tests.tui.service.bench_files import START
 from tui.commands.main import app
 from tui.service.history.series import history
+from tui.service.history.shown import history_figure, history_table, label_lines
 from tui.service.records.run_state import BandNoise, Run, RunState
 from tui.service.records.store import RunStore
 
@@ -135,8 +137,8 @@ def test_a_second_change_is_found_after_the_first() -> None:
     assert found[1].shift == pytest.approx(-4 * DECIBEL)
 
 
-def noise_of(runs: list[Run]) -> list[tuple[str, datetime, BandNoise]]:
-    return [(run.bench, run.due, noise) for run in runs for noise in run.noise]
+def noise_of(runs: list[Run]) -> list[tuple[str, datetime, BandNoise, bool]]:
+    return [(run.bench, run.due, noise, run.simulated) for run in runs for noise in run.noise]
 
 
 def run_with(
@@ -160,6 +162,19 @@ def test_serial_numbers_tie_benches_together_and_intervals_at_zero_are_left_out(
     (change,) = series.changes
     assert series.due_of(change.first) == START + timedelta(days=20)
     assert history(noise_of(runs), band=(10.0, 20.0)) == []
+
+
+def test_simulated_runs_are_compared_with_their_like_only() -> None:
+    runs = [replace(run_with(day, 3.0 * (day % 2)), simulated=day % 2 > 0) for day in range(40)]
+    real, simulated = history(noise_of(runs))
+    assert not real.changes
+    assert not simulated.changes
+    assert (real.sensor, simulated.sensor) == ("a S1", "a S1, simulated")
+    assert [series.document()["simulated"] for series in (real, simulated)] == [False, True]
+    assert list(history_table([simulated]).columns[1].cells) == ["a, simulated"]
+    assert "simulated" in label_lines([simulated])
+    (panel,) = history_figure([simulated]).axes
+    assert panel.get_title("left") == "a S1, simulated, 1 to 10 Hz"
 
 
 def huddle(*arguments: str, code: int = 0) -> str:

@@ -96,7 +96,7 @@ def test_a_sensor_is_known_again_on_another_bench_by_its_serial_number(tmp_path:
     assert lines[1].startswith("B S1: +")
     assert "dB since 25 October" in lines[1]
     assert lines[1].endswith("3 tests (1–16 Hz)")
-    assert len({started for _, started, _ in noise_of("S1")}) == 3
+    assert len({started for _, started, *_ in noise_of("S1")}) == 3
 
 
 def test_history_shows_a_sensor_over_all_benches(tmp_path: Path) -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
+import sqlite3
 import threading
+from contextlib import closing
 from dataclasses import replace
 from datetime import timedelta
 from typing import TYPE_CHECKING
@@ -75,13 +77,27 @@ def test_runs_that_have_begun_and_their_recordings_are_known(store: RunStore) ->
 
 def test_noise_is_read_by_time(store: RunStore) -> None:
     found = list(store.noise("lab"))
-    assert [due for _, due, _ in found] == [run_at(hour).due for hour in range(4)]
-    assert found[0] == ("lab", START, NOISE)
-    assert [due for _, due, _ in store.noise(since=run_at(2).due)] == [
+    assert [due for _, due, *_ in found] == [run_at(hour).due for hour in range(4)]
+    assert found[0] == ("lab", START, NOISE, False)
+    assert [due for _, due, *_ in store.noise(since=run_at(2).due)] == [
         run_at(2).due,
         run_at(3).due,
         run_at(9).due,
     ]
+
+
+def test_simulated_runs_are_marked_and_earlier_versions_kept_no_mark(store: RunStore) -> None:
+    store.save(replace(run_at(2), simulated=True))
+    assert [run.simulated for run in store.runs("lab")] == [n == 2 for n in range(7)]
+    assert [simulated for *_, simulated in store.noise("lab")] == [n == 2 for n in range(4)]
+    store.save(run_at(2))  # again, as after a restart: the mark stays
+    assert store.runs("lab")[2].simulated
+    with closing(sqlite3.connect(store.path)) as database, database:
+        database.execute("DROP TABLE simulated")
+    assert not any(run.simulated for run in store.runs("lab"))
+    assert not any(simulated for *_, simulated in store.noise())
+    store.save(replace(run_at(3), simulated=True))
+    assert [run.simulated for run in store.runs("lab")] == [n == 3 for n in range(7)]
 
 
 def test_questions_of_a_database_that_does_not_exist_make_none(tmp_path: Path) -> None:

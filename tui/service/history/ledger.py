@@ -329,7 +329,7 @@ def noise_of(serial_number: str) -> list[Found]:
         rows = ledger.execute(_OF_SENSOR, (serial_number,)).fetchall()
     is_simulated = all(row[2] for row in rows)
     return [
-        (bench, datetime.fromtimestamp(started, UTC), BandNoise.of(*values))
+        (bench, datetime.fromtimestamp(started, UTC), BandNoise.of(*values), is_simulated)
         for bench, started, simulated, *values in rows
         if bool(simulated) is is_simulated
     ]

@@ -14,8 +14,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from datetime import datetime
 
-    Found = tuple[str, datetime, BandNoise]
-    """Name of the bench, time at which the run was due, and the noise that the run found."""
+    Found = tuple[str, datetime, BandNoise, bool]
+    """Name of the bench, time at which the run was due, the noise that the run found, and whether
+    a sensor was simulated."""
 
 SCATTER = 0.1
 """Standard deviation in dB from run to run that is no change."""
@@ -36,12 +37,15 @@ class Series:
         By positions in `usable`.
     usable : tuple of int
         Positions of the noise that has an interval above zero: only these are tested.
+    simulated : bool
+        Whether a sensor was simulated: such runs are compared with their like only.
     """
 
     noise: tuple[BandNoise, ...]
     runs: tuple[tuple[str, datetime], ...]
     changes: tuple[Change, ...]
     usable: tuple[int, ...]
+    simulated: bool = False
 
     @property
     def last(self) -> BandNoise:
@@ -52,6 +56,12 @@ class Series:
     def name(self) -> str:
         """Sensor and channel."""
         return f"{self.last.sensor}.{self.last.channel}"
+
+    @property
+    def sensor(self) -> str:
+        """Sensor and its serial number, for people."""
+        name = f"{self.last.sensor} {self.last.serial_number}".strip()
+        return f"{name}, simulated" if self.simulated else name
 
     def due_of(self, position: int) -> datetime:
         """Return when the run at a position in `usable` was due."""
@@ -65,6 +75,7 @@ class Series:
             "channel": last.channel,
             "model": last.model,
             "serial_number": last.serial_number,
+            "simulated": self.simulated,
             "unit": last.unit,
             "method": last.method,
             "low_hz": last.low_hz,
@@ -103,8 +114,8 @@ def history(
 
     Parameters
     ----------
-    found : iterable of (str, datetime, BandNoise)
-        Bench, due time and noise of runs, of any benches.
+    found : iterable of (str, datetime, BandNoise, bool)
+        Bench, due time and noise of runs, of any benches, and whether they were simulated.
     band : (float, float), optional
         In Hz; all bands that were kept, if not given.
     scatter : float
@@ -117,7 +128,7 @@ def history(
     for each in sorted(found, key=lambda each: each[1]):
         noise = each[2]
         if band is None or _same_band(noise, band):
-            collected.setdefault(_key(each[0], noise), []).append(each)
+            collected.setdefault((_key(each[0], noise), each[3]), []).append(each)
     return [
         _series(own, scatter * DECIBEL, false_alarms / len(collected))
         for _, own in sorted(collected.items(), key=lambda item: str(item[0]))
@@ -126,7 +137,7 @@ def history(
 
 def bands_of(found: Iterable[Found]) -> list[tuple[float, float]]:
     """Return the bands of which there is noise, in Hz."""
-    return sorted({_rounded(noise.low_hz, noise.high_hz) for _, _, noise in found})
+    return sorted({_rounded(noise.low_hz, noise.high_hz) for _, _, noise, _ in found})
 
 
 def _key(bench: str, noise: BandNoise) -> tuple[object, ...]:
@@ -153,9 +164,8 @@ def _series(found: Sequence[Found], scatter: float, false_alarms: float) -> Seri
     levels = [math.log(noise[n].psd) for n in usable]
     # A standard deviation of zero would be beyond any measurement.
     deviations = [max(1e-6, math.hypot(_deviation(noise[n]), scatter)) for n in usable]
-    return Series(
-        noise, runs, tuple(changes(levels, deviations, false_alarms=false_alarms)), usable
-    )
+    found_changes = tuple(changes(levels, deviations, false_alarms=false_alarms))
+    return Series(noise, runs, found_changes, usable, simulated=found[0][3])
 
 
 def _deviation(noise: BandNoise) -> float:

@@ -41,8 +41,7 @@ def history_figure(found: Sequence[Series]) -> Figure:
     panels: dict[tuple[str, float, float, str], list[Series]] = {}
     for series in found:
         last = series.last
-        sensor = f"{last.sensor} {last.serial_number}".strip()
-        panels.setdefault((sensor, last.low_hz, last.high_hz, last.unit), []).append(series)
+        panels.setdefault((series.sensor, last.low_hz, last.high_hz, last.unit), []).append(series)
     with look():
         figure = Figure(
             figsize=(_WIDTH, 0.8 + _HEIGHT * max(1, len(panels))),
@@ -89,7 +88,9 @@ def history_table(found: Sequence[Series]) -> Table:
     for series in found:
         last = series.last
         table.add_row(
-            *(last.serial_number or "-", last.sensor, last.channel),
+            last.serial_number or "-",
+            f"{last.sensor}, simulated" if series.simulated else last.sensor,
+            last.channel,
             *(f"{last.low_hz:.3g} to {last.high_hz:.3g}", last.unit, str(len(series.noise))),
             *(_level(series.noise[0]), _level(last)),
             f"{len(series.changes)} ×" if series.changes else "no",
@@ -109,7 +110,8 @@ def tests_table(tests: Sequence[SensorTest]) -> Table:
         temperature = "-" if each.temperature is None else f"{each.temperature:.1f}"
         table.add_row(
             utc_text(each.started),
-            *map(Text, (each.bench, each.sensor, each.model or "-", each.firmware or "-")),
+            Text(f"{each.bench}, simulated" if each.simulated else each.bench),
+            *map(Text, (each.sensor, each.model or "-", each.firmware or "-")),
             temperature,
             ", ".join(f"{n} {verdict}" for verdict, n in verdicts.items()) or "none",
         )
@@ -127,7 +129,8 @@ def label_lines(found: Sequence[Series]) -> list[str]:
     same = [each for each in own if (each.low_hz, each.high_hz) == band]
     noise = [f"{each.channel} {_level(each)} dB" for each in same[:3]]
     test = f"{latest:%Y-%m-%d}, {band[0]:.3g} to {band[1]:.3g} Hz"
-    return [*filter(None, [widest.model]), test, *noise]
+    simulated = "simulated" if any(series.simulated for series in found) else ""
+    return [*filter(None, [widest.model, simulated]), test, *noise]
 
 
 def label_svg(serial_number: str, lines: Sequence[str]) -> str:

@@ -103,6 +103,7 @@ class Outcome:
     error: str = ""
     parts: tuple[str, ...] = ()
     refused: bool = False
+    simulated: bool = False
     identities: tuple[tuple[str, str, str], ...] = ()
     """File name, run id and root SHA-256 of each closed recording."""
 
@@ -217,7 +218,7 @@ def _finished(request: Request, progress: Callable[[], object]) -> Outcome:
         except (HuddleError, OSError) as error:
             notes.append(f"no report: {error}")
             refused |= is_of_disk(error)
-    return Outcome(verdict, tuple(notes), noise, refused=refused)
+    return Outcome(verdict, tuple(notes), noise, refused=refused, simulated=snapshot.simulated)
 
 
 def is_of_disk(error: BaseException | None) -> bool:

@@ -118,6 +118,8 @@ class Run:
         When its files were removed.
     pending_hooks : tuple of str
         Hooks that have not been carried out.
+    simulated : bool
+        Whether a sensor was simulated; earlier versions did not keep it.
     """
 
     bench: str
@@ -136,6 +138,7 @@ class Run:
     pinned: bool = False
     removed: datetime | None = None
     pending_hooks: tuple[str, ...] = ()
+    simulated: bool = False
     noise: tuple[BandNoise, ...] = field(default=(), compare=False)
 
     @property
@@ -222,6 +225,7 @@ class Run:
             "target_cov": self.until.cov,
             "until": self.until.text or None,
             "recordings": list(self.parts),
+            "simulated": self.simulated,
             "pinned": self.pinned,
             "removed": utc_text(self.removed),
         }

@@ -58,6 +58,7 @@ CREATE INDEX IF NOT EXISTS noise_by_run ON noise (run);
 _INDEXES = """
 CREATE TABLE IF NOT EXISTS identities (
     part TEXT PRIMARY KEY, run TEXT NOT NULL, run_id TEXT NOT NULL, root_sha256 TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS simulated (run TEXT PRIMARY KEY);
 CREATE INDEX IF NOT EXISTS runs_by_time ON runs (due, entry);
 CREATE INDEX IF NOT EXISTS runs_by_state ON runs (bench, state, due);
 CREATE INDEX IF NOT EXISTS runs_pending ON runs (bench) WHERE untold != '[]';
@@ -127,6 +128,8 @@ class RunStore:
                 f" ON CONFLICT (key) DO UPDATE SET {updates}",
                 row,
             )
+            if run.simulated:
+                database.execute("INSERT OR IGNORE INTO simulated VALUES (?)", (run.key,))
             if run.noise:
                 database.execute("DELETE FROM noise WHERE run = ?", (run.key,))
                 database.executemany(
@@ -165,11 +168,20 @@ class RunStore:
 
     def identities(self) -> dict[str, tuple[str, str]]:
         """Return run id and root SHA-256 of recordings, by file name."""
-        known = "SELECT name FROM sqlite_master WHERE name = 'identities'"
-        if not self._rows(known):  # of an earlier version
+        if not self._has("identities"):
             return {}
         rows = self._rows("SELECT part, run_id, root_sha256 FROM identities")
         return {part: (run_id, root) for part, run_id, root in rows}
+
+    def _has(self, table: str) -> bool:
+        """Whether a table is there: earlier versions had fewer."""
+        return bool(self._rows("SELECT 1 FROM sqlite_master WHERE name = ?", table))
+
+    @property
+    def _is_simulated(self) -> str:
+        """The question whether a run was simulated."""
+        is_kept = self._has("simulated")
+        return "EXISTS (SELECT 1 FROM simulated WHERE run = runs.key)" if is_kept else "0"
 
     def forget_planned(self, run: Run) -> None:
         """Remove a run that is no longer in the schedule, unless it has begun."""
@@ -247,8 +259,8 @@ class RunStore:
 
     def noise(
         self, bench: str | None = None, since: datetime | None = None
-    ) -> Iterator[tuple[str, datetime, BandNoise]]:
-        """Yield the noise that all runs have found by their time, with bench and due time."""
+    ) -> Iterator[tuple[str, datetime, BandNoise, bool]]:
+        """Yield the noise of all runs by their time: bench, due time, noise, whether simulated."""
         conditions, values = [], []
         if bench is not None:
             conditions.append("bench = ?")
@@ -259,16 +271,17 @@ class RunStore:
         where = f" WHERE {' AND '.join(conditions)}" if conditions else ""
         columns = ", ".join(f"noise.{name}" for name in _NOISE)
         rows = self._rows(
-            f"SELECT bench, due, {columns} FROM runs CROSS JOIN noise ON noise.run = runs.key"  # noqa: S608
+            f"SELECT bench, due, {self._is_simulated}, {columns}"  # noqa: S608 - our own words
+            " FROM runs CROSS JOIN noise ON noise.run = runs.key"
             f"{where} ORDER BY due, entry, noise.rowid",
             *values,
         )
         moments: dict[str, datetime] = {}
-        for name, due, *values_of_row in rows:
+        for name, due, simulated, *values_of_row in rows:
             moment = moments.get(due)
             if moment is None:
                 moment = moments[due] = datetime.fromisoformat(due)
-            yield name, moment, BandNoise.of(*values_of_row)
+            yield name, moment, BandNoise.of(*values_of_row), bool(simulated)
 
     def _found(
         self,
@@ -288,13 +301,15 @@ class RunStore:
         condition = f" WHERE {' AND '.join(where)}" if where else ""
         order = "due, entry" if last is None else f"due DESC, entry DESC LIMIT {last:d}"
         rows = self._rows(
-            f"SELECT {', '.join(_COLUMNS)} FROM runs{condition} ORDER BY {order}",  # noqa: S608
+            f"SELECT {', '.join(_COLUMNS)}, {self._is_simulated}"  # noqa: S608 - our own words
+            f" FROM runs{condition} ORDER BY {order}",
             *values,
         )
         if last is not None:
             rows.reverse()
         try:
-            return [_run(dict(zip(_COLUMNS, row, strict=True))) for row in rows]
+            columns = (*_COLUMNS, "simulated")
+            return [_run(dict(zip(columns, row, strict=True))) for row in rows]
         except (TypeError, ValueError) as error:
             raise StoreError(
                 f"{self.path}: a row cannot be read ({error}); huddle serve restores the database:"
@@ -538,6 +553,7 @@ def _run(row: dict[str, Any]) -> Run:
         pinned=bool(row["pinned"]),
         removed=from_text(row["removed"]),
         pending_hooks=tuple(json.loads(row["untold"])),
+        simulated=bool(row["simulated"]),
     )
 
 
