@@ -24,11 +24,11 @@ $(VENV)/.installed-docs: $(VENV)/.installed
 demo: $(VENV)/.installed  ## the whole huddle test on a simulated bench, over its real protocols
 	$(BIN)/huddle demo
 
-test: $(VENV)/.installed-dev  ## the tests but the long ones; three at a time on two cores, for many wait for their devices
-	$(BIN)/pytest -n 3
+test: $(VENV)/.installed-dev  ## the tests but the long ones; four at a time on two cores, for many wait for their devices
+	$(BIN)/pytest -n 4
 
 test-long: $(VENV)/.installed-dev  ## the tests that are studies, endurance or whole sessions
-	$(BIN)/pytest -n 3 -m long
+	$(BIN)/pytest -n 4 -m long
 
 peers:  ## compile the program in Rust that the tests talk to; kept in the user's cache
 	cargo build --quiet --manifest-path $(PEER)/Cargo.toml --target-dir $(PEER_CACHE)

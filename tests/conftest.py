@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 USGS_RECORDING = "usgs-tst-huddle"
 FIRST = (
     "tests/acceptance/",
+    "tests/benchmarks/",
     "tests/tui/commands/test_run.py",
     "tests/daq/devices/test_conformance",
     "tests/tui/",

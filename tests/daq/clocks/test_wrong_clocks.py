@@ -194,8 +194,8 @@ def test_between_two_sensors_arrivals_say_which_lost_samples(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("motion", "polled"),
     [
-        ("coloured", True),
         ("hum", False),
+        pytest.param("coloured", True, marks=LONG),
         *(
             pytest.param(motion, polled, marks=LONG)
             for motion, polled in itertools.product(("white", "red"), (False, True))
@@ -230,7 +230,8 @@ def test_a_rate_that_follows_the_temperature_is_followed(
     assert_right(*errors(snapshot, scene))
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=LONG)])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [1, 2])
 def test_sensors_that_all_restart_are_aligned_or_left_out(tmp_path: Path, seed: int) -> None:
     """Where restarts of several leave an epoch without a delay, arrivals hardly know it."""
     restarts = dict.fromkeys(range(3), (20.0, 40.0, 1.5))

@@ -265,6 +265,7 @@ def test_a_measured_response_counts_as_far_as_it_was_measured(tmp_path: Path) ->
     assert abs(np.mean(flat) - 1) < 0.15  # of which the errors are 0.05; without filters 100
 
 
+@pytest.mark.long
 def test_equal_sensors_are_not_spoilt_where_nothing_moves(tmp_path: Path) -> None:
     """Three flat sensors of other rates; no motion above 39 Hz, where noise was doubled."""
     scene = known_clocks.Scene(rates=(100.0, 250.0, 200.0), reach=0.35)

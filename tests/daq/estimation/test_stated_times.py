@@ -167,7 +167,9 @@ def test_stated_times_that_agree_with_the_motion_are_used_as_they_are(tmp_path: 
     assert not clock_facts(snapshot)
 
 
-@pytest.mark.parametrize(("ppm", "every"), [(PPM, 3000), ((*PPM, 0.0), 600)])
+@pytest.mark.parametrize(
+    ("ppm", "every"), [(PPM, 3000), pytest.param((*PPM, 0.0), 600, marks=pytest.mark.long)]
+)
 def test_drift_is_corrected_while_the_recording_grows(
     tmp_path: Path, ppm: tuple[float, ...], every: int
 ) -> None:
