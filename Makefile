@@ -24,8 +24,8 @@ $(VENV)/.installed-docs: $(VENV)/.installed
 demo: $(VENV)/.installed  ## the whole huddle test on a simulated bench, over its real protocols
 	$(BIN)/huddle demo
 
-test: $(VENV)/.installed-dev  ## the tests but the long ones; four at a time on two cores, for many wait for their devices
-	$(BIN)/pytest -n 4
+test: $(VENV)/.installed-dev  ## the tests but the long ones; three at a time on two cores, for many wait for their devices
+	$(BIN)/pytest -n 3
 
 test-long: $(VENV)/.installed-dev  ## the tests that are studies, endurance or whole sessions
 	$(BIN)/pytest -n 4 -m long

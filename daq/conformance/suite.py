@@ -558,12 +558,12 @@ async def watching_the_loop() -> AsyncIterator[list[float]]:
             beats.append(time.monotonic())
 
     async def look() -> None:
-        before = time.monotonic()
+        before, waited = time.monotonic(), _waited()
         while True:
             await asyncio.sleep(TICK)
-            now = time.monotonic()
+            now, waited_before, waited = time.monotonic(), waited, _waited()
             running = np.diff([before, *(b for b in beats if before < b < now), now])
-            held_up = running[running > 2 * TICK].sum()
+            held_up = max(running[running > 2 * TICK].sum(), waited - waited_before)
             if now - before - held_up > MAX_BLOCKED:
                 blocked.append(now - before)
             beats.clear()
@@ -579,6 +579,15 @@ async def watching_the_loop() -> AsyncIterator[list[float]]:
         ended.set()
         thread.join()
         await asyncio.gather(looking, return_exceptions=True)
+
+
+def _waited() -> float:
+    """Return for how long this thread could run and had no processor, in s; 0 where unknown."""
+    try:
+        with open("/proc/thread-self/schedstat", encoding="ascii") as file:  # noqa: PTH123 - often
+            return int(file.read().split()[1]) * 1e-9
+    except (OSError, ValueError, IndexError):  # not Linux
+        return 0.0
 
 
 def _run(coroutine: Coroutine[object, object, None]) -> None:
