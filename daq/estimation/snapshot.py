@@ -59,11 +59,13 @@ class SensorTotals:
     """Whether the sensor has sent nothing, or was lost after its last block."""
     n_damaged: int = 0
     """Number of its blocks whose checksum is wrong; the estimate leaves them out as gaps."""
+    began: float = float("nan")
+    """UTC of the first sample to within the delay of its block, as `last_seen`."""
 
     @classmethod
     def of(cls, record: ReadableSensor, events: Iterable[Event] = ()) -> SensorTotals:
         """Return the totals of a sensor of a recording."""
-        last = record.blocks[-1:]["utc_ns"]
+        first, last = record.blocks[:1], record.blocks[-1:]["utc_ns"]
         last_ns = int(record.blocks[-1:]["monotonic_ns"][0]) if len(last) else -1
         states = [
             STATE_AFTER[event.kind]
@@ -79,6 +81,10 @@ class SensorTotals:
             n_gaps=len(record.gaps),
             n_missing=int(record.gaps["missing"].sum()),
             last_seen=float(last[0]) * 1e-9 if len(last) else float("nan"),
+            began=float(first["utc_ns"][0]) * 1e-9
+            - float(first["n_samples"][0]) / record.sampling_rate
+            if len(first)
+            else float("nan"),
             n_damaged=record.n_damaged,
             is_lost=not len(last) or (bool(states) and states[-1].is_lost),
         )

@@ -188,6 +188,22 @@ class SamplesMissing(Fact):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SpanShortened(Fact):
+    """`sensors` begin late, or end early, and only the time of all sensors is estimated.
+
+    Attributes
+    ----------
+    seconds : float
+        Of the other sensors, that are not used.
+    at_end : bool
+    """
+
+    name: ClassVar[str] = "span-shortened"
+    seconds: float
+    at_end: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SegmentsExcluded(Fact):
     """Segments are excluded.
 

@@ -48,6 +48,7 @@ from daq.results.facts import (
     SensorOverdue,
     SensorsSimulated,
     SharedNoiseNotSearched,
+    SpanShortened,
     StatedTimesDrift,
     StatedTimesUnchecked,
     SteadinessNotTested,
@@ -84,7 +85,10 @@ if TYPE_CHECKING:
     from estimator.levels.contributions import Source
 
 LEAST_SHARE = 0.01
-"""Share of the noise from which a contribution to an interval is a fact."""
+"""Share of the noise from which a contribution to an interval is a fact; of the time, too."""
+LEAST_SECONDS, DELAYING_SHARE = 30.0, 0.1
+"""Time by which a sensor shortens an estimate, from which that is a fact; and share of the time of
+the estimate from which it delays the result."""
 WITHOUT_ESTIMATE = (
     Flag.DEAD_CHANNEL
     | Flag.DUPLICATE
@@ -168,9 +172,34 @@ def _recording(snapshot: Snapshot) -> Iterator[Fact]:
                 n_gaps=sensor.n_gaps,
                 n_samples=sensor.n_missing,
             )
+    for at_end in (False, True) if snapshot.closed else (False,):
+        yield from _shortened(snapshot, at_end=at_end)
     if left_out := snapshot.not_estimated:
         n_all = len(snapshot.sensor_names) + len(left_out)
         yield NotInLiveEstimate(rank=Rank.TO_KNOW, sensors=tuple(left_out), n_all=n_all)
+
+
+def _shortened(snapshot: Snapshot, *, at_end: bool) -> Iterator[SpanShortened]:
+    """Yield that sensors shorten the time of the estimate, where its end is theirs."""
+    sensors = [each for each in snapshot.sensors if math.isfinite(each.last_seen)]
+    if not sensors or (at_end and any(each.is_lost for each in sensors)):  # a fact of its own
+        return
+    sign = -1.0 if at_end else 1.0
+    seen = [sign * (each.last_seen if at_end else each.began) for each in sensors]
+    begin = snapshot.start_utc_ns * 1e-9 + (snapshot.elapsed if at_end else 0.0)
+    least = max(LEAST_SECONDS, LEAST_SHARE * snapshot.elapsed)
+    seconds = max(seen) - min(seen)
+    if seconds > least and abs(sign * begin - max(seen)) < least:
+        yield SpanShortened(
+            rank=Rank.DELAYS if seconds > DELAYING_SHARE * snapshot.elapsed else Rank.TO_KNOW,
+            sensors=tuple(
+                each.name
+                for each, own in zip(sensors, seen, strict=True)
+                if own > min(seen) + least
+            ),
+            seconds=seconds,
+            at_end=at_end,
+        )
 
 
 def _lost(snapshot: Snapshot, sensor: SensorTotals) -> SensorLost:

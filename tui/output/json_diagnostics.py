@@ -95,6 +95,7 @@ def _sensor(each: SensorTotals) -> dict[str, Any]:
         "gaps": each.n_gaps,
         "missing_samples": each.n_missing,
         "damaged_blocks": each.n_damaged,
+        "began_utc_s": each.began,
         "last_seen_utc_s": each.last_seen,
         "is_lost": each.is_lost,
     }

@@ -53,6 +53,7 @@ from daq.results.facts import (
     SensorOverdue,
     SensorsSimulated,
     SharedNoiseNotSearched,
+    SpanShortened,
     SpectraUnreadable,
     StatedTimesDrift,
     StatedTimesUnchecked,
@@ -302,6 +303,19 @@ def _missing(fact: SamplesMissing, names: Names) -> Wording:
         f"{several(fact.n_samples, 'sample')} missing"
     )
     return Wording(text, f"{text}.")
+
+
+@word.register(SpanShortened)
+def _shortened(fact: SpanShortened, names: Names) -> Wording:
+    del names
+    who = f"{listed(fact.sensors)} end" if fact.at_end else f"{listed(fact.sensors)} begin"
+    who += "s" * (len(fact.sensors) == 1) + (" early" if fact.at_end else " late")
+    return Wording(
+        f"{who}: {clock_time(fact.seconds)} of the other sensors are not used",
+        f"{who}. Only the time of all sensors is estimated: {clock_time(fact.seconds)} of the"
+        " others are not used.",
+        "If the others are enough, import them alone: they are estimated over all of their time.",
+    )
 
 
 @word.register(SegmentsExcluded)

@@ -45,6 +45,7 @@ EXAMPLES: tuple[Fact, ...] = (
         never_seen=False,
     ),
     facts.BlocksDamaged(rank=Rank.DELAYS, sensors=A, n_blocks=2),
+    facts.SpanShortened(rank=Rank.DELAYS, sensors=A, seconds=300.0, at_end=False),
     facts.SamplesMissing(rank=Rank.TO_KNOW, sensors=A, n_gaps=2, n_samples=40),
     facts.SegmentsExcluded(rank=Rank.TO_KNOW, n_segments=3, reasons={Reason.CLIPPED: 3}),
     facts.GapsBridged(rank=Rank.TO_KNOW, n_segments=4, lost=0.02, leakage=0.01),
