@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -23,7 +24,6 @@ from tui.output.exit_codes import ExitCode
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from pathlib import Path
 
     from rich.console import Console
 
@@ -174,7 +174,7 @@ def show_result(
         None where the bench file has no limits.
     """
     from daq.results.noise_parameters import quantisation_shares
-    from tui.output.console import for_people, write_json, write_text
+    from tui.output.console import STANDARD_OUTPUT, for_people, write_json, write_text
     from tui.output.diagnosis import details
     from tui.output.noise_parameters import quantisation_notes
     from tui.output.results import averages_line, curves_csv, result_table, result_title
@@ -197,20 +197,21 @@ def show_result(
         from daq.results.decision.limits import judge
 
         found = judge(bench, snapshot, settings)
-    if json is not None:
+    if json is not None or csv is not None:
         from daq.results.sources import sources
-        from tui.output.json_document import document
+        from tui.output.csv_text import write_metadata
+        from tui.output.json_document import document, provenance
 
-        result = document(
-            snapshot,
-            settings,
-            sources=sources(recordings),
-            verdict=found,
-            noise_parameters=parameters,
-        )
-        write_json(json, result)
-    if csv is not None:
-        write_text(csv, curves_csv(snapshot))
+        about = sources(recordings)
+        if json is not None:
+            result = document(
+                snapshot, settings, sources=about, verdict=found, noise_parameters=parameters
+            )
+            write_json(json, result)
+        if csv is not None:
+            write_text(csv, curves_csv(snapshot))
+            if csv != STANDARD_OUTPUT:
+                write_metadata(Path(csv), provenance(snapshot, settings, about))
     if found is not None:
         _show_verdict(screen, found)
     return found

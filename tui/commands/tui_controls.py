@@ -32,8 +32,9 @@ from tui.commands.check import examined_bench
 from tui.commands.runs import RunNotFoundError, runs_named
 from tui.output.check_list import sentence
 from tui.output.console import write_json
+from tui.output.csv_text import write_metadata
 from tui.output.extras import require
-from tui.output.json_document import document
+from tui.output.json_document import document, provenance
 from tui.output.results import curves_csv
 from tui.runs.estimate_settings import settings_for
 from tui.runs.recorder_process import RecorderProcess
@@ -511,6 +512,7 @@ def save_result(
     csv, json = (folder / f"{path.stem}{suffix}" for suffix in (".csv", ".json"))
     csv.write_text(curves_csv(snapshot), encoding="utf-8")
     about = sources([path]) if snapshot.closed else ()
+    write_metadata(csv, provenance(snapshot, settings, about))
     result = document(snapshot, settings, sources=about, verdict=verdict)
     write_json(str(json), result)
     return csv, json

@@ -19,7 +19,7 @@ import numpy as np
 
 from daq.recording.reader import Recording
 from tui.notebook.tables import to_frame, to_xarray
-from tui.output.csv_text import csv_text
+from tui.output.csv_text import csv_text, write_metadata
 from tui.output.extras import load
 
 if TYPE_CHECKING:
@@ -44,13 +44,6 @@ def _csv(snapshot: Snapshot, path: Path, said: Said) -> None:
     del said  # in the metadata beside it
     header = ("method", "sensor", "channel", "unit", "frequency_hz", "data_psd", *_COLUMNS)
     path.write_text(csv_text(header, _rows(snapshot)), encoding="utf-8")
-
-
-def _csv_metadata(path: Path, said: Said) -> None:
-    """Write what made a table beside it, as CSV on the Web has it."""
-    metadata = {"@context": "http://www.w3.org/ns/csvw", "url": path.name, "notes": [said]}
-    beside = path.with_name(f"{path.name}-metadata.json")
-    beside.write_text(json.dumps(metadata, ensure_ascii=False, indent=1), encoding="utf-8")
 
 
 def _rows(snapshot: Snapshot) -> Iterator[tuple[object, ...]]:
@@ -188,7 +181,7 @@ def _uff(snapshot: Snapshot, path: Path, said: Said) -> None:
                         id2=f"one-sided, ({_ascii(label.unit)})^2/Hz"[:80],
                         id3=f"{said['source']}; {span}"[:80],
                         id4=f"SHA-256 {digest}"[:80] if digest else "NONE",
-                        id5="SIMULATED SENSORS" if snapshot.simulated else "NONE",
+                        id5="SIMULATED SENSORS" if said["simulated"] == "true" else "NONE",
                         rsp_ent_name=_ascii(label.sensor)[:10],
                         rsp_node=nodes[label.sensor],
                         rsp_dir=_DIRECTIONS.get(label.channel[-1:].upper(), 0),
@@ -252,7 +245,7 @@ def write_curves(snapshot: Snapshot, kind: str, path: Path, said: Said) -> None:
         WRITERS[kind][1](snapshot, part, said)
         _named(part, path)
         if kind == "csv":
-            _csv_metadata(path, said)
+            write_metadata(path, said)
     finally:
         _removed(part)
 

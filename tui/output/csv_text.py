@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
+    from pathlib import Path
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """What a cell begins with that a spreadsheet program would compute."""
@@ -31,3 +33,20 @@ def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
             ]
         )
     return out.getvalue()
+
+
+def write_metadata(path: Path, said: Mapping[str, str]) -> None:
+    """Write what made a table beside it, as CSV on the Web has it.
+
+    Parameters
+    ----------
+    path : Path
+        The table; a pipe or a device has nothing beside it.
+    said : mapping of str to str
+        What made it, as `tui.output.json_document.provenance` has it.
+    """
+    if not path.is_file():
+        return
+    metadata = {"@context": "http://www.w3.org/ns/csvw", "url": path.name, "notes": [dict(said)]}
+    beside = path.with_name(f"{path.name}-metadata.json")
+    beside.write_text(json.dumps(metadata, ensure_ascii=False, indent=1), encoding="utf-8")

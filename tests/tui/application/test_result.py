@@ -125,6 +125,9 @@ def test_csv_and_json_are_those_of_the_commands(tmp_path: Path) -> None:
     assert csv.read_text(encoding="utf-8") == curves_csv(snapshot)
     found = loads(json.read_text(encoding="utf-8"))
     assert len(found["results"]) == len(snapshot.results)
+    beside = csv.with_name("run.csv-metadata.json")
+    (said,) = loads(beside.read_text(encoding="utf-8"))["notes"]
+    assert (said["simulated"], said["recordings"]) == ("false", "[]")
 
 
 @pytest.mark.parametrize("size", [NARROW, (120, 36), (200, 60)])

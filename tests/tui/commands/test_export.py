@@ -7,6 +7,7 @@ import hashlib
 import importlib
 import io
 import json
+import os
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,6 +29,7 @@ from daq.recording.reader import Recording
 from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, create
 from tests.daq.formats.test_sources import START, STEP, counts, write_records
 from tui.commands.main import app
+from tui.notebook.curve_files import WRITERS
 from tui.output.exit_codes import ExitCode
 
 if TYPE_CHECKING:
@@ -368,3 +370,45 @@ def test_every_export_says_what_made_it(recording: Path, tmp_path: Path, kind: s
     assert said["confidence_of_intervals"] == "0.95"
     assert json.loads(said["flags"])["dead_channel"] == 4
     assert run(recording, "--format", kind, "-o", path).exit_code == ExitCode.DONE  # replaced
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("simulated") / "s.h5"
+    command = ["simulate", "fig4", "--duration", "40s", "--out", str(path)]
+    assert CliRunner().invoke(app, command).exit_code == ExitCode.DONE
+    return path
+
+
+@pytest.mark.usefixtures("zarr_threads")
+@pytest.mark.parametrize("kind", [*WRITERS, "estimate --csv"])
+def test_every_export_says_whether_sensors_were_simulated(
+    recording: Path, simulated: Path, tmp_path: Path, kind: str
+) -> None:
+    if kind == "parquet":
+        pytest.importorskip("pyarrow", reason="pyarrow is large, and an extra")
+    for source, wanted in ((simulated, "true"), (recording, "false")):
+        path = tmp_path / f"{source.stem}.out"
+        if kind == "estimate --csv":
+            options = ["estimate", source, "--segment", "5s", "--csv", path]
+            found = CliRunner().invoke(app, list(map(str, options)))
+        else:
+            found = run(source, "--format", kind, "-o", path, "--segment", "5s")
+        assert found.exit_code == ExitCode.DONE, found.output
+        if kind == "uff58":
+            notes = {each["id5"].strip() for each in pyuff.UFF(str(path)).read_sets()}
+            assert notes == {"SIMULATED SENSORS" if source is simulated else "NONE"}
+        else:
+            form = "csv" if kind == "estimate --csv" else kind
+            assert said_by_file(tmp_path, form, path)["simulated"] == wanted
+
+
+def test_a_table_on_standard_output_leaves_no_metadata(
+    simulated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for place in ("-", os.devnull):
+        options = ["estimate", str(simulated), "--segment", "5s", "--csv", place]
+        assert CliRunner().invoke(app, options).exit_code == ExitCode.DONE
+    assert not list(tmp_path.iterdir())
+    assert not Path(f"{os.devnull}-metadata.json").exists()

@@ -90,7 +90,7 @@ def test_a_recording_that_has_ended_since_is_read_again(tmp_path: Path) -> None:
 
 def test_deleting_takes_what_belongs_to_the_run_and_nothing_else(tmp_path: Path) -> None:
     path = closed(tmp_path / "a.h5")
-    for name in ("a.html", "a.json", "b.html"):
+    for name in ("a.html", "a.json", "a.csv", "a.csv-metadata.json", "b.html"):
         (tmp_path / name).touch()
     delete_recording(path)
     assert [file.name for file in tmp_path.iterdir()] == ["b.html"]
