@@ -58,6 +58,11 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         """Let time pass as if the running callback took so long."""
         self._jumping.now += seconds
 
+    async def shutdown_default_executor(self, timeout: float | None = None) -> None:  # noqa: ASYNC109 - as in asyncio
+        """Wait for the threads: a limit (from Python 3.12 on) would pass at once."""
+        del timeout
+        await super().shutdown_default_executor()
+
     def run_in_executor(
         self,
         executor: Executor | None,
