@@ -22,7 +22,7 @@ from estimator.spectra.welch import CrossSpectra, scale
 from estimator.spectra.windows import effective_averages, get_window
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -69,22 +69,22 @@ def averages(passes: Sequence[Pass]) -> tuple[Band, ...]:
     """Return cross-spectra of all recordings together, in the channels' own units.
 
     One band, or one an octave; none before the first segment. Nothing is known where
-    interpolation attenuates.
+    interpolation attenuates. With octaves, segments that all channels have need as many averages
+    as those that only some have, where there are enough of these.
     """
     first = passes[0]
     usable = min(each.aligned.usable for each in passes)
     n_segments = sum(each.n_segments for each in passes)
     if n_segments == 0:
         return ()
-    if first.octaves is not None:
-        octaves = MultiResolution.like(first.octaves)
-        for each in passes:
-            if each.octaves is not None:
-                octaves.merge(each.octaves)
-        highest = octaves.bands()[-1]
-        wanted = max(MIN_AVERAGES, first.n_channels + 2)
-        bands = octaves.bands(min(wanted, highest.n_effective))
-        return tuple(up_to(band, usable) for band in bands)
+    octaves = _octaves(passes)
+    if octaves is not None:
+        wanted: float = _enough(first.n_channels)
+        if not octaves.depth(wanted):
+            if any(octaves.depth(_enough(len(each)), each) for each in octaves.sets.spectra):
+                return ()
+            wanted = octaves.bands()[-1].n_effective
+        return tuple(up_to(band, usable) for band in octaves.bands(wanted))
     spectra = first.spectra
     if len(passes) > 1:
         spectra = CrossSpectra(first.welch, first.n_channels)
@@ -102,39 +102,101 @@ def averages(passes: Sequence[Pass]) -> tuple[Band, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChannelSet:
-    """Averages of the segments that only these channels have, by their columns."""
+    """Averages of the segments that only these channels have, by their columns.
+
+    With octaves, the lowest frequencies may not be among them.
+    """
 
     columns: tuple[int, ...]
-    band: Band
+    bands: tuple[Band, ...]
 
-    def whole(self, n_channels: int) -> Band:
-        """Return averages of all channels: zero for those that have no samples."""
-        csm = np.zeros((len(self.band.csm), n_channels, n_channels), np.complex128)
-        csm[:, np.array(self.columns)[:, None], np.array(self.columns)] = self.band.csm
-        return replace(self.band, csm=csm)
+    @property
+    def n_segments(self) -> int:
+        """Segments; with octaves those of the highest."""
+        return self.bands[-1].n_segments
+
+    @property
+    def frequency(self) -> FloatArray:
+        """Frequencies of all octaves in Hz, shape (n_freqs,)."""
+        return np.concatenate([band.frequencies for band in self.bands])
+
+    @property
+    def csm(self) -> ComplexArray:
+        """Averages at these, shape (n_freqs, n_columns, n_columns)."""
+        return np.concatenate([band.csm for band in self.bands])
 
 
-def channel_sets(passes: Sequence[Pass]) -> tuple[ChannelSet, ...]:
+def _enough(n_channels: int) -> int:
+    """Return the fewest averages of an octave, or of a set of channels."""
+    return max(MIN_AVERAGES, n_channels + 2)
+
+
+def _octaves(passes: Sequence[Pass]) -> MultiResolution | None:
+    """Return the octaves of all recordings together."""
+    if passes[0].octaves is None:
+        return None
+    octaves = MultiResolution.like(passes[0].octaves)
+    for each in passes:
+        if each.octaves is not None:
+            octaves.merge(each.octaves)
+    return octaves
+
+
+def _sets_of_octaves(
+    octaves: MultiResolution, complete: tuple[Band, ...]
+) -> Iterator[tuple[tuple[int, ...], tuple[Band, ...]]]:
+    """Yield the octaves of sets of channels, divided as those of all channels.
+
+    Where there are none, the lowest octave is one that every channel has.
+    """
+    depths = {
+        columns: octaves.depth(_enough(len(columns)), columns) for columns in octaves.sets.spectra
+    }
+    depths = {columns: depth for columns, depth in depths.items() if depth}
+    of_channel: dict[int, int] = {}
+    for columns, depth in depths.items():
+        for column in columns:
+            of_channel[column] = max(depth, of_channel.get(column, 0))
+    depth = len(complete) or min(of_channel.values(), default=0)
+    for columns in depths:
+        yield columns, octaves.bands(_enough(len(columns)), columns=columns, depth=depth)
+
+
+def channel_sets(passes: Sequence[Pass], complete: tuple[Band, ...]) -> tuple[ChannelSet, ...]:
     """Return averages of segments in which channels have no samples; most channels first.
 
-    Sets with fewer averages than an octave needs are left out.
+    Sets with fewer averages than an octave needs are left out. `complete` are the averages of the
+    segments that all channels have.
     """
-    first = passes[0]
     usable = min(each.aligned.usable for each in passes)
-    window = get_window(first.welch.window, first.welch.segment_length)
+    octaves = _octaves(passes)
+    if octaves is None:
+        by_columns = _sets_of_one_length(passes)
+    else:
+        by_columns = _sets_of_octaves(octaves, complete)
+    found = [
+        ChannelSet(columns, tuple(up_to(band, usable) for band in bands))
+        for columns, bands in by_columns
+    ]
+    return tuple(sorted(found, key=lambda each: (-len(each.columns), each.columns)))
+
+
+def _sets_of_one_length(
+    passes: Sequence[Pass],
+) -> Iterator[tuple[tuple[int, ...], tuple[Band, ...]]]:
+    """Yield the averages of sets of channels, where all segments have the same length."""
+    welch = passes[0].welch
+    window = get_window(welch.window, welch.segment_length)
     sums: dict[tuple[int, ...], tuple[CrossSpectra, float]] = {}
     for each in passes:
-        for columns, spectra in each.sets.spectra.items() if each.sets is not None else ():
+        for columns, spectra in each.sets.spectra.items():
             n_effective = effective_averages(window, each.welch.hop, spectra.n_segments)
             before, n_before = sums.get(columns, (CrossSpectra(each.welch, len(columns)), 0.0))
             sums[columns] = before + spectra, n_before + n_effective
-    found = []
     for columns, (spectra, n_effective) in sums.items():
-        if n_effective >= max(MIN_AVERAGES, len(columns) + 2):
-            frequencies, n_segments = first.welch.frequencies, spectra.n_segments
-            band = Band(first.welch, frequencies, spectra.csm(), n_segments, n_effective)
-            found.append(ChannelSet(columns, up_to(band, usable)))
-    return tuple(sorted(found, key=lambda each: (-len(each.columns), each.columns)))
+        if n_effective >= _enough(len(columns)):
+            n_segments = spectra.n_segments
+            yield columns, (Band(welch, welch.frequencies, spectra.csm(), n_segments, n_effective),)
 
 
 def with_sets(
@@ -144,6 +206,7 @@ def with_sets(
     *,
     dims: tuple[int, ...],
     gains: FloatArray,
+    frequency: FloatArray,
 ) -> tuple[Estimates, tuple[ChannelSet, ...]]:
     """Return estimates combined with those of sets of channels, and the sets that count.
 
@@ -160,11 +223,14 @@ def with_sets(
     settings : Settings
     dims : tuple of int
     gains : float64, shape (n_channels,)
+    frequency : float64, shape (n_freqs,)
+        Of the estimates, in Hz.
     """
     settings = settings.for_sensors(dims)
     wanted = ALL_METHODS if "all" in settings.methods else settings.methods
     wanted = tuple(name for name in wanted if name in _BY_MOTION)
     sensor_of, usual = np.repeat(np.arange(len(dims)), dims), max(dims)
+    shape = (len(frequency), len(sensor_of))
     parts = {name: [found] for name, found in estimates.results.items()}
     refused, dimensions, counted = dict(estimates.refused), estimates.dimensions, []
     for each in sets if wanted else ():
@@ -176,29 +242,35 @@ def with_sets(
             q = settings.dimension if isinstance(settings.dimension, int) else usual
             its = replace(settings, methods=("maximum-likelihood",), dimension=q)
         found = noise_estimates(
-            [each.band], its, dims=tuple(int(n) for n in left if n), gains=gains[columns]
+            each.bands, its, dims=tuple(int(n) for n in left if n), gains=gains[columns]
         )
         refused = {**found.refused, **refused}
         for name in wanted:
             noise = found.results.get(name if is_whole else "maximum-likelihood")
             if noise is not None and np.isfinite(noise.noise_psd).any():
-                whole = _spread(noise, columns, len(sensor_of), name)
+                whole = _spread(noise, columns, shape, name)
                 parts.setdefault(name, []).append(whole)
                 counted += [] if each in counted else [each]
-        dimensions = dimensions or (found.dimensions if is_whole else None)
-    blocks = blocks_of(sets[0].band.frequencies)
+        if is_whole and len(each.frequency) == len(frequency):
+            dimensions = dimensions or found.dimensions
+    blocks = blocks_of(frequency)
     results = {name: combined(found, blocks) for name, found in parts.items()}
     refused = {name: why for name, why in refused.items() if name not in results}
     return Estimates(results, refused, dimensions), tuple(counted)
 
 
-def _spread(noise: SelfNoise, columns: Sequence[int], n_channels: int, method: str) -> SelfNoise:
-    """Return a result of some channels as one of all: the others are dead."""
-    shape = (len(noise.noise_psd), n_channels)
+def _spread(
+    noise: SelfNoise, columns: Sequence[int], shape: tuple[int, int], method: str
+) -> SelfNoise:
+    """Return a result of some channels, and of the highest frequencies, as one of all.
+
+    The other channels are dead, and nothing is known of the other frequencies.
+    """
+    low = shape[0] - len(noise.noise_psd)
     psd, cumulants = np.full(shape, np.nan), np.full((3, *shape), np.nan)
     flags = np.full(shape, int(Flag.DEAD_CHANNEL))
-    psd[:, columns], cumulants[:, :, columns] = noise.noise_psd, noise.cumulants
-    flags[:, columns] = noise.flags
+    psd[low:, columns], cumulants[:, low:, columns] = noise.noise_psd, noise.cumulants
+    flags[low:, columns] = noise.flags
     return SelfNoise.of(method, psd, cumulants, flags)
 
 

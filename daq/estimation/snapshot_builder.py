@@ -234,25 +234,31 @@ class SnapshotBuilder:
             in_units(band, channels, self._unit, self._equalisation.response(band.frequencies))
             for band in raw
         )
+        sets = self._sets(passes, raw)
         if bands:
             frequency = np.concatenate([band.frequencies for band in bands])
             csm = bands[0].csm if len(bands) == 1 else np.concatenate([b.csm for b in bands])
         else:
-            frequency = first.welch.frequencies
+            known = [each.frequency for each in sets] or [first.welch.frequencies]
+            frequency = max(known, key=len)
             shape = (len(frequency), first.n_channels, first.n_channels)
             csm = np.full(shape, np.nan, dtype=np.complex128)
-        n_segments = sum(each.n_segments for each in passes)
+        n_segments, n_unused = sum(each.n_segments for each in passes), 0
         estimates = self._estimates(bands, raw, recordings[0], first, n_segments, final=final)
-        sets = self._sets(passes)
         if sets:
             estimates, sets = with_sets(
-                estimates, sets, self._settings, dims=dims, gains=self._gains
+                estimates,
+                sets,
+                self._settings,
+                dims=dims,
+                gains=self._gains,
+                frequency=frequency,
             )
         if sets and not bands:
-            csm, bands = _largest(sets, first.n_channels)
-            n_segments = bands[0].n_segments
+            n_unused, bands = n_segments, _largest(sets, csm)
+            n_segments = bands[-1].n_segments
         n_effective = bands[-1].n_effective if bands else 0.0
-        n_partial = sum(each.band.n_segments for each in sets) - (0 if raw else n_segments)
+        n_partial = sum(each.n_segments for each in sets) - (0 if raw else n_segments)
         latest = recordings[-1]
         events = latest.events
         diagnostics = SnapshotDiagnostics(
@@ -294,9 +300,9 @@ class SnapshotBuilder:
             clocks=clock_states(passes),
             drift=last.drift(),
             closed=all(map(is_complete, recordings, (*recordings[1:], None))),
-            left_out=_left_out(passes, sum(each.band.n_segments for each in sets)),
+            left_out=_left_out(passes, sum(each.n_segments for each in sets) - n_unused),
             channel_segments=_segments_of(sets, n_segments if raw else 0, first.n_channels),
-            octaves=tuple(map(Octave.of, bands)) if self._settings.octaves else (),
+            octaves=_octaves(bands, sets) if self._settings.octaves else (),
             diagnostics=diagnostics,
             no_segment=None if sets else _no_segment(passes, self._settings.segment),
             bridged=_bridged(passes, estimates.results),
@@ -311,20 +317,23 @@ class SnapshotBuilder:
         )
         return with_contributions(snapshot)
 
-    def _sets(self, passes: Sequence[Pass]) -> tuple[ChannelSet, ...]:
+    def _sets(self, passes: Sequence[Pass], raw: tuple[Band, ...]) -> tuple[ChannelSet, ...]:
         """Return averages of segments in which channels have no samples, in physical units."""
         channels = passes[0].aligned.channels
-        filters = self._equalisation.response(passes[0].welch.frequencies)
         found = []
-        for each in channel_sets(passes):
-            columns = list(each.columns)
-            band = in_units(
-                each.band,
-                [channels[column] for column in columns],
-                self._unit,
-                None if filters is None else filters[:, columns],
-            )
-            found.append(replace(each, band=band))
+        for each in channel_sets(passes, raw):
+            columns, bands = list(each.columns), []
+            for band in each.bands:
+                filters = self._equalisation.response(band.frequencies)
+                bands.append(
+                    in_units(
+                        band,
+                        [channels[column] for column in columns],
+                        self._unit,
+                        None if filters is None else filters[:, columns],
+                    )
+                )
+            found.append(replace(each, bands=tuple(bands)))
         return tuple(found)
 
     def _diagnose(
@@ -426,20 +435,34 @@ class SnapshotBuilder:
         return [len(n_factors) for n_factors in before] == [len(each.frequencies) for each in bands]
 
 
-def _largest(
-    sets: Sequence[ChannelSet], n_channels: int
-) -> tuple[NDArray[np.complex128], tuple[Band, ...]]:
-    """Return the averages of the set with the most channels and segments, as of all channels.
+def _largest(sets: Sequence[ChannelSet], csm: NDArray[np.complex128]) -> tuple[Band, ...]:
+    """Write averages of the set with the most channels and segments, as of all channels.
 
-    The PSD of other channels is that of their own segments; nothing is coherent with it.
+    The PSD of other channels is that of their own segments; nothing is coherent with it. Returns
+    what the set rests on.
     """
-    main = max(sets, key=lambda each: len(each.columns) * each.band.n_segments)
-    whole = main.whole(n_channels)
+    main = max(sets, key=lambda each: len(each.columns) * each.n_segments)
+    own = csm[len(csm) - len(main.frequency) :]
+    own[:] = 0.0
+    own[:, np.array(main.columns)[:, None], np.array(main.columns)] = main.csm
     for each in sets:
+        highest = csm[len(csm) - len(each.frequency) :]
         for place, column in enumerate(each.columns):
             if column not in main.columns:
-                whole.csm[:, column, column] = each.band.csm[:, place, place]
-    return whole.csm, (whole,)
+                highest[:, column, column] = each.csm[:, place, place]
+    return main.bands
+
+
+def _octaves(bands: Sequence[Band], sets: Sequence[ChannelSet]) -> tuple[Octave, ...]:
+    """Return what each octave rests on; segments of sets of channels are not left out."""
+    found = []
+    for place, band in enumerate(bands, start=-len(bands)):
+        left_out = Counter(band.left_out)
+        left_out[Reason.GAP] -= sum(
+            each.bands[place].n_segments for each in sets if len(each.bands) >= -place
+        )
+        found.append(Octave.of(replace(band, left_out=left_out)))
+    return tuple(found)
 
 
 def _segments_of(sets: Sequence[ChannelSet], n_complete: int, n_channels: int) -> tuple[int, ...]:
@@ -447,7 +470,7 @@ def _segments_of(sets: Sequence[ChannelSet], n_complete: int, n_channels: int) -
     if not sets:
         return ()
     return tuple(
-        n_complete + sum(each.band.n_segments for each in sets if column in each.columns)
+        n_complete + sum(each.n_segments for each in sets if column in each.columns)
         for column in range(n_channels)
     )
 
@@ -491,7 +514,7 @@ def _left_out(passes: Sequence[Pass], n_partial: int = 0) -> dict[Reason, int]:
     for each in passes:
         counts.update(each.left_out)
         counts[Reason.GAP] -= each.n_bridged
-        counts[Reason.GAP] -= 0 if each.sets is None else each.sets.n_disturbed
+        counts[Reason.GAP] -= each.sets.n_disturbed
     dropped = sum(each.n_seen - each.n_segments for each in passes) - n_partial
     counts[Reason.TRANSIENT] = dropped - counts.total()
     return {reason: counts[reason] for reason in Reason}

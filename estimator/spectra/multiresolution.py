@@ -8,22 +8,29 @@ between stages prevents aliasing into the used octave; its response in that octa
 
 Disturbed segments are excluded separately at each stage, by comparison with earlier segments of
 equal length: a knock may disturb the highest octave and not the lowest.
+
+Segments that only some channels have count for these channels, as in
+`estimator.spectra.channel_sets`, at each stage by its own segments.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from itertools import takewhile
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.errors import EstimatorError, InsufficientDataError
+from estimator.spectra.channel_sets import ChannelSets
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 
 if TYPE_CHECKING:
-    from estimator.types import BoolArray, ComplexArray, FloatArray
+    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+
+    Columns = tuple[int, ...]
 
 LOW, HIGH = 0.2, 0.4  # octave of a stage, as fractions of its rate
 TAPS = 89  # odd; stop-band from 0.3 of the rate above, 120 dB down
@@ -45,7 +52,7 @@ class Band:
     n_segments : int
     n_effective : float
     left_out : Counter of Reason
-        Excluded segments of this stage: incomplete (GAP) or disturbed.
+        Segments of this stage that do not count for all channels: incomplete (GAP) or disturbed.
     """
 
     settings: WelchSettings
@@ -94,29 +101,33 @@ class MultiResolution:
             for level in range(n_stages)
         ]
 
-    def add(self, samples: FloatArray, complete: BoolArray | None = None) -> None:
+    def add(self, samples: FloatArray, present: BoolArray | None = None) -> None:
         """Add the next samples.
 
         Parameters
         ----------
         samples : float64, shape (n_samples, n_channels)
             Contiguous with the previous samples, including gaps.
-        complete : bool, shape (n_samples,), optional
-            False if any sensor has a gap; these samples are not used.
+        present : bool, shape (n_samples, n_channels) or (n_samples,), optional
+            Which channels have each sample; the second shape states it for all channels. Absent
+            samples are not used.
         """
         samples = np.array(samples, dtype=np.float64)
-        if complete is None:
-            complete = np.ones(len(samples), dtype=bool)
+        if present is None:
+            present = np.ones(samples.shape, dtype=bool)
         self._stages[0].check(samples)
-        if complete.shape != samples.shape[:1]:
+        if present.shape == samples.shape[:1]:
+            present = np.repeat(present[:, None], samples.shape[1], axis=1)
+        if present.shape != samples.shape:
             raise EstimatorError(
-                f"completeness of shape {complete.shape}, expected {samples.shape[:1]}"
+                f"presence of shape {present.shape}, expected {samples.shape} or"
+                f" {samples.shape[:1]}"
             )
-        samples[~complete] = 0  # might be NaN, which would spread through the filter
+        samples[~present] = 0  # might be NaN, which would spread through the filter
         for stage in self._stages:
-            stage.take(samples, complete)
+            stage.take(samples, present)
             if stage is not self._stages[-1]:
-                samples, complete = stage.halve(samples, complete)
+                samples, present = stage.halve(samples, present)
 
     @property
     def n_segments(self) -> int:
@@ -142,40 +153,70 @@ class MultiResolution:
         for own, added in zip(self._stages, other._stages, strict=True):
             own.merge(added)
 
-    def bands(self, least_effective: float = 1.0) -> tuple[Band, ...]:
+    @property
+    def sets(self) -> ChannelSets:
+        """Segments of the top stage that only some channels have."""
+        return self._stages[0].sets
+
+    def depth(self, least_effective: float, columns: Columns | None = None) -> int:
+        """Return how many stages, from the top, have enough averages.
+
+        Parameters
+        ----------
+        least_effective : float
+            Minimum number of effective averages of a stage.
+        columns : tuple of int, optional
+            Channels of a set of `sets`; default: segments that all channels have.
+        """
+        enough = (stage.n_effective(columns) >= max(least_effective, 1.0) for stage in self._stages)
+        return sum(1 for _ in takewhile(bool, enough))
+
+    def bands(
+        self,
+        least_effective: float = 1.0,
+        *,
+        columns: Columns | None = None,
+        depth: int | None = None,
+    ) -> tuple[Band, ...]:
         """Return the contributions of the stages, in ascending order of frequency.
 
         Parameters
         ----------
         least_effective : float
-            Minimum number of effective averages of a stage. Stages with fewer are excluded, and the
-            lowest remaining stage extends down to 0.
+            Minimum number of effective averages of a stage. Stages with fewer are excluded.
+        columns : tuple of int, optional
+            Channels of a set of `sets`; default: segments that all channels have.
+        depth : int, optional
+            Number of stages that divide the frequencies; the lowest of these extends down to 0.
+            Default: all that are not excluded. With more, the lowest frequencies are not among the
+            bands.
 
         Raises
         ------
         InsufficientDataError
             If no stage has this number of averages.
         """
-        least = max(least_effective, 1.0)
-        used = [stage for stage in self._stages if stage.total().n_effective >= least]
-        if not used:
+        own = self.depth(least_effective, columns)
+        if not own:
             raise InsufficientDataError(
                 f"no segment length has {least_effective:g} effective averages yet"
             )
+        depth = own if depth is None else depth
         bands = []
-        for level in reversed(range(len(used))):
-            stage = used[level]
+        for level in reversed(range(min(own, depth))):
+            stage = self._stages[level]
             frequencies = stage.settings.frequencies
             rate = stage.settings.sampling_rate
             inside = np.ones(len(frequencies), dtype=bool)
             if level > 0:
                 inside &= frequencies <= HIGH * rate
-            if level < len(used) - 1:
+            if level < depth - 1:
                 inside &= frequencies > LOW * rate
             gain = np.prod(
-                [_response(frequencies[inside], above.settings) for above in used[:level]], axis=0
+                [_response(frequencies[inside], above.settings) for above in self._stages[:level]],
+                axis=0,
             )
-            spectra = stage.total()
+            spectra = stage.total(columns)
             csm = spectra.csm()[inside] / np.reshape(gain, (-1, 1, 1)) ** 2
             bands.append(
                 Band(
@@ -184,12 +225,7 @@ class MultiResolution:
                     csm,
                     spectra.n_segments,
                     spectra.n_effective,
-                    Counter(
-                        {
-                            Reason.GAP: stage.incomplete,
-                            Reason.TRANSIENT: stage.judged - spectra.n_segments,
-                        }
-                    ),
+                    stage.left_out,
                 )
             )
         return tuple(bands)
@@ -210,44 +246,63 @@ class _Stage:
         self._undisturbed: SelectedSpectra | None = None
         if rejection is not None:
             self._undisturbed = SelectedSpectra(settings, n_channels, rejection=rejection)
+        self.sets = ChannelSets(settings, short=0.0, rejection=rejection)
         self._total: CrossSpectra | None = None
         self._samples = np.zeros((0, n_channels))  # start of the next segment
-        self._complete = np.zeros(0, dtype=bool)
+        self._present = np.zeros((0, n_channels), dtype=bool)
         # before the first sample, the filter treats the input as a gap
-        self._tail = np.zeros((TAPS - 1, n_channels)), np.zeros(TAPS - 1, dtype=bool)
+        tail = (TAPS - 1, n_channels)
+        self._tail = np.zeros(tail), np.zeros(tail, dtype=bool)
 
     def check(self, samples: FloatArray) -> None:
         """Raise the errors of `take`."""
         self._spectra.check(samples, np.zeros(0, dtype=np.int64))
 
-    def total(self) -> CrossSpectra:
-        """Return the spectra of the accepted segments."""
+    def total(self, columns: Columns | None = None) -> CrossSpectra:
+        """Return the spectra of the accepted segments of all channels, or of a set of them."""
+        if columns is not None:
+            found = self.sets.spectra.get(columns)
+            return CrossSpectra(self.settings, len(columns)) if found is None else found
         if self._undisturbed is None:
             return self._spectra
         if self._total is None:
             self._total = self._undisturbed.spectra()
         return self._total
 
+    def n_effective(self, columns: Columns | None) -> float:
+        """Return the effective averages of `total`; 0 without segments."""
+        total = self.total(columns)
+        return total.n_effective if total.n_segments else 0.0
+
+    @property
+    def left_out(self) -> Counter[Reason]:
+        """Segments that do not count for all channels."""
+        disturbed = self.sets.n_disturbed
+        transient = self.judged - self.total().n_segments + disturbed
+        return Counter({Reason.GAP: self.incomplete - disturbed, Reason.TRANSIENT: transient})
+
     def merge(self, other: _Stage) -> None:
         """Add the segments of the same stage of another recording."""
         if self._undisturbed is not None:
             raise EstimatorError("segments of another recording cannot be judged by these")
         self._spectra.merge(other.total())
-        self.incomplete += other.incomplete
-        self.judged += other.judged
+        self.sets.merge(other.sets)
+        disturbed = other.sets.n_disturbed
+        self.incomplete += other.incomplete - disturbed
+        self.judged += other.judged + disturbed
 
-    def take(self, samples: FloatArray, complete: BoolArray) -> None:
+    def take(self, samples: FloatArray, present: BoolArray) -> None:
         """Test and add the segments completed by these samples."""
         self._samples = np.concatenate([self._samples, samples])
-        self._complete = np.concatenate([self._complete, complete])
+        self._present = np.concatenate([self._present, present])
         n = (len(self._samples) - self.settings.segment_length) // self.settings.hop + 1
         if n <= 0:
             return
         starts = np.arange(n) * self.settings.hop
-        missing = np.concatenate([[0], np.cumsum(~self._complete)])
-        whole = missing[starts + self.settings.segment_length] == missing[starts]
+        whole = _whole(self._present, starts, self.settings.segment_length).all(axis=1)
         if not self._begun:  # segments before the first sample are not lost
-            first = int(np.argmax(self._complete)) if self._complete.any() else len(self._complete)
+            some = np.flatnonzero(self._present.any(axis=1))
+            first = int(some[0]) if len(some) else len(self._present)
             self.incomplete -= int(np.sum(starts < first))
             self._begun = first <= starts[-1]
         self.incomplete += n - int(whole.sum())
@@ -257,23 +312,32 @@ class _Stage:
         else:
             self._undisturbed.add(self._samples, starts[whole])
             self._total = None
+        if not whole.all():
+            self.sets.take(self._samples, self._present, None, starts[~whole])
         self._samples = self._samples[n * self.settings.hop :]
-        self._complete = self._complete[n * self.settings.hop :]
+        self._present = self._present[n * self.settings.hop :]
 
-    def halve(self, samples: FloatArray, complete: BoolArray) -> tuple[FloatArray, BoolArray]:
-        """Return the new samples at half the rate."""
+    def halve(self, samples: FloatArray, present: BoolArray) -> tuple[FloatArray, BoolArray]:
+        """Return the new samples at half the rate, and which channels have them."""
         from scipy.signal import upfirdn  # noqa: PLC0415 - takes a second to import
 
         samples = np.concatenate([self._tail[0], samples])
-        complete = np.concatenate([self._tail[1], complete])
+        present = np.concatenate([self._tail[1], present])
         n = max(0, (len(samples) - TAPS) // 2 + 1)
-        self._tail = samples[2 * n :], complete[2 * n :]
+        self._tail = samples[2 * n :], present[2 * n :]
         if n == 0:
-            return samples[:0], complete[:0]
+            return samples[:0], present[:0]
         filtered = upfirdn(_taps(), samples, down=2, axis=0)[TAPS // 2 : TAPS // 2 + n]
-        missing = np.concatenate([[0], np.cumsum(~complete)])
-        first = 2 * np.arange(n)
-        return np.asarray(filtered), missing[first + TAPS] == missing[first]
+        return np.asarray(filtered), _whole(present, 2 * np.arange(n), TAPS)
+
+
+def _whole(present: BoolArray, starts: IntArray, length: int) -> BoolArray:
+    """Return which channels have all of `length` samples from each start on."""
+    if present.all():
+        return np.ones((len(starts), present.shape[1]), dtype=bool)
+    missing = np.zeros((len(present) + 1, present.shape[1]), np.int64)
+    np.cumsum(~present, axis=0, out=missing[1:])
+    return np.asarray(missing[starts + length] == missing[starts])
 
 
 def _taps() -> FloatArray:

@@ -13,12 +13,12 @@ import numpy as np
 
 from daq.clocks.aligned_recording import AlignedRecording
 from daq.clocks.growing_rows import GrowingRows
-from daq.estimation.segments.channel_sets import ChannelSets
 from daq.estimation.segments.clipping import in_clipped_blocks
 from daq.estimation.segments.delay_measurement import DelayMeasurement
 from daq.estimation.segments.flatline import FlatlineDetector, stands_still
 from daq.estimation.segments.own_spectra import OwnSpectra, need_samples_of_grid
 from daq.estimation.segments.stated_times import agree, compare
+from estimator.spectra.channel_sets import ChannelSets
 from estimator.spectra.multiresolution import MultiResolution
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
 from estimator.spectra.welch import CrossSpectra, SegmentSpectra, WelchSettings, kept_bins
@@ -204,6 +204,7 @@ class Pass:
     def restart(self) -> None:
         """Begin again, with the clocks as they are now."""
         wanted = self._settings
+        rejection = RejectionSettings() if wanted.reject else None
         self.octaves: MultiResolution | None = None
         self._undisturbed: SelectedSpectra | None = None
         if wanted.octaves:
@@ -211,7 +212,7 @@ class Pass:
                 self.welch,
                 self.n_channels,
                 n_stages=OCTAVES,
-                rejection=RejectionSettings() if wanted.reject else None,
+                rejection=rejection,
             )
         elif wanted.reject:
             self._undisturbed = SelectedSpectra(self.welch, self.n_channels)
@@ -223,10 +224,10 @@ class Pass:
         self._bridge: GapBridge | None = None
         if wanted.bridge > 0 and self._undisturbed is None and self.octaves is None:
             self._bridge = GapBridge(self.welch, self.n_channels, most=wanted.bridge)
-        self.sets: ChannelSets | None = None
-        if self.octaves is None:
-            short = 0.0 if wanted.reject else wanted.bridge
-            self.sets = ChannelSets(self.welch, short=short, reject=bool(wanted.reject))
+        short = 0.0 if wanted.reject else wanted.bridge
+        self.sets = ChannelSets(self.welch, short=short, rejection=rejection)
+        if self.octaves is not None:
+            self.sets = self.octaves.sets
         self.n_seen = self._n_taken = 0
         self._fed = 0  # grid samples that the octaves have had
         self.left_out: Counter[Reason] = Counter()
@@ -271,8 +272,7 @@ class Pass:
     @property
     def n_bridged(self) -> int:
         """Segments that count though they have gaps: none where half of all need not."""
-        partial = 0 if self.sets is None else self.sets.n_segments
-        if self._bridge is None or 2 * (self._n_taken + partial) >= self.n_seen:
+        if self._bridge is None or 2 * (self._n_taken + self.sets.n_segments) >= self.n_seen:
             return 0
         return self._bridge.spectra.n_segments
 
@@ -486,9 +486,11 @@ class Pass:
         self.left_out[Reason.CLIPPED] += int((whole & ~clean).sum())
         starts = starts[clean]
         if self.octaves is not None:
-            complete = usable if clipped is None else usable & ~clipped
+            present = usable if part.present is None else part.present
+            if clipped is not None:
+                present = (present.T & ~clipped).T
             new = self._fed - begin
-            self.octaves.add(samples[new:], complete[new:])
+            self.octaves.add(samples[new:], present[new:])
             self._fed = begin + len(samples)
         else:
             self._take(samples, starts, begin + reach)
@@ -496,7 +498,7 @@ class Pass:
         self._taken_at.add(self._positions(np.arange(first, first + count)))
         self._delays.measure(samples, starts, begin + reach + starts, together=together)
         touched = np.flatnonzero(~whole) * hop
-        if self.sets is not None and part.present is not None and len(touched):
+        if self.octaves is None and part.present is not None and len(touched):
             taken = self.sets.take(samples, part.present, clipped, touched)
             touched = np.setdiff1d(touched, taken)
         if self._bridge is not None and len(touched):

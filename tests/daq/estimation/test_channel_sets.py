@@ -74,13 +74,14 @@ NEVER_TOGETHER = {"A2": [0, 1], "B0": [2, 3]}
 WHOLE_SENSORS = {"A0": [1], "A1": [1], "A2": [1], "B0": [2], "B1": [2], "B2": [2]}
 
 
+@pytest.mark.parametrize("octaves", [False, True])
 @pytest.mark.parametrize(
     ("names", "lacking"), [("ABC", DAYS), ("ABC", NEVER_TOGETHER), ("ABCD", WHOLE_SENSORS)]
 )
 def test_noise_is_right_where_channels_lack_samples(
-    names: str, lacking: dict[str, list[int]]
+    names: str, lacking: dict[str, list[int]], octaves: bool
 ) -> None:
-    snapshot = estimated(names, lacking)
+    snapshot = estimated(names, lacking, settings=replace(SETTINGS, octaves=octaves))
     off = deviations(snapshot)
     assert np.isfinite(off).all()
     assert np.abs(off).max() < 4
@@ -95,15 +96,17 @@ def test_noise_is_right_where_channels_lack_samples(
     assert snapshot.n_dropped < 2 * N_PARTS
 
 
-def test_segments_with_transients_are_left_out_of_every_set() -> None:
+@pytest.mark.parametrize("octaves", [False, True])
+def test_segments_with_transients_are_left_out_of_every_set(octaves: bool) -> None:
+    settings = replace(SETTINGS, octaves=octaves)
     arrays = sensors("ABC", NEVER_TOGETHER, 1)
     for second in range(5, 800, 40):  # on 5 % of the segments, of each set
         at = int(second * RATE)
         for each in arrays.values():
             each[at : at + 3] += 3e4
     recording = recording_of_arrays(arrays, RATE)
-    with_them = deviations(estimate([recording], SETTINGS))
-    snapshot = estimate([recording], replace(SETTINGS, reject=True))
+    with_them = deviations(estimate([recording], settings))
+    snapshot = estimate([recording], replace(settings, reject=True))
     assert np.abs(with_them).max() > 20
     off = deviations(snapshot)
     assert np.abs(off).max() < 4
@@ -112,6 +115,36 @@ def test_segments_with_transients_are_left_out_of_every_set() -> None:
     assert snapshot.left_out[Reason.TRANSIENT] >= 40
     assert snapshot.left_out[Reason.GAP] < 2 * N_PARTS
     assert n_all == snapshot.n_dropped
+
+
+def test_octaves_have_the_channels_that_are_there() -> None:
+    octaves = replace(SETTINGS, octaves=True)
+    whole = estimated("ABC", {}, settings=octaves)
+    lost = estimated("ABC", {"A2": [1]}, settings=octaves)
+    assert len(lost.octaves) >= len(whole.octaves) - 1 > 2
+    assert lost.octaves[0].low == 0
+    left_out = [sum(octave.left_out.values()) for octave in lost.octaves]
+    assert max(left_out[-2:]) <= 4
+    assert left_out[0] > 4  # too few averages of the set
+    few = lost.results["three-sensor"].cov[-20:-2].mean(axis=0)
+    all_of_it = whole.results["three-sensor"].cov[-20:-2].mean(axis=0)
+    wider = few / all_of_it
+    assert np.median(wider) < 1.05
+    assert 1.1 < wider[2] < 1.3  # √(4/3) without a quarter
+    never = estimated("ABC", NEVER_TOGETHER, settings=octaves)
+    assert np.isfinite(never.results["three-sensor"].noise_psd[1:-1]).all()
+    assert never.diagnostics.untested is Untested.INCOMPLETE
+    assert len(never.octaves) > 2
+
+
+def test_octaves_of_few_complete_segments_are_those_of_the_sets() -> None:
+    arrays = sensors("ABC", NEVER_TOGETHER, 1)
+    for column in (arrays["A"][:, 2], arrays["B"][:, 0]):
+        column[2 * PART - 100 : 2 * PART + 100] = 0.1  # some seconds that all channels have
+    snapshot = estimate([recording_of_arrays(arrays, RATE)], replace(SETTINGS, octaves=True))
+    assert len(snapshot.octaves) > 2
+    assert np.isfinite(snapshot.results["three-sensor"].noise_psd[1:-1]).all()
+    assert sum(snapshot.left_out.values()) == snapshot.n_dropped > 4
 
 
 def test_a_live_estimate_has_them_too(tmp_path: Path) -> None:

@@ -93,6 +93,36 @@ def test_a_gap_excludes_the_segments_and_filter_lengths_it_touches() -> None:
         assert psd == pytest.approx(1, rel=0.1)
 
 
+def test_segments_that_some_channels_have_count_for_these() -> None:
+    samples = noise(60_000, 3)
+    given, present = samples.copy(), np.ones(samples.shape, dtype=bool)
+    present[20_000:40_000, 1] = False
+    given[~present] = np.nan
+    pieces = MultiResolution(SETTINGS, 3, n_stages=4)
+    for some in np.array_split(np.arange(len(given)), 37):
+        pieces.add(given[some], present[some])
+    assert list(pieces.sets.spectra) == [(0, 2)]
+    alone = MultiResolution(SETTINGS, 2, n_stages=4)
+    absent = ~present[:, 1]
+    alone.add(np.where(absent[:, None], samples[:, [0, 2]], np.nan), absent)
+    both = pieces.bands(columns=(0, 2))
+    n_all = [band.n_segments for band in ladder(samples, 4).bands()]
+    for band, own, whole, n in zip(both, alone.bands(), pieces.bands(), n_all, strict=True):
+        # the filter needs no samples of the absent channel: a few segments more at each end
+        assert 0 <= band.n_segments - own.n_segments <= 4
+        assert band.n_segments + whole.n_segments == n
+        psd = np.einsum("fpp->fp", band.csm).real[1:-1].mean() * 50
+        assert psd == pytest.approx(1, rel=0.1)
+    shared = pieces.bands(columns=(0, 2), depth=5)
+    assert shared[0].frequencies[0] > 0.2 * shared[0].settings.sampling_rate
+    twice = MultiResolution.like(pieces)
+    twice.merge(pieces)
+    twice.merge(pieces)
+    for one, two in zip(both, twice.bands(columns=(0, 2)), strict=True):
+        assert two.n_segments == 2 * one.n_segments
+        np.testing.assert_allclose(two.csm, one.csm, rtol=1e-12)
+
+
 def test_self_noise_over_three_decades() -> None:
     rng = np.random.default_rng(3)
     n = 400_000
@@ -132,7 +162,7 @@ def test_invalid_arguments_are_refused() -> None:
     spectra = MultiResolution(SETTINGS, 2, n_stages=2)
     with pytest.raises(EstimatorError, match="expected"):
         spectra.add(noise(100, 3))
-    with pytest.raises(EstimatorError, match="completeness"):
+    with pytest.raises(EstimatorError, match="presence"):
         spectra.add(noise(100), np.ones(99, dtype=bool))
 
 

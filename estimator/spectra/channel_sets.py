@@ -16,11 +16,8 @@ from estimator.spectra.segment_rejection import SelectedSpectra
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    FloatArray = NDArray[np.float64]
-    BoolArray = NDArray[np.bool_]
-    IntArray = NDArray[np.int64]
+    from estimator.spectra.segment_rejection import RejectionSettings
+    from estimator.types import BoolArray, FloatArray, IntArray
 
 MOST_SETS = 16
 
@@ -33,12 +30,15 @@ class ChannelSets:
     welch : WelchSettings
     short : float
         Share of a segment up to which missing samples are a short gap, and no concern here.
-    reject : bool
-        Whether segments with transients are left out, each set by segments of its own.
+    rejection : RejectionSettings, optional
+        Criteria for segments with transients, which are left out of each set by its own segments;
+        default: none is.
     """
 
-    def __init__(self, welch: WelchSettings, *, short: float, reject: bool = False) -> None:
-        self._welch, self._short, self._reject = welch, short, reject
+    def __init__(
+        self, welch: WelchSettings, *, short: float, rejection: RejectionSettings | None = None
+    ) -> None:
+        self._welch, self._short, self._rejection = welch, short, rejection
         self._sums: dict[tuple[int, ...], CrossSpectra | SelectedSpectra] = {}
 
     @property
@@ -60,12 +60,21 @@ class ChannelSets:
         tested = (each for each in self._sums.values() if isinstance(each, SelectedSpectra))
         return sum(each.counts.total() for each in tested)
 
+    def merge(self, other: ChannelSets) -> None:
+        """Add the segments that count in another recording; these are not judged again."""
+        for columns, spectra in other.spectra.items():
+            before = self._sums.get(columns)
+            known = CrossSpectra(self._welch, len(columns), threads=1)
+            if before is not None:
+                known = before if isinstance(before, CrossSpectra) else before.spectra()
+            self._sums[columns] = known + spectra
+
     def take(
         self, samples: FloatArray, present: BoolArray, clipped: BoolArray | None, starts: IntArray
     ) -> IntArray:
         """Take the segments at `starts` that some channels have whole; return which.
 
-        `present` has the shape of `samples`. The first `MOST_SETS` sets of channels count.
+        `present` has the shape of `samples`. Only the first `MOST_SETS` sets of channels are taken.
         """
         groups: dict[tuple[int, ...], list[int]] = {}
         for start in starts.tolist():
@@ -84,6 +93,6 @@ class ChannelSets:
         return np.sort(np.array([start for at in groups.values() for start in at], np.int64))
 
     def _new(self, n_channels: int) -> CrossSpectra | SelectedSpectra:
-        if self._reject:
-            return SelectedSpectra(self._welch, n_channels)
+        if self._rejection is not None:
+            return SelectedSpectra(self._welch, n_channels, rejection=self._rejection)
         return CrossSpectra(self._welch, n_channels, threads=1)
