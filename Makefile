@@ -28,7 +28,7 @@ test: $(VENV)/.installed-dev  ## the tests but the long ones; three at a time on
 	$(BIN)/pytest -n 3
 
 test-long: $(VENV)/.installed-dev  ## the tests that are studies, endurance or whole sessions
-	$(BIN)/pytest -n 4 -m long
+	$(BIN)/pytest -n 3 -m long
 
 peers:  ## compile the program in Rust that the tests talk to; kept in the user's cache
 	cargo build --quiet --manifest-path $(PEER)/Cargo.toml --target-dir $(PEER_CACHE)
