@@ -2,12 +2,12 @@
 
 Theory of operation
 -------------------
-One loop looks at the file again and again. Each look takes what the recorder has committed since;
-where a new segment is complete, the estimate is made again. The choice of the dimension of the
-motion takes seconds: it is made again beside the looks, in a thread. Looks and estimates are
-throttled, so that a bench box stays free to record. When the recording is closed, the whole of it
-is estimated once more: that is the result. A recorder that ends without closing its file ends the
-loop with `RecordingLeftOpenError`.
+One loop looks at the file again and again, at the states of the sensors each time. Once enough for
+the next estimate is there, the segments are taken together, and the estimate is made again. The
+choice of the dimension of the motion takes seconds: it is made again beside the looks, in a thread.
+Looks and estimates are throttled, so that a bench box stays free to record. When the recording is
+closed, the whole of it is estimated once more: that is the result. A recorder that ends without
+closing its file ends the loop with `RecordingLeftOpenError`.
 """
 
 from __future__ import annotations
@@ -218,8 +218,8 @@ def follow(
             # Asked before: what it wrote last is seen below.
             left_open = known.ended and not is_continued(recording)
             recording.refresh()
-            is_due = looks.is_due and estimates.is_due and estimation.lacking(wanted) <= 0.0
-            if is_due or is_left(recording) or recording.closed:
+            is_ready = estimates.is_due and estimation.lacking(wanted) <= 0.0
+            if (looks.is_due and (is_ready or is_left(recording))) or recording.closed:
                 with looks, _usual_cost(estimation, looks):
                     if not _is_updated(estimation, observer, cancelled):
                         return None
