@@ -198,7 +198,10 @@ def _with_neighbours(
     steps = [np.diff(each[rows], prepend=-1) != 0 for each in (blocks, n_dims)]
     number = np.cumsum(steps[0] | steps[1]) - 1
     psd = given.psd[rows[:, None], columns]
-    matrix = given.matrix[rows[:, None, None], columns[:, None], columns]
+    matrix = given.matrix
+    if len(rows) < len(found.flags) or len(columns) < len(sensor):
+        matrix = matrix[rows[:, None, None], columns[:, None], columns]
+    del given  # as large as all averages
     rest, _ = unpredicted(
         matrix,
         dims=live,
@@ -206,7 +209,8 @@ def _with_neighbours(
     )
     scale = _scale(psd, rest * psd, number, n_effective)
     amplitude = np.sqrt(psd / scale)
-    matrix = matrix * amplitude[:, :, None] * amplitude[:, None, :]
+    matrix *= amplitude[:, :, None]
+    matrix *= amplitude[:, None, :]
     share = found.noise_psd[rows[:, None], columns] / scale
     scatter = found.cumulants[0][rows[:, None], columns] / scale**2
     unresolved = unresolved_blocks(

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import enum
 import math
-from dataclasses import dataclass
 from typing import ClassVar
+
+from estimator.records import Record, record
 
 
 class Level(enum.StrEnum):
@@ -91,8 +92,8 @@ class Untested(enum.StrEnum):
     """At no frequency is the cross-spectral matrix finite and regular."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Advice:
+@record
+class Advice(Record):
     """Advice on a test; each kind is a subclass.
 
     Attributes
@@ -112,7 +113,7 @@ class Advice:
     band: tuple[float, float] | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class NoSignal(Advice):
     """Channels of one sensor have no power, or a constant count.
 
@@ -131,7 +132,7 @@ class NoSignal(Advice):
     share_of_frequencies: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Copies(Advice):
     """Channels repeat others sample for sample.
 
@@ -148,7 +149,7 @@ class Copies(Advice):
     share_of_frequencies: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class NoSharedMotion(Advice):
     """A sensor records none of the motion that others share.
 
@@ -171,14 +172,14 @@ class NoSharedMotion(Advice):
     for_part: bool = False
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class TooFewSensors(Advice):
     """Fewer than three sensors, `sensors`, have a signal of their own."""
 
     kind: ClassVar[AdviceKind] = AdviceKind.TOO_FEW_SENSORS
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class MissingChannels(Advice):
     """Channels of `sensors` are missing, so that fewer than three sensors are complete.
 
@@ -192,7 +193,7 @@ class MissingChannels(Advice):
     whole_sensors: tuple[int, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class TooFewDimensions(Advice):
     """A model of fewer dimensions than the sensors sense does not explain the averages.
 
@@ -215,7 +216,7 @@ class TooFewDimensions(Advice):
     worst_band: tuple[float, float]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class ModelMisfit(Advice):
     """One common motion does not explain the averages.
 
@@ -254,7 +255,7 @@ class ModelMisfit(Advice):
     is_wrong: bool
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class MotionAcross(Advice):
     """Sensors compared by fewer than three channels do not measure motion across these.
 
@@ -277,7 +278,7 @@ class MotionAcross(Advice):
     added_by_one_degree: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class MissingDimension(Advice):
     """Motion is found in fewer dimensions than the sensors sense; in the others it is weaker.
 
@@ -298,7 +299,7 @@ class MissingDimension(Advice):
     condition: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class NearlySingular(Advice):
     """The cross-spectral matrix between two sensors is nearly singular.
 
@@ -312,7 +313,7 @@ class NearlySingular(Advice):
     condition: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class WeakMotion(Advice):
     """The motion is weaker than the noise in every channel.
 
@@ -326,7 +327,7 @@ class WeakMotion(Advice):
     snr: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class SwappedChannels(Advice):
     """Two channels of the second of `sensors` are swapped.
 
@@ -340,7 +341,7 @@ class SwappedChannels(Advice):
     channels: tuple[tuple[int, int], ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Rotated(Advice):
     """Two sensors have different orientations.
 
@@ -361,7 +362,7 @@ class Rotated(Advice):
     error_deg: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class NotOrthogonal(Advice):
     """Channels of one of two sensors are not at right angles.
 
@@ -375,7 +376,7 @@ class NotOrthogonal(Advice):
     deviation_deg: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class ReversedPolarity(Advice):
     """A channel has the opposite sign of its counterpart.
 
@@ -390,7 +391,7 @@ class ReversedPolarity(Advice):
     counterpart: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Gain(Advice):
     """A channel's gain differs from that of its counterpart.
 
@@ -408,7 +409,7 @@ class Gain(Advice):
     ratio: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Delay(Advice):
     """One sensor lags another.
 
@@ -425,7 +426,7 @@ class Delay(Advice):
     delay_samples: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class UnequalResponses(Advice):
     """Responses of `sensors` differ from those of others: motion leaks at the edges of segments.
 
@@ -452,7 +453,7 @@ class UnequalResponses(Advice):
     unproven: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class SharedNoise(Advice):
     """Pairs of channels, of one sensor or of two, share noise.
 
@@ -490,7 +491,7 @@ class SharedNoise(Advice):
         return max(known, default=0.0)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class DisturbedSegments(Advice):
     """Single segments differ from all others beyond their common motion.
 
@@ -513,7 +514,7 @@ class DisturbedSegments(Advice):
     channel: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class NoiseChanges(Advice):
     """The noise of a channel differs between parts of the recording.
 

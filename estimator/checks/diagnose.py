@@ -15,7 +15,11 @@ import numpy as np
 
 from estimator.checks.advice import DisturbedSegments, Level, NoiseChanges, Untested
 from estimator.checks.band import BandDiagnosis
-from estimator.checks.relative_response import RelativeResponse, relative_response
+from estimator.checks.relative_response import (
+    PairProducts,
+    RelativeResponse,
+    relative_response,
+)
 from estimator.checks.rules import advise
 from estimator.checks.shared_motion import (
     CanonicalCoherence,
@@ -30,7 +34,7 @@ from estimator.checks.stability import Stability, stability
 from estimator.errors import InsufficientDataError
 from estimator.likelihood import fisher
 from estimator.likelihood.dimension import bands
-from estimator.likelihood.factor_analysis import Maximum, maximise
+from estimator.likelihood.factor_analysis import Maxima, Maximum, joined
 from estimator.likelihood.goodness_of_fit import (
     HANN_HALF,
     REJECT,
@@ -45,6 +49,7 @@ from estimator.likelihood.maximum_likelihood import standard_error
 from estimator.median import median_of_columns
 from estimator.self_noise.coherency import (
     Presence,
+    blocks,
     check_averages,
     check_dims,
     check_frequency,
@@ -178,6 +183,7 @@ def diagnose(
     neighbours: FloatArray | None = None,
     vertical: int | None = None,
     course: SegmentCourse | None = None,
+    maxima: Maxima | None = None,
 ) -> Diagnostics:
     """Diagnose a huddle test.
 
@@ -205,6 +211,8 @@ def diagnose(
     course : SegmentCourse, optional
         Spectra of single segments, all channels: reveal disturbances and changes, for which the
         tests are then corrected.
+    maxima : Maxima, optional
+        Fits of the same matrices, which are not kept for others.
 
     Returns
     -------
@@ -228,23 +236,24 @@ def diagnose(
     )
     there = presence(given, dims)
     part = given.part(list(there.channels))
-    matrix = testable(part, frequency)
     condition = np.full((len(csm), len(pairs)), np.nan)
     for one, two in combinations(range(len(there.sensors)), 2):
         pair = pairs.index((there.sensors[one], there.sensors[two]))
         condition[:, pair] = _condition(part.matrix, there.dims, one, two)
     d = max(there.dims, default=max(dims))
     q = d if n_factors is None else n_factors
-    fit = _fit(matrix, there, d, n_effective)
-    tested = fit if q == d else _fit(matrix, there, q, n_effective)
+    maxima = maxima or Maxima()
+    fit = _fit(part, frequency, there, d, n_effective=n_effective, maxima=maxima)
+    tested = fit
+    if q != d:
+        tested = _fit(part, frequency, there, q, n_effective=n_effective, maxima=maxima)
     model, untested = _test(tested, there, n_effective, len(csm))
     snr, lost = np.full((2, len(csm), sum(dims)), np.nan)
     if isinstance(fit, Maximum):
         error = standard_error(fit, n_effective=n_effective)
         snr = there.spread(np.where(error < fit.psi, 1 / fit.psi - 1, np.nan), sum(dims))
         lost = there.spread((error >= fit.psi).astype(np.float64), sum(dims))
-    canonical = CanonicalCoherence(matrix)
-    del matrix  # as large as all averages
+    canonical = CanonicalCoherence(part.matrix, part.valid & (frequency > 0))
     dimension = significant_dimensions(canonical, there.dims, n_effective)
     number = bands(frequency)
     insides = [number == band for band in sorted(set(number.tolist()))]
@@ -354,19 +363,36 @@ def _least(values: FloatArray) -> FloatArray:
 def _condition(matrix: ComplexArray, dims: tuple[int, ...], j: int, k: int) -> FloatArray:
     """Return the condition number of the coherency between two sensors, shape (n_freqs,)."""
     a, b = (slice(sum(dims[:sensor]), sum(dims[: sensor + 1])) for sensor in (j, k))
-    singular = np.linalg.svd(matrix[:, a, b], compute_uv=False)
+    if min(dims[j], dims[k]) == 1:  # of one singular value, the norm
+        singular = np.linalg.norm(matrix[:, a, b], axis=(1, 2))[:, None]
+    else:
+        singular = np.linalg.svd(matrix[:, a, b], compute_uv=False)
     least = singular[:, -1]
     return np.where(least > 0, singular[:, 0] / np.where(least > 0, least, 1.0), np.inf)
 
 
-def _fit(matrix: ComplexArray, there: Presence, q: int, n_effective: float) -> Maximum | Untested:
+def _fit(
+    part: Coherency,
+    frequency: FloatArray,
+    there: Presence,
+    q: int,
+    *,
+    n_effective: float,
+    maxima: Maxima,
+) -> Maximum | Untested:
     """Fit motion of q dimensions, or return why this is impossible."""
     if len(there.sensors) < 3:
         return Untested.TOO_FEW_SENSORS
-    if n_effective <= matrix.shape[1]:
+    n_channels = part.psd.shape[1]
+    if n_effective <= n_channels:
         return Untested.TOO_FEW_AVERAGES
     try:
-        return maximise(matrix, q)
+        return joined(
+            [
+                maxima.maximise(testable(part.block(some), frequency[some]), q, last=True)
+                for some in blocks(len(frequency), n_channels)
+            ]
+        )
     except InsufficientDataError:
         return Untested.TOO_FEW_CHANNELS
 
@@ -390,7 +416,7 @@ def _test(
     untested = None if np.isfinite(test.p_value).any() else Untested.SINGULAR
     if len(set(there.dims)) == 1 and fit.n_factors <= there.dims[0]:
         return test, untested
-    information = fisher.information(fit.eigenvectors[:, :, fit.n_factors :])
+    information = fisher.information(fit)
     degrees = test.degrees + (n_effective * np.linalg.eigvalsh(information) < 1).sum(axis=1)
     return ModelTest(test.statistic, degrees, p_values(degrees, test.statistic)), untested
 
@@ -408,6 +434,7 @@ def _responses(
     if len(there.channels) < csm.shape[1] and len(there.whole) > 1:
         csm = csm[np.ix_(range(len(csm)), there.channels, there.channels)]
         checked = coherency(csm, there.dims)
+    products = PairProducts(csm, there.dims)
     for first, second in combinations(range(len(there.sensors)), 2):
         pair = there.sensors[first], there.sensors[second]
         if not set(pair) <= set(there.whole):  # motion along a missing channel is unknown
@@ -422,6 +449,7 @@ def _responses(
                 vertical=vertical,
                 coherence=coherence,
                 checked=checked,
+                products=products,
             )
             found.append(replace(response, first=pair[0], second=pair[1]))
     return tuple(found)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from estimator.checks.shared_motion import (
 )
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.self_noise.coherency import (
+    blocks,
     check_dims,
     check_frequency,
     coherency,
@@ -31,6 +32,8 @@ from estimator.self_noise.coherency import (
 if TYPE_CHECKING:
     from estimator.self_noise.coherency import Coherency
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+
+_Numbers = TypeVar("_Numbers", "ComplexArray", "FloatArray")
 
 _NEAREST, _FARTHEST = 0.3, 1.2  # rivals that are examined: cycles from the delay, either way
 _STEP = 0.02  # cycles; the maximum is refined by a parabola
@@ -90,6 +93,7 @@ def _largest(omega: FloatArray, weighted: ComplexArray, *, start: float, step: f
     return at - (after - before) ** 2 / (8 * bend) if bend < 0 else at
 
 
+_PRODUCT_BYTES = 1 << 24  # of products of sensors with all others that are kept
 _STEPS = 4  # steps of least squares from the coarse delay
 _PARTS = 8  # parts of the band, for the scatter of the angles
 _MIN_PARTS = 4
@@ -173,6 +177,7 @@ def relative_response(
     vertical: int | None = None,
     coherence: CanonicalCoherence | None = None,
     checked: Coherency | None = None,
+    products: PairProducts | None = None,
 ) -> RelativeResponse:
     """Return rotation, gains, non-orthogonality and delay of one sensor against another.
 
@@ -197,6 +202,8 @@ def relative_response(
         Canonical coherence of the same matrix, to avoid its computation for several pairs.
     checked : Coherency, optional
         Coherency of the same matrix, likewise.
+    products : PairProducts, optional
+        Of the same matrix, likewise.
 
     Returns
     -------
@@ -258,18 +265,29 @@ def relative_response(
     inside = np.flatnonzero(weight)
     f, weight = frequency[inside], weight[inside]
     power = _power(csm, dims, first)[inside]
-    S_ik, S_jk = (_part(csm, inside, channels, rest) / power[:, None, None] for channels in own)
-    delay, delay_error, is_ambiguous = _delay(f, weight, S_ik, S_jk)
-    S_jk = S_jk * np.exp(2j * np.pi * f * delay)[:, None, None]
-    matrix = _transfer(weight, S_ik, S_jk)
+    if products is None or len(rest) == d:
+        S_ik, S_jk = (_part(csm, inside, channels, rest) / power[:, None, None] for channels in own)
+        transfer = _over(S_jk, S_ik)
+    else:
+        transfer = _quotient(*(each[inside] for each in products.of(first, second)))
+    delay, delay_error, is_ambiguous = _delay(f, weight, transfer)
     horizontal = _horizontal_channels(d, vertical)
-    rotation, reversed_channels = _rotation(matrix)
+    starts = _parts(weight)
+    late = np.exp(2j * np.pi * f * delay)
+    right, left = (
+        _weighted_sums(csm, inside, channels, by, starts)[:, :, rest]
+        for channels, by in zip(own, (weight / power, weight / power * late), strict=True)
+    )
+    matrix = _over(left.sum(axis=0), right.sum(axis=0)).real
+    # one after the other without a part of the band, for the scatter
+    without = _over(_others(left), _others(right)).real if len(starts) > 1 else matrix[None][:0]
+    rotation, is_reversed = (found[0] for found in _rotations(matrix[None]))
     gains, between = _gains_and_skew(matrix)
-    rotation_deg, horizontal_deg = _angles(matrix, horizontal)
-    without = [_transfer(weight[~part], S_ik[~part], S_jk[~part]) for part in _parts(weight)]
-    gain_errors = _jackknife([_gains_and_skew(each)[0] for each in without], gains)
-    skew_errors = _jackknife([_gains_and_skew(each)[1] for each in without], between)
-    turned = _jackknife([np.rad2deg(_rotation(each)[0] - rotation) for each in without], rotation)
+    rotation_deg, horizontal_deg = _angles(matrix[None], horizontal)[0].tolist()
+    gains_without, between_without = _gains_and_skew(without)
+    gain_errors = _jackknife(gains_without, gains)
+    skew_errors = _jackknife(between_without, between)
+    turned = _jackknife(np.rad2deg(_rotations(without)[0] - rotation), rotation)
     return RelativeResponse(
         first=first,
         second=second,
@@ -279,13 +297,13 @@ def relative_response(
         rotation=rotation,
         rotation_deg=rotation_deg,
         horizontal_deg=float("nan") if horizontal is None else horizontal_deg,
-        angle_error_deg=_angle_error(weight, S_ik, S_jk, horizontal),
+        angle_error_deg=_angle_error(len(weight), left, right, without, horizontal),
         rotation_error_deg=float(np.linalg.norm(turned) / math.sqrt(2)),
         gains=gains,
         gain_errors=gain_errors,
         nonorthogonality_deg=float(np.abs(between).max()),
         nonorthogonality_error_deg=float(np.linalg.norm(skew_errors)),
-        reversed_channels=reversed_channels,
+        reversed_channels=tuple(np.flatnonzero(is_reversed).tolist()),
         delay=delay,
         delay_error=delay_error,
         is_ambiguous=is_ambiguous,
@@ -293,11 +311,99 @@ def relative_response(
     )
 
 
+class PairProducts:
+    """Sums of ``S_jk S_ik*`` and of ``S_ik S_ik*`` over all other sensors k, by pairs of i and j.
+
+    Those of some sensors i with all j are made together, and kept until others are asked for.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+    dims : tuple of int
+        Channels of each sensor.
+    """
+
+    def __init__(self, csm: ComplexArray, dims: tuple[int, ...]) -> None:
+        self._csm, self._dims = csm, dims
+        self._first = np.cumsum([0, *dims])
+        self._made: dict[int, tuple[ComplexArray, ComplexArray]] = {}
+
+    def of(self, first: int, second: int) -> tuple[ComplexArray, ComplexArray]:
+        """Return both sums for sensors i and j, shapes (n_freqs, d_j, d_i) and (n_freqs, d_i, d_i).
+
+        Neither has a part of the channels of i and j themselves.
+        """
+        if first not in self._made:
+            self._made = self._make(first)
+        crossed, inner = self._made[first]
+        return crossed[:, self._first[second] : self._first[second + 1]], inner[:, second]
+
+    def _make(self, begin: int) -> dict[int, tuple[ComplexArray, ComplexArray]]:
+        n_freqs, p = self._csm.shape[:2]
+        each = 16 * n_freqs * (p + len(self._dims) * max(self._dims)) * max(self._dims)
+        some = range(begin, min(begin + max(1, _PRODUCT_BYTES // each), len(self._dims)))
+        made = {
+            i: (
+                np.empty((n_freqs, p, self._dims[i]), np.complex128),
+                np.empty((n_freqs, len(self._dims), self._dims[i], self._dims[i]), np.complex128),
+            )
+            for i in some
+        }
+        sensor = np.repeat(np.arange(len(self._dims)), self._dims)
+        alike = sensor[:, None] == sensor
+        for block in blocks(n_freqs, p):
+            part = np.where(alike, 0.0, self._csm[block])
+            for i, (crossed, inner) in made.items():
+                mine = part[:, self._first[i] : self._first[i + 1]]
+                with np.errstate(invalid="ignore"):  # what is not known is not asked for
+                    crossed[block] = part @ mine.conj().swapaxes(1, 2)
+                    inner[block] = self._without_each(mine)
+        return made
+
+    def _without_each(self, mine: ComplexArray) -> ComplexArray:
+        """Return sums over all sensors but each: of those before and after it, without cancelling.
+
+        Shape (n_freqs, n_sensors, d, d).
+        """
+        squares = mine[:, :, None] * mine[:, None].conj()
+        of_each = np.moveaxis(np.add.reduceat(squares, self._first[:-1], axis=3), 3, 1)
+        found = np.zeros_like(of_each)
+        found[:, 1:] += np.cumsum(of_each, axis=1)[:, :-1]
+        found[:, :-1] += np.cumsum(of_each[:, ::-1], axis=1)[:, -2::-1]
+        return found
+
+
+def _weighted_sums(
+    csm: ComplexArray,
+    inside: IntArray,
+    channels: IntArray,
+    weight: FloatArray | ComplexArray,
+    starts: IntArray,
+) -> ComplexArray:
+    """Return the weighted sums of some rows over each part of the band, (n_parts, d, n_channels).
+
+    By a product of matrices where no other frequency is among those `inside`.
+    """
+    d, p = len(channels), csm.shape[1]
+    low, high = int(inside[0]), int(inside[-1]) + 1
+    if high - low > len(inside):
+        rows = csm[inside[:, None], channels]
+    else:
+        rows = csm[low:high, channels[0] : channels[-1] + 1]
+    part = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(inside)))
+    by_part = np.zeros((len(starts), len(inside)), weight.dtype)
+    by_part[part, np.arange(len(inside))] = weight
+    flat = rows.reshape(len(inside), d * p)
+    if np.iscomplexobj(by_part):
+        found = by_part @ flat
+    else:
+        found = (by_part @ flat.view(np.float64)).view(np.complex128)
+    return np.asarray(found.reshape(len(starts), d, p))
+
+
 def _part(csm: ComplexArray, inside: IntArray, rows: IntArray, columns: IntArray) -> ComplexArray:
-    """Return rows and columns at some frequencies, which are the fastest axis in memory."""
-    part = np.empty((len(rows), len(columns), len(inside)), np.complex128).transpose(2, 0, 1)
-    part[...] = csm[inside[:, None, None], rows[:, None], columns]
-    return part
+    """Return rows and columns at some frequencies."""
+    return np.asarray(csm[inside[:, None, None], rows[:, None], columns])
 
 
 def _power(csm: ComplexArray, dims: tuple[int, ...], sensor: int) -> FloatArray:
@@ -306,54 +412,77 @@ def _power(csm: ComplexArray, dims: tuple[int, ...], sensor: int) -> FloatArray:
     return np.asarray(csm[:, channels, channels].real.mean(axis=1))
 
 
-def _transfer(weight: FloatArray, S_ik: ComplexArray, S_jk: ComplexArray) -> FloatArray:
-    """Return the band average of ``S_jk S_ik^-1``, real part, shape (d, d)."""
-    left = np.einsum("f,fab->ab", weight, S_jk)
-    right = np.einsum("f,fab->ab", weight, S_ik)
-    return np.asarray((left @ np.linalg.pinv(right)).real)
+def _over(S_jk: ComplexArray, S_ik: ComplexArray) -> ComplexArray:
+    """Return ``S_jk S_ik^-1``, by least squares if S_ik has more columns than rows.
+
+    Of single matrices or stacks of them.
+    """
+    if S_ik.shape[-1] > S_ik.shape[-2]:
+        adjoint = S_ik.conj().swapaxes(-1, -2)
+        S_jk, S_ik = S_jk @ adjoint, S_ik @ adjoint
+    return _quotient(S_jk, S_ik)
+
+
+def _quotient(S_jk: ComplexArray, S_ik: ComplexArray) -> ComplexArray:
+    """Return ``S_jk S_ik^-1`` of square matrices."""
+    try:
+        found = np.linalg.solve(S_ik.swapaxes(-1, -2), S_jk.swapaxes(-1, -2)).swapaxes(-1, -2)
+    except np.linalg.LinAlgError:  # a singular one
+        found = S_jk @ np.linalg.pinv(S_ik)
+    return np.asarray(found)
+
+
+def _sums(values: _Numbers, starts: IntArray) -> _Numbers:
+    """Return the sums over each part of the band."""
+    found: _Numbers = np.add.reduceat(values, starts, axis=0)
+    return found
+
+
+def _others(sums: _Numbers) -> _Numbers:
+    """Return the sums over all parts but each."""
+    found: _Numbers = sums.sum(axis=0) - sums
+    return found
 
 
 def _gains_and_skew(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the lengths of the rows, and their deviations from right angles in degrees."""
-    gains = np.linalg.norm(matrix, axis=1)
-    directions = matrix / gains[:, None]
-    between = np.rad2deg(np.arcsin(np.clip(np.triu(directions @ directions.T, 1), -1, 1)))
-    return gains, np.asarray(between)
+    gains = np.linalg.norm(matrix, axis=-1)
+    directions = matrix / gains[..., None]
+    cosines = np.triu(directions @ directions.swapaxes(-1, -2), 1)
+    return gains, np.asarray(np.rad2deg(np.arcsin(np.clip(cosines, -1, 1))))
 
 
-def _delay(
-    f: FloatArray, weight: FloatArray, S_ik: ComplexArray, S_jk: ComplexArray
-) -> tuple[float, float, bool]:
+def _delay(f: FloatArray, weight: FloatArray, transfer: ComplexArray) -> tuple[float, float, bool]:
     """Return the lag of the second sensor and its error in s, and whether its cycle is ambiguous.
 
     It is from a grid, refined by the phase.
     """
-    transfer = S_jk @ np.linalg.pinv(S_ik)
     known = np.isfinite(transfer).all(axis=(1, 2))
     f, weight, transfer = f[known], weight[known], transfer[known]
     delay = _coarse_delay(f, np.asarray(weight[:, None, None] * transfer, np.complex128))
+    flat, lever = transfer.reshape(len(f), -1), weight * f
     for _ in range(_STEPS):
-        aligned = transfer * np.exp(2j * np.pi * f * delay)[:, None, None]
-        mean = np.einsum("f,fab->ab", weight, aligned).real
-        phase = np.angle(np.einsum("ab,fab->f", mean, aligned))
-        delay -= float((weight * f) @ phase / ((weight * f) @ f) / (2 * np.pi))
-    without = [
-        np.atleast_1d((weight * f)[~part] @ phase[~part] / ((weight * f)[~part] @ f[~part]))
-        for part in _parts(weight)
-    ]
+        aligned = flat * np.exp(2j * np.pi * f * delay)[:, None]
+        phase = np.angle(aligned @ (weight @ aligned).real)
+        delay -= float(lever @ phase / (lever @ f) / (2 * np.pi))
+    starts = _parts(weight)
+    without: FloatArray = np.empty(0)
+    if len(starts) > 1:
+        without = _others(_sums(lever * phase, starts)) / _others(_sums(lever * f, starts))
     aligned = transfer * np.exp(2j * np.pi * f * delay)[:, None, None]
-    error = float(_jackknife(without, np.zeros(1))[0]) / (2 * np.pi)
+    error = float(_jackknife(without, np.zeros(()))) / (2 * np.pi)
     return delay, error, cycle_is_ambiguous(f, weight, aligned)
 
 
-def _parts(weight: FloatArray) -> list[BoolArray]:
-    """Return parts of the band of about equal weight, as masks; none with few frequencies."""
+def _parts(weight: FloatArray) -> IntArray:
+    """Return where parts of the band of about equal weight begin; one with few frequencies."""
     share = np.minimum(np.cumsum(weight) / weight.sum() * _PARTS, _PARTS - 1e-9).astype(np.int64)
-    parts = [share == number for number in sorted(set(share.tolist()))]
-    return parts if len(parts) >= _MIN_PARTS and len(weight) >= 2 * _PARTS else []
+    starts = np.flatnonzero(np.diff(share, prepend=-1))
+    enough = len(starts) >= _MIN_PARTS and len(weight) >= 2 * _PARTS
+    return starts if enough else starts[:1]
 
 
-def _jackknife(without: list[FloatArray], like: FloatArray) -> FloatArray:
+def _jackknife(without: FloatArray, like: FloatArray) -> FloatArray:
     """Return standard errors from estimates that leave out one part each; NaN without any."""
     n = len(without)
     if not n:
@@ -383,62 +512,73 @@ def _horizontal_channels(d: int, vertical: int | None) -> tuple[int, int] | None
     return (channels[0], channels[1]) if len(channels) == 2 else None
 
 
-def _rotation(matrix: FloatArray) -> tuple[FloatArray, tuple[int, ...]]:
-    """Return the nearest rotation and the reversed channels.
+def _rotations(matrices: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return the rotations nearest to matrices, (n, d, d), and the reversed channels, (n, d).
 
     Of the reversals that leave a proper rotation, the one with the smallest angle is chosen:
     sensors meant to be parallel are rarely rotated by more than a right angle.
     """
-    d = len(matrix)
-    directions = matrix / np.linalg.norm(matrix, axis=1)[:, None]
-    candidates = []
-    for code in range(2**d):
-        signs = 1.0 - 2.0 * ((code >> np.arange(d)) & 1)
-        u, _, v = np.linalg.svd(signs[:, None] * directions)
-        nearest = u @ v
-        if np.linalg.det(nearest) > 0:
-            candidates.append((float(np.trace(nearest)), signs, nearest))
-            if code == 0:  # no reversed channels
-                break
-    _, signs, nearest = max(candidates, key=lambda entry: entry[0])
-    return nearest, tuple(int(channel) for channel in np.flatnonzero(signs < 0))
+    directions = matrices / np.linalg.norm(matrices, axis=2)[:, :, None]
+    u, _, v = np.linalg.svd(directions)
+    nearest = np.asarray(u @ v)
+    is_reversed = np.zeros(matrices.shape[:2], np.bool_)
+    for number in np.flatnonzero(~(np.linalg.det(nearest) > 0)):
+        nearest[number], is_reversed[number] = _reversed(directions[number])
+    return nearest, is_reversed
 
 
-def _angles(matrix: FloatArray, horizontal: tuple[int, int] | None) -> tuple[float, float]:
-    """Return the angles of the rotation and of the first horizontal channel, degrees."""
-    rotation, turned_round = _rotation(matrix)
-    d = len(matrix)
-    sine = np.linalg.norm(rotation - rotation.T) / (2 * np.sqrt(2)) if d > 1 else 0.0
-    cosine = (np.trace(rotation) - (d - 2)) / 2 if d > 1 else 1.0
-    whole = float(np.rad2deg(np.arctan2(sine, cosine)))
-    if horizontal is None:
-        return whole, 0.0
-    one, two = horizontal
-    sign = -1.0 if one in turned_round else 1.0
-    return whole, float(np.rad2deg(np.arctan2(-sign * matrix[one, two], sign * matrix[one, one])))
+def _reversed(directions: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return the nearest rotation, and which channels are reversed, where some are."""
+    d = len(directions)
+    signs = 1.0 - 2.0 * ((np.arange(2**d)[:, None] >> np.arange(d)) & 1)
+    u, _, v = np.linalg.svd(signs[:, :, None] * directions)
+    nearest = u @ v
+    cosine = np.trace(nearest, axis1=1, axis2=2)
+    best = int(np.argmax(np.where(np.linalg.det(nearest) > 0, cosine, -np.inf)))
+    return nearest[best], signs[best] < 0
+
+
+def _angles(matrices: FloatArray, horizontal: tuple[int, int] | None) -> FloatArray:
+    """Return the angles of rotations and of the first horizontal channels, degrees, (n, 2)."""
+    rotation, is_reversed = _rotations(matrices)
+    n, d = len(matrices), matrices.shape[1]
+    sine, cosine = np.zeros(n), np.ones(n)
+    if d > 1:
+        sine = np.linalg.norm(rotation - rotation.swapaxes(1, 2), axis=(1, 2)) / (2 * np.sqrt(2))
+        cosine = (np.trace(rotation, axis1=1, axis2=2) - (d - 2)) / 2
+    first = np.zeros(n)
+    if horizontal is not None:
+        one, two = horizontal
+        sign = np.where(is_reversed[:, one], -1.0, 1.0)
+        first = np.arctan2(-sign * matrices[:, one, two], sign * matrices[:, one, one])
+    return np.asarray(np.rad2deg(np.column_stack([np.arctan2(sine, cosine), first])))
 
 
 def _angle_error(
-    weight: FloatArray,
-    S_ik: ComplexArray,
-    S_jk: ComplexArray,
+    n_freqs: int,
+    left: ComplexArray,
+    right: ComplexArray,
+    without: FloatArray,
     horizontal: tuple[int, int] | None,
 ) -> float:
     """Return the larger standard error of the two angles, degrees; NaN with few frequencies.
 
     By the scatter between parts of the band of equal weight. Where single frequencies weigh too
     much for that, as in microseism, by a jackknife that leaves out one part at a time.
+
+    Parameters
+    ----------
+    n_freqs : int
+    left, right : complex128, shape (n_parts, d, n_columns)
+        Sums of ``S_jk`` and ``S_ik`` over the parts.
+    without : float64, shape (n_parts, d, d)
+        Relative responses without each part; none with few frequencies.
+    horizontal : (int, int) or None
     """
-    parts = _parts(weight)
-    n = len(parts)
-    if len(weight) < 4 * _PARTS or not n:
+    n = len(without)
+    if n_freqs < 4 * _PARTS or not n:
         return math.nan
     whole = n == _PARTS
-    angles = np.array(
-        [
-            _angles(_transfer(weight[part], S_ik[part], S_jk[part]), horizontal)
-            for part in (parts if whole else [~part for part in parts])
-        ]
-    )
+    angles = _angles(_over(left, right).real if whole else without, horizontal)
     scatter = float(angles.std(axis=0, ddof=1).max())
     return scatter / math.sqrt(n) if whole else scatter * (n - 1) / math.sqrt(n)

@@ -61,18 +61,22 @@ class CanonicalCoherence:
     Parameters
     ----------
     csm : complex128, shape (n_freqs, n_channels, n_channels)
-        Coherency or cross-spectral matrix.
+        Coherency or cross-spectral matrix, of which no copy is made.
+    known : bool, shape (n_freqs,), optional
+        Frequencies that count; default: all.
 
     Attributes
     ----------
     usable : bool, shape (n_freqs,)
-        Whether the matrix is finite.
+        Whether the matrix is finite, and counts.
     """
 
-    def __init__(self, csm: ComplexArray) -> None:
-        self._n_freqs = len(csm)
-        self.usable: BoolArray = np.asarray(np.isfinite(csm).all(axis=(1, 2)))
-        self._csm = csm[self.usable]
+    def __init__(self, csm: ComplexArray, known: BoolArray | None = None) -> None:
+        self._n_freqs, self._csm = len(csm), csm
+        self.usable: BoolArray = np.ones(len(csm), np.bool_) if known is None else known.copy()
+        for some in blocks(*csm.shape[:2]):
+            self.usable[some] &= np.isfinite(csm[some]).all(axis=(1, 2))
+        self._rows = np.flatnonzero(self.usable)
         self._roots: dict[tuple[int, ...], ComplexArray] = {}
         self._found: dict[frozenset[tuple[int, ...]], FloatArray] = {}
 
@@ -100,17 +104,17 @@ class CanonicalCoherence:
         one, two = sorted((tuple(first), tuple(second)), key=len)
         if where is not None:
             found = np.zeros((self._n_freqs, len(one)))
-            rows = np.flatnonzero(where[self.usable])
-            at = np.flatnonzero(where & self.usable)
-            for some in blocks(len(rows), self._csm.shape[1]):
-                csm = self._csm[rows[some]]
-                roots = _inverse_root(csm, one), _inverse_root(csm, two)
-                found[at[some]] = _squares(csm, one, two, *roots)
+            rows = np.flatnonzero(where & self.usable)
+            for block in blocks(len(rows), self._csm.shape[1]):
+                some = rows[block]
+                roots = (_inverse_root(_part(self._csm, some, each, each)) for each in (one, two))
+                found[some] = _squares(_part(self._csm, some, one, two), *roots)
             return np.clip(found, 0.0, 1.0)
         pair = frozenset((one, two))
         if pair not in self._found:
             found = np.zeros((self._n_freqs, len(one)))
-            found[self.usable] = _squares(self._csm, one, two, self._root(one), self._root(two))
+            towards = _part(self._csm, self._rows, one, two)
+            found[self.usable] = _squares(towards, self._root(one), self._root(two))
             self._found[pair] = np.clip(found, 0.0, 1.0)
         return self._found[pair]
 
@@ -119,28 +123,30 @@ class CanonicalCoherence:
         if channels not in self._roots:
             while sum(each.nbytes for each in self._roots.values()) > ROOT_BYTES:
                 del self._roots[max(self._roots, key=len)]
-            self._roots[channels] = _inverse_root(self._csm, channels)
+            own = _part(self._csm, self._rows, channels, channels)
+            self._roots[channels] = _inverse_root(own)
         return self._roots[channels]
 
 
-def _inverse_root(csm: ComplexArray, channels: tuple[int, ...]) -> ComplexArray:
-    """Return the inverse root of a group's matrix, zero in directions without power."""
-    w, u = np.linalg.eigh(csm[:, np.array(channels)[:, None], channels])
+def _part(
+    csm: ComplexArray, rows: IntArray, one: tuple[int, ...], two: tuple[int, ...]
+) -> ComplexArray:
+    """Return the cross-spectra of two groups of channels at some frequencies."""
+    return csm[rows[:, None, None], np.array(one)[:, None], two]
+
+
+def _inverse_root(matrices: ComplexArray) -> ComplexArray:
+    """Return the inverse roots of matrices, zero in directions without power."""
+    w, u = np.linalg.eigh(matrices)
     alive = w > 1e-12 * w[:, -1:]
     root = np.where(alive, 1 / np.sqrt(np.where(alive, w, 1.0)), 0.0)
     return np.asarray((u * root[:, None, :]) @ u.conj().swapaxes(1, 2))
 
 
-def _squares(
-    csm: ComplexArray,
-    one: tuple[int, ...],
-    two: tuple[int, ...],
-    root_one: ComplexArray,
-    root_two: ComplexArray,
-) -> FloatArray:
+def _squares(towards: ComplexArray, root_one: ComplexArray, root_two: ComplexArray) -> FloatArray:
     """Return the squared singular values of the coherence of two groups, descending."""
     # Eigenvalues of the product are the squares, at half the cost of singular values.
-    whitened = root_one @ csm[:, np.array(one)[:, None], two] @ root_two
+    whitened = root_one @ towards @ root_two
     return np.asarray(np.linalg.eigvalsh(whitened @ whitened.conj().swapaxes(1, 2))[:, ::-1])
 
 

@@ -212,6 +212,7 @@ def stepwise(scores: Scores, level: float, groups: Sequence[IntArray]) -> IntArr
     int64, shape (n_chosen,), or None
         None if a few pairs or groups do not explain the scores.
     """
+    scores = scores.kept()
     n_tested = int(np.count_nonzero(scores.z))
     if not n_tested:
         return np.empty(0, np.int64)
@@ -317,7 +318,6 @@ def _effect(
     root = np.sqrt(psi)
     outer = root[:, :, None] * root[:, None, :]
     motion = np.clip(maximum.eigenvalues[rows] - 1, 0.0, None)
-    motion[:, maximum.n_factors :] = 0.0
     u = maximum.eigenvectors[rows]
     sound = outer * ((u * motion[:, None, :]) @ u.conj().swapaxes(1, 2) + np.eye(psi.shape[1]))
     shared: ComplexArray = sound.copy()

@@ -40,8 +40,8 @@ DISTURBED = 8.0
 """Residuals of a group from which a segment is disturbed, in standard deviations by the median."""
 MAX_DISTURBED = 0.2
 """Maximum share of disturbed segments; with more, the noise changes and no segment is excluded."""
-PAIR_BYTES = 1 << 26
-"""Bytes of products of pairs of channels with all others that exist together: 64 MB."""
+PAIR_BYTES = 1 << 24
+"""Bytes of products of pairs of channels with all others that exist together: 16 MB."""
 SIGNIFICANCE = 2.0
 """Standard errors by which scatter must exceed its expectation to be significant."""
 
@@ -232,11 +232,11 @@ class _Residuals:
         self, course: SegmentCourse, columns: IntArray, at: Maximum, groups: list[IntArray]
     ) -> None:
         self._spectra, self._columns, self._groups = course.spectra, columns, groups
-        vectors = at.eigenvectors
-        self._free = vectors[:, :, at.n_factors :]
-        self._fitted = np.einsum("fpm,fm,fpm->fp", vectors, at.eigenvalues, vectors.conj()).real
-        self.projector = self._free @ self._free.conj().swapaxes(1, 2)
-        self.n_channels = vectors.shape[1]
+        self._motion = at.eigenvectors
+        share = (np.abs(at.eigenvectors) ** 2 @ at.eigenvalues[:, :, None])[:, :, 0]
+        self._fitted = np.einsum("fpp->fp", at.rest).real + share
+        self.projector = at.projector
+        self.n_channels = at.psi.shape[1]
 
     def __iter__(self) -> Iterator[ComplexArray]:
         """Yield the residuals of each group, shape (n_segments, n_freqs, n_channels)."""
@@ -246,11 +246,12 @@ class _Residuals:
             for place, number in enumerate(group.tolist()):
                 x = self._spectra[:, self._columns[number]].astype(np.complex128)
                 x *= np.sqrt(self._fitted[number] / np.mean(np.abs(x) ** 2, axis=0))
-                residual[:, place] = x @ self._free[number].conj() @ self._free[number].T
+                motion = self._motion[number]
+                residual[:, place] = x - x @ motion.conj() @ motion.T
             yield residual
 
-    def covariances(self, divisions: Sequence[Sequence[IntArray]]) -> list[ComplexArray]:
-        """Return the mean products of channels over each part of several divisions.
+    def covariances(self, divisions: Sequence[Sequence[IntArray]]) -> list[FloatArray]:
+        """Return real parts of mean products of channels over each part of several divisions.
 
         Parameters
         ----------
@@ -259,16 +260,16 @@ class _Residuals:
 
         Returns
         -------
-        list of complex128, shape (n_parts, n_bins, n_channels, n_channels)
+        list of float64, shape (n_parts, n_bins, n_channels, n_channels)
         """
         shape = (len(self._columns), self.n_channels, self.n_channels)
-        found = [np.empty((len(parts), *shape), np.complex128) for parts in divisions]
+        found = [np.empty((len(parts), *shape)) for parts in divisions]
         for group, residual in zip(self._groups, self, strict=True):
             for parts, covariance in zip(divisions, found, strict=True):
                 for number, some in enumerate(parts):
                     part = residual[some]
                     products = np.matmul(part.transpose(1, 2, 0), part.swapaxes(0, 1).conj())
-                    covariance[number, group] = products / len(part)
+                    covariance[number, group] = products.real / len(part)
         return found
 
 
@@ -288,8 +289,8 @@ class _Parts:
     ----------
     parts : sequence of int64
         Segments of each.
-    covariance : complex128, shape (n_parts, n_freqs, n_channels, n_channels)
-        Of the residuals.
+    covariance : float64, shape (n_parts, n_freqs, n_channels, n_channels)
+        Of the residuals, its real part.
     projector : complex128, shape (n_freqs, n_channels, n_channels)
     n_effective : float
     correlation : float64, shape (n_freqs, n_freqs)
@@ -298,7 +299,7 @@ class _Parts:
     def __init__(
         self,
         parts: Sequence[IntArray],
-        covariance: ComplexArray,
+        covariance: FloatArray,
         projector: ComplexArray,
         n_effective: float,
         correlation: FloatArray,
@@ -309,7 +310,7 @@ class _Parts:
         self._averages = n_effective * len(parts) / sum(total / len(part) for part in parts)
         self._covariance = covariance
         self._inverse = fisher.covariance(np.abs(projector) ** 2)
-        diagonal = np.einsum("bfpp->bfp", self._covariance - projector).real
+        diagonal = np.einsum("bfpp->bfp", covariance) - np.einsum("fpp->fp", projector).real
         self._noise = np.einsum("fpq,bfq->bfp", self._inverse, diagonal)
 
     def scatter(self, groups: list[IntArray]) -> Scatter:
@@ -375,7 +376,7 @@ class _Parts:
         """Return the variance of pairs' scores, that for steady noise, and the information."""
         projector = self._projector
         with_noise = 2 * (projector[:, :, i].conj() * projector[:, :, j]).real
-        score = 2 * self._covariance[:, :, i, j].real
+        score = 2 * self._covariance[:, :, i, j]
         score -= np.einsum("bfp,fpa->bfa", self._noise, with_noise)
         own = 2 * (projector[:, i, j] ** 2 + projector[:, i, i] * projector[:, j, j]).real
         own -= np.einsum("fpa,fpq,fqa->fa", with_noise, self._inverse, with_noise)

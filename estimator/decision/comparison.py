@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.decision.decision_time import Margins, predict
-from estimator.decision.verdict import REMOVED_BY_TIME, Obstacle, Verdict
+from estimator.decision.verdict import MIN_AVERAGES, REMOVED_BY_TIME, Obstacle, Verdict
 from estimator.levels.bands import third_octaves
 
 if TYPE_CHECKING:
@@ -31,9 +31,6 @@ if TYPE_CHECKING:
 
     from estimator.decision.verdict import Prediction
     from estimator.types import BoolArray, FloatArray
-
-MIN_AVERAGES = 20.0
-"""Averages below which the far tails of the interval have not been verified by simulation."""
 
 
 def joint_quantile(n_bands: int) -> float:

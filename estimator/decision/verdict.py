@@ -45,6 +45,8 @@ class Obstacle(enum.StrEnum):
     """The limit lies within the interval: a longer recording narrows it."""
 
 
+MIN_AVERAGES = 20.0
+"""Averages below which the far tails of the interval have not been verified by simulation."""
 CLOSE = 1.3
 """Length of a test over the predicted one up to which the prediction is a close one."""
 REMOVED_BY_TIME = frozenset({Obstacle.TOO_FEW_AVERAGES, Obstacle.SPANS_LIMIT})

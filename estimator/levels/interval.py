@@ -37,7 +37,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from estimator.types import ComplexArray, FloatArray
+    from estimator.types import BoolArray, ComplexArray, FloatArray
 
 NORMAL_95 = 1.959963984540054
 """Standard normal quantile of 97.5 %."""
@@ -202,8 +202,22 @@ def cumulants(traces: FloatArray, averages: float, gain: FloatArray | float = 1.
     )
 
 
+_REGULAR = 1e8  # power of a channel over what the others leave unpredicted
+_BLOCK_BYTES = 1 << 21  # of matrices that are inverted together
 LEAST_AVERAGES = 4.0
 """Averages beyond the number of predictors without which nothing is bounded."""
+
+
+def _inverse(matrices: ComplexArray, wanted: BoolArray) -> ComplexArray | None:
+    """Return the inverses of coherencies where wanted; None if one is nearly singular."""
+    identity = np.eye(matrices.shape[1])
+    try:
+        found = np.linalg.inv(np.where(wanted[:, None, None], matrices, identity))
+    except np.linalg.LinAlgError:
+        return None
+    diagonal = np.einsum("fii->fi", found).real
+    regular = (diagonal.min(initial=1.0) > 0) & (diagonal.max(initial=1.0) < _REGULAR)
+    return np.asarray(found) if regular else None
 
 
 def unpredicted(
@@ -228,27 +242,43 @@ def unpredicted(
     cumulants : float64, shape (3, n_freqs, n_channels)
     """
     psd = np.einsum("fii->fi", csm).real
+    level, averages = np.full((2, *psd.shape), np.nan)
+    step = max(1, _BLOCK_BYTES // (16 * csm.shape[1] ** 2))
+    for low in range(0, len(csm), step):
+        some = slice(low, low + step)
+        level[some], averages[some] = _unpredicted(csm[some], psd[some], dims, n_effective[some])
+    return level, np.stack([level**k / averages ** (k - 1) for k in (2, 3, 4)])
+
+
+def _unpredicted(
+    csm: ComplexArray, psd: FloatArray, dims: tuple[int, ...], n_effective: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the level of `unpredicted`, and the averages that it is worth."""
     sensor = np.repeat(np.arange(len(dims)), dims)
     level = np.full(psd.shape, np.nan)
     averages = np.full(psd.shape, np.nan)
-    good = np.isfinite(csm).all(axis=(1, 2)) & (psd > 0).all(axis=1)
+    good: BoolArray = np.asarray(np.isfinite(csm).all(axis=(1, 2)) & (psd > 0).all(axis=1))
     scale = 1 / np.sqrt(np.where(good[:, None], psd, 1.0))
     unit = csm * scale[:, :, None] * scale[:, None, :]
+    inverse = _inverse(unit, good)
     for i in range(len(dims)):
         own, others = np.flatnonzero(sensor == i), np.flatnonzero(sensor != i)
         left = n_effective - len(others)
         some = np.flatnonzero(good & (left > LEAST_AVERAGES))
         if not len(some) or not len(others):
             continue
-        rows = unit if len(some) == len(unit) else unit[some]
-        within, towards = rows[:, others[:, None], others], rows[:, others[:, None], own]
-        try:
-            predicted = np.linalg.solve(within, towards)
-        except np.linalg.LinAlgError:
-            continue
-        rest = 1 - (towards.real * predicted.real + towards.imag * predicted.imag).sum(axis=1)
+        if inverse is not None:  # of the inverse, the part of a sensor is that of what is left
+            within = np.linalg.inv(inverse[some[:, None, None], own[:, None], own])
+            rest = np.einsum("fii->fi", within).real
+        else:
+            rows = unit if len(some) == len(unit) else unit[some]
+            within, towards = rows[:, others[:, None], others], rows[:, others[:, None], own]
+            try:
+                predicted = np.linalg.solve(within, towards)
+            except np.linalg.LinAlgError:
+                continue
+            rest = 1 - (towards.real * predicted.real + towards.imag * predicted.imag).sum(axis=1)
         gain = (n_effective / left)[some, None]
         level[np.ix_(some, own)] = np.where(rest > 0, rest * gain, np.nan)
         averages[np.ix_(some, own)] = left[some, None]
-    level *= np.where(good[:, None], psd, np.nan)
-    return level, np.stack([level**k / averages ** (k - 1) for k in (2, 3, 4)])
+    return level * np.where(good[:, None], psd, np.nan), averages

@@ -55,6 +55,7 @@ SAMPLED = 15
 """Sub-blocks of a block by which the number of resolved dimensions is decided."""
 _STEP = 1.5  # of ln psi in one round
 _FLOOR = 1e-7  # of psi over the channel's PSD
+_TRACE_BYTES = 1 << 24  # of products of all channels' differentials that exist together
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -433,6 +434,16 @@ def _traces(inverse: FloatArray, projected: ComplexArray) -> FloatArray:
     ``M_i = Q diag(inverse_i) Q``, so that with ``Y = Q X Q``, `projected`, these are the traces of
     the powers of ``diag(inverse_i) Y``. Shape (3, n, p).
     """
+    n, p = inverse.shape[:2]
+    step = max(1, _TRACE_BYTES // (16 * p**3))
+    parts = [
+        _traces_of_some(inverse[low : low + step], projected[low : low + step])
+        for low in range(0, max(n, 1), step)
+    ]
+    return np.concatenate(parts, axis=1)
+
+
+def _traces_of_some(inverse: FloatArray, projected: ComplexArray) -> FloatArray:
     B = inverse[:, :, :, None] * projected[:, None]
     twice = B @ B
     return np.stack(

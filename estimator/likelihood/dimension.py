@@ -14,7 +14,7 @@ import numpy as np
 
 from estimator.errors import InsufficientDataError, InvalidMatrixError
 from estimator.levels.pooled import blocks_of
-from estimator.likelihood.factor_analysis import max_factors, maximise
+from estimator.likelihood.factor_analysis import Maxima, max_factors
 from estimator.likelihood.goodness_of_fit import HANN_HALF, BandTest, ModelTest, model_test, pool
 from estimator.likelihood.maximum_likelihood import standard_error
 from estimator.likelihood.prior import expected_noise, kinds, maximise_expecting
@@ -138,6 +138,7 @@ def choose_dimension(
     band: IntArray | None = None,
     level: float = LEVEL,
     neighbours: FloatArray | None = None,
+    maxima: Maxima | None = None,
 ) -> tuple[IntArray, tuple[BandDimension, ...]]:
     """Choose the dimension of the common motion in every band.
 
@@ -157,6 +158,8 @@ def choose_dimension(
         Level of the pooled model test.
     neighbours : float64, shape (n_lags,), optional
         From `estimator.likelihood.goodness_of_fit.neighbour_correlation`.
+    maxima : Maxima, optional
+        Fits of the same matrices, to share.
 
     Returns
     -------
@@ -192,19 +195,21 @@ def choose_dimension(
     number = bands(frequency) if band is None else np.asarray(band)
     if number.shape != frequency.shape or np.any(np.diff(number) < 0):
         raise InvalidMatrixError("band: expected one number per frequency, non-decreasing")
-    matrix = testable(given, frequency)
     usual = max(dims)
     most = _most_testable(n_channels, usual)
     most = most if len(there.sensors) > 3 else min(usual, most)
     stride = {int(b): -(-int(np.sum(number == b)) // MAX_BINS) for b in np.unique(number)}
     taken = np.concatenate([np.flatnonzero(number == b)[::step] for b, step in stride.items()])
+    part = given.block(taken)
+    del given  # as large as all averages
     search = _Search(
-        matrix[taken],
-        given.psd[taken],
+        testable(part, frequency[taken]),
+        part.psd,
         number=number[taken],
         usual=usual,
         kind=kind,
         n_effective=n_effective,
+        maxima=maxima or Maxima(),
     )
     r = HANN_HALF if neighbours is None else neighbours
     open_bands = list(stride)
@@ -300,7 +305,9 @@ class _Search:
         usual: int,
         kind: IntArray,
         n_effective: float,
+        maxima: Maxima,
     ) -> None:
+        self._maxima = maxima
         self._matrix = matrix
         self._psd = psd
         self._number = number
@@ -313,7 +320,7 @@ class _Search:
         """Maximise the likelihood of q factors in these bands, at every so many frequencies."""
         rows = np.flatnonzero(np.isin(self._number, some))[every // 2 :: every]
         if q <= self._usual:
-            maximum = maximise(self._matrix[rows], q)
+            maximum = self._maxima.maximise(self._matrix[rows], q)
         else:
             maximum = maximise_expecting(
                 self._matrix[rows],

@@ -217,7 +217,7 @@ def model_test(maximum: Maximum, *, n_effective: float) -> ModelTest:
     ``tr J (J + penalty)^-1`` effective parameters instead of p, as in ridge regression.
     """
     check_averages(n_effective)
-    p = maximum.eigenvalues.shape[1]
+    p = maximum.psi.shape[1]
     q = maximum.n_factors
     order, averages = p - q, n_effective - q
     if order**2 - p < 1:
@@ -242,10 +242,10 @@ def p_values(degrees: FloatArray, statistic: FloatArray) -> FloatArray:
 
 
 def _estimated_parameters(maximum: Maximum) -> FloatArray:
-    n_freqs, p = maximum.eigenvalues.shape
+    n_freqs, p = maximum.psi.shape
     if not maximum.penalty.any():
         return np.full(n_freqs, float(p))
-    information = fisher.information(maximum.eigenvectors[:, :, maximum.n_factors :])
+    information = fisher.information(maximum)
     inverse = fisher.covariance(information + maximum.penalty)
     count = np.einsum("fij,fji->f", information, inverse)
     return np.where(np.isfinite(count), count, float(p))

@@ -26,7 +26,7 @@ import numpy as np
 from estimator.levels.interval import like_psd
 from estimator.likelihood import fisher
 from estimator.likelihood.dimension import MAX_BINS, MIN_BINS, MIN_DETERMINED_SENSORS, MISFIT_LEVEL
-from estimator.likelihood.factor_analysis import maximise
+from estimator.likelihood.factor_analysis import Maxima
 from estimator.likelihood.goodness_of_fit import (
     HANN_HALF,
     BandTest,
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from estimator.likelihood.dimension import BandDimension
+    from estimator.likelihood.factor_analysis import Maximum
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 DIMENSIONS = 3
@@ -184,20 +185,31 @@ def _evaluate(
     scale = np.exp(-0.5 * x)
     white = csm * scale[:, :, None] * scale[:, None, :]
     basis = np.linalg.qr(loadings * scale[:, :, None])[0]
-    inner = basis.conj().swapaxes(1, 2) @ white @ basis
+    image = white @ basis
+    inner = basis.conj().swapaxes(1, 2) @ image
     w, turn = np.linalg.eigh((inner + inner.conj().swapaxes(1, 2)) / 2)
-    basis = basis @ turn
+    basis, image = basis @ turn, image @ turn
     conj = basis.conj().swapaxes(1, 2)
     moving = w > 1
-    motion = (basis / np.maximum(w, 1.0)[:, None, :]) @ conj
+    size = 1 / np.maximum(w, 1.0)
+    motion = (basis * size[:, None, :]) @ conj
     still = (basis * ~moving[:, None, :]) @ conj
     inverse = np.eye(csm.shape[1]) - basis @ conj + motion
     value = x.sum(axis=1) + np.einsum("fii->f", white).real - w.sum(axis=1)
     value += np.where(moving, np.log(np.maximum(w, 1.0)) + 1, w).sum(axis=1)
     value += 0.5 * np.einsum("fi,ij,fj->f", x, penalty, x)
-    gradient = np.einsum("fii->fi", inverse - inverse @ white @ inverse).real + x @ penalty
-    information = np.abs(inverse) ** 2 - np.abs(motion) ** 2 + np.abs(still) ** 2 + penalty
+    # the diagonal of inverse - inverse @ white @ inverse, with inverse = 1 - B diag(taken) B*
+    taken = (1 - size)[:, None, :]
+    power = basis.real**2 + basis.imag**2
+    along = image.real * basis.real + image.imag * basis.imag
+    gradient = np.einsum("fii->fi", inverse - white).real + x @ penalty
+    gradient += (taken * (2 * along - power * taken * w[:, None, :])).sum(axis=2)
+    information = _squares(inverse) - _squares(motion) + _squares(still) + penalty
     return _Point(value, gradient, information, moving.sum(axis=1))
+
+
+def _squares(matrices: ComplexArray) -> FloatArray:
+    return np.asarray(matrices.real**2 + matrices.imag**2)
 
 
 def known_loadings_test(found: KnownLoadings, *, n_factors: int, n_effective: float) -> ModelTest:
@@ -270,6 +282,7 @@ def with_gradients(
     n_effective: float,
     neighbours: FloatArray | None = None,
     positions: FloatArray | None = None,
+    maxima: Maxima | None = None,
 ) -> tuple[Gradients | None, tuple[BandDimension, ...]]:
     """Explain bands by gradients of the motion where these explain them best.
 
@@ -288,6 +301,8 @@ def with_gradients(
         As `estimator.likelihood.goodness_of_fit.pool` takes them.
     positions : float64, shape (n_sensors, 2) or (n_sensors, 3), optional
         Metres: where the fit of the space begins. By default at the averages' own directions.
+    maxima : Maxima, optional
+        Fits of the same matrices, to share.
 
     Returns
     -------
@@ -323,7 +338,8 @@ def with_gradients(
         return None, choices
     calm = whole & (frequency <= top)
     noise = np.full_like(given.psd, np.nan)
-    noise[calm] = maximise(given.matrix[calm], d).psi * given.psd[calm]
+    maxima = maxima or Maxima()
+    noise[calm] = maxima.maximise(given.matrix[calm], d).psi * given.psd[calm]
     expected = expected_noise(noise, calm, kind)
     response, delay = _responses(csm[low], frequency[low], n_sensors)
     late = np.exp(-2j * np.pi * frequency[:, None] * np.repeat(delay, d))
@@ -348,7 +364,12 @@ def with_gradients(
         r = HANN_HALF if neighbours is None else neighbours
         found.append(
             _chosen(
-                choice, fit, csm[some], n_effective=n_effective, neighbours=r[stride - 1 :: stride]
+                choice,
+                fit,
+                maxima.maximise(given.matrix[some], d) if _is_usual(choice) else None,
+                csm.shape[1],
+                n_effective=n_effective,
+                neighbours=r[stride - 1 :: stride],
             )
         )
     used = _where(found, frequency, lambda choice: choice.gradients)
@@ -419,7 +440,8 @@ def _outer(noise: FloatArray) -> FloatArray:
 def _chosen(
     choice: BandDimension,
     fit: KnownLoadings,
-    csm: ComplexArray,
+    usual: Maximum | None,
+    n_channels: int,
     *,
     n_effective: float,
     neighbours: FloatArray,
@@ -430,13 +452,13 @@ def _chosen(
         # axes that lean look like gradients; free directions have no error that all bins share
         return choice
     test = known_loadings_test(fit, n_factors=n_factors, n_effective=n_effective)
-    pooled = pool(test, np.ones(len(csm), np.bool_), neighbours=neighbours)
+    pooled = pool(test, np.ones(len(fit.psi), np.bool_), neighbours=neighbours)
     enough = choice.n_sensors >= MIN_DETERMINED_SENSORS
-    harmless = misfit(pooled, csm.shape[1], n_effective) < _HARMLESS * choice.cov
+    harmless = misfit(pooled, n_channels, n_effective) < _HARMLESS * choice.cov
     if not (pooled.p_value > MISFIT_LEVEL or (enough and harmless)):
         return choice
-    if _is_usual(choice):
-        one = model_test(maximise(csm, choice.usual), n_effective=n_effective)
+    if usual is not None:
+        one = model_test(usual, n_effective=n_effective)
         better = _excess(one) - _excess(test)
         if not better > _BETTER_BY * np.sqrt(2 * pooled.degrees * pooled.spread):
             return choice
@@ -544,10 +566,19 @@ def _shape(
         tilted[:, 1:] += beside @ by.reshape(-1, 2)
         return tilted
 
-    def left(by: FloatArray) -> float:
-        loadings = _loadings(response, moved(by)) * scale
-        free = np.linalg.qr(loadings, mode="complete")[0][:, 3 * d :]
-        return float(np.linalg.slogdet(free.T @ white @ free)[1])
+    inverse = np.linalg.inv(white)
+    responses = response * scale
 
-    best = minimize(left, np.zeros(2 * (n_sensors - 3)), method="BFGS")
+    def left(by: FloatArray) -> tuple[float, FloatArray]:
+        # |F' W F| with F orthonormal, beside the loadings L, is |W| |L' W^-1 L| / |L' L|
+        L = _loadings(responses, moved(by))
+        slope, value = np.zeros_like(L), 0.0
+        for metric, sign in ((inverse @ L, 1), (L, -1)):
+            inner = L.T @ metric
+            value += sign * float(np.linalg.slogdet(inner)[1])
+            slope += 2 * sign * np.linalg.solve(inner, metric.T).T
+        by_sensor = (slope * np.tile(responses, 3)).reshape(n_sensors, d, 3, d).sum(axis=(1, 3))
+        return value, (beside.T @ by_sensor[:, 1:]).ravel()
+
+    best = minimize(left, np.zeros(2 * (n_sensors - 3)), jac=True, method="BFGS")
     return np.asarray(np.linalg.qr(moved(best.x))[0])

@@ -12,20 +12,33 @@ indistinguishable from its noise: `alone` finds these channels (`docs/decisions/
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.likelihood import fisher
-from estimator.likelihood.factor_analysis import Maximum, check_factors, max_factors, maximise
+from estimator.likelihood.factor_analysis import (
+    Maxima,
+    Maximum,
+    check_factors,
+    max_factors,
+    maximise,
+)
 from estimator.likelihood.goodness_of_fit import model_test
 from estimator.likelihood.prior import NOISE_SPREAD, expected_noise, kinds, maximise_expecting
-from estimator.self_noise.coherency import blocks, check_averages, check_dims, coherency, inverse
+from estimator.self_noise.coherency import (
+    blocks,
+    check_averages,
+    check_dims,
+    coherency,
+    inverse,
+)
 from estimator.self_noise.result import Flag, SelfNoise
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from estimator.self_noise.coherency import Coherency
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
@@ -170,9 +183,9 @@ def _doubtful(maximum: Maximum, n_effective: float) -> BoolArray:
     A factor fitted to the noise of one channel has a large strength in it: its strength is computed
     without its largest channel.
     """
-    q, p = maximum.n_factors, maximum.psi.shape[1]
-    share = np.abs(maximum.eigenvectors[:, :, :q]) ** 2
-    strength = ((maximum.eigenvalues[:, :q] - 1) * (1 - share.max(axis=1))).min(axis=1)
+    p = maximum.psi.shape[1]
+    share = np.abs(maximum.eigenvectors) ** 2
+    strength = ((maximum.eigenvalues - 1) * (1 - share.max(axis=1))).min(axis=1)
     weak = strength < CERTAIN * np.sqrt(p / n_effective)
     captured = 1 - share.sum(axis=2).max(axis=1) < CAPTURED
     return np.asarray(~maximum.singular & (weak | captured))
@@ -190,6 +203,7 @@ def maximum_likelihood(
     correct: bool = True,
     n_factors: int | IntArray | None = None,
     noise_spread: float = NOISE_SPREAD,
+    maxima: Maxima | None = None,
 ) -> SelfNoise:
     """Return the self-noise PSD of every channel of three or more collocated sensors.
 
@@ -216,6 +230,8 @@ def maximum_likelihood(
         like channels, about the ratios at frequencies of fewer factors. The matrix alone may not
         determine their noise, and c.o.v. and interval depend on this prior (see
         `estimator.likelihood.prior`).
+    maxima : Maxima, optional
+        Fits of the same matrices, to share.
 
     Returns
     -------
@@ -265,7 +281,8 @@ def maximum_likelihood(
         raise EstimatorError(f"noise_spread {noise_spread}: expected a finite number above zero")
     few = factors > max_factors(p - absent.sum(axis=1))
     lone = np.zeros_like(absent)
-    lone[~few] = alone(matrix[~few], absent[~few], dims=dims, n_effective=n_effective)
+    some = ~few if few.any() else slice(None)
+    lone[some] = alone(matrix[some], absent[some], dims=dims, n_effective=n_effective)
     lone &= given.flags == 0
     shared = factors - lone.sum(axis=1)  # without dimensions that only one channel measures
     kind = kinds(given, dims)
@@ -274,36 +291,35 @@ def maximum_likelihood(
     flags[few] |= np.where(absent[few], 0, Flag.NO_COUNTERPART)
     for q in np.unique(factors[~few]):  # ascending: usual fits come first, and give the prior
         rows = np.flatnonzero((factors == q) & ~few)
+        fit: _Fit
         if q <= max(dims):
-            fits = _usual(matrix[rows], int(q), n_effective=n_effective, correct=correct)
+            fit = partial(
+                _usual,
+                q=int(q),
+                n_effective=n_effective,
+                correct=correct,
+                maxima=maxima or Maxima(),
+            )
         else:
-            fits = _expecting(
-                matrix[rows],
-                (
-                    int(q),
-                    int(min(q + EXTRA_FACTORS, max_factors(p - absent[rows].sum(axis=1)).min())),
-                ),
-                expected_noise(noise_psd * given.psd, factors <= max(dims), kind)[rows]
-                / given.psd[rows],
+            wider = int(min(q + EXTRA_FACTORS, max_factors(p - absent[rows].sum(axis=1)).min()))
+            fit = partial(
+                _expecting,
+                n_factors=(int(q), wider),
+                expected=expected_noise(noise_psd * given.psd, factors <= max(dims), kind)
+                / given.psd,
                 kind=kind,
                 n_effective=n_effective,
                 spread=noise_spread,
             )
-        for some, fit, error in fits:
-            here = rows[some]
-            good = given.flags[here] == 0
-            gain = np.ones(fit.psi.shape)
+        for here, maximum, error, covariance in _in_blocks(fit, matrix, rows):
+            gain = np.ones(maximum.psi.shape)
             if correct:
-                gain = small_sample_correction(fit, n_effective=n_effective)
-            noise_psd[here] = np.where(fit.boundary, 0.0, fit.psi) * gain
-            scatter[:, here] = _cumulants(fit, error, gain, n_effective=n_effective)
-            flags[here] |= np.where(fit.boundary, Flag.BOUNDARY, 0)
-            missed = good & (fit.n_factors < shared[here, None])
-            flags[here] |= np.where(missed, Flag.UNRESOLVED, 0)
-            undetermined = ~np.isfinite(error) & ~fit.boundary & good
-            flags[here] |= np.where(undetermined, Flag.SINGULAR, 0)
-            lost = ~fit.converged & ~fit.singular
-            flags[here] |= np.where(lost, Flag.NOT_CONVERGED, 0)[:, None]
+                gain = small_sample_correction(maximum, covariance, n_effective=n_effective)
+            noise_psd[here] = np.where(maximum.boundary, 0.0, maximum.psi) * gain
+            found = fisher.cumulants(maximum, covariance, n_effective=n_effective)
+            found[0] = error**2  # which includes all factors
+            scatter[:, here] = found * np.stack([gain**m for m in (2, 3, 4)])
+            flags[here] |= _remarks(maximum, error, given.flags[here] == 0, shared[here])
     flags[lone] = Flag.NO_COUNTERPART
     unknown = (given.flags | (flags & (Flag.SINGULAR | Flag.NO_COUNTERPART))) != 0
     noise_psd[unknown] = np.nan
@@ -312,59 +328,95 @@ def maximum_likelihood(
     return SelfNoise.of("maximum-likelihood", noise_psd * given.psd, scatter * powers, flags)
 
 
+def _remarks(maximum: Maximum, error: FloatArray, good: BoolArray, shared: IntArray) -> IntArray:
+    """Return the flags of a fit with this standard error, of which channels are `good`.
+
+    `shared` is the number of dimensions that several channels measure.
+    """
+    flags = np.where(maximum.boundary, int(Flag.BOUNDARY), 0)
+    fewer = maximum.n_factors < shared[:, None]
+    flags |= np.where(good & fewer, int(Flag.UNRESOLVED), 0)
+    undetermined = ~np.isfinite(error) & ~maximum.boundary & good
+    flags |= np.where(undetermined, int(Flag.SINGULAR), 0)
+    lost = ~maximum.converged & ~maximum.singular
+    flags |= np.where(lost, int(Flag.NOT_CONVERGED), 0)[:, None]
+    return flags
+
+
+_Fit: TypeAlias = (
+    "Callable[[ComplexArray, IntArray], Iterator[tuple[IntArray, Maximum, FloatArray, FloatArray]]]"
+)
+
+
+def _in_blocks(
+    fit: _Fit, matrix: ComplexArray, rows: IntArray
+) -> Iterator[tuple[IntArray, Maximum, FloatArray, FloatArray]]:
+    """Yield the fits at some frequencies, a few at a time: several times their matrices exist."""
+    for block in blocks(len(rows), matrix.shape[1]):
+        here = rows[block]
+        for some, maximum, error, covariance in fit(matrix[here], here):
+            yield here[some], maximum, error, covariance
+
+
 def _usual(
-    matrix: ComplexArray, q: int, *, n_effective: float, correct: bool
-) -> Iterator[tuple[IntArray, Maximum, FloatArray]]:
+    matrix: ComplexArray,
+    _: IntArray,
+    *,
+    q: int,
+    n_effective: float,
+    correct: bool,
+    maxima: Maxima,
+) -> Iterator[tuple[IntArray, Maximum, FloatArray, FloatArray]]:
     """Fit q factors or, with `correct`, those that the averages resolve.
 
-    Yields frequencies, their fit and the standard error of psi, which includes the effect of
-    excluded factors.
+    Yields frequencies, their fit, the standard error of psi, which includes the effect of excluded
+    factors, and `fisher.spread`.
     """
-    maximum = maximise(matrix, q)
+    maximum = maxima.maximise(matrix, q)
     if not correct:
-        yield np.arange(len(matrix)), maximum, standard_error(maximum, n_effective=n_effective)
+        covariance = fisher.spread(maximum)
+        error = standard_error(maximum, covariance, n_effective=n_effective)
+        yield np.arange(len(matrix)), maximum, error, covariance
         return
     for some, fit in resolved(matrix, maximum, n_effective=n_effective):
-        error = standard_error(fit, n_effective=n_effective)
+        covariance = fisher.spread(fit)
+        error = standard_error(fit, covariance, n_effective=n_effective)
         if fit.n_factors < q:
             error = np.hypot(error, fit.psi - maximum.psi[some])
-        yield some, fit, error
+        yield some, fit, error, covariance
 
 
 def _expecting(
     matrix: ComplexArray,
+    here: IntArray,
+    *,
     n_factors: tuple[int, int],
     expected: FloatArray,
-    *,
     kind: IntArray,
     n_effective: float,
     spread: float,
-) -> Iterator[tuple[IntArray, Maximum, FloatArray]]:
+) -> Iterator[tuple[IntArray, Maximum, FloatArray, FloatArray]]:
     """Fit more factors than usual; the standard error allows for some additional factors.
 
     Factors at the limit of detection are easily missed. Their motion is then attributed to the
     noise of channels, and the standard error of the fit alone does not include this.
     """
     fit, wider = (
-        maximise_expecting(matrix, q, expected, kind=kind, n_effective=n_effective, spread=spread)
+        maximise_expecting(
+            matrix, q, expected[here], kind=kind, n_effective=n_effective, spread=spread
+        )
         for q in n_factors
     )
-    error, beyond = (standard_error(each, n_effective=n_effective) for each in (fit, wider))
+    covariance = fisher.spread(fit)
+    error = standard_error(fit, covariance, n_effective=n_effective)
+    beyond = standard_error(wider, n_effective=n_effective)
     beyond = np.where(np.isfinite(beyond), np.minimum(beyond, fit.psi), 0.0)
     yield (
         np.arange(len(matrix)),
         fit,
         np.hypot(np.maximum(error, beyond), fit.psi - wider.psi),
+        covariance,
     )
-
-
-def _cumulants(
-    fit: Maximum, error: FloatArray, gain: FloatArray, *, n_effective: float
-) -> FloatArray:
-    """Return the cumulants of ``gain * psi`` with the standard error that includes all factors."""
-    found = fisher.cumulants(fit, n_effective=n_effective)
-    found[0] = error**2
-    return np.asarray(found * np.stack([gain**m for m in (2, 3, 4)]))
 
 
 def _without_dead_and_copies(given: Coherency) -> tuple[ComplexArray, BoolArray]:
@@ -374,6 +426,8 @@ def _without_dead_and_copies(given: Coherency) -> tuple[ComplexArray, BoolArray]
     """
     p = given.psd.shape[1]
     absent = given.absent
+    if not absent.any():
+        return given.matrix, absent
     present = ~absent
     matrix = given.matrix * (present[:, :, None] & present[:, None, :])
     i = np.arange(p)
@@ -381,18 +435,23 @@ def _without_dead_and_copies(given: Coherency) -> tuple[ComplexArray, BoolArray]
     return matrix, absent
 
 
-def small_sample_correction(maximum: Maximum, *, n_effective: float) -> FloatArray:
+def small_sample_correction(
+    maximum: Maximum, covariance: FloatArray, *, n_effective: float
+) -> FloatArray:
     """Return the factors that correct the bias of psi, shape (n_freqs, n_channels)."""
     lost = maximum.n_factors / n_effective
-    bias = fisher.bias(maximum, n_effective=n_effective)
+    bias = fisher.bias(maximum, covariance, n_effective=n_effective)
     return (1 + np.clip(-bias - lost, 0.0, 0.5)) / (1 - lost)
 
 
-def standard_error(maximum: Maximum, *, n_effective: float) -> FloatArray:
+def standard_error(
+    maximum: Maximum, covariance: FloatArray | None = None, *, n_effective: float
+) -> FloatArray:
     """Return the standard error of psi, unit**2/Hz, shape (n_freqs, n_channels), by `fisher`."""
-    variance = np.empty(maximum.psi.shape)
-    for some in blocks(*maximum.psi.shape):
-        free = maximum.eigenvectors[some, :, maximum.n_factors :]
-        known = fisher.information(free) + maximum.penalty
-        variance[some] = np.einsum("fii->fi", fisher.covariance(known))
+    if covariance is None:
+        variance = np.empty_like(maximum.psi)
+        for some in blocks(*maximum.psi.shape):
+            variance[some] = np.einsum("fii->fi", fisher.spread(maximum.take(some)))
+    else:
+        variance = np.einsum("fii->fi", covariance)
     return np.asarray(maximum.psi * np.sqrt(variance / (n_effective - maximum.n_factors)))

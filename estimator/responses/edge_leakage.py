@@ -17,16 +17,17 @@ mean is taken, with weights ``|S_yz|² / S_zz``: their predictions may have any 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.likelihood.dimension import bands
-from estimator.self_noise.coherency import check_dims, other_channels, own_channels
+from estimator.self_noise.coherency import BLOCK_BYTES, blocks, check_dims, own_channels
 
 if TYPE_CHECKING:
-    from estimator.types import ComplexArray, FloatArray
+    from collections.abc import Iterator
+
+    from estimator.types import BoolArray, ComplexArray, FloatArray
 
 MIN_COHERENCE = 0.3
 """Minimum coherence between a channel and its prediction at a used frequency."""
@@ -125,6 +126,17 @@ class ChannelResponses:
         is in it: `scatter_of_slopes`; the variance of ``D'/D`` is that of a ratio of
         averages, ``(1 / g - 1) / n`` at coherence g, at two frequencies.
         """
+        pairs, deviation = np.empty((2, *self.ratio.shape[:2]))
+        step = max(1, BLOCK_BYTES // (16 * self.ratio.shape[0] * self.ratio.shape[2]))
+        for low in range(0, self.ratio.shape[1], step):
+            some = slice(low, low + step)
+            part = ChannelResponses(self.frequency, self.ratio[:, some], self.coherence[:, some])
+            pairs[:, some], deviation[:, some] = part._of_pairs(n_effective)
+        power = np.where(np.isfinite(motion_psd), np.maximum(motion_psd, 0.0), 0.0) * factor
+        return np.asarray(power * pairs), np.asarray(power * deviation)
+
+    def _of_pairs(self, n_effective: float) -> tuple[FloatArray, FloatArray]:
+        """Return the mean of products of slopes over pairs of sensors, and its deviation."""
         slopes, f = self.slopes(), self.frequency
         variance = np.full(slopes.shape, np.inf)
         width = (f[2:] - f[:-2])[:, None, None]
@@ -132,19 +144,15 @@ class ChannelResponses:
             own = (1 / self.coherence[1:-1] - 1) / max(n_effective, 1.0)
         own[self.coherence[1:-1] < MIN_COHERENCE] = np.inf
         variance[1:-1] = _TWO_FREQUENCIES * own / width**2
-        count = np.zeros(slopes.shape[:2], np.int64)
-        total, deviation = np.zeros((2, *slopes.shape[:2]))
-        for j, k in combinations(range(slopes.shape[2]), 2):  # one by one, to bound memory
-            product = (slopes[:, :, j] * slopes[:, :, k].conj()).real
-            with np.errstate(invalid="ignore"):
-                spread = np.sqrt(variance[:, :, j] * variance[:, :, k])
-            known = np.isfinite(product) & np.isfinite(spread)
-            count += known
-            total += np.where(known, product, 0.0)
-            deviation += np.where(known, spread, 0.0)
-        count = np.maximum(count, 1)
-        power = np.where(np.isfinite(motion_psd), np.maximum(motion_psd, 0.0), 0.0) * factor
-        return np.asarray(power * (total / count)), np.asarray(power * (deviation / count))
+        known = np.isfinite(slopes) & np.isfinite(variance)
+        slopes, variance = np.where(known, slopes, 0.0), np.where(known, variance, 0.0)
+        n_known = known.sum(axis=2)
+        count = np.maximum(n_known * (n_known - 1) // 2, 1)
+        # sums over pairs: the square of the sum, less the squares
+        total = (np.abs(slopes.sum(axis=2)) ** 2 - (np.abs(slopes) ** 2).sum(axis=2)) / 2
+        deviation = (np.sqrt(variance).sum(axis=2) ** 2 - variance.sum(axis=2)) / 2
+        deviation = np.maximum(deviation, 0.0)
+        return np.asarray(total / count), np.asarray(deviation / count)
 
 
 def band_shares(
@@ -202,30 +210,67 @@ def channel_responses(
     ratio = np.full((n_freqs, n_channels, n_sensors), np.nan, dtype=np.complex128)
     coherence = np.zeros((n_freqs, n_channels, n_sensors))
     directions = _directions(csm, dims, own)
-    for c in range(n_channels):
-        around = [j for j in range(n_sensors) if (c, j) in directions]
-        if len(around) < 2:
-            continue
-        # Predictions of channel c by each sensor, and their cross-spectra.
-        to = np.zeros((len(around), n_channels))
-        for row, j in enumerate(around):
-            to[row, own[j]] = directions[c, j]
-        predicted = csm @ to.T
-        crossed = predicted[:, c]  # S_c,y
-        among = to @ predicted  # S_y,y'
-        power = np.maximum(csm[:, c, c].real, 0.0)
-        for row, j in enumerate(around):
-            others = [n for n in range(len(around)) if n != row]
-            S_cz, S_yz = crossed[:, others], among[:, row, others]
-            S_zz = np.array([among[:, n, n].real for n in others]).T
+    # by each sensor, of as many channels as the largest has: zero for the others
+    combined = np.zeros((n_channels, n_sensors, max(dims)))
+    for (c, j), direction in directions.items():
+        combined[c, j, : len(direction)] = direction
+    i = np.arange(n_sensors)
+    for some in blocks(n_freqs, 2 * n_channels):
+        padded = _padded(csm[some], dims)
+        for c in range(n_channels):
+            around = combined[c].any(axis=1)
+            if np.count_nonzero(around) < 2:
+                continue
+            crossed, among = _predictions(padded, csm[some, c], combined[c], dims)
+            own_power = among[:, i, i].real.copy()
+            among[:, i, i] = 0.0  # the third is another
+            power = np.maximum(csm[some, c, c].real, 0.0)[:, None]
             with np.errstate(invalid="ignore", divide="ignore"):
-                weight = np.where(S_zz > 0, S_yz.conj() / S_zz, 0.0)
-                sizes = (weight * S_yz).sum(axis=1)
-                mean = (weight * S_cz).sum(axis=1) / sizes
-                ratio[:, c, j] = np.where(usable & (sizes != 0), mean, np.nan)
-                found = np.abs(crossed[:, row]) ** 2 / (power * among[:, row, row].real)
-            coherence[:, c, j] = np.where(np.isfinite(found), np.clip(found, 0.0, 1.0), 0.0)
+                inverse = np.where(own_power > 0, 1 / own_power, 0.0)
+                sizes = ((among.real**2 + among.imag**2) @ inverse[:, :, None])[:, :, 0]
+                mean = (among.conj() @ (crossed * inverse)[:, :, None])[:, :, 0] / sizes
+                found = np.abs(crossed) ** 2 / (power * own_power)
+            known = usable[some, None] & around & (sizes != 0)
+            ratio[some, c] = np.where(known, mean, np.nan)
+            found = np.where(np.isfinite(found), np.clip(found, 0.0, 1.0), 0.0)
+            coherence[some, c] = np.where(around, found, 0.0)
     return ChannelResponses(frequency, ratio, coherence)
+
+
+def _padded(csm: ComplexArray, dims: tuple[int, ...]) -> ComplexArray:
+    """Return matrices, (n_freqs, n_sensors, d, n_sensors, d), in which all sensors have d channels.
+
+    Those of smaller sensors are followed by channels without power.
+    """
+    n_sensors, d = len(dims), max(dims)
+    if min(dims) < d:
+        place = np.concatenate([j * d + np.arange(n) for j, n in enumerate(dims)])
+        padded = np.zeros((len(csm), n_sensors * d, n_sensors * d), np.complex128)
+        padded[:, place[:, None], place] = csm
+        csm = padded
+    return csm.reshape(len(csm), n_sensors, d, n_sensors, d)
+
+
+def _predictions(
+    padded: ComplexArray, own: ComplexArray, combined: FloatArray, dims: tuple[int, ...]
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return cross-spectra of a channel with its predictions, and those of the predictions.
+
+    Sums over the few channels of a sensor: products of whole matrices would take most terms for
+    nothing.
+    """
+    crossed = np.add.reduceat(
+        own * np.concatenate([by[:n] for by, n in zip(combined, dims, strict=True)]),
+        np.cumsum([0, *dims[:-1]]),
+        axis=1,
+    )
+    rows = padded[:, :, 0] * combined[:, 0, None, None]
+    for more in range(1, combined.shape[1]):
+        rows += padded[:, :, more] * combined[:, more, None, None]
+    among = rows[..., 0] * combined[:, 0]
+    for more in range(1, combined.shape[1]):
+        among += rows[..., more] * combined[:, more]
+    return np.asarray(crossed), np.asarray(among)
 
 
 def _directions(
@@ -240,38 +285,55 @@ def _directions(
     alive = (power > 0).all(axis=1)
     some = np.flatnonzero(alive)
     some = some[:: max(1, len(some) // _MAX_FREQUENCIES)]
+    sensor = np.repeat(np.arange(len(dims)), dims)
+    moments = [np.zeros((len(sensor), d, d)) for d in dims]
+    seen = np.zeros((len(sensor), len(dims)), np.bool_)
+    for block in blocks(len(some), 2 * len(sensor)):  # several times their matrices exist
+        for j, (moment, weighted) in enumerate(_moments(csm[some[block]], dims, own)):
+            moments[j] += moment
+            seen[:, j] |= weighted
     found: dict[tuple[int, int], FloatArray] = {}
-    if not len(some):
-        return found
-    scale = np.sqrt(power[some])
-    part = csm[some] / (scale[:, :, None] * scale[:, None, :])
-    for j in range(len(dims)):
-        for i in range(len(dims)):
-            rest = other_channels(dims, i, j)
-            if i == j or len(rest) < dims[j]:
-                continue
-            S_jk = part[:, own[j][:, None], rest]
-            S_ck = part[:, own[i][:, None], rest]
-            adjoint = S_jk.conj().swapaxes(1, 2)
-            normal = S_jk @ adjoint
-            ridge = _RIDGE * np.trace(normal, axis1=1, axis2=2).real / dims[j] + 1e-300
-            rows = np.linalg.solve(
-                (normal + ridge[:, None, None] * np.eye(dims[j])).swapaxes(1, 2),
-                (S_ck @ adjoint).swapaxes(1, 2),
-            ).swapaxes(1, 2)  # in units of the channels' own amplitudes
-            own_csm = part[:, own[j][:, None], own[j]]
-            predicted = np.einsum("fcj,fjk,fck->fc", rows, own_csm, rows.conj()).real
-            with np.errstate(invalid="ignore", divide="ignore"):
-                cross = np.einsum(
-                    "fcj,fcj->fc", rows, part[:, own[j][:, None], own[i]].swapaxes(1, 2)
-                )
-                g = np.clip(np.abs(cross) ** 2 / predicted, 0.0, 1 - 1e-9)
-            g = np.where(np.isfinite(g) & (g > MIN_COHERENCE), g, 0.0)
-            rows = rows * scale[:, own[i]][:, :, None] / scale[:, None, own[j]]
-            size = np.einsum("fcj,fcj->fc", rows, rows.conj()).real
-            weight = g / (1 - g) / np.where(size > 0, size, np.inf)
-            moment = np.einsum("fc,fcj,fck->cjk", weight, rows, rows.conj()).real
-            for row, c in enumerate(own[i].tolist()):
-                if weight[:, row].any():
-                    found[c, j] = np.linalg.eigh(moment[row])[1][:, -1]
+    for j, moment in enumerate(moments):
+        enough = (sensor != j) & (len(sensor) - np.array(dims)[sensor] - dims[j] >= dims[j])
+        for c in np.flatnonzero(enough & seen[:, j]).tolist():
+            found[c, j] = np.linalg.eigh(moment[c])[1][:, -1]
     return found
+
+
+def _moments(
+    csm: ComplexArray, dims: tuple[int, ...], own: list[np.ndarray]
+) -> Iterator[tuple[FloatArray, BoolArray]]:
+    """Yield second moments of the rows ``S_ck S_jk^-1`` for each sensor j, and where any counts.
+
+    Shapes (n_channels, d, d) and (n_channels,); summed over the frequencies.
+    """
+    scale = np.sqrt(np.einsum("fpp->fp", csm).real)
+    part = csm / (scale[:, :, None] * scale[:, None, :])
+    sensor = np.repeat(np.arange(len(dims)), dims)
+    starts = np.cumsum([0, *dims[:-1]])
+    alike = sensor[:, None] == sensor
+    # S S*, less what the channels' own sensors contribute, by row
+    whole = part @ part
+    products = whole - np.where(alike, part, 0.0) @ part
+    for j, of_j in enumerate(own):
+        towards, within = part[:, of_j], part[:, of_j[:, None], of_j]
+        shares = towards[:, :, None] * towards[:, None].conj()  # by channel, last
+        normal = whole[:, of_j[:, None], of_j] - within @ within
+        normal = normal[..., None] - np.add.reduceat(shares, starts, axis=3)
+        normal = np.moveaxis(normal, 3, 1)  # S_jk S_jk*, without each sensor i
+        ridge = _RIDGE * np.trace(normal, axis1=2, axis2=3).real / dims[j] + 1e-300
+        normal += ridge[..., None, None] * np.eye(dims[j])
+        cross = products[:, :, of_j] - part[:, :, of_j] @ within  # S_ck S_jk*
+        normal[:, j] = np.eye(dims[j])
+        # in units of the channels' own amplitudes
+        rows = (cross[:, :, None] @ np.linalg.inv(normal)[:, sensor])[:, :, 0]
+        predicted = ((rows @ within) * rows.conj()).sum(axis=2).real
+        with np.errstate(invalid="ignore", divide="ignore"):
+            crossed = (rows * towards.swapaxes(1, 2)).sum(axis=2)
+            g = np.clip(np.abs(crossed) ** 2 / predicted, 0.0, 1 - 1e-9)
+        g = np.where(np.isfinite(g) & (g > MIN_COHERENCE), g, 0.0)
+        rows = rows * scale[:, :, None] / scale[:, None, of_j]
+        size = (rows.real**2 + rows.imag**2).sum(axis=2)
+        weight = g / (1 - g) / np.where(size > 0, size, np.inf)
+        moment = np.einsum("fc,fcj,fck->cjk", weight, rows, rows.conj()).real
+        yield moment, weight.any(axis=0)

@@ -26,7 +26,7 @@ TOLERANCE = 1e-8  # of Hermitian symmetry, and of coherence above 1
 DEAD = 1e-28  # fraction of a channel's largest PSD that is rounding of a constant
 DUPLICATE = 1e-13  # one minus the coherence of a channel and its copy
 SINGULAR = 1e12  # magnitude from which elements of an inverse coherency are only rounding
-BLOCK_BYTES = 1 << 23
+BLOCK_BYTES = 1 << 21
 """Bytes of matrices that are worked on together: several times as much exists for a moment."""
 
 
@@ -83,7 +83,7 @@ class Coherency:
 
 def blocks(n_freqs: int, n_channels: int) -> Iterator[slice]:
     """Yield blocks of frequencies whose matrices take `BLOCK_BYTES`; one in most tests."""
-    step = max(1, BLOCK_BYTES // (16 * n_channels**2))
+    step = max(1, BLOCK_BYTES // (16 * max(1, n_channels) ** 2))
     for low in range(0, n_freqs, step):
         yield slice(low, min(low + step, n_freqs))
 
@@ -251,6 +251,11 @@ def inverse(matrices: ComplexArray) -> tuple[ComplexArray, BoolArray]:
     """
     regular = np.ones(len(matrices), dtype=bool)
     inverses: ComplexArray
+    if matrices.shape[1:] == (1, 1):
+        regular = matrices[:, 0, 0] != 0
+        inverses = np.asarray(1 / np.where(regular[:, None, None], matrices, 1.0), np.complex128)
+        regular &= np.abs(inverses[:, 0, 0]) < SINGULAR
+        return np.where(regular[:, None, None], inverses, 0j), regular
     try:
         inverses = np.asarray(np.linalg.inv(matrices), dtype=np.complex128)
     except np.linalg.LinAlgError:  # one singular matrix fails the whole batch

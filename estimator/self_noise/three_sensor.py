@@ -34,7 +34,7 @@ from __future__ import annotations
 
 import itertools
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -51,7 +51,7 @@ from estimator.self_noise.result import Flag
 from estimator.spectra.welch import THREADS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from numpy.typing import NDArray
 
@@ -162,12 +162,12 @@ class PairWeights:
         self, n_freqs: int, variances: Callable[[IntArray], FloatArray], *, chunk: int
     ) -> None:
         self._bins = sampled(n_freqs)
-        self._sums, self._counts = np.empty((0, 0, 0)), np.empty((0, 0, 0), np.int32)
+        self._sums, self._counts = np.empty((0, 0, 0)), np.empty((0, 0, 0), np.int16)
         for low in range(0, len(self._bins), chunk):
             log = variances(self._bins[low : low + chunk])
             if low == 0:
                 shape = (len(self._bins) + 1, *log.shape[1:])
-                self._sums, self._counts = np.zeros(shape), np.zeros(shape, np.int32)
+                self._sums, self._counts = np.zeros(shape), np.zeros(shape, np.int16)
             known = np.isfinite(log)
             for row, (values, there) in enumerate(zip(log, known, strict=True), start=low):
                 np.add(self._sums[row], np.where(there, values, 0.0), out=self._sums[row + 1])
@@ -220,10 +220,16 @@ class PairWeights:
 
 FREQUENCIES = 128  # number of frequencies per step: fits into the processor's cache
 ELEMENTS = 150_000  # maximum number of elements of predictors per step, for weighted pairs
+WEIGHT_BYTES = 1 << 27  # of the variances of pairs that are kept at a time, at most
 
 
 def three_sensor(
-    csm: ComplexArray, *, dims: tuple[int, ...], n_effective: float, correct: bool = True
+    csm: ComplexArray,
+    *,
+    dims: tuple[int, ...],
+    n_effective: float,
+    correct: bool = True,
+    scatter: bool = True,
 ) -> SelfNoise:
     """Return the self-noise PSD of every channel of three or more sensors of any orientation.
 
@@ -241,6 +247,8 @@ def three_sensor(
         Number of independent averages in `csm`.
     correct : bool
         Divide by ``1 - d / n_effective``, which removes the small-sample bias.
+    scatter : bool
+        Find c.o.v. and intervals, which takes most of the time with many sensors; NaN without.
 
     Returns
     -------
@@ -265,7 +273,9 @@ def three_sensor(
     """
     check_dims(dims)
     given = coherency(csm, dims)
-    return estimate(given, dims=dims, n_effective=n_effective, correct=correct, weighted=True)
+    return estimate(
+        given, dims=dims, n_effective=n_effective, correct=correct, weighted=True, scatter=scatter
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,9 +306,25 @@ class _Group:
         """Whether any channel is comparable with more than one pair."""
         return bool(self.others.sum(axis=1).max() > 2)
 
+    def parts(self, n_freqs: int) -> Iterator[_Group]:
+        """Yield groups of some of the channels, whose weights take `WEIGHT_BYTES` at most."""
+        m = len(self.columns)
+        each = len(sampled(n_freqs)) * m * (m - 1) // 2 * (8 + 2)
+        number = -(-len(self.rows) // max(1, WEIGHT_BYTES // each)) if self.several_pairs else 1
+        for some in np.array_split(np.arange(len(self.rows)), number):
+            yield replace(
+                self, rows=self.rows[some], target=self.target[some], others=self.others[some]
+            )
+
 
 def estimate(
-    given: Coherency, *, dims: tuple[int, ...], n_effective: float, correct: bool, weighted: bool
+    given: Coherency,
+    *,
+    dims: tuple[int, ...],
+    n_effective: float,
+    correct: bool,
+    weighted: bool,
+    scatter: bool = True,
 ) -> SelfNoise:
     """Return the result of `three_sensor` for a checked and normalised matrix.
 
@@ -307,17 +333,38 @@ def estimate(
     groups = _groups(dims)
     for group in groups:
         check_averages(n_effective, group.d)
-    weights = [_weights(given, group) if weighted else None for group in groups]
-    size = min(_at_a_time(group) for group in groups)
+    n_freqs, n_channels = given.psd.shape
+    noise, spread = np.full((n_freqs, n_channels), np.nan), np.full((3, *given.psd.shape), np.nan)
+    flags = given.flags.copy()
+    flags[:, np.delete(np.arange(n_channels), np.concatenate([g.rows for g in groups]))] |= (
+        Flag.NO_COUNTERPART
+    )
+    for group in groups:
+        gain, averages = (
+            (1 / (1 - group.d / n_effective), n_effective - group.d)
+            if correct
+            else (1, n_effective)
+        )
+        # the weights of some channels at a time: those of all may take more than all matrices
+        for part in group.parts(n_freqs) if weighted else (group,):
+            found, traces, possible = _estimate(given, part, weighted=weighted, scatter=scatter)
+            noise[:, part.rows] = found * gain
+            spread[:, :, part.rows] = cumulants(traces, averages, gain)
+            flags[:, part.rows] |= np.where(possible, 0, Flag.SINGULAR)
+    return from_parts("three-sensor", given, noise, spread, flags)
+
+
+def _estimate(
+    given: Coherency, group: _Group, *, weighted: bool, scatter: bool
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return what `_mean_of_pairs` does, at all frequencies."""
+    weights = _weights(given, group) if weighted else None
+    size = _at_a_time(group)
     blocks = range(0, len(given.psd), size)
 
-    def of_block(low: int) -> tuple[FloatArray, FloatArray, IntArray]:
+    def of_block(low: int) -> tuple[FloatArray, FloatArray, BoolArray]:
         block = given.block(slice(low, low + size))
-        parts = [
-            _mean_of_pairs(block, group, weight, low)
-            for group, weight in zip(groups, weights, strict=True)
-        ]
-        return _estimate(block, dims, groups, parts, n_effective=n_effective, correct=correct)
+        return _mean_of_pairs(block, group, weights, low, scatter=scatter)
 
     if len(blocks) == 1:
         found = [of_block(0)]
@@ -327,14 +374,8 @@ def estimate(
         with ThreadPoolExecutor(THREADS) as pool:
             of_shares = pool.map(lambda part: [of_block(low) for low in part], shares)
             found = list(itertools.chain.from_iterable(of_shares))
-    noise, scatter, flags = zip(*found, strict=True)
-    return from_parts(
-        "three-sensor",
-        given,
-        np.concatenate(noise),
-        np.concatenate(scatter, axis=1),
-        np.concatenate(flags),
-    )
+    noise, traces, possible = zip(*found, strict=True)
+    return np.concatenate(noise), np.concatenate(traces, axis=1), np.concatenate(possible)
 
 
 def _groups(dims: tuple[int, ...]) -> list[_Group]:
@@ -370,35 +411,6 @@ def _at_a_time(group: _Group) -> int:
         return FREQUENCIES
     m, d = group.columns.shape
     return int(np.clip(ELEMENTS // (len(group.rows) * m * m * d), 1, FREQUENCIES))
-
-
-def _estimate(
-    given: Coherency,
-    dims: tuple[int, ...],
-    groups: list[_Group],
-    parts: list[tuple[FloatArray, FloatArray, BoolArray]],
-    *,
-    n_effective: float,
-    correct: bool,
-) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return noise and its cumulants as fractions of the channel's PSD, and flags."""
-    shape = given.psd.shape
-    noise, scatter = np.full(shape, np.nan), np.full((3, *shape), np.nan)
-    flags = given.flags.copy()
-    covered = np.zeros(sum(dims), dtype=np.bool_)
-    for group, (part, traces, possible) in zip(groups, parts, strict=True):
-        d, rows = group.d, group.rows
-        covered[rows] = True
-        unknown = np.zeros(flags.shape, dtype=np.bool_)
-        unknown[:, rows] = ~possible
-        flags[unknown] |= Flag.SINGULAR
-        gain, averages = (
-            (1 / (1 - d / n_effective), n_effective - d) if correct else (1, n_effective)
-        )
-        noise[:, rows] = part * gain
-        scatter[:, :, rows] = cumulants(traces, averages, gain)
-    flags[:, ~covered] |= Flag.NO_COUNTERPART
-    return noise, scatter, flags
 
 
 def _shared(dims: tuple[int, ...], i: int) -> int:
@@ -456,7 +468,7 @@ def _spectra(given: Coherency, group: _Group) -> _Spectra:
 
 
 def _mean_of_pairs(
-    given: Coherency, group: _Group, weights: PairWeights | None, first: int
+    given: Coherency, group: _Group, weights: PairWeights | None, first: int, *, scatter: bool
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return the mean of (26) over all pairs of other sensors, its moments, and its validity.
 
@@ -468,6 +480,8 @@ def _mean_of_pairs(
         Without weights all pairs count equally.
     first : int
         Index of the first frequency of `given` in the matrix of `weights`.
+    scatter : bool
+        Whether the moments are wanted; NaN otherwise.
 
     Returns
     -------
@@ -497,11 +511,14 @@ def _mean_of_pairs(
         ).reshape(of.towards.shape)
     own = np.einsum("frkc->frk", (motion * of.towards.conj()).reshape(n_freqs, n_rows, m, d))
     noise = of.power - np.einsum("frj,frj->fr", share, own.real)
+    possible = np.asarray(share.any(axis=2))
+    if not scatter:
+        return noise, np.full((3, n_freqs, n_rows), np.nan), possible
     # One residual per sensor: those of sensor j paired with different k differ only by sampling
     # error, and are averaged. M = W^H omega W, with W the rows of these residuals and omega half of
     # each pair's weight; so tr((M S)^k) = tr((omega G)^k), G = W S W^H.
     traces = moments(_residuals(of.between, motion, own, of.power), omega)
-    return noise, traces, np.asarray(share.any(axis=2))
+    return noise, traces, possible
 
 
 def _inverses(

@@ -60,6 +60,15 @@ class ChannelSets:
         tested = (each for each in self._sums.values() if isinstance(each, SelectedSpectra))
         return sum(each.counts.total() for each in tested)
 
+    def lacking(self, n_channels: int) -> dict[int, int]:
+        """Return how many of the segments that count each channel lacks, by its column, if any."""
+        counts = {columns: each.n_segments for columns, each in self.spectra.items()}
+        found = {
+            column: sum(n for columns, n in counts.items() if column not in columns)
+            for column in range(n_channels)
+        }
+        return {column: n for column, n in found.items() if n}
+
     def merge(self, other: ChannelSets) -> None:
         """Add the segments that count in another recording; these are not judged again."""
         for columns, spectra in other.spectra.items():

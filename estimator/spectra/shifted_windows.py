@@ -25,12 +25,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from estimator.types import ComplexArray, FloatArray
+    from estimator.types import ComplexArray, FloatArray, IntArray
 
 PRECISION = 1e-5
 """Error of the series relative to the motion, as an amplitude: -100 dB, as interpolation has."""
 _HIGHEST = 0.45  # of the sampling rate: above, clocks that differ allow no estimate
 _SHORTEST = 256  # samples: below, the part of a sample at the ends of the window counts
+_CACHED_VALUES = 1 << 15  # samples times channels: 256 kB
 _LEVER = 1 / 6  # of a segment's length: rms of u under a Hann window
 
 
@@ -52,39 +53,81 @@ def order_of(drift: float, length: int) -> int | None:
 
 
 def shifted_spectra(
-    segments: FloatArray, shift: FloatArray, drift: FloatArray, *, order: int
+    samples: FloatArray,
+    rows: IntArray,
+    shift: FloatArray,
+    drift: FloatArray,
+    *,
+    order: int,
+    trends: FloatArray,
+    out: ComplexArray | None = None,
 ) -> ComplexArray:
     """Return spectra of segments under a Hann window that lies on the grid.
 
     Parameters
     ----------
-    segments : float64, shape (n_segments, n_channels, length)
-        Samples of the sensor, without trend.
+    samples : float64, shape (n_channels, n_samples)
+        Of one sensor.
+    rows : int64, shape (n_segments,)
+        First sample of each segment.
     shift : float64, shape (n_segments,)
         `d`: position of the grid segment's middle less that of this one's, in samples; a fraction.
     drift : float64, shape (n_segments,)
         `e`: own samples per sample of the grid, less one.
     order : int
         As `order_of` returns it.
+    trends : float64, shape (n_trends, length)
+        Orthogonal trends that are removed from each segment; `length` is that of the segments.
+    out : complex128, shape (n_segments, length // 2 + 1, n_channels), optional
+        Takes the spectra.
 
     Returns
     -------
-    complex128, shape (n_segments, n_channels, length // 2 + 1)
+    complex128, shape (n_segments, length // 2 + 1, n_channels)
     """
-    length = segments.shape[-1]
-    omega = 2 * np.pi * np.arange(length // 2 + 1) / length
-    spectra: ComplexArray | None = None
-    for power, window in enumerate(_windows(shift, drift, length, order)):
-        found = np.fft.rfft(segments * window[:, None, :], axis=-1)
-        if power:
-            found *= (1j * omega) ** power
-        spectra = found if spectra is None else np.add(spectra, found, out=spectra)
-    turn = np.exp(1j * np.outer(shift, omega))
-    return np.asarray(spectra * turn[:, None, :])
+    n_segments, n_channels, length = len(rows), len(samples), trends.shape[1]
+    n_freqs = length // 2 + 1
+    if out is None:
+        out = np.empty((n_segments, n_freqs, n_channels), np.complex128)
+    frames = np.lib.stride_tricks.sliding_window_view(samples, length, axis=1).swapaxes(0, 1)
+    fit = trends / np.sum(trends**2, axis=1, keepdims=True)
+    weights = _weights(shift, drift, length, order)
+    derivative = 2j * np.pi / length * np.arange(n_freqs)
+    turn = _turn(shift, length)
+    # Few segments at a time, so that all that is made of them stays in the cache.
+    block = min(n_segments, max(1, _CACHED_VALUES // (n_channels * length)))
+    segments, products = np.empty((2, block, n_channels, length))
+    total, lower = np.empty((2, block, n_channels, n_freqs), np.complex128)
+    for first in range(0, n_segments, block):
+        some = slice(first, min(first + block, n_segments))
+        n = some.stop - first
+        own, product, found = segments[:n], products[:n], total[:n]
+        own[:] = frames[rows[some]]
+        for trend, slope in zip(trends, fit, strict=True):
+            np.subtract(own, np.multiply((own @ slope)[..., None], trend, out=product), out=own)
+        windows = weights[:, some] @ _rows(length)
+        for power in range(order, -1, -1):  # Horner's scheme in iω
+            np.multiply(own, windows[power, :, None], out=product)
+            if power == order:
+                np.fft.rfft(product, axis=-1, out=found)
+                continue
+            found *= derivative
+            found += np.fft.rfft(product, axis=-1, out=lower[:n])
+        np.multiply(found.swapaxes(1, 2), turn[some, :, None], out=out[some])
+    return out
 
 
-def _windows(shift: FloatArray, drift: FloatArray, length: int, order: int) -> FloatArray:
-    """Return h0, h1, h2 up to `order`, shape (order + 1, n_segments, length)."""
+def _turn(shift: FloatArray, length: int) -> ComplexArray:
+    """Return exp(iωd), shape (n_segments, length // 2 + 1), by powers of one factor, 32 a row."""
+    n_rows = length // 64 + 1
+    angle = 2j * np.pi / length * shift[:, None]
+    fine, coarse = np.exp(angle * np.arange(32)), np.exp(angle * (32 * np.arange(n_rows)))
+    turned = (coarse[:, :, None] * fine[:, None]).reshape(len(shift), -1)
+    return np.asarray(turned[:, : length // 2 + 1])
+
+
+def _weights(shift: FloatArray, drift: FloatArray, length: int, order: int) -> FloatArray:
+    """Return h0, h1, h2 up to `order` in terms of `_rows`, (order + 1, n_segments, 9)."""
     angle, nothing, one = 2 * np.pi * shift / length, np.zeros_like(shift), np.ones_like(shift)
     cosine, sine = np.cos(angle), np.sin(angle)
     flat = np.stack([one, nothing, nothing])  # in terms of 1, cos and sin of 2 pi k / length
@@ -109,8 +152,7 @@ def _windows(shift: FloatArray, drift: FloatArray, length: int, order: int) -> F
         h[0] = h[0] + second / 2 * (product(curvature, u2) + 4 * product(slope, u1) + 2 * w)
         h[1] = h[1] - second * (product(slope, u2) + 2 * wu)
         h.append(second / 2 * wu2)
-    weights = np.stack(h).reshape(order + 1, 9, len(shift)).swapaxes(1, 2)
-    return np.asarray(weights @ _rows(length))
+    return np.stack(h).reshape(order + 1, 9, len(shift)).swapaxes(1, 2)
 
 
 @lru_cache(maxsize=4)

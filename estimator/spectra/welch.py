@@ -13,7 +13,6 @@ from __future__ import annotations
 import functools
 import io
 import json
-import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Literal, Self
@@ -30,9 +29,10 @@ if TYPE_CHECKING:
 
 SEGMENTS_PER_BLOCK = 32
 BLOCK_VALUES = 2**20  # maximum number of values per group: 8 MB
-FEW_GROUPS = 4
 FREQUENCIES_PER_BLOCK = 512
 PRODUCT_VALUES = 2**22  # maximum number of values of products of channels at a time: 32 MB
+KEPT_VALUES = 10**7  # maximum number of values of products that are kept: 80 MB
+TOGETHER = 16  # segments of many channels whose products are added together
 THREADS = 2
 
 
@@ -122,7 +122,9 @@ class CrossSpectra:
         length = settings.segment_length
         self._window = get_window(settings.window, length)
         n_freqs = settings.segment_length // 2 + 1
-        self._sum = np.zeros((n_freqs, n_channels, n_channels), dtype=np.complex128)
+        self._shape = n_freqs, n_channels
+        self._products = _Products(*self._shape)
+        self._work = _Work()
         self._block = max(1, min(SEGMENTS_PER_BLOCK, BLOCK_VALUES // (n_channels * length)))
         # One value per sample and channel: contiguous products are several times faster in numpy.
         self._taper = np.repeat(self._window[:, None], n_channels, axis=1)
@@ -157,13 +159,13 @@ class CrossSpectra:
             return
         workers = min(self._threads, -(-len(starts) // self._block))
         if workers == 1:
-            self._keep(self._add_to(self._sum, samples, starts))
+            self._keep(self._add_to(self._products, samples, starts, self._work))
         else:
             with ThreadPoolExecutor(workers) as pool:
                 for total, single in pool.map(
                     functools.partial(self._total, samples), np.array_split(starts, workers)
                 ):
-                    self._sum += total
+                    self._products.merge(total)
                     self._keep(single)
         self.n_segments += len(starts)
 
@@ -180,25 +182,17 @@ class CrossSpectra:
         EstimatorError
             If their shape is another.
         """
-        if spectra.ndim != 3 or spectra.shape[1:] != self._sum.shape[:2]:
-            n_freqs, n_channels, _ = self._sum.shape
+        if spectra.ndim != 3 or spectra.shape[1:] != self._shape:
+            n_freqs, n_channels = self._shape
             raise EstimatorError(
                 f"spectra of shape {spectra.shape}, expected (n_segments, {n_freqs}, {n_channels})"
             )
         if len(spectra) == 0:
             return
-        parts = spectra.view(np.float64)
-        for some in self._pieces():
-            _add_gram(self._sum[some], _gram(parts[:, some]))
+        self._products.add(spectra)
         if self._single is not None:
             self._single.add(spectra[:, self._single.bins])
         self.n_segments += len(spectra)
-
-    def _pieces(self) -> list[slice]:
-        """Return the frequencies whose products of channels are made at a time."""
-        n_freqs, n_channels, _ = self._sum.shape
-        step = max(1, min(FREQUENCIES_PER_BLOCK, PRODUCT_VALUES // (2 * n_channels) ** 2))
-        return [slice(low, low + step) for low in range(0, n_freqs, step)]
 
     def _keep(self, single: list[ComplexArray]) -> None:
         if self._single is not None:
@@ -219,31 +213,24 @@ class CrossSpectra:
                 f"segments begin at rows {starts.min()} to {starts.max()}, expected 0 to {last}"
             )
 
-    def _total(
-        self, samples: FloatArray, starts: IntArray
-    ) -> tuple[ComplexArray, list[ComplexArray]]:
-        """Return the sum of ``X conj(X).T`` over the segments, and what `_add_to` returns."""
-        total = np.zeros_like(self._sum)
-        return total, self._add_to(total, samples, starts)
+    def _total(self, samples: FloatArray, starts: IntArray) -> tuple[_Products, list[ComplexArray]]:
+        """Return the products of the segments, and what `_add_to` returns."""
+        total = _Products(*self._shape)
+        return total, self._add_to(total, samples, starts, _Work())
 
     def _add_to(
-        self, total: ComplexArray, samples: FloatArray, starts: IntArray
+        self, total: _Products, samples: FloatArray, starts: IntArray, work: _Work
     ) -> list[ComplexArray]:
-        """Add ``X conj(X).T`` of the segments to `total`, (n_freqs, n_channels, n_channels).
+        """Add the products of the segments to `total`.
 
         Return the spectra of the segments at the kept frequencies, if there are any.
         """
-        length, (n_freqs, n_channels, _) = self.settings.segment_length, self._sum.shape
+        length, n_channels = self.settings.segment_length, self.n_channels
         block = min(self._block, len(starts))
-        frames = np.empty((block, length, n_channels))
-        spectra = np.empty((block, n_freqs, n_channels), dtype=np.complex128)
+        by_channel = samples.strides[0] == samples.itemsize  # channel after channel in memory
+        taper = self._window[:, None] if by_channel else self._taper
+        frames, spectra = work.of(block, length, n_channels, by_channel=by_channel)
         trend = np.empty((block, len(self._fit), n_channels))
-        # Real and imaginary parts as 2 n_channels real numbers: their Gram matrix is symmetric,
-        # so that BLAS does half the work. It takes twice the memory of `total`, and is kept only
-        # where many groups of segments add up.
-        many = len(starts) > FEW_GROUPS * block
-        gram = np.zeros((n_freqs if many else 0, 2 * n_channels, 2 * n_channels))
-        pieces = self._pieces()
         single: list[ComplexArray] = []
         for first in range(0, len(starts), block):
             rows = starts[first : first + block]
@@ -251,24 +238,12 @@ class CrossSpectra:
             segments = _segments(samples, rows, length)
             np.matmul(self._fit, segments, out=trend[:n])
             if self._tapers:
-                segments = np.multiply(segments, self._taper, out=frames[:n])
+                segments = np.multiply(segments, taper, out=frames[:n])
             np.fft.rfft(segments, axis=1, out=spectra[:n])
             spectra[:n, self._trend_bins] -= self._trend_spectra @ trend[:n]
             if self._single is not None:
                 single.append(spectra[:n, self._single.bins])
-            parts = spectra[:n].view(np.float64)
-            for some in pieces:
-                if len(starts) == 1:  # cheaper than the sum over real and imaginary parts
-                    total[some] += spectra[0, some, :, None] * spectra[0, some, None, :].conj()
-                    continue
-                products = _gram(parts[:, some])
-                if many:
-                    gram[some] += products
-                else:
-                    _add_gram(total[some], products)
-        if many:
-            for some in pieces:
-                _add_gram(total[some], gram[some])
+            total.add(spectra[:n])
         return single
 
     @property
@@ -292,11 +267,13 @@ class CrossSpectra:
         if self.n_segments == 0:
             raise InsufficientDataError("no segment yet; expected at least one")
         energy = self.settings.sampling_rate * float(self._window @ self._window)
-        density = np.full(len(self._sum), 2 / (energy * self.n_segments))
+        density = np.full(self._shape[0], 2 / (energy * self.n_segments))
         density[0] /= 2
         if self.settings.segment_length % 2 == 0:
             density[-1] /= 2
-        csm: ComplexArray = self._sum * density[:, None, None]
+        self._work = _Work()  # whoever asks for the sum is rarely about to add more
+        csm = self._products.total()
+        csm *= density[:, None, None]
         return csm
 
     def merge(self, other: CrossSpectra) -> None:
@@ -306,7 +283,7 @@ class CrossSpectra:
                 f"spectra of {other.n_channels} channels with {other.settings} cannot be added to "
                 f"{self.n_channels} channels with {self.settings}"
             )
-        self._sum += other._sum
+        self._products.merge(other._products)
         self.n_segments += other.n_segments
 
     def __add__(self, other: CrossSpectra) -> CrossSpectra:
@@ -322,7 +299,7 @@ class CrossSpectra:
             content,
             settings=np.array(json.dumps(asdict(self.settings))),
             n_segments=np.array(self.n_segments),
-            sum=self._sum,
+            sum=self._products.total(),
         )
         return content.getvalue()
 
@@ -335,6 +312,8 @@ class CrossSpectra:
         EstimatorError
             If `content` is invalid.
         """
+        import zipfile  # noqa: PLC0415 - only of parts of an estimate
+
         try:
             with np.load(io.BytesIO(content), allow_pickle=False) as archive:
                 fields = json.loads(str(archive["settings"]))
@@ -346,11 +325,112 @@ class CrossSpectra:
         except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
             raise EstimatorError(f"not a serialised cross-spectral matrix: {error}") from error
         spectra = cls(settings, total.shape[-1])
-        if total.shape != spectra._sum.shape or n_segments < 0:
+        if total.shape != (*spectra._shape, total.shape[-1]) or n_segments < 0:
             raise EstimatorError(f"not a serialised cross-spectral matrix: shape {total.shape}")
-        spectra._sum = total.astype(np.complex128)
+        spectra._products.add_total(total)
         spectra.n_segments = n_segments
         return spectra
+
+
+class _Work:
+    """Tapered segments and spectra of one group: memory that is not taken afresh for each."""
+
+    def __init__(self) -> None:
+        self._frames, self._spectra = np.empty(0), np.empty(0, dtype=np.complex128)
+
+    def of(
+        self, n_segments: int, length: int, n_channels: int, *, by_channel: bool
+    ) -> tuple[FloatArray, ComplexArray]:
+        """Return arrays (n_segments, length, n_channels) and (n_segments, n_freqs, n_channels)."""
+        n_frames = n_segments * length * n_channels
+        n_spectra = n_segments * (length // 2 + 1) * n_channels
+        if len(self._frames) < n_frames:
+            self._frames = np.empty(n_frames)
+            self._spectra = np.empty(n_spectra, dtype=np.complex128)
+        frames, spectra = self._frames[:n_frames], self._spectra[:n_spectra]
+        inner = (n_channels, length) if by_channel else (length, n_channels)
+        shaped = frames.reshape(n_segments, *inner)
+        return (
+            shaped.swapaxes(1, 2) if by_channel else shaped,
+            spectra.reshape(n_segments, -1, n_channels),
+        )
+
+
+class _Products:
+    """Sum of ``X conj(X).T`` over segments.
+
+    Real and imaginary parts are 2 n_channels real numbers: their Gram matrix is symmetric, so that
+    BLAS does half the work. It takes twice the memory of the sum of complex numbers, so it is kept
+    only where it is small. A larger sum is written once for `TOGETHER` segments, which takes longer
+    than their products. Of the sum, which is Hermitian, the real part of the lower triangle is kept
+    with the imaginary part of the upper one.
+    """
+
+    def __init__(self, n_freqs: int, n_channels: int) -> None:
+        n_parts = 2 * n_channels
+        self._total = np.zeros((n_freqs, n_channels, n_channels))
+        self._gram: FloatArray | None = None
+        self._waiting: list[ComplexArray] = []
+        self._is_small = n_freqs * n_parts**2 <= KEPT_VALUES
+        step = max(1, min(FREQUENCIES_PER_BLOCK, PRODUCT_VALUES // n_parts**2))
+        self._pieces = [slice(low, low + step) for low in range(0, n_freqs, step)]
+
+    def add(self, spectra: ComplexArray) -> None:
+        """Add segments by their spectra, contiguous."""
+        if self._is_small:
+            self._add_small(spectra)
+            return
+        self._waiting.append(spectra.copy())
+        if sum(map(len, self._waiting)) >= TOGETHER:
+            self._add_waiting()
+
+    def _add_small(self, spectra: ComplexArray) -> None:
+        if len(spectra) == 1:  # cheaper than the sum over real and imaginary parts
+            for some in self._pieces:
+                found = spectra[0, some]
+                self._total[some] += _packed(found[:, :, None] * found[:, None, :].conj())
+            return
+        parts = spectra.view(np.float64)
+        if self._gram is None:
+            self._gram = np.zeros((parts.shape[1], parts.shape[2], parts.shape[2]))
+        for some in self._pieces:
+            self._gram[some] += _gram(parts[:, some])
+
+    def _add_waiting(self) -> None:
+        waiting, self._waiting = self._waiting, []
+        for some in self._pieces if waiting else ():
+            found = np.concatenate([each[:, some] for each in waiting])
+            self._total[some] += _packed(
+                np.matmul(found.transpose(1, 2, 0), found.conj().swapaxes(0, 1))
+            )
+
+    def _settle(self) -> None:
+        """Add what waits, and what is kept in another form."""
+        if self._gram is not None:
+            for some in self._pieces:
+                _add_gram(self._total[some], self._gram[some])
+            self._gram = None
+        self._add_waiting()
+
+    def total(self) -> ComplexArray:
+        """Return the sum in an array of its own, (n_freqs, n_channels, n_channels)."""
+        self._settle()
+        found = np.empty(self._total.shape, dtype=np.complex128)
+        for some in self._pieces:
+            lower, upper = np.tril(self._total[some]), np.triu(self._total[some], 1)
+            found.real[some] = lower + np.tril(lower, -1).swapaxes(1, 2)
+            found.imag[some] = upper - upper.swapaxes(1, 2)
+        return found
+
+    def merge(self, other: _Products) -> None:
+        """Add another sum."""
+        self._settle()
+        other._settle()
+        self._total += other._total
+
+    def add_total(self, total: ComplexArray) -> None:
+        """Add what `total` returned."""
+        self._total += _packed(total)
 
 
 def _gram(parts: FloatArray) -> FloatArray:
@@ -358,10 +438,17 @@ def _gram(parts: FloatArray) -> FloatArray:
     return np.asarray(np.matmul(parts.transpose(1, 2, 0), parts.swapaxes(0, 1)))
 
 
-def _add_gram(total: ComplexArray, gram: FloatArray) -> None:
+def _packed(matrices: ComplexArray) -> FloatArray:
+    """Return real parts of the lower triangles, with imaginary parts of the upper ones."""
+    lower = np.tri(matrices.shape[1], dtype=np.bool_)
+    return np.where(lower, matrices.real, matrices.imag)
+
+
+def _add_gram(total: FloatArray, gram: FloatArray) -> None:
     """Add products of complex numbers, given those of their real and imaginary parts."""
-    total.real += gram[:, ::2, ::2] + gram[:, 1::2, 1::2]
-    total.imag += gram[:, 1::2, ::2] - gram[:, ::2, 1::2]
+    real = gram[:, ::2, ::2] + gram[:, 1::2, 1::2]
+    imag = gram[:, 1::2, ::2] - gram[:, ::2, 1::2]
+    total += np.where(np.tri(total.shape[1], dtype=np.bool_), real, imag)
 
 
 def _segments(samples: FloatArray, rows: IntArray, length: int) -> FloatArray:

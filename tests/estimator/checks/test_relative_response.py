@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.checks.advice import ModelMisfit, Rotated
 from estimator.checks.diagnose import diagnose
-from estimator.checks.relative_response import relative_response
+from estimator.checks.relative_response import PairProducts, relative_response
 from estimator.checks.rules import orientation
 from estimator.checks.shared_motion import CanonicalCoherence, matched_coherence
 from estimator.errors import EstimatorError, InsufficientDataError
@@ -238,8 +238,11 @@ def test_sensors_that_are_not_comparable_are_refused() -> None:
 
 
 @pytest.fixture(scope="module")
-def tst(usgs_recording: Path) -> tuple[ComplexArray, WelchSettings, float]:
-    """Average the real recording: Hann, segments of 16384 samples at 50 % overlap."""
+def tst(usgs_recording: Path) -> tuple[ComplexArray, FloatArray, float]:
+    """Average the real recording: Hann, segments of 16384 samples at 50 % overlap.
+
+    Of three neighbouring frequencies, which share their noise, one is used.
+    """
     obspy = pytest.importorskip("obspy", reason="the real recording is miniSEED: needs obspy")
     samples = np.column_stack(
         [
@@ -252,7 +255,7 @@ def tst(usgs_recording: Path) -> tuple[ComplexArray, WelchSettings, float]:
     starts = np.arange(0, len(samples) - 16384 + 1, settings.hop, dtype=np.int64)
     spectra = CrossSpectra(settings, 9)
     spectra.add(samples, starts)
-    return spectra.csm(), settings, spectra.n_effective
+    return spectra.csm()[::3], settings.frequencies[::3], spectra.n_effective
 
 
 @pytest.mark.parametrize(
@@ -260,17 +263,17 @@ def tst(usgs_recording: Path) -> tuple[ComplexArray, WelchSettings, float]:
 )
 @pytest.mark.parametrize("band", [None, (0.1, 1.0)], ids=["all", "microseism"])
 def test_horizontal_angles_of_the_real_recording(
-    tst: tuple[ComplexArray, WelchSettings, float],
+    tst: tuple[ComplexArray, FloatArray, float],
     first: int,
     second: int,
     angle: float,
     band: tuple[float, float] | None,
 ) -> None:
     """Published angles are those of BH1; BH2 turns by 0.2 to 0.3 degrees more or less."""
-    csm, settings, _ = tst
+    csm, frequencies, _ = tst
     found = relative_response(
         csm,
-        settings.frequencies,
+        frequencies,
         dims=(3, 3, 3),
         first=first,
         second=second,
@@ -284,12 +287,12 @@ def test_horizontal_angles_of_the_real_recording(
 
 
 def test_the_report_says_where_one_motion_does_not_explain_the_real_recording(
-    tst: tuple[ComplexArray, WelchSettings, float],
+    tst: tuple[ComplexArray, FloatArray, float],
 ) -> None:
-    csm, settings, n_effective = tst
+    csm, frequencies, n_effective = tst
     found = diagnose(
-        csm[::3],
-        settings.frequencies[::3],
+        csm,
+        frequencies,
         dims=(3, 3, 3),
         n_effective=n_effective,
         neighbours=np.zeros(0),  # Hann: bins three apart are independent
@@ -305,3 +308,25 @@ def test_the_report_says_where_one_motion_does_not_explain_the_real_recording(
     assert warned[0].band[0] < 0.2 < warned[0].band[1]
     (rotated,) = [a for a in found.advice if isinstance(a, Rotated) and a.sensors == (0, 1)]
     assert rotated.horizontal_deg == pytest.approx(2.242, abs=0.05)
+
+
+def test_pairs_together_have_the_response_of_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(3)
+    dims = (3, 3, 2, 3)
+    sensors = [Rotation.random(random_state=k).as_matrix()[:d] * 3.0**k for k, d in enumerate(dims)]
+    csm = wishart(bench(sensors, delays=(0, 1e-3, 0, -2e-3)), 200, rng)[0]
+    csm[50] = np.nan  # not known in the middle of the band
+    csm[-10:] = np.nan
+    for n_bytes in (1, 1 << 24):
+        monkeypatch.setattr("estimator.checks.relative_response._PRODUCT_BYTES", n_bytes)
+        products = PairProducts(csm, dims)
+        for first, second in ((0, 1), (0, 3), (1, 3)):
+            alone, together = (
+                relative_response(
+                    csm, FREQUENCY, dims=dims, first=first, second=second, products=each
+                )
+                for each in (None, products)
+            )
+            np.testing.assert_allclose(together.matrix, alone.matrix, rtol=1e-9)
+            np.testing.assert_allclose(together.gain_errors, alone.gain_errors, rtol=1e-6)
+            assert together.delay == pytest.approx(alone.delay, rel=1e-9)

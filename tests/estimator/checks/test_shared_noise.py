@@ -10,7 +10,7 @@ from estimator.checks.diagnose import diagnose
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.score_test import pair_scores
 from estimator.self_noise.three_sensor import three_sensor
-from tests.estimator.csm_models import pentagon, plane_waves, rotation, wishart
+from tests.estimator.csm_models import pentagon, plane_waves, random_bench, rotation, wishart
 
 N = 226
 FREQUENCY = np.linspace(1, 60, 160)
@@ -133,3 +133,24 @@ def test_sound_tests_seldom_report_shared_noise() -> None:
     assert z.std() == pytest.approx(1.0, abs=4 / np.sqrt(2 * 40 * 12))
     assert np.abs(z.mean(axis=0)).max() < 4.5 / np.sqrt(40)
     assert np.mean(np.abs(z).max(axis=1) > 3.63) <= 3 / 40
+
+
+def test_information_on_some_pairs_is_that_on_all() -> None:
+    rng = np.random.default_rng(8)
+    csm = random_bench(rng, dims=(3,) * 4, snr=1e3, noise_psd=np.ones(12))
+    fit = maximise(wishart(csm, 200, rng, n_draws=12), 3)
+    low = np.arange(12) < 6
+    halves = [
+        pair_scores(fit, band, n_effective=200, neighbours=np.empty(0)) for band in (low, ~low)
+    ]
+    assert halves[0] is not None
+    assert halves[1] is not None
+    both = halves[0] + halves[1]
+    table = both.between(None)
+    np.testing.assert_allclose(table, table.T, atol=1e-12)
+    np.testing.assert_allclose(np.diag(table), both.power, rtol=1e-9)
+    some = np.array([3, 40, 65])
+    np.testing.assert_allclose(both.between(some), table[:, some], atol=1e-12)
+    left, kept = both.without(some), both.kept().without(some)
+    np.testing.assert_allclose(left.between(None), kept.between(None), atol=1e-12)
+    np.testing.assert_allclose(np.diag(left.between(None)), left.power, atol=1e-12)

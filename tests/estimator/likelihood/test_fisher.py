@@ -79,7 +79,8 @@ def test_the_first_cumulant_is_the_cramer_rao_bound() -> None:
     """At the truth, for n - q averages; the third and fourth are those of a PSD far from zero."""
     rng = np.random.default_rng(4)
     csm = random_bench(rng, dims=(2, 2, 2), snr=1e4, noise_psd=np.ones(6))[None]
-    found = fisher.cumulants(maximise(csm, 2), n_effective=102)
+    fit = maximise(csm, 2)
+    found = fisher.cumulants(fit, fisher.spread(fit), n_effective=102)
     bound = fisher.cramer_rao_cov(csm, np.ones((1, 6)), n_effective=100)
     np.testing.assert_allclose(found[0], bound**2, rtol=1e-3)
     assert np.all(found[2] * found[0] >= found[1] ** 2)  # Cauchy and Schwarz
@@ -92,12 +93,11 @@ def test_cumulants_are_traces_of_powers(*, with_penalty: bool) -> None:
     csm = wishart(true, 150, rng)
     penalty = 0.3 * np.eye(8) + 0.1 if with_penalty else None
     found = maximise(np.repeat(csm.reshape(1, 8, 8), 3, axis=0), 2, penalty=penalty)
-    cumulants = fisher.cumulants(found, n_effective=150.0)
-    free = found.eigenvectors[1][:, 2:]
-    information = np.abs(free @ free.conj().T) ** 2 + found.penalty
-    inverse = np.linalg.inv(information)
+    cumulants = fisher.cumulants(found, fisher.spread(found), n_effective=150.0)
+    projector = found.projector[1]
+    inverse = np.linalg.inv(np.abs(projector) ** 2 + found.penalty)
     for i in range(8):
-        K = sum(inverse[i, j] * np.outer(free[j].conj(), free[j]) for j in range(8))
+        K = projector @ np.diag(inverse[i]) @ projector
         for m in range(3):
             trace = np.trace(np.linalg.matrix_power(K, m + 2)).real
             expected = trace * found.psi[1, i] ** (m + 2) / 148.0 ** (m + 1)
@@ -128,7 +128,7 @@ def test_the_bias_is_of_first_order(d: int, snr: float) -> None:
     csm = random_bench(rng, dims=(d,) * 3, snr=snr, noise_psd=np.ones(p))
     found = maximise(wishart(csm, 100, rng, n_draws=n_draws), d)
     seen = found.psi.mean(axis=1) - 1
-    predicted = fisher.bias(found, n_effective=100).mean()
+    predicted = fisher.bias(found, fisher.spread(found), n_effective=100).mean()
     allowed = 4 * seen.std() / np.sqrt(n_draws) + (2 * d / 100) ** 2
     assert abs(seen.mean() - predicted) < allowed
     if snr == 1e6:

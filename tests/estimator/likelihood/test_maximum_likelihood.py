@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from estimator.errors import EstimatorError, InsufficientDataError, InvalidMatrixError
-from estimator.likelihood import fisher
+from estimator.likelihood import factor_analysis, fisher
 from estimator.likelihood.factor_analysis import DECREMENT, max_factors, maximise
 from estimator.likelihood.maximum_likelihood import maximum_likelihood
 from estimator.self_noise.result import Flag
@@ -370,3 +370,36 @@ def test_dimension_may_differ_from_frequency_to_frequency() -> None:
     for q, rows in ((3, [0, 2]), (2, [1, 3])):
         alone = maximum_likelihood(csm[rows], dims=(3, 3, 3), n_effective=200, n_factors=q)
         np.testing.assert_array_equal(mixed.noise_psd[rows], alone.noise_psd)
+
+
+def test_the_same_matrices_are_fitted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(5)
+    csm = wishart(equal_noise(1, dims=(1,) * 4, snr=10.0), 50, rng, n_draws=6)
+    maxima, fitted = factor_analysis.Maxima(), []
+
+    def counted(some: ComplexArray, n_factors: int) -> factor_analysis.Maximum:
+        fitted.append(len(some))
+        return maximise(some, n_factors)
+
+    monkeypatch.setattr(factor_analysis, "maximise", counted)
+    maxima.maximise(csm[::2], 1)
+    found = maxima.maximise(csm[::-1], 1)
+    assert fitted == [3, 3]
+    assert maxima.maximise(csm[:0], 1).psi.shape == (0, 4)
+    np.testing.assert_allclose(found.psi, maximise(csm, 1).psi[::-1], rtol=1e-12)
+
+
+def test_many_channels_are_fitted_as_few_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By subspace iteration, or by all eigenvalues: strong, weak and missing motion."""
+    rng = np.random.default_rng(6)
+    draws = np.concatenate(
+        [
+            wishart(equal_noise(2, dims=(2,) * 9, snr=snr), 60, rng, n_draws=2)
+            for snr in (1e6, 3.0, 1e-3)
+        ]
+    )
+    found = maximise(draws, 2)
+    monkeypatch.setattr(factor_analysis, "_FEW", 18)
+    whole = maximise(draws, 2)
+    np.testing.assert_allclose(found.psi, whole.psi, rtol=1e-6)
+    np.testing.assert_allclose(found.discrepancy, whole.discrepancy, rtol=1e-6)

@@ -74,6 +74,7 @@ def true_deviation(tau: FloatArray, high: float) -> FloatArray:
     return np.asarray(np.sqrt(np.trapezoid(2 * (terms_at(f) @ TERMS) * np.sin(x) ** 4 / x**2, f)))
 
 
+@pytest.mark.long
 def test_terms_are_recovered_from_samples_with_strong_motion() -> None:
     """Motion taken out, windows, neighbouring frequencies correlated: terms and Allan deviation."""
     rate, settings = 50.0, WelchSettings(50.0, 1000)

@@ -19,8 +19,14 @@ def two_poor_sensors(ratio: float) -> np.ndarray:
     return noise_psd
 
 
-@pytest.mark.parametrize(("ratio", "snr"), [(10.0, 1e3), (100.0, 1e3), (1000.0, 1e4)])
-@pytest.mark.parametrize("n", [30, pytest.param(200, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    ("ratio", "snr", "n"),
+    [
+        pytest.param(ratio, snr, n, marks=() if (ratio, n) == (100.0, 30) else pytest.mark.long)
+        for ratio, snr in ((10.0, 1e3), (100.0, 1e3), (1000.0, 1e4))
+        for n in (30, 200)
+    ],
+)
 def test_two_poor_sensors_hardly_affect_the_others(ratio: float, snr: float, n: int) -> None:
     """Scatter within 10 % of maximum likelihood; no bias; the interval is that of these weights."""
     noise_psd = two_poor_sensors(ratio)
@@ -103,3 +109,22 @@ def test_sampled_frequencies_are_dense_below_and_rising() -> None:
     assert np.all(steps <= np.maximum(1, bins[:-1] / DENSE_BINS))
     np.testing.assert_array_equal(bins[:64], np.arange(64))
     assert len(bins) < 250
+
+
+def test_channels_may_be_estimated_in_parts_and_without_scatter(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(5)
+    dims = (3, 3, 2, 3, 3)
+    noise_psd = np.geomspace(1, 100, sum(dims))
+    csm = random_bench(rng, dims=dims, snr=1e3, noise_psd=noise_psd)
+    sample = wishart(csm, 50, rng, n_draws=100)
+    found = three_sensor(sample, dims=dims, n_effective=50)
+    monkeypatch.setattr("estimator.self_noise.three_sensor.WEIGHT_BYTES", 1)
+    in_parts = three_sensor(sample, dims=dims, n_effective=50)
+    for one, other in ((found.noise_psd, in_parts.noise_psd), (found.cov, in_parts.cov)):
+        np.testing.assert_allclose(one, other, rtol=1e-9)
+    np.testing.assert_array_equal(found.flags, in_parts.flags)
+    quick = self_noise("three-sensor", sample, dims=dims, n_effective=50, scatter=False)
+    np.testing.assert_allclose(quick.noise_psd, found.noise_psd, rtol=1e-9)
+    assert np.isnan(quick.cov).all()

@@ -34,8 +34,14 @@ def test_spectra_are_those_of_samples_taken_on_the_grid(
     k = np.arange(LENGTH)
     hann = 0.5 - 0.5 * np.cos(2 * np.pi * k / LENGTH)
     true = np.fft.rfft(hann * motion(k + shift + drift * (k - LENGTH / 2)))
-    own = motion(k.astype(float))[None, None, :]
-    found = shifted_spectra(own, np.array([shift]), np.array([drift]), order=order)[0, 0]
+    found = shifted_spectra(
+        motion(k.astype(float))[None],
+        np.array([0]),
+        np.array([shift]),
+        np.array([drift]),
+        order=order,
+        trends=np.empty((0, LENGTH)),
+    )[0, :, 0]
     band = slice(3, int(0.44 * LENGTH))
     error = np.mean(np.abs(found - true)[band] ** 2) / np.mean(np.abs(true[band]) ** 2)
     assert 10 * np.log10(error + 1e-30) < below_db

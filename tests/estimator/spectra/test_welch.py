@@ -48,6 +48,20 @@ def test_the_matrix_is_the_transpose_of_scipy_csd(
     np.testing.assert_allclose(settings.frequencies, frequencies)
 
 
+@pytest.mark.parametrize("window", ["hann", "rectangular"])
+def test_the_order_of_samples_in_memory_does_not_matter(window: str) -> None:
+    samples, settings = noise(5000, 3), WelchSettings(RATE, 100, window=window)
+    by_sample, by_channel = np.ascontiguousarray(samples), np.asfortranarray(samples)
+    expected = accumulated(by_sample, settings).csm()
+    found = CrossSpectra(settings, 3)
+    starts = np.arange(0, 4901, settings.hop)
+    for first in (0, 40, 60):  # as many segments, then fewer, then more than before
+        last = {0: 40, 40: 60, 60: 99}[first]
+        found.add(by_sample if first == 40 else by_channel, starts[first:last])
+    size = np.abs(expected).max()
+    np.testing.assert_allclose(found.csm(), expected, rtol=0, atol=1e-13 * size)
+
+
 def test_a_delay_has_the_sign_of_the_convention() -> None:
     # csm[f, 0, 1] = E[X_0 conj(X_1)]; channel 1 comes m samples later: phase +2 pi f m / fs.
     m, length = 3, 256
@@ -196,3 +210,22 @@ def test_scale_divides_by_both_responses_and_marks_zeros() -> None:
     assert np.isfinite(scaled[1:]).all()
     with pytest.raises(EstimatorError, match="shape"):
         scale(csm, gain[1:])
+
+
+def test_products_of_many_channels_are_added_some_segments_at_a_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    samples, settings = noise(3000, 3), WelchSettings(RATE, 100)
+    expected = accumulated(samples, settings)
+    monkeypatch.setattr(welch, "KEPT_VALUES", 0)  # as if there were very many channels
+    starts = np.arange(0, 2901, settings.hop)
+    total, other = (CrossSpectra(settings, 3) for _ in range(2))
+    for some in np.array_split(starts[:50], 9):
+        total.add(samples, some)
+    other.add(samples, starts[50:])
+    np.testing.assert_allclose(
+        total.csm() * 50, accumulated(samples[:2550], settings).csm() * 50, rtol=1e-12
+    )
+    total.merge(other)
+    assert total.n_segments == expected.n_segments
+    np.testing.assert_allclose(total.csm(), expected.csm(), rtol=1e-12)

@@ -1,0 +1,67 @@
+"""Records against frozen dataclasses of the same fields."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from dataclasses import FrozenInstanceError, dataclass, fields, is_dataclass, replace
+from typing import ClassVar
+
+import pytest
+
+from estimator.records import Record, record
+
+
+@record
+class _Base(Record):
+    name: ClassVar[str] = "base"
+    level: int
+    sensors: tuple[int, ...] = ()
+
+
+@record
+class _Special(_Base):
+    name: ClassVar[str] = "special"
+    share: float
+    whole: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Usual:
+    level: int
+    sensors: tuple[int, ...] = ()
+    share: float
+    whole: bool = False
+
+
+def test_a_record_is_as_a_frozen_dataclass() -> None:
+    made, usual = _Special(level=1, share=0.5), _Usual(level=1, share=0.5)
+    assert is_dataclass(made)
+    assert [each.name for each in fields(made)] == [each.name for each in fields(usual)]
+    assert repr(made).removeprefix("_Special") == repr(usual).removeprefix("_Usual")
+    assert made == _Special(level=1, share=0.5, sensors=(), whole=False)
+    assert made != _Special(level=1, share=0.25)
+    assert made != _Base(level=1)
+    assert hash(made) == hash(usual)
+    assert replace(made, sensors=(2,)) == _Special(level=1, share=0.5, sensors=(2,))
+    assert copy.copy(made) == made
+    assert pickle.loads(pickle.dumps(made)) == made  # noqa: S301 - made here
+    assert not hasattr(made, "__dict__")
+
+
+def test_a_record_cannot_be_changed() -> None:
+    made = _Base(level=1)
+    with pytest.raises(FrozenInstanceError, match="cannot assign to field 'level'"):
+        made.level = 2  # type: ignore[misc]  # what is tested
+    with pytest.raises(FrozenInstanceError, match="cannot delete field 'level'"):
+        del made.level
+    assert made.level == 1
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [({"level": 1}, "_Special without share"), ({"level": 1, "share": 2.0, "x": 3}, "has no x")],
+)
+def test_fields_are_complete_and_known(values: dict[str, float], message: str) -> None:
+    with pytest.raises(TypeError, match=message):
+        _Special(**values)  # type: ignore[arg-type]  # what is tested
