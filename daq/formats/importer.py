@@ -7,6 +7,7 @@ Each contiguous stretch is written as blocks that state the UTC of their first s
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from heapq import merge
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from daq.bench.estimate_settings import EstimateSettings
     from daq.formats.foreign_sensor import ForeignSensor, Stretch
     from daq.formats.response import Responses
+    from daq.formats.traces import PartCache
 
 _ROWS_AT_ONCE = 16 * BLOCK_ROWS
 _NAMES_KEPT = 100
@@ -220,7 +222,7 @@ def _import(
     found = {name: sources.named(sensor) for name, sensor in opened.sensors.items()}
     if bench is not None:
         found = _ordered(found, bench)
-    described, taken = _all_described(found, bench, _responses(sources.responses, response_for))
+    described, taken = _all_described(found, bench, responses_in(sources.responses, response_for))
     written = _bench(out, bench, tuple(described.values()), estimate)
     start = min(sensor.stretches[0].start_utc_ns for sensor in found.values())
     with ArrayWriter(
@@ -248,6 +250,9 @@ def open_files(
     response_for: Sequence[tuple[str, Any]] = (),
     sampling_rate: float | None = None,
     selection: Selection | None = None,
+    responses_of: tuple[int, int] | None = None,
+    logged: bool = True,
+    cache: PartCache | None = None,
 ) -> tuple[RecordingInMemory, ImportResult]:
     """Return what `import_files` would write, as a recording that reads the files when asked.
 
@@ -258,6 +263,11 @@ def open_files(
         Takes what is fetched or unpacked; must exist as long as the recording is read.
     response, response_for, sampling_rate, selection
         As `import_files` takes them; a response may also be an inventory of ObsPy.
+    responses_of : (int, int), optional
+        UTC in ns, from which and before which samples decide what responses are taken; default: all
+        do.
+    logged, cache
+        As `open_sources` takes them.
 
     Raises
     ------
@@ -265,9 +275,13 @@ def open_files(
         No file is understood, or files and responses do not fit together.
     """
     fetched = _fetched(sources, response, selection or Selection(), folder)
-    opened = open_sources(fetched.files, selection, sampling_rate=sampling_rate)
+    opened = open_sources(
+        fetched.files, selection, sampling_rate=sampling_rate, logged=logged, cache=cache
+    )
     found = {name: fetched.named(sensor) for name, sensor in opened.sensors.items()}
-    described, taken = _all_described(found, None, _responses(fetched.responses, response_for))
+    described, taken = _all_described(
+        found, None, responses_in(fetched.responses, response_for), responses_of
+    )
     sensors = [SensorInMemory(each, described[name].channels) for name, each in found.items()]
     imported = tuple(_imported(each) for each in found.values())
     result = ImportResult(imported, opened.problems, opened.left_aside, taken)
@@ -292,20 +306,52 @@ def _is_path(given: object) -> bool:
     return isinstance(given, (str, Path))
 
 
-def _responses(given: Sequence[Any], response_for: Sequence[tuple[str, Any]]) -> Responses | None:
+def responses_in(given: Sequence[Any], response_for: Sequence[tuple[str, Any]]) -> Responses | None:
+    """Return the responses of files, read once while these stay as they are; None without any.
+
+    Raises
+    ------
+    ImportFormatError
+        ObsPy is absent, or a file holds no response that it understands.
+    """
     if not given and not response_for:
         return None
+    paths = [*given, *(path for _, path in response_for)]
+    if not all(map(_is_path, paths)):  # inventories
+        from daq.formats.response import Responses  # noqa: PLC0415 - ObsPy is an extra
+
+        return Responses(given, response_for)
+    state = tuple(
+        (str(file), file.stat().st_size, file.stat().st_mtime_ns)
+        for path in map(Path, paths)
+        for file in (sorted(path.rglob("*")) if path.is_dir() else [path])
+        if file.is_file()
+    )
+    return _read_responses(tuple(map(Path, given)), tuple(response_for), state)
+
+
+@lru_cache(maxsize=2)
+def _read_responses(
+    given: tuple[Path, ...],
+    response_for: tuple[tuple[str, Path], ...],
+    state: tuple[tuple[str, int, int], ...],
+) -> Responses:
+    """Read responses once, as long as their files are in this `state`: a day needs them, too."""
+    del state
     from daq.formats.response import Responses  # noqa: PLC0415 - ObsPy is an extra
 
     return Responses(given, response_for)
 
 
 def _all_described(
-    found: dict[str, ForeignSensor], bench: Bench | None, responses: Responses | None
+    found: dict[str, ForeignSensor],
+    bench: Bench | None,
+    responses: Responses | None,
+    span: tuple[int, int] | None = None,
 ) -> tuple[dict[str, Sensor], tuple[Taken, ...]]:
     taken: list[Taken] = []
     described = {
-        name: _described(sensor, bench, responses, taken) for name, sensor in found.items()
+        name: _described(sensor, bench, responses, taken, span) for name, sensor in found.items()
     }
     return described, tuple(taken)
 
@@ -327,7 +373,11 @@ def _ordered(found: dict[str, ForeignSensor], bench: Bench) -> dict[str, Foreign
 
 
 def _described(
-    foreign: ForeignSensor, bench: Bench | None, responses: Responses | None, taken: list[Taken]
+    foreign: ForeignSensor,
+    bench: Bench | None,
+    responses: Responses | None,
+    taken: list[Taken],
+    span: tuple[int, int] | None,
 ) -> Sensor:
     """Return a sensor as the recording's bench names it; what was taken is added to `taken`."""
     units = [canonical(unit) for unit in foreign.units] or ["counts"] * len(foreign.channels)
@@ -359,8 +409,9 @@ def _described(
         _refuse_scaling_twice(foreign, channels)
         found = [Taken(each.name, "bench", each.sensitivity, each.unit) for each in channels]
         sensor = listed.model_copy(update={"sampling_rate": foreign.sampling_rate})
+    stretches = _within(foreign.dated_spans_ns(), span)
     for number, name in enumerate(foreign.channels):
-        known = responses and responses.of(foreign.name, name, foreign.dated_spans_ns())
+        known = responses and responses.of(foreign.name, name, stretches)
         if not known:
             continue
         changes: dict[str, Any] = {
@@ -387,6 +438,16 @@ def _described(
         )
     taken += [replace(each, channel=f"{foreign.name}.{each.channel}") for each in found]
     return sensor.model_copy(update={"channels": tuple(channels)})
+
+
+def _within(
+    stretches: list[tuple[int, int]], span: tuple[int, int] | None
+) -> list[tuple[int, int]]:
+    """Return stretches cut to a span of time; as they are, if none is in it."""
+    if span is None:
+        return stretches
+    cut = [(max(first, span[0]), min(last, span[1] - 1)) for first, last in stretches]
+    return [each for each in cut if each[0] <= each[1]] or stretches
 
 
 def _refuse_scaling_twice(foreign: ForeignSensor, channels: Sequence[Channel]) -> None:

@@ -9,6 +9,7 @@ responses of imported channels are built: what is wrong with another channel doe
 
 from __future__ import annotations
 
+import hashlib
 import math
 import warnings
 from dataclasses import dataclass, field, replace
@@ -33,7 +34,7 @@ from daq.errors import ImportFormatError
 from daq.formats.readers.waveforms import load_obspy
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from daq.bench.response import Stage
 
@@ -66,6 +67,8 @@ _EDGE_NS = 10**9
 _USED = 0.4
 """Of the sampling rate: up to where the ripple of digital filters is stated."""
 _NAMED = 8
+_REMARKS = {"name", "description", "resource_id", "resource_id2"}
+"""Of stages: they do not change the response."""
 _HEAD = 1 << 16
 
 
@@ -160,6 +163,10 @@ class Responses:
     ) -> None:
         self._epochs = _read_all(files)
         self._assigned = [(pattern, _read_all([path])) for pattern, path in assigned]
+        self._by_channel: dict[tuple[str, str], list[_Epoch]] = {}
+        for each in self._epochs:
+            self._by_channel.setdefault((each.sensor, each.channel), []).append(each)
+        self._contents: dict[_Epoch, str] = {}
 
     def of(
         self, sensor: str, channel: str, stretches: Sequence[tuple[int, int]] = ()
@@ -180,27 +187,68 @@ class Responses:
             not understood.
         """
         name = f"{sensor}.{channel}"
+        found, is_assigned = self._epochs_for(sensor, channel)
+        if not found:
+            return None
+        whole = [each for each in found if not (each.is_sensor_alone or each.is_digitizer_alone)]
+        if whole:
+            return _in_time(name, whole, stretches, is_assigned=is_assigned)
+        return _joined_halves(name, found, stretches, is_assigned=is_assigned)
+
+    def fingerprint(self, sensor: str, channel: str, begin_ns: int, end_ns: int) -> str:
+        """Return the SHA-256 of what files say of a channel in a span of time.
+
+        It is that of stages and directions, and of when they hold within the span: what a file
+        says of other times or channels, its comments and its date do not enter.
+
+        Parameters
+        ----------
+        sensor, channel : str
+        begin_ns, end_ns : int
+            UTC in ns.
+        """
+        try:
+            found, is_assigned = self._epochs_for(sensor, channel)
+        except ImportFormatError as error:
+            return hashlib.sha256(str(error).encode()).hexdigest()
+        digest = hashlib.sha256()
+        for each in found:
+            begin, end = max(begin_ns, each.start_ns), min(end_ns, each.end_ns)
+            if is_assigned and len(found) == 1:  # for any time
+                begin, end = begin_ns, end_ns
+            if end - begin > _EDGE_NS:
+                digest.update(f"{begin} {end} {self._content(each)}\n".encode())
+        return digest.hexdigest()
+
+    def _content(self, epoch: _Epoch) -> str:
+        if epoch not in self._contents:
+            raw = epoch.raw
+            about = repr((raw.azimuth, raw.dip)), *_contents_of(raw.response)
+            self._contents[epoch] = hashlib.sha256("\0".join(about).encode()).hexdigest()
+        return self._contents[epoch]
+
+    def _epochs_for(self, sensor: str, channel: str) -> tuple[list[_Epoch], bool]:
+        """Return the epochs of a channel, and whether their files are assigned to it.
+
+        There are none if only assigned files were given, for others.
+
+        Raises
+        ------
+        ImportFormatError
+            If there is no response for this channel, or if it is not known which one.
+        """
+        name = f"{sensor}.{channel}"
         files = [
             epochs
             for pattern, epochs in self._assigned
             if any(fnmatchcase(each, pattern) for each in (name, sensor, channel))
         ]
         if files:
-            found = [each for epochs in files for each in _assigned_epochs(name, channel, epochs)]
-            is_assigned = True
-        elif self._epochs:
-            found = [
-                each for each in self._epochs if (each.sensor, each.channel) == (sensor, channel)
-            ]
-            is_assigned = False
-            if not found:
-                raise ImportFormatError(self._nothing_for(name))
-        else:
-            return None
-        whole = [each for each in found if not (each.is_sensor_alone or each.is_digitizer_alone)]
-        if whole:
-            return _in_time(name, whole, stretches, is_assigned=is_assigned)
-        return _joined_halves(name, found, stretches, is_assigned=is_assigned)
+            return [e for epochs in files for e in _assigned_epochs(name, channel, epochs)], True
+        found = self._by_channel.get((sensor, channel), [])
+        if self._epochs and not found:
+            raise ImportFormatError(self._nothing_for(name))
+        return found, False
 
     def _nothing_for(self, name: str) -> str:
         names = list(dict.fromkeys(each.name for each in self._epochs))
@@ -209,8 +257,24 @@ class Responses:
         path = self._epochs[0].path
         return (
             f"no response for {name}; --response gives {known}{more}. If one of its files is for"
-            f" this channel, say so: --response-for '{name}={path}'"
+            f" this channel, say so: --response-for '{name}={path}', or in Python"
+            f" response={{'{name}': '{path}'}}"
         )
+
+
+def _contents_of(value: Any) -> Iterator[str]:  # noqa: ANN401 - ObsPy has no types
+    """Yield all numbers and texts in a response of ObsPy, in order."""
+    if isinstance(value, (list, tuple)):
+        for each in value:
+            yield from _contents_of(each)
+    elif hasattr(value, "__dict__"):
+        yield repr(value) if isinstance(value, (float, complex)) else type(value).__name__
+        for name, each in sorted(vars(value).items()):
+            if name not in _REMARKS:
+                yield name
+                yield from _contents_of(each)
+    else:
+        yield repr(value)
 
 
 def is_response(path: Path) -> bool:

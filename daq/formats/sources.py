@@ -75,6 +75,19 @@ def sds_files(url: str, codes: Codes) -> Iterator[Path]:
     ImportFormatError
         There is no such folder.
     """
+    yield from (path for *_, path in sds_days(url, codes))
+
+
+def sds_days(url: str, codes: Codes) -> list[tuple[str, datetime, Path]]:
+    """Return channel, as ``NET.STA.LOC.CHA``, day and file of an archive, by channel and day.
+
+    The files of the day before `codes.start_ns` are among them: their last record may reach it.
+
+    Raises
+    ------
+    ImportFormatError
+        There is no such folder.
+    """
     root = Path(url.removeprefix(SCHEME)).expanduser()
     if not root.is_dir():
         raise ImportFormatError(f"{url}: no such folder; expected sds://ROOT, with a folder a year")
@@ -91,7 +104,7 @@ def sds_files(url: str, codes: Codes) -> Iterator[Path]:
         day = datetime(int(fields[5]), 1, 1, tzinfo=UTC) + timedelta(days=int(fields[6]) - 1)
         if (first is None or day >= first) and (last is None or day <= last):
             found.append((".".join(fields[:4]), day, path))
-    yield from (path for *_, path in sorted(found))
+    return sorted(found)
 
 
 def _day(instant_ns: int) -> datetime:
@@ -168,6 +181,19 @@ class Selection:
     stations: str = "*"
     locations: str = "*"
 
+    def reason_against(self, sensor: str, channel: str, *, fdsn: bool) -> str:
+        """Return why a channel is left aside; empty if it is taken."""
+        if self.channels:
+            names = (channel, f"{sensor}.{channel}")
+            if any(fnmatchcase(each, pattern) for each in names for pattern in self.channels):
+                return ""
+            return "not in --channels"
+        if not fdsn or len(channel) != _CODE_LENGTH:
+            return ""
+        if channel[0] in _STATE_BANDS or channel[1] in _STATE_INSTRUMENTS:
+            return "state of health"
+        return ""
+
 
 @dataclass(frozen=True, slots=True)
 class OpenedSources:
@@ -192,6 +218,8 @@ def open_sources(
     selection: Selection | None = None,
     *,
     sampling_rate: float | None = None,
+    logged: bool = True,
+    cache: PartCache | None = None,
 ) -> OpenedSources:
     """Open files of other programs; every sensor may be in several of them.
 
@@ -202,6 +230,10 @@ def open_sources(
     selection : Selection, optional
     sampling_rate : float, optional
         In Hz, where a file does not say.
+    logged : bool
+        Whether each file that is read has a log line.
+    cache : PartCache, optional
+        Grows to what is read together.
 
     Raises
     ------
@@ -209,7 +241,7 @@ def open_sources(
         Nothing could be opened; with the reason for each file.
     """
     selection = selection or Selection()
-    cache = PartCache()
+    cache = PartCache() if cache is None else cache
     index = _Index(selection)
     problems: list[str] = []
     n_files = 0
@@ -217,11 +249,14 @@ def open_sources(
         n_files += 1
         try:
             for part in _parts(path, sampling_rate):
-                index.add(part, cache, order, problems)
+                if part.reaches(selection.start_ns, selection.end_ns):
+                    index.add(part, cache, order, problems)
         except (ImportFormatError, OSError) as error:
             problems.append(_message(path, error))
             continue
-        _LOGGER.info("%s read", path, extra={"file": str(path)})
+        if logged:
+            _LOGGER.info("%s read", path, extra={"file": str(path)})
+    cache.make_room(index.n_bytes_together)
     sensors: dict[str, ForeignSensor] = {}
     for name in index.names:
         try:
@@ -286,6 +321,16 @@ class _Index:
             self._pieces, key=lambda name: (name in self._coded, name * (name in self._coded))
         )
 
+    @property
+    def n_bytes_together(self) -> int:
+        """Bytes of the largest parts of all channels, twice: the cache lets go of half."""
+        largest = (
+            max(piece.n_samples * piece.dtype.itemsize for piece in pieces)
+            for channels in self._pieces.values()
+            for pieces in channels.values()
+        )
+        return 2 * sum(largest)
+
     def add(self, part: Part, cache: PartCache, order: int, problems: list[str]) -> None:
         """Take a part; what cannot be read of it is a problem."""
         try:
@@ -299,7 +344,7 @@ class _Index:
             return
         for trace, piece in pieces_of(part, traces, order):
             name = f"{trace.sensor}.{trace.channel}"
-            reason = self._reason_against(trace)
+            reason = self._selection.reason_against(trace.sensor, trace.channel, fdsn=trace.fdsn)
             if reason:
                 self.left_aside[name] = reason
                 continue
@@ -370,20 +415,6 @@ class _Index:
         found = assembled(name, channels, known, self._selection.overlap, cache)
         calibrations = tuple(self._calibrations[name, channel] for channel in channels)
         return replace(found, calibrations=calibrations) if any(calibrations) else found
-
-    def _reason_against(self, trace: Trace) -> str:
-        code = trace.channel
-        if self._selection.channels:
-            full = f"{trace.sensor}.{code}"
-            patterns = self._selection.channels
-            if any(fnmatchcase(each, pattern) for each in (code, full) for pattern in patterns):
-                return ""
-            return "not in --channels"
-        if not trace.fdsn or len(code) != _CODE_LENGTH:
-            return ""
-        if code[0] in _STATE_BANDS or code[1] in _STATE_INSTRUMENTS:
-            return "state of health"
-        return ""
 
     def _within_span(self, piece: Piece) -> Piece | None:
         """Return the samples within the span of time asked for, if there are any."""

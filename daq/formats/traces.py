@@ -12,6 +12,7 @@ a day.
 
 from __future__ import annotations
 
+import threading
 from collections import OrderedDict
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     Samples: TypeAlias = NDArray[Any]
 
 CACHE_BYTES = 48 << 20
+MOST_CACHE_BYTES = 256 << 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,6 +79,9 @@ class Part(Protocol):
     def load(self) -> Sequence[Trace]:
         """Return its traces, every time the same."""
 
+    def reaches(self, start_ns: int | None, end_ns: int | None) -> bool:
+        """Whether it may have samples between two instants of UTC; it is not loaded for that."""
+
     def split(self) -> Sequence[Part]:
         """Return smaller parts, of which some may be sound; nothing if there are none."""
 
@@ -91,6 +96,11 @@ class LoadedPart:
     def load(self) -> Sequence[Trace]:
         """Return the traces."""
         return self.traces
+
+    def reaches(self, start_ns: int | None, end_ns: int | None) -> bool:
+        """Return True: what it has is known when it is loaded."""
+        del start_ns, end_ns
+        return True
 
     def split(self) -> Sequence[Part]:
         """Return nothing: it is read as a whole."""
@@ -112,6 +122,11 @@ class FilePart:
     def load(self) -> Sequence[Trace]:
         """Read the file."""
         return self.read(self.path)
+
+    def reaches(self, start_ns: int | None, end_ns: int | None) -> bool:
+        """Return True: what it has is known when it is loaded."""
+        del start_ns, end_ns
+        return True
 
     def split(self) -> Sequence[Part]:
         """Return nothing: it is read as a whole."""
@@ -183,11 +198,15 @@ class Piece:
 
 
 class PartCache:
-    """The parts that were loaded last, up to a number of bytes; the last one in any case."""
+    """The parts that were loaded last, up to a number of bytes; the last one in any case.
+
+    Threads that read ahead may share it.
+    """
 
     def __init__(self, n_bytes: int = CACHE_BYTES) -> None:
         self._n_bytes = n_bytes
         self._held = 0
+        self._lock = threading.Lock()
         self._parts: OrderedDict[int, tuple[Part, Sequence[Trace], int]] = OrderedDict()
 
     def traces(self, part: Part) -> Sequence[Trace]:
@@ -198,6 +217,14 @@ class PartCache:
         ImportFormatError
             It cannot be read.
         """
+        with self._lock:
+            return self._traces(part)
+
+    def make_room(self, n_bytes: int) -> None:
+        """Hold at least so many bytes: what is read together, or every row would load it again."""
+        self._n_bytes = max(self._n_bytes, min(n_bytes, MOST_CACHE_BYTES))
+
+    def _traces(self, part: Part) -> Sequence[Trace]:
         known = self._parts.get(id(part))
         if known is not None:
             self._parts.move_to_end(id(part))

@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from tui.commands.options import (
+    ChannelsOption,
     JsonOption,
+    LocationOption,
+    NetworkOption,
+    ResponseForOption,
+    ResponseOption,
+    StationOption,
     examples,
     read_option,
     with_estimate_options,
@@ -63,24 +69,8 @@ def import_(
             "--bench", metavar="BENCH", help="Bench file with sensitivities, names and settings."
         ),
     ] = None,
-    response: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--response",
-            metavar="FILE",
-            help="Instrument responses: RESP or StationXML files, or folders of them; repeatable. "
-            "Each channel takes the response of its code and date.",
-        ),
-    ] = None,
-    response_for: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--response-for",
-            metavar="PATTERN=FILE",
-            help="Response for channels of another code, as in 'XX.ABC.*=FILE'; repeatable. "
-            "A sensor and its digitizer may be in two files.",
-        ),
-    ] = None,
+    response: ResponseOption = None,
+    response_for: ResponseForOption = None,
     sampling_rate: Annotated[
         float | None,
         typer.Option(
@@ -90,15 +80,7 @@ def import_(
             help="Sampling rate, if the files do not give it.",
         ),
     ] = None,
-    channels: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--channels",
-            metavar="PATTERN",
-            help="Channels to import, such as 'HH?' or 'XX.ABC.*.HHZ,XX.DEF.*.HHZ'."
-            " Default: all but those of the instrument's state of health.",
-        ),
-    ] = None,
+    channels: ChannelsOption = None,
     start: Annotated[
         str | None,
         typer.Option("--start", metavar="UTC", help="First time to import: 2026-11-21T03:00:00."),
@@ -116,13 +98,9 @@ def import_(
             " overlap of segments.",
         ),
     ] = None,
-    net: Annotated[
-        str, typer.Option("--net", metavar="CODE", help="Network in an SDS archive, or a pattern.")
-    ] = "*",
-    sta: Annotated[str, typer.Option("--sta", metavar="CODE", help="Station, or a pattern.")] = "*",
-    loc: Annotated[
-        str, typer.Option("--loc", metavar="CODE", help="Location, or a pattern; -- if empty.")
-    ] = "*",
+    net: NetworkOption = "*",
+    sta: StationOption = "*",
+    loc: LocationOption = "*",
     json: JsonOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
@@ -245,7 +223,7 @@ def import_recording(
         bench=described,
         estimate=settings,
         response=response,
-        response_for=[_assigned(text) for text in response_for],
+        response_for=[assigned(text) for text in response_for],
         sampling_rate=sampling_rate,
         selection=selection,
     )
@@ -255,7 +233,7 @@ def import_recording(
         raise typer.Exit(ExitCode.TROUBLE)
 
 
-def _assigned(text: str) -> tuple[str, Path]:
+def assigned(text: str) -> tuple[str, Path]:
     """Return pattern and file of ``PATTERN=FILE``."""
     pattern, equals, path = text.partition("=")
     if not pattern or not equals or not path:

@@ -62,8 +62,8 @@ class MiniSeedPart:
                 content = file.read(self.end - self.offset)
             found = pymseed.MS3TraceList.from_buffer(content, unpack_data=True, record_list=True)
             traces = [
-                _trace(pymseed, trace.sourceid, segment)
-                for trace in found
+                _trace(pymseed, trace.sourceid, segment, self.path, number)
+                for number, trace in enumerate(found, start=1)
                 for segment in trace
                 if segment.sampletype in _NUMERIC and segment.samprate and segment.numsamples
             ]
@@ -74,6 +74,28 @@ class MiniSeedPart:
         if n_records < n_expected:  # libmseed passes over what is no record
             raise self._damaged(f"{n_records} of {n_expected} records can be read")
         return traces
+
+    def reaches(self, start_ns: int | None, end_ns: int | None) -> bool:
+        """Whether a record has samples between two instants, by headers; a damaged part may."""
+        if start_ns is None and end_ns is None:
+            return True
+        pymseed = load("pymseed", reads="miniSEED is", extra="formats")
+        try:
+            with self.path.open("rb") as file:
+                file.seek(self.offset)
+                content = file.read(self.end - self.offset)
+            found = pymseed.MS3TraceList.from_buffer(content, record_list=True)
+            segments = [segment for trace in found for segment in trace]
+            n_records = sum(segment.recordlist.recordcnt for segment in segments)
+        except (pymseed.MiniSEEDError, ValueError, OverflowError):
+            return True
+        if n_records * (self.record_length or len(content)) < len(content):
+            return True
+        return any(
+            (end_ns is None or segment.starttime < end_ns)
+            and (start_ns is None or segment.endtime >= start_ns)
+            for segment in segments
+        )
 
     def split(self) -> Sequence[MiniSeedPart]:
         """Return both halves of a part that is damaged somewhere; nothing if it is one record."""
@@ -91,17 +113,50 @@ class MiniSeedPart:
         return ImportFormatError(f"{self.path}: {where} are not sound miniSEED: {reason}")
 
 
-def _trace(pymseed: Any, sourceid: str, segment: Any) -> Trace:  # noqa: ANN401 - see above
-    network, station, location, channel = pymseed.sourceid2nslc(sourceid)
+def _codes(pymseed: Any, sourceid: str, path: Path, number: int) -> tuple[str, str, bool]:  # noqa: ANN401 - see above
+    """Return sensor, channel, and whether a source has codes; else a file and a number name it."""
+    *codes, channel = pymseed.sourceid2nslc(sourceid)
+    sensor = ".".join(code for code in codes if code)
+    return sensor or path.stem, channel.strip("_") or str(number), bool(sensor)
+
+
+def contents(path: Path) -> list[tuple[str, str, int, int]]:
+    """Return sensor, channel, and the times of first and last sample of each stretch of a file.
+
+    Times are UTC in ns. Headers are read, and no sample.
+
+    Raises
+    ------
+    ImportFormatError
+        pymseed is not installed, or the file cannot be read.
+    """
+    pymseed = load("pymseed", reads="miniSEED is", extra="formats")
+    try:
+        return [
+            (
+                *_codes(pymseed, trace.sourceid, path, number)[:2],
+                int(segment.starttime),
+                int(segment.endtime),
+            )
+            for number, trace in enumerate(pymseed.MS3TraceList.from_file(str(path)), start=1)
+            for segment in trace
+            if segment.samprate and segment.samplecnt
+        ]
+    except (pymseed.MiniSEEDError, ValueError, OverflowError) as error:
+        raise ImportFormatError(f"{path}: not sound miniSEED: {error}") from error
+
+
+def _trace(pymseed: Any, sourceid: str, segment: Any, path: Path, number: int) -> Trace:  # noqa: ANN401 - see above
+    sensor, channel, is_coded = _codes(pymseed, sourceid, path, number)
     rate = float(segment.samprate)
     return Trace(
-        sensor=".".join(code for code in (network, station, location) if code),
+        sensor=sensor,
         channel=channel,
         start_ns=int(segment.starttime),
         sampling_rate=rate if rate > 0 else -1.0 / rate,
         samples=segment.take_np_datasamples(),
         end_ns=int(segment.endtime),
-        fdsn=True,
+        fdsn=is_coded,
     )
 
 

@@ -116,7 +116,7 @@ def test_a_gap_stays_a_gap_of_its_length(tmp_path: Path) -> None:
 def test_a_response_assigned_to_all_channels(tmp_path: Path, usgs_recording: Path) -> None:
     write_npz(tmp_path / "a.npz", 100)
     response = usgs_recording / "T-compact_Q330HR_BH_40"
-    with pytest.raises(ImportFormatError, match=r"--response-for 'A\.1=.*T-compact"):
+    with pytest.raises(ImportFormatError, match=r"--response-for 'A\.1=.*{'A\.1': '.*T-com"):
         import_files([tmp_path / "a.npz"], tmp_path / "a.h5", response=response)
     result = import_files([tmp_path / "a.npz"], tmp_path / "a.h5", response_for=[("*", response)])
     with Recording.open(tmp_path / "a.h5") as recording:

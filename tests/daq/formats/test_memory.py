@@ -95,7 +95,8 @@ def test_sensors_that_begin_apart_and_at_other_rates_are_brought_onto_one_grid(
     np.savez(second, sampling_rate=100.0, C=found["C"][::2], start_time="1970-01-01T00:00:00.003")
     import_files([first, second], tmp_path / "both.h5")
     memory = in_memory((*read_npz(first), *read_npz(second)))
-    same(estimate([memory]), estimate([tmp_path / "both.h5"]))
+    settings = Settings(segment=2.0)
+    same(estimate([memory], settings), estimate([tmp_path / "both.h5"], settings))
 
 
 def test_rows_are_read_across_gaps() -> None:

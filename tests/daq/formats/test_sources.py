@@ -13,6 +13,8 @@ from daq.clocks.aligned_recording import AlignedRecording
 from daq.errors import ImportFormatError
 from daq.formats.importer import import_files
 from daq.formats.memory import RecordingInMemory, SensorInMemory
+from daq.formats.readers import miniseed
+from daq.formats.readers.miniseed import MiniSeedPart
 from daq.formats.sources import Selection, open_sources, sensors_of_parts
 from daq.formats.traces import LoadedPart, PartCache, Trace
 from daq.protocols.block import HostTime
@@ -301,6 +303,54 @@ def test_an_estimate_from_files_needs_no_recording(tmp_path: Path) -> None:
     np.testing.assert_array_equal(samples[:, 0], counts(5000, 1))
 
 
+def test_parts_outside_of_the_span_are_not_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By headers, also where a file is not in order of time; damaged parts are loaded."""
+    loaded: list[int] = []
+    load = MiniSeedPart.load
+
+    def counted(part: MiniSeedPart) -> Sequence[Trace]:
+        loaded.append(part.offset)
+        return load(part)
+
+    monkeypatch.setattr(miniseed, "_PART_BYTES", 4096)
+    monkeypatch.setattr(MiniSeedPart, "load", counted)
+    path = tmp_path / "all"
+    x = counts(4000, 1)  # 20 records, 4 in a part
+    write_records(path, x[2000:], start=START + 2000 * STEP)
+    write_records(path, x[:2000])
+    span = Selection(start_ns=START + 1300 * STEP, end_ns=START + 1700 * STEP)
+    sensor = opened([path], span)
+    np.testing.assert_array_equal(whole(sensor.stretches[0])[:, 0], x[1300:1700])
+    assert set(loaded) == {4 * 4096}
+    content = bytearray(path.read_bytes())
+    content[1024:1032] = b"?" * 8
+    path.write_bytes(content)
+    loaded.clear()
+    problems = open_sources([path], span).problems
+    assert len(problems) == 1
+    assert 0 in loaded
+
+
+def test_a_cache_makes_room_for_what_is_read_together() -> None:
+    loads: list[Part] = []
+
+    class Counted(LoadedPart):
+        def load(self) -> Sequence[Trace]:
+            loads.append(self)
+            return self.traces
+
+    parts = [Counted("", [Trace("S", c, START, RATE, np.zeros(1 << 16))]) for c in "abcd"]
+    for n_loads, n_bytes in ((8, 0), (4, 4 << 20)):
+        loads.clear()
+        cache = PartCache(1 << 20)
+        cache.make_room(n_bytes)
+        for part in (*parts, *parts):
+            cache.traces(part)
+        assert len(loads) == n_loads
+
+
 def test_parts_that_were_read_are_dropped_again() -> None:
     cache = PartCache(8 << 20)
     loads: list[str] = []
@@ -312,6 +362,9 @@ def test_parts_that_were_read_are_dropped_again() -> None:
         def load(self) -> list[Trace]:
             loads.append(self.source)
             return [Trace("S", "a", START, RATE, np.zeros(1 << 17))]
+
+        def reaches(self, start_ns: int | None, end_ns: int | None) -> bool:
+            return start_ns == end_ns
 
         def split(self) -> list[Part]:
             return []
@@ -340,3 +393,21 @@ def test_long_arrays_are_written_in_bounded_memory(tmp_path: Path) -> None:
                 writer.samples("A", samples, first_sample=number << 16, restart=number == 0)
 
         assert peak_of(write) < 40 << 20
+
+
+def test_miniseed_without_codes_is_named_by_its_file(tmp_path: Path) -> None:
+    path = write_records(tmp_path / "shake.mseed", counts(600, 1))
+    content = bytearray(path.read_bytes())
+    for record in range(0, len(content), 1024):
+        content[record + 8 : record + 20] = b" " * 12  # station, location, channel, network
+    path.write_bytes(content)
+    opened = open_sources([path])
+    assert (opened.problems, opened.left_aside) == ((), {})
+    assert {n: each.channels for n, each in opened.sensors.items()} == {"shake": ("1",)}
+
+
+def test_a_file_named_as_its_sensor_has_codes(tmp_path: Path) -> None:
+    path = write_records(tmp_path / "XX.ABC.00.mseed", counts(600, 1))
+    write_records(path, counts(600, 2), channel="LKM")
+    opened = open_sources([path])
+    assert opened.left_aside == {"XX.ABC.00.LKM": "state of health"}
