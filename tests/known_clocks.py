@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
+    from scipy.interpolate import BSpline
 
     from daq.estimation.snapshot import Snapshot
 
@@ -144,7 +145,25 @@ def _spectrum(scene: Scene, frequency: FloatArray) -> FloatArray:
     return np.asarray(scene.snr * NOISE * level * np.cos(np.pi / 2 * edge) ** 2)
 
 
-def _motion(scene: Scene, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+def _motion(scene: Scene, rng: np.random.Generator) -> BSpline:
+    """Return the motion in three directions, as a function of time.
+
+    Scenes of one motion come one after the other, so the last one is kept, with the state of the
+    generator after it: what is drawn then is the same.
+    """
+    given = scene.rates, scene.snr, scene.motion, scene.seconds, scene.seed, scene.reach
+    if _last_motion.get("given") != given:
+        drawn = make_interp_spline(*_drawn_motion(scene, rng), k=5)
+        _last_motion.update(given=given, spline=drawn, state=rng.bit_generator.state)
+    rng.bit_generator.state = _last_motion["state"]
+    spline: BSpline = _last_motion["spline"]
+    return spline
+
+
+_last_motion: dict[str, Any] = {}
+
+
+def _drawn_motion(scene: Scene, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """Return times and the motion in three directions, shape (n, 3)."""
     rate = _FINE * max(scene.rates)
     n = int((scene.seconds + 2 * _MARGIN) * rate) // 2 * 2
@@ -226,8 +245,7 @@ def growing(
 @lru_cache(maxsize=1)
 def _made(scene: Scene) -> tuple[list[SensorLayout], list[Block], Truth]:
     rng = np.random.default_rng(scene.seed)
-    at, motion = _motion(scene, rng)
-    spline = make_interp_spline(at, motion, k=5)
+    spline = _motion(scene, rng)
     layouts: list[SensorLayout] = []
     blocks: list[Block] = []
     indices, times = [], []

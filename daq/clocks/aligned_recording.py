@@ -4,8 +4,10 @@ Theory of operation
 -------------------
 Within an *epoch* of its clock the sample indices of a sensor are exact; the clock gives the time of
 each sample (:mod:`daq.clocks.clock_model`). The grid has one rate and begins when the last sensor
-begins. Samples on the grid (sensors of one clock, recordings with exact times) are copied; others
-are interpolated (:mod:`daq.clocks.resampling`).
+begins. Where no clock is measured from the motion, it does not wait for sensors that begin over a
+minute after the third one, nor end, in a closed recording, with those that end so much earlier:
+these have no samples there. Samples on the grid (sensors of one clock, recordings with exact times)
+are copied; others are interpolated (:mod:`daq.clocks.resampling`).
 
 A grid instant is valid if every sensor has all samples for it; gaps are never filled. Spans have
 fixed positions on the grid and are filtered as a whole, so the result does not depend on the limits
@@ -21,7 +23,15 @@ import numpy as np
 
 from daq.clocks.clock_model import ClockSource, ClockState, nominal
 from daq.clocks.device_utc import UtcRate
-from daq.clocks.grid import SNAP, Grid, OwnSamples, grid_rate
+from daq.clocks.grid import (
+    SNAP,
+    Grid,
+    OwnSamples,
+    grid_rate,
+    joint_start,
+    late_by,
+    start_of,
+)
 from daq.clocks.resampling import USABLE
 from daq.clocks.sensor_reader import SensorSource, main_columns
 from daq.clocks.slip_search import find_by_arrivals, find_by_motion
@@ -145,6 +155,7 @@ class AlignedRecording:
         self._sources: list[SensorSource] = []
         self._origin = self._set_at = (0, 0)
         self._grid: Grid | None = None
+        self._apart = False  # whether the grid has times without some sensors
         self.n_settings = 0  # of the clocks, so far
         self._end = math.inf
         self._at_face_value = nominal_clocks
@@ -186,12 +197,54 @@ class AlignedRecording:
         grid = self._grid
         if grid is None:
             return 0
-        ends = (
+        ends = self._ends(grid)
+        known = self._apart and self._recording.closed  # before that, samples may come
+        last = -joint_start([-end for end in ends]) if known else min(ends)
+        stop = (min(last, self._end) - grid.start) * self.sampling_rate
+        return max(0, math.floor(stop + SNAP) + 1)
+
+    @property
+    def common(self) -> tuple[int, int]:
+        """First grid sample that all sensors have, and the one after the last.
+
+        All that are available where no sensor begins late or ends early, or never all have any.
+        """
+        grid, n_available = self._grid, self.n_available
+        if grid is None or not self._apart:
+            return 0, n_available
+        begin = max(map(start_of, self._sources)) - grid.start
+        end = min(self._ends(grid)) - grid.start
+        first = max(0, math.ceil(begin * self.sampling_rate - SNAP))
+        last = min(n_available, math.floor(end * self.sampling_rate + SNAP) + 1)
+        return (first, last) if first < last else (0, n_available)
+
+    def _ends(self, grid: Grid) -> list[float]:
+        """Return until when each sensor has samples on the grid, in s."""
+        return [
             source.known_clock.end - (0.0 if grid.has(source) else grid.reach(source))
             for source in self._sources
-        )
-        stop = (min(*ends, self._end) - grid.start) * self.sampling_rate
-        return max(0, math.floor(stop + SNAP) + 1)
+        ]
+
+    @property
+    def shortened(self) -> dict[str, tuple[float, float]]:
+        """Return by how many s sensors begin late and end early, where that shortens the grid.
+
+        Samples that other sensors have before and after are not on it. Ends count in closed
+        recordings.
+        """
+        grid = self._grid
+        if grid is None:
+            return {}
+        begin, _ = self._limits
+        starts, ends = list(map(start_of, self._sources)), self._ends(grid)
+        late = late_by(starts, max(min(starts), begin), grid.start)
+        early = [0.0] * len(late)
+        if self._recording.closed:
+            last = grid.start + (self.n_available - 1) / self.sampling_rate
+            early = late_by([-end for end in ends], -min(max(ends), self._end), -last)
+        names = [record.name for record in self._records]
+        found = zip(names, zip(late, early, strict=True), strict=True)
+        return {name: seconds for name, seconds in found if any(seconds)}
 
     @property
     def is_exact(self) -> bool:
@@ -322,8 +375,11 @@ class AlignedRecording:
         for source in self._sources:
             source.learnt.clear()
 
-    def set_clocks(self) -> None:
-        """Set every clock from all current data."""
+    def set_clocks(self, *, slips: bool = True) -> None:
+        """Set every clock from all current data.
+
+        `slips`: whether samples lost without being counted are looked for in measured delays.
+        """
         sources = self._sources
         self.n_settings += 1
         place_stated(sources)
@@ -341,7 +397,7 @@ class AlignedRecording:
         measurable = [sources[number] for number in numbers if sources[number] is not reference]
         for source in sources:
             find_by_arrivals(source)
-        find_by_motion(reference, [each for each in measurable if each.learnt])
+        find_by_motion(reference, [each for each in measurable if each.learnt and slips])
         utc = UtcRate() if all(each.device_utc for each in sources) else reference.utc_rate()
         first_of: dict[str, SensorSource] = {}
         for source in [reference, *(each for each in sources if each is not reference)]:
@@ -413,10 +469,19 @@ class AlignedRecording:
         if self._grid is None:
             self._lay_grid()
 
-    def _lay_grid(self) -> None:
+    @property
+    def _limits(self) -> tuple[float, float]:
+        """Return the limits of the grid that are wanted, in s."""
         begin, end = (None if at is None else (at - self._origin[1]) * 1e-9 for at in self._wanted)
-        self._end = math.inf if end is None else end
+        return -math.inf if begin is None else begin, math.inf if end is None else end
+
+    def _lay_grid(self) -> None:
+        begin, self._end = self._limits
+        self._apart = False
         self._grid = Grid.laid(self._sources, self.sampling_rate, wanted=begin)
+        if not self.measurable:  # delays are measured where all sensors have samples
+            self._apart = True
+            self._grid = Grid.laid(self._sources, self.sampling_rate, wanted=begin, apart=True)
 
     def read(self, start: int, stop: int) -> tuple[FloatArray, BoolArray]:
         """Return grid samples `start` to `stop` (not included).
@@ -439,7 +504,8 @@ class AlignedRecording:
                 f"{self._recording.path}: grid samples {start} to {stop} requested;"
                 f" {self.n_available} available"
             )
-        samples = np.zeros((stop - start, len(self.channels)))
+        # Channel after channel in memory: so they are converted, and transformed, the fastest.
+        samples = np.empty((len(self.channels), stop - start)).T
         valid = np.ones(stop - start, dtype=bool)
         edges = np.cumsum([0, *self.dims])
         for source, low, high in zip(self._sources, edges[:-1], edges[1:], strict=True):

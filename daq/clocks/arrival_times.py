@@ -38,7 +38,6 @@ import numpy as np
 
 from daq.clocks.clock_model import Clock, ClockSource, ClockState, Epoch, MeasuredDelays
 from daq.clocks.device_utc import corrected, from_device_utc
-from daq.clocks.kalman import Observations, smooth
 from daq.clocks.lower_envelope import least_of_each, levelled, scatter_of_least, supporting_line
 from daq.clocks.quantiles import median
 from daq.clocks.usb_polling import BEATS_PER_WINDOW, Polls, shows
@@ -129,6 +128,9 @@ _LIKELY = 2.0  # standard deviations
 _FAR_OFF = 6.0  # standard deviations, beyond which a measured delay is not on the clock
 _SEEN_AS = 1e-6  # seconds; the least of these standard deviations
 _SCATTER = 1.5  # stated deviations of measured delays, to which they may scatter of themselves
+_LEAST_DELAYS = 40
+_OUTWEIGHED = 0.05  # share of arrivals in what is known of a clock
+_EVERYWHERE = 8.0  # times the usual distance of delays, beyond which there are none
 _A_FEW = 0.05  # share of measured delays that may be off: false ones, where motion is weak
 _BREAKS = BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
 
@@ -420,6 +422,40 @@ class ArrivalTimes:
         number = (self._index - starts[self._epoch]) // length
         return np.asarray(np.minimum(number, whole[self._epoch] - 1), dtype=np.int64)
 
+    def _earliest(
+        self, left: FloatArray, node: float
+    ) -> tuple[FloatArray, FloatArray, IntArray, float]:
+        """Return samples, lateness and epochs of the earliest arrivals in stretches of `node` s.
+
+        The last is by how much they must scatter, in s. `left` is the lateness that the lines
+        leave, shape (n_arrivals,). Of stated times, each epoch is one stretch.
+        """
+        group = self._epoch if self._device_utc else self._stretches(self.sampling_rate * node)
+        kept = least_of_each(group, left, self._epoch)
+        begins = (np.diff(group, prepend=-1) != 0) | (np.diff(self._epoch, prepend=-1) != 0)
+        scatter = scatter_of_least(left, left[kept], begins)
+        return self._index[kept].astype(float), left[kept], self._epoch[kept], scatter
+
+    def _sparse(
+        self, measured: MeasuredDelays | None, left: FloatArray, node: float, hidden: float
+    ) -> float:
+        """Return how far apart measured delays are, in s, if arrivals need be no closer; else 0.
+
+        Where delays know the clock everywhere, and far better, arrivals only say when it began.
+        `left` and `node` are those of `_earliest`, `hidden` is what polls hide of an arrival, in s.
+        """
+        if measured is None or len(self._epoch_starts) > 1:
+            return 0.0
+        known = np.isfinite(measured.std)
+        apart = np.diff(measured.index[known]) / self.sampling_rate
+        if len(apart) < _LEAST_DELAYS or apart.max() > _EVERYWHERE * apart.mean():
+            return 0.0
+        _, late, _, scatter = self._earliest(left, node)
+        bends = np.abs(np.diff(late, 2))
+        jitter = max(hidden, scatter, 1.4826 * median(bends) / math.sqrt(6), _FLOOR)
+        by_delays = float(np.sum(1 / (measured.std[known] ** 2 + _FLOOR**2)))
+        return float(apart.mean()) if len(late) / jitter**2 < _OUTWEIGHED * by_delays else 0.0
+
     def _with_delays(
         self,
         slope: float,
@@ -457,6 +493,11 @@ class ArrivalTimes:
         measured: MeasuredDelays | None,
         unplaced: BoolArray | None = None,
     ) -> Clock:
+        from daq.clocks.kalman import (  # noqa: PLC0415 - only free clocks
+            Observations,
+            smooth,
+        )
+
         left = self._late - slope * self._index - np.array(anchors)[self._epoch]
         duration = float(self._index[-1] - self._index[0] + 1) / self.sampling_rate
         # Within one step of polled latencies nothing is seen of a clock, for a whole beat.
@@ -466,12 +507,8 @@ class ArrivalTimes:
         if step and shows(self._index / self.sampling_rate, left, step=step, beat=beat):
             node = max(node, BEATS_PER_WINDOW * beat)  # the earliest of those is early indeed
             step = 0.0
-        group = self._epoch if self._device_utc else self._stretches(self.sampling_rate * node)
-        kept = least_of_each(group, left, self._epoch)
-        begins = np.diff(group, prepend=-1) != 0
-        begins |= np.diff(self._epoch, prepend=-1) != 0
-        scatter = scatter_of_least(left, left[kept], begins)
-        index, late, epoch = self._index[kept].astype(float), left[kept], self._epoch[kept]
+        node = max(node, self._sparse(measured, left, node, step / math.sqrt(12)))
+        index, late, epoch, scatter = self._earliest(left, node)
         variance = np.zeros(len(index))
         is_placed = np.ones(len(anchors), np.bool_)
         if measured is not None:
@@ -491,7 +528,7 @@ class ArrivalTimes:
         residual = smoothed.varying
         refined = bool(observations.from_samples.any())
         if not refined:  # nothing checks the line within the time of one observation
-            unchecked = max(hidden, 2 * scatter) / len(kept)
+            unchecked = max(hidden, 2 * scatter) / len(index)
             residual = math.hypot(residual, smoothed.wander, unchecked)
         if refined and unplaced is None:
             seen = observations.from_samples

@@ -122,6 +122,16 @@ class DelayEstimator:
         return bool(self._frames)
 
     @property
+    def measured(self) -> tuple[int, ...]:
+        """Sensors that have a frame: not the reference."""
+        return tuple(self._frames)
+
+    @property
+    def compared(self) -> tuple[slice, tuple[slice, ...]]:
+        """Columns of the reference, and of each sensor that has a frame."""
+        return self.columns[self._reference], tuple(self.columns[n] for n in self._frames)
+
+    @property
     def omega(self) -> FloatArray:
         """Angular frequencies used, in rad/s, from the first above zero."""
         length = len(self.window)

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     BoolArray = NDArray[np.bool_]
 
 _TOGETHER = 60.0  # s
+_FEWEST = 3  # sensors that have an estimate without the others
 SNAP = 1e-3
 """Constant offset between exact clocks, in samples, up to which it is rounding of the times."""
 
@@ -53,17 +54,24 @@ class Grid:
 
     @classmethod
     def laid(
-        cls, sources: Sequence[SensorSource], sampling_rate: float, *, wanted: float | None
+        cls,
+        sources: Sequence[SensorSource],
+        sampling_rate: float,
+        *,
+        wanted: float,
+        apart: bool = False,
     ) -> Grid:
         """Return the grid from the start of all sensors on, or from `wanted` (s) if later.
 
         Channels of a sensor often begin some samples apart: it starts with the last of them.
+        `apart`: the grid does not wait for sensors that begin late (`joint_start`).
         """
-        start = max(map(_start, sources))
+        starts = list(map(start_of, sources))
+        start = joint_start(starts) if apart else max(starts)
         grid = cls(sampling_rate, start)
         if not all(grid.has(source) and not source.doubted for source in sources):
             start += max(map(grid.reach, sources))
-        if wanted is not None and wanted > start:  # the first sensor's next sample
+        if wanted > start:  # the first sensor's next sample
             epoch = sources[0].known_clock.epochs[0]
             index = np.ceil(epoch.position(np.array([wanted])) - SNAP)
             start = float(epoch.at(index)[0])
@@ -157,7 +165,25 @@ class Grid:
         return max(1.0, source.record.sampling_rate / self.sampling_rate)
 
 
-def _start(source: SensorSource) -> float:
+def joint_start(starts: Sequence[float]) -> float:
+    """Return when all sensors have begun but those that begin over a minute after the third one.
+
+    `starts` are those of the sensors, in s.
+    """
+    third = sorted(starts)[:_FEWEST][-1]
+    return max(start for start in starts if start <= third + _TOGETHER)
+
+
+def late_by(starts: Sequence[float], first: float, begin: float) -> list[float]:
+    """Return by how much each sensor shortens what could begin at `first` and begins at `begin`.
+
+    All in s. 0 up to a minute, and for sensors that are not waited for.
+    """
+    late = [start - first if start <= begin else 0.0 for start in starts]
+    return [each if each > _TOGETHER else 0.0 for each in late]
+
+
+def start_of(source: SensorSource) -> float:
     """Return when a sensor begins with all channels, unless that takes longer than a minute."""
     clock, first = source.known_clock, source.whole_from
     if first == source.runs[0].first_sample:
@@ -239,7 +265,18 @@ class OwnSamples:
         # The interpolated grid has no samples either where a clock is prolonged.
         if low < epochs[0].first_sample or high > epochs[0].end_sample:
             return None
-        samples = np.empty((high - low, len(source.columns)))
+        samples = np.empty((len(source.columns), high - low)).T
         if not source.fill(samples, low).all() or not math.isfinite(samples.sum()):
             return None
         return cls(samples, at - low, middle - length / 2 - at, (last - first) / length - 1)
+
+    @classmethod
+    def joined(cls, parts: Sequence[OwnSamples]) -> OwnSamples:
+        """Return the segments of several pieces of one sensor, one at least."""
+        before = np.cumsum([0, *(len(each.samples) for each in parts)])
+        return cls(
+            np.concatenate([each.samples.T for each in parts], axis=1).T,
+            np.concatenate([each.rows + n for each, n in zip(parts, before, strict=False)]),
+            np.concatenate([each.shift for each in parts]),
+            np.concatenate([each.drift for each in parts]),
+        )

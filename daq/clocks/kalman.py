@@ -47,7 +47,8 @@ _USUAL = 5e-9  # walk that is expected, within
 _USUALLY = 0.75  # decades
 _HARDLY_MORE = 0.35  # decades by which arrivals scatter more than those of their group say
 _UNLIKELY = 0.01  # of the greatest likelihood: too little to count
-_AT_ONCE = 1024  # observations whose gains are found together
+_GROWS = 9  # covariances of three numbers
+_AT_ONCE = 128  # observations that are prepared, and whose gains are found, together
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,57 +172,75 @@ def _filter(
     observations: Observations, walks: FloatArray, noises: FloatArray, track: _Track | None
 ) -> FloatArray:
     """Return the log-likelihood of every pair; `track` takes their states."""
-    n_pairs = len(walks)
-    power, arrival = walks**2, noises**2
-    x = np.zeros((3, n_pairs))
-    p = np.zeros((3, 3, n_pairs))
-    p[0, 0], p[1, 1], p[2, 2] = _START[:, None] ** 2
-    likelihood = np.zeros(n_pairs)
-    transition = np.eye(3)
-    before = float(observations.seconds[0])
-    rows = zip(
-        observations.seconds.tolist(),
-        observations.lateness.tolist(),
-        observations.variance.tolist(),
-        observations.from_samples.tolist(),
-        observations.restarts.tolist(),
-        strict=True,
-    )
-    for number, (now, lateness, variance, from_samples, restart) in enumerate(rows):
-        step, before = now - before, now
-        # Predict: lateness grows by its rate, the rate walks.
-        transition[0, 1] = 0.0 if restart else step
-        if restart:
-            x[0] = 0.0
-            p[0] = p[:, 0] = 0.0
-            p[0, 0] = _START[0] ** 2
-            p[1, 1] += _RESTART_RATE**2
-            transition[0, 0] = 0.0
-        else:
-            x[0] += step * x[1]
-            p[0, 0] += step * (2 * p[0, 1] + step * p[1, 1]) + power * (step**3 / 3)
-            p[0, 1] += step * p[1, 1] + power * (step**2 / 2)
-            p[0, 2] += step * p[1, 2]
-            p[1, 0], p[2, 0] = p[0, 1], p[0, 2]
-        p[1, 1] += power * step
+    arrival = noises**2
+    x = np.zeros((3, len(walks)))
+    # The covariance, row after row, above what it grows by: the walks, and one.
+    p, grown = np.zeros((2, _GROWS + 2, len(walks)))
+    p[_GROWS:] = grown[_GROWS:] = walks**2, np.ones_like(walks)
+    p[:_GROWS:4] = _START[:, None] ** 2
+    square = (3, 3, len(walks))
+    likelihood = np.zeros(len(walks))
+    steps = np.diff(observations.seconds, prepend=observations.seconds[0])
+    for first in range(0, len(steps), _AT_ONCE):
+        rows = slice(first, first + _AT_ONCE)
+        transitions, growths = _predictions(steps[rows], observations.restarts[rows])
+        spreads, innovations = np.empty((2, len(transitions), len(walks)))
+        each = zip(
+            observations.lateness[rows].tolist(),
+            observations.variance[rows].tolist(),
+            observations.from_samples[rows].tolist(),
+            strict=True,
+        )
+        for number, (lateness, variance, from_samples) in enumerate(each):
+            x = transitions[number] @ x
+            np.matmul(growths[number], p, out=grown[:_GROWS])
+            p, grown = grown, p
+            covariance = p[:_GROWS].reshape(square)
+            if track is not None:
+                track.predicted[first + number] = x.T
+                track.predicted_covariance[first + number] = covariance.T
+            innovation, spread = innovations[number], spreads[number]
+            if from_samples:
+                gain = covariance[0] + covariance[2]
+                np.add(gain[0] + gain[2], variance, out=spread)
+                np.subtract(lateness - x[0], x[2], out=innovation)
+            else:
+                gain = covariance[0].copy()
+                np.add(gain[0], arrival, out=spread)
+                np.subtract(lateness, x[0], out=innovation)
+            np.maximum(spread, (innovation / _HUBER) ** 2, out=spread)
+            weight = gain / spread
+            x += weight * innovation
+            covariance -= weight[:, None] * gain
+            if track is not None:
+                track.filtered[first + number] = x.T
+                track.filtered_covariance[first + number] = covariance.T
         if track is not None:
-            track.predicted[number] = x.T
-            track.predicted_covariance[number] = p.T
-            track.transition[number] = transition
-            transition[0, 0] = 1.0
-        # Update.
-        gain = p[0] + p[2] if from_samples else p[0].copy()
-        spread = gain[0] + gain[2] + variance if from_samples else gain[0] + arrival
-        innovation = lateness - x[0] - (x[2] if from_samples else 0.0)
-        spread = np.maximum(spread, innovation**2 / _HUBER**2)
-        weight = gain / spread
-        x += weight * innovation
-        p -= weight[:, None] * gain[None, :]
-        likelihood -= 0.5 * (np.log(spread) + innovation**2 / spread)
-        if track is not None:
-            track.filtered[number] = x.T
-            track.filtered_covariance[number] = p.T
+            track.transition[rows] = transitions
+        likelihood -= 0.5 * (np.log(spreads) + innovations**2 / spreads).sum(axis=0)
     return likelihood
+
+
+def _predictions(steps: FloatArray, restarts: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Return the transition of each state, (n, 3, 3), and how its covariance grows.
+
+    Lateness grows by its rate, and the rate walks; a restart forgets the lateness, and the rate is
+    a little less certain. The second, (n, 9, 11), acts on the nine covariances, the power of the
+    walk and one.
+    """
+    n, goes_on = len(steps), np.where(restarts, 0.0, 1.0)
+    transitions = np.zeros((n, 3, 3))
+    transitions[:, 0, 0], transitions[:, 0, 1] = goes_on, goes_on * steps
+    transitions[:, 1, 1] = transitions[:, 2, 2] = 1.0
+    both = transitions[:, :, None, :, None] * transitions[:, None, :, None, :]
+    growths = np.zeros((n, _GROWS, _GROWS + 2))
+    growths[:, :, :_GROWS] = both.reshape(n, _GROWS, _GROWS)
+    growths[:, 0, _GROWS] = goes_on * steps**3 / 3
+    growths[:, 1, _GROWS] = growths[:, 3, _GROWS] = goes_on * steps**2 / 2
+    growths[:, 4, _GROWS] = steps
+    growths[:, 0, -1] = (1 - goes_on) * _START[0] ** 2
+    growths[:, 4, -1] = (1 - goes_on) * _RESTART_RATE**2
+    return transitions, growths
 
 
 def _backwards(
@@ -243,13 +262,16 @@ def _backwards(
         predicted = track.predicted_covariance[begin + 1 : end + 1]
         crossed = track.transition[begin + 1 : end + 1, None] @ covariance[begin:end]
         gains = np.linalg.solve(predicted, crossed).swapaxes(-1, -2)
+        after = np.empty((end - begin, *later.shape))
         for number in range(end - 1, begin - 1, -1):
-            gain, after = gains[number - begin], number + 1
-            ahead = state[after] - track.predicted[after]
+            gain, next_one = gains[number - begin], number + 1
+            weighted = share[next_one] * (covariance[next_one] @ sees) + later
+            after[number - begin] = later = (gain @ weighted[:, :, None])[:, :, 0]
+            ahead = state[next_one] - track.predicted[next_one]
             state[number] += (gain @ ahead[:, :, None])[:, :, 0]
-            known = covariance[after] - track.predicted_covariance[after]
+            known = covariance[next_one] - track.predicted_covariance[next_one]
             covariance[number] += gain @ known @ gain.swapaxes(-1, -2)
-            later = (gain @ (share[after] * covariance[after] @ sees + later)[:, :, None])[:, :, 0]
-            mine = share[number] * (sees @ covariance[number] @ sees) + 2 * later @ sees
-            of_mean = of_mean + share[number] * mine
+        mine = share[begin:end]
+        own = sees @ covariance[begin:end] @ sees
+        of_mean = of_mean + mine @ (mine[:, None] * own + 2 * after @ sees)
     return state, covariance, np.asarray(of_mean)

@@ -206,7 +206,8 @@ class SensorSource:
         ahead = [run.first_sample - run.first_row - first for run in runs]
         if len(runs) == 1:
             place = slice(row + ahead[0], last_row + ahead[0])
-            np.divide(counts, self.sensitivity, out=samples[place])
+            for column, sensitivity in enumerate(self.sensitivity):
+                np.divide(counts[:, column], sensitivity, out=samples[place, column])
             for column, lacking in self._lacking(row, last_row):
                 samples[place][lacking, column] = np.nan
             present[place] = True

@@ -13,7 +13,6 @@ from estimator.checks.advice import Level, ModelMisfit, SharedNoise, TooFewDimen
 from estimator.levels.contributions import Contribution, Source, contribution, widened
 from estimator.levels.interval import NORMAL_95
 from estimator.likelihood.dimension import most_testable
-from estimator.likelihood.gradients import misfit
 from estimator.self_noise.result import Flag, SelfNoise
 
 if TYPE_CHECKING:
@@ -99,6 +98,8 @@ def _dimensions(snapshot: Snapshot, method: str) -> tuple[FloatArray, BoolArray]
     share, explained = np.zeros(len(frequency)), np.zeros(len(frequency), np.bool_)
     if method != "maximum-likelihood":
         return share, explained
+    from estimator.likelihood.gradients import misfit  # noqa: PLC0415 - of many sensors
+
     pooled = ((snapshot.results[method].flags & Flag.POOLED) != 0).any(axis=1)
     for choice in snapshot.diagnostics.dimensions:
         inside = (frequency >= choice.low) & (frequency <= choice.high)
@@ -128,6 +129,8 @@ def _unseen(snapshot: Snapshot, method: str) -> FloatArray:
     unseen = np.full(len(snapshot.frequency), math.inf)
     if method != "maximum-likelihood" or most_testable(snapshot.dims) < DIMENSIONS:
         return unseen
+    from estimator.likelihood.gradients import misfit  # noqa: PLC0415 - as above
+
     for choice in snapshot.diagnostics.dimensions:
         if choice.accepted:
             inside = (snapshot.frequency >= choice.low) & (snapshot.frequency <= choice.high)

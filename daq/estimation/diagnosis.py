@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from daq.estimation.segments.segment_pass import Pass
     from estimator.checks.band import BandDiagnosis
     from estimator.checks.stability import SegmentCourse
+    from estimator.likelihood.factor_analysis import Maxima
     from estimator.self_noise.result import SelfNoise
     from estimator.spectra.multiresolution import Band
 
@@ -241,6 +242,7 @@ def diagnosis(
     axes: tuple[float, ...] = (),
     aligned: Collection[tuple[str, str]] = (),
     course: SegmentCourse | None = None,
+    maxima: Maxima | None = None,
 ) -> tuple[Diagnosis | None, Untested | None]:
     """Diagnose the test.
 
@@ -250,7 +252,7 @@ def diagnosis(
     Noise that channels seem to share is motion across `axes` that are off, if it is no more than
     this share of the motion, of each sensor.
     Delays between sensors that are `aligned` by their motion or by arrival times are not known.
-    `course` is that of the segments of the only band.
+    `course` is that of the segments of the only band, `maxima` are fits of the same averages.
 
     Returns
     -------
@@ -284,6 +286,7 @@ def diagnosis(
                     neighbours=neighbours(band),
                     vertical=vertical,
                     course=course if len(bands) == 1 else None,
+                    maxima=maxima,
                 )
             except InsufficientDataError:
                 few = len(dims) < 3

@@ -107,6 +107,8 @@ class Equalisation:
         With their sensors.
     dims : tuple of int
         Channels of each sensor.
+    intervals : bool
+        Whether `noise` is wanted: with intervals, which leakage does not need.
     """
 
     def __init__(
@@ -115,8 +117,10 @@ class Equalisation:
         welch: WelchSettings,
         channels: Sequence[tuple[str, Channel]],
         dims: tuple[int, ...],
+        *,
+        intervals: bool = False,
     ) -> None:
-        self._mode, self._welch, self._dims = mode, welch, dims
+        self._mode, self._welch, self._dims, self._intervals = mode, welch, dims, intervals
         window = get_window(welch.window, welch.segment_length)
         self._factor = slope_factor(window, welch.sampling_rate)
         known = mode in {"auto", "known"} and len(channels) > 1
@@ -333,13 +337,15 @@ class Equalisation:
             )
 
     def noise(self, bands: Sequence[Band]) -> tuple[SelfNoise, ...] | None:
-        """Return the noise of each band by `METHOD`, if `revise` has estimated it.
+        """Return the noise of each band by `METHOD`, if `revise` has estimated it with intervals.
 
         Parameters
         ----------
         bands : sequence of Band
             As `revise` takes them.
         """
+        if not self._intervals:
+            return None
         key, found = self._found
         return found.noise if found is not None and bands and key == _key(bands) else None
 
@@ -365,6 +371,7 @@ class Equalisation:
                         dims=self._dims,
                         n_effective=band.n_effective,
                         real=band.settings.real(band.frequencies),
+                        scatter=self._intervals,
                     )
             except InsufficientDataError:
                 return None

@@ -32,10 +32,12 @@ from daq.estimation.blas_threads import one_blas_thread
 from daq.estimation.equalisation import (
     FILTER_SEGMENTS,
     FOUND_FROM,
+    METHOD,
     PROOF_SEGMENTS,
     ROUNDS,
     Equalisation,
 )
+from daq.estimation.freed_memory import FREED_FROM, give_back
 from daq.estimation.noise_estimates import averages
 from daq.estimation.recording_set import (
     check_same,
@@ -60,13 +62,15 @@ if TYPE_CHECKING:
     from estimator.spectra.welch import WelchSettings
 
 _LOGGER = logging.getLogger(__name__)
-MATRICES = 9
+MATRICES = 7
 """Matrices that exist at the same time, at most: in the diagnosis."""
-PAIR_TABLES = 27
-"""Tables of all pairs of channels by all pairs that exist at the same time: some 20 bands."""
+PAIR_TABLES = 5
+"""Tables of all pairs of channels by all pairs that exist at the same time, if noise is shared."""
 LARGE = 1e9
-"""Bytes from which on an estimate is announced, and is not live with all sensors."""
-PART_BYTES = 60e6
+"""Bytes from which on an estimate is announced."""
+LIVE = 0.43e9
+"""Bytes from which on an estimate is not live with all sensors."""
+PART_BYTES = 47e6
 """Bytes that the matrices of a live estimate of a part of the sensors may take, by the prediction
 of a diagnosed one: such an estimate is not diagnosed."""
 MIN_SENSORS = 3
@@ -96,7 +100,7 @@ def live_sensors(recording: ReadableRecording, settings: Settings) -> tuple[str,
     """Return the sensors of a live estimate: the first ones; None where that is all of them."""
     rate = settings.sampling_rate or min(each.sampling_rate for each in recording.sensors)
     n_channels = [*accumulate(len(main_columns(record)) for record in recording.sensors)]
-    if bytes_of(n_channels[-1], rate, settings.segment) <= LARGE:
+    if bytes_of(n_channels[-1], rate, settings.segment) <= LIVE:
         return None
     matrices = [_matrices(n, rate, settings.segment) for n in n_channels]
     n_sensors = max(MIN_SENSORS, bisect_right(matrices, PART_BYTES))
@@ -176,8 +180,13 @@ class Estimation:
                 announce(self._passes[0].n_channels, self._passes[0].welch)
             aligned = self._passes[0].aligned
             unit = canonical(self.settings.unit or aligned.channels[0][1].unit)
+            methods = self.settings.for_sensors(aligned.dims).methods
             self._equalisation = Equalisation(
-                self.settings.equalise, self._passes[0].welch, aligned.channels, aligned.dims
+                self.settings.equalise,
+                self._passes[0].welch,
+                aligned.channels,
+                aligned.dims,
+                intervals=bool({METHOD, "all"} & set(methods)),
             )
             self._snapshots = SnapshotBuilder(
                 self.settings,
@@ -471,4 +480,8 @@ def estimate(
         If there is too little for any of the methods.
     """
     with Estimation(paths, settings) as estimation:
-        return estimation.finish(progress)
+        snapshot = estimation.finish(progress)
+    if snapshot.csm.nbytes > FREED_FROM:
+        del estimation
+        give_back()
+    return snapshot

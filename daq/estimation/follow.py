@@ -14,15 +14,14 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import sys
 import threading
 import time
 from dataclasses import replace
-from functools import cache
 from typing import TYPE_CHECKING, Protocol
 
 from daq.errors import HuddleError, NotConnectedError, RecordingError
 from daq.estimation.estimation import Estimation
+from daq.estimation.freed_memory import c_function, give_back
 from daq.estimation.recording_set import is_continued, is_left
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError
@@ -55,28 +54,16 @@ class FreedMemory:
 
     def __init__(self) -> None:
         self._next = 0.0
-        option = _function("mallopt", ctypes.c_int, ctypes.c_int)
+        option = c_function("mallopt", ctypes.c_int, ctypes.c_int)
         if option is not None:
             option(_M_MMAP_THRESHOLD, LARGE)
             option(_M_ARENA_MAX, _HEAPS)
 
     def give_back(self) -> None:
         """Return it to the system, every `INTERVAL`, where the C library can do so (glibc)."""
-        trim = _function("malloc_trim", ctypes.c_size_t)
-        if trim is not None and time.monotonic() >= self._next:
+        if time.monotonic() >= self._next:
             self._next = time.monotonic() + INTERVAL
-            trim(0)
-
-
-@cache
-def _function(name: str, *arguments: type[ctypes._SimpleCData[int]]) -> Callable[..., int] | None:
-    """Return a function of the C library; None where it has none of this name (musl)."""
-    if sys.platform != "linux":
-        return None
-    function = getattr(ctypes.CDLL(None), name, None)
-    if function is not None:
-        function.argtypes, function.restype = arguments, ctypes.c_int
-    return function
+            give_back()
 
 
 STATUS_INTERVAL = 1.0

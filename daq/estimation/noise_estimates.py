@@ -14,7 +14,6 @@ from estimator.levels.bands import bin_correlation
 from estimator.levels.pooled import blocks_of
 from estimator.likelihood.dimension import BandDimension, choose_dimension
 from estimator.likelihood.goodness_of_fit import neighbour_correlation
-from estimator.likelihood.gradients import Gradients, noise_by_gradients, with_gradients
 from estimator.methods import METHODS, self_noise
 from estimator.self_noise.result import Flag, SelfNoise, combined
 from estimator.spectra.multiresolution import Band, MultiResolution
@@ -30,6 +29,8 @@ if TYPE_CHECKING:
     from daq.estimation.segments.segment_pass import Pass
     from daq.estimation.settings import Settings
     from daq.recording.interface import ReadableRecording
+    from estimator.likelihood.factor_analysis import Maxima
+    from estimator.likelihood.gradients import Gradients
 
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
@@ -40,9 +41,8 @@ ALL_METHODS = tuple(sorted(METHODS, key=lambda name: name != "three-sensor"))
 """The first is what limits, c.o.v. and clocks are judged by: one that needs no alignment."""
 MIN_AVERAGES = 20
 """Of an octave with its own segments: with fewer it goes with the octave above."""
-
-
-_BY_MOTION = frozenset({"three-sensor", "maximum-likelihood"})
+BY_MOTION = frozenset({"three-sensor", "maximum-likelihood"})
+"""Methods that use segments which only some channels have: they pair no channels by number."""
 _WHOLE = 3  # sensors with all channels
 
 
@@ -228,7 +228,7 @@ def with_sets(
     """
     settings = settings.for_sensors(dims)
     wanted = ALL_METHODS if "all" in settings.methods else settings.methods
-    wanted = tuple(name for name in wanted if name in _BY_MOTION)
+    wanted = tuple(name for name in wanted if name in BY_MOTION)
     sensor_of, usual = np.repeat(np.arange(len(dims)), dims), max(dims)
     shape = (len(frequency), len(sensor_of))
     parts = {name: [found] for name, found in estimates.results.items()}
@@ -384,6 +384,7 @@ def noise_estimates(
     dimensions: Dimensions | None = None,
     positions: FloatArray | None = None,
     known: Mapping[str, Sequence[SelfNoise]] | None = None,
+    maxima: Maxima | None = None,
 ) -> Estimates:
     """Estimate by every method that is wanted.
 
@@ -400,6 +401,8 @@ def noise_estimates(
         Of the sensors, in metres.
     known : mapping of str to sequence of SelfNoise, optional
         What some methods give for each band, where that is estimated already.
+    maxima : Maxima, optional
+        Fits of the same averages, to share.
     """
     chosen, known = "auto" in settings.methods, known or {}
     settings = settings.for_sensors(dims)
@@ -413,8 +416,12 @@ def noise_estimates(
                 if method == "two-channel":
                     options = [{"response": gains.astype(np.complex128)} for _ in bands]
                 elif method == "maximum-likelihood" and settings.dimension is not None:
-                    dimensions = dimensions or chosen_dimensions(bands, settings, dims, positions)
+                    dimensions = dimensions or chosen_dimensions(
+                        bands, settings, dims, positions, maxima
+                    )
                     options = [{"n_factors": q} for q in dimensions.n_factors]
+                if method == "maximum-likelihood":
+                    options = [option | {"maxima": maxima} for option in options]
                 parts = list(known.get(method, ())) or [
                     self_noise(
                         method,
@@ -449,6 +456,8 @@ def _by_gradients(
     gradients = dimensions.gradients
     if gradients is None:
         return parts
+    from estimator.likelihood.gradients import noise_by_gradients  # noqa: PLC0415 - as below
+
     (part,), (band,) = parts, bands
     n = band.n_effective
     return [noise_by_gradients(part, band.csm, gradients, dims=dims, n_effective=n)]
@@ -459,6 +468,7 @@ def chosen_dimensions(
     settings: Settings,
     dims: tuple[int, ...],
     positions: FloatArray | None,
+    maxima: Maxima | None = None,
 ) -> Dimensions:
     """Return the dimension of the motion at every frequency; takes seconds with 15 channels.
 
@@ -477,6 +487,7 @@ def chosen_dimensions(
             dims=dims,
             n_effective=band.n_effective,
             neighbours=neighbours(band),
+            maxima=maxima,
         )
         for band in bands
     ]
@@ -484,6 +495,8 @@ def chosen_dimensions(
     chosen = tuple(choice for _, choices in found for choice in choices)
     if len(bands) > 1:
         return Dimensions(n_factors, chosen)
+    from estimator.likelihood.gradients import with_gradients  # noqa: PLC0415 - of many sensors
+
     gradients, chosen = with_gradients(
         bands[0].csm,
         bands[0].frequencies,
@@ -492,6 +505,7 @@ def chosen_dimensions(
         n_effective=bands[0].n_effective,
         neighbours=neighbours(bands[0]),
         positions=positions,
+        maxima=maxima,
     )
     return Dimensions(n_factors, chosen, gradients)
 

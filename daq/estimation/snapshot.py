@@ -212,6 +212,9 @@ class Snapshot:
     channel_segments : tuple of int
         Segments behind the noise of each channel, where some channels have no samples in some
         segments; empty where all rest on the same ones.
+    shortened : mapping of str to (float, float)
+        By how many seconds sensors that begin late, and that end early, shorten the span, by name
+        of the sensor. Of all recordings together.
     """
 
     frequency: FloatArray
@@ -241,6 +244,7 @@ class Snapshot:
     rounding: float = 0.0
     simulated: bool = False
     channel_segments: tuple[int, ...] = ()
+    shortened: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def sensor_names(self) -> tuple[str, ...]:

@@ -27,6 +27,7 @@ from daq.estimation.diagnosis import (
     synchronisation,
 )
 from daq.estimation.equalisation import METHOD
+from daq.estimation.freed_memory import FREED_FROM, give_back
 from daq.estimation.noise_estimates import (
     Dimensions,
     Estimates,
@@ -50,6 +51,7 @@ from daq.estimation.throttle import Throttle
 from estimator.checks.advice import Untested
 from estimator.checks.stability import SegmentCourse
 from estimator.errors import InsufficientDataError
+from estimator.likelihood.factor_analysis import Maxima
 from estimator.spectra.segment_rejection import Reason
 
 if TYPE_CHECKING:
@@ -244,7 +246,12 @@ class SnapshotBuilder:
             shape = (len(frequency), first.n_channels, first.n_channels)
             csm = np.full(shape, np.nan, dtype=np.complex128)
         n_segments, n_unused = sum(each.n_segments for each in passes), 0
-        estimates = self._estimates(bands, raw, recordings[0], first, n_segments, final=final)
+        maxima = Maxima()
+        if final and csm.nbytes > FREED_FROM:
+            give_back()
+        estimates = self._estimates(
+            bands, raw, recordings[0], first, n_segments, maxima=maxima, final=final
+        )
         if sets:
             estimates, sets = with_sets(
                 estimates,
@@ -272,10 +279,14 @@ class SnapshotBuilder:
             dimensions=() if estimates.dimensions is None else estimates.dimensions.chosen,
         )
         left = _not_estimated(latest, channels)
+        if final and csm.nbytes > FREED_FROM:
+            give_back()
         if final or (self._diagnoses.is_due and not left):
             with self._diagnoses:
                 bands_of_all = bands if raw else ()
-                self._findings = self._diagnose(recordings, passes, raw, bands_of_all, estimates)
+                self._findings = self._diagnose(
+                    recordings, passes, raw, bands_of_all, estimates, maxima=maxima
+                )
             self._occasional_cost += self._diagnoses.cost
         if self._findings.fits(frequency):
             diagnostics = self._findings.added_to(diagnostics)
@@ -303,6 +314,7 @@ class SnapshotBuilder:
             left_out=_left_out(passes, sum(each.n_segments for each in sets) - n_unused),
             channel_segments=_segments_of(sets, n_segments if raw else 0, first.n_channels),
             octaves=_octaves(bands, sets) if self._settings.octaves else (),
+            shortened=_shortened(passes),
             diagnostics=diagnostics,
             no_segment=None if sets else _no_segment(passes, self._settings.segment),
             bridged=_bridged(passes, estimates.results),
@@ -343,6 +355,8 @@ class SnapshotBuilder:
         raw: tuple[Band, ...],
         bands: tuple[Band, ...],
         estimates: Estimates,
+        *,
+        maxima: Maxima,
     ) -> Findings:
         """Diagnose the test: too costly for every snapshot."""
         dims, channels = passes[0].aligned.dims, passes[0].aligned.channels
@@ -357,6 +371,7 @@ class SnapshotBuilder:
             axes=self._axes,
             aligned=aligned_pairs(clock_states(passes)),
             course=segment_course(passes, channels, self._unit, self._equalisation),
+            maxima=maxima,
         )
         edges = self._equalisation.leakage(raw, channels, self._unit)
         return Findings.of(
@@ -371,6 +386,7 @@ class SnapshotBuilder:
         first: Pass,
         n_segments: int,
         *,
+        maxima: Maxima,
         final: bool,
     ) -> Estimates:
         """Estimate; while following, the dimension of the motion is the one chosen before."""
@@ -390,6 +406,7 @@ class SnapshotBuilder:
                 dimensions=self._dimensions if keep else None,
                 positions=positions,
                 known=self._known(bands, raw),
+                maxima=maxima,
             )
         if estimates.dimensions is not self._dimensions:
             self._dimensions, self._chosen_at = estimates.dimensions, n_segments
@@ -490,6 +507,16 @@ def _bridged(passes: Sequence[Pass], results: Mapping[str, SelfNoise]) -> Bridge
         lost=float(np.average([each.lost for each in leakages], weights=counts)),
         leakage=np.einsum("r,rfc->fc", counts / total, biases),
     )
+
+
+def _shortened(passes: Sequence[Pass]) -> dict[str, tuple[float, float]]:
+    """Return by how many seconds sensors shorten the spans of all recordings together."""
+    found: dict[str, tuple[float, float]] = {}
+    for each in passes:
+        for sensor, (late, early) in each.aligned.shortened.items():
+            before = found.get(sensor, (0.0, 0.0))
+            found[sensor] = before[0] + late, before[1] + early
+    return found
 
 
 def _not_estimated(recording: ReadableRecording, channels: Channels) -> tuple[str, ...]:

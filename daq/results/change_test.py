@@ -48,6 +48,8 @@ WIDTHS = np.array([0.1, 0.3, 1.0, 3.0, 10.0]) * DECIBEL
 NORMAL_95 = 1.959963984540054
 BLOCK = 64
 """Runs that are tested at once."""
+FIRST_RUNS = 8
+"""Of these at first; then as many as before, up to a block."""
 PER_OCTAVE = 16
 """Possible changes that are kept in each octave of their age, at least."""
 
@@ -81,6 +83,7 @@ def changes(
     deviations: Sequence[float] | FloatArray,
     *,
     false_alarms: float,
+    most: int | None = None,
 ) -> list[Change]:
     """Return the changes of a series of levels.
 
@@ -90,15 +93,17 @@ def changes(
         Natural logarithms, in order of time, and their standard deviations; all finite.
     false_alarms : float
         Probability that a series without changes ever gives one.
+    most : int or None
+        Changes after which the others are not looked for.
     """
     found: list[Change] = []
     levels, deviations = np.asarray(levels, float), np.asarray(deviations, float)
     begin, rate = 0, false_alarms
-    while True:
+    while len(found) != most:
         rate /= 2  # so that all tests of the series together keep the rate
         change = _first_change(levels[begin:], deviations[begin:], rate)
         if change is None:
-            return found
+            break
         found.append(
             Change(
                 change.first + begin,
@@ -107,6 +112,7 @@ def changes(
             )
         )
         begin += change.found + 1
+    return found
 
 
 class Evidence:
@@ -119,13 +125,22 @@ class Evidence:
         self._prior = np.zeros((len(WIDTHS), 0))
         """Weights of the possible changes, for each width."""
 
-    def add(self, levels: FloatArray, deviations: FloatArray) -> Iterator[FloatArray]:
-        """Yield the martingale after each of the next runs, in blocks."""
-        for begin in range(0, len(levels), BLOCK):
-            rows = slice(begin, begin + BLOCK)
-            yield self._block(levels[rows], deviations[rows])
+    def add(
+        self, levels: FloatArray, deviations: FloatArray, *, least: float = 0.0
+    ) -> Iterator[FloatArray]:
+        """Yield the martingale after each of the next runs, in blocks.
 
-    def _block(self, levels: FloatArray, deviations: FloatArray) -> FloatArray:
+        In a block in which it certainly stays below `least`, it is given as 0.
+        """
+        begin = 0
+        while begin < len(levels):
+            # A drift has a change every few runs: the first ones are not tested with all of a block
+            n_runs = min(max(self._n, FIRST_RUNS), BLOCK, BLOCK - self._n % BLOCK)
+            rows = slice(begin, begin + n_runs)
+            yield self._block(levels[rows], deviations[rows], least)
+            begin += n_runs
+
+    def _block(self, levels: FloatArray, deviations: FloatArray, least: float) -> FloatArray:
         before, slopes, residuals = _residuals(levels, deviations, self._weight, self._mean)
         weights = deviations**-2.0
         total = self._weight + float(weights.sum())
@@ -143,26 +158,38 @@ class Evidence:
         zeros = np.zeros(len(first))
         a = np.concatenate([self._a, zeros]) + np.cumsum(c**2, axis=0)
         b = np.concatenate([self._b, zeros]) + np.cumsum(c * residuals[:, None], axis=0)
-        values = np.full(len(levels), 1.0 / self._n)  # of the changes that are still to come
-        for number, width in enumerate(WIDTHS):
-            spread = 1 + width**2 * a
-            ratios = np.exp(np.minimum(width**2 * b**2 / (2 * spread), 700.0)) / np.sqrt(spread)
-            values += ratios @ self._prior[number]
-            self._prior[number] *= ratios[-1]
-        self._merge(a[-1], b[-1])
+        square = b**2
+        # No width gives a change more than exp(b² / 2a). What is still to come counts 1 at most.
+        most = least / (1 + float(self._prior.sum()))
+        if np.all(square <= 2 * math.log(max(most, 1.0)) * a):
+            values = np.zeros(len(levels))
+        else:
+            values = np.full(len(levels), 1.0 / self._n)  # of the changes that are still to come
+            for number, width in enumerate(WIDTHS):
+                spread = 1 + width**2 * a
+                ratios = np.exp(np.minimum(width**2 * square / (2 * spread), 700.0))
+                values += (ratios / np.sqrt(spread)) @ self._prior[number]
+        self._a, self._b = a[-1], b[-1]
+        if self._n % BLOCK == 0:
+            self._merge()
         return values
 
-    def _merge(self, a: FloatArray, b: FloatArray) -> None:
-        """Keep the first of the changes in each interval; the prior is that times likelihood."""
+    def _merge(self) -> None:
+        """Keep the first of the changes in each interval, with the weights of the others."""
+        self._prior = self._prior * self._likelihood()
         steps = 2.0 ** np.floor(np.log2(np.maximum(1.0, (self._n - self._first) / PER_OCTAVE)))
         groups = np.cumsum(np.diff(self._first // steps + 1j * steps, prepend=-1) != 0) - 1
         kept = np.flatnonzero(np.diff(groups, prepend=-1))
-        self._a, self._b = a[kept], b[kept]
+        self._a, self._b = self._a[kept], self._b[kept]
         self._first, self._before = self._first[kept], self._before[kept]
         self._prior = np.add.reduceat(self._prior, kept, axis=1) if len(kept) else self._prior
+        self._prior = self._prior / self._likelihood()
+
+    def _likelihood(self) -> FloatArray:
+        """Return the likelihood ratio of each possible change, for each width."""
         spread = 1 + np.outer(WIDTHS**2, self._a)
         exponent = np.minimum(np.outer(WIDTHS**2, self._b**2) / (2 * spread), 700.0)
-        self._prior = self._prior * np.sqrt(spread) * np.exp(-exponent)
+        return np.asarray(np.exp(exponent) / np.sqrt(spread))
 
 
 def _residuals(
@@ -181,7 +208,7 @@ def _residuals(
 
 def _first_change(levels: FloatArray, deviations: FloatArray, rate: float) -> Change | None:
     k = -1
-    for values in Evidence().add(levels, deviations):
+    for values in Evidence().add(levels, deviations, least=1 / rate):
         is_over = values * rate >= 1
         if is_over.any():
             k += 1 + int(np.argmax(is_over))

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import enum
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from estimator.checks.advice import Level
+from estimator.records import Record, record
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -45,8 +45,8 @@ RANK_OF_LEVEL: Mapping[Level, Rank] = {
 }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Fact:
+@record
+class Fact(Record):
     """A fact about a test; each kind is a subclass.
 
     Attributes
@@ -73,7 +73,7 @@ class Fact:
     method: str = ""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Finding(Fact):
     """Findings of one kind of the estimator, worst first.
 
@@ -87,14 +87,14 @@ class Finding(Fact):
     findings: tuple[Advice, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class SensorsSimulated(Fact):
     """A sensor was simulated: the noise is that of a model, not of instruments."""
 
     name: ClassVar[str] = "sensors-simulated"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class MethodRefused(Fact):
     """A method gives no result.
 
@@ -108,7 +108,7 @@ class MethodRefused(Fact):
     reason: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class WithoutEstimate(Fact):
     """Frequencies of `channels` have no valid estimate by `method`.
 
@@ -125,7 +125,7 @@ class WithoutEstimate(Fact):
     n_frequencies: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class NoSegmentUsable(Fact):
     """No segment can be used.
 
@@ -145,7 +145,7 @@ class NoSegmentUsable(Fact):
     longest: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class NotInLiveEstimate(Fact):
     """A live estimate leaves out `sensors` to limit its memory; `n_all` are recorded."""
 
@@ -153,7 +153,7 @@ class NotInLiveEstimate(Fact):
     n_all: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class SensorLost(Fact):
     """A sensor sent nothing from `time_utc_ns` on.
 
@@ -170,7 +170,7 @@ class SensorLost(Fact):
     never_seen: bool
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class BlocksDamaged(Fact):
     """Blocks of a sensor in the file have wrong checksums, and are excluded as gaps."""
 
@@ -178,7 +178,7 @@ class BlocksDamaged(Fact):
     n_blocks: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class SamplesMissing(Fact):
     """A sensor has gaps."""
 
@@ -187,7 +187,7 @@ class SamplesMissing(Fact):
     n_samples: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class SpanShortened(Fact):
     """`sensors` begin late, or end early, and only the time of all sensors is estimated.
 
@@ -203,7 +203,7 @@ class SpanShortened(Fact):
     at_end: bool
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class SegmentsExcluded(Fact):
     """Segments are excluded.
 
@@ -222,7 +222,7 @@ class SegmentsExcluded(Fact):
     transients_by_octave: tuple[tuple[float, float, int], ...] = ()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class GapsBridged(Fact):
     """Segments with gaps are used, with windows that are zero in the gaps.
 
@@ -241,7 +241,7 @@ class GapsBridged(Fact):
     leakage: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class ChannelsAbsent(Fact):
     """Channels have no samples in some segments; the others are estimated from these without them.
 
@@ -251,14 +251,17 @@ class ChannelsAbsent(Fact):
         Segments behind the noise of each of `channels`.
     most : int
         Segments behind the channel with the most.
+    complete_only : tuple of str
+        Methods that are estimated from the segments that all channels have.
     """
 
     name: ClassVar[str] = "channels-absent"
     n_segments: tuple[int, ...]
     most: int
+    complete_only: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class OctaveSegments(Fact):
     """Low octaves have longer segments; `only_one` where there are too few samples for them.
 
@@ -280,7 +283,7 @@ class OctaveSegments(Fact):
     only_one: bool
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class ChannelsClipped(Fact):
     """Samples are at the end of the range: the noise of these channels is too high.
 
@@ -294,7 +297,7 @@ class ChannelsClipped(Fact):
     shares: tuple[float, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class ChannelsStoodStill(Fact):
     """Channels had a constant count for a while.
 
@@ -308,7 +311,7 @@ class ChannelsStoodStill(Fact):
     seconds: tuple[float, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class ClocksFitted(Fact):
     """The times of samples come from clocks fitted to their arrivals.
 
@@ -325,7 +328,7 @@ class ClocksFitted(Fact):
     error: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class StatedTimesDrift(Fact):
     """The UTC that sensors state drifts against the motion.
 
@@ -346,14 +349,14 @@ class StatedTimesDrift(Fact):
     reference: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class StatedTimesUnchecked(Fact):
     """The UTC that sensors state could not be compared with the motion."""
 
     name: ClassVar[str] = "stated-times-unchecked"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class SamplesUncounted(Fact):
     """A sensor lost or repeated samples without counting them; its count was corrected."""
 
@@ -361,7 +364,7 @@ class SamplesUncounted(Fact):
     slips: tuple[Uncounted, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class ClockNotUnderstood(Fact):
     """The delays measured from the motion do not lie on a sensor's clock.
 
@@ -377,14 +380,14 @@ class ClockNotUnderstood(Fact):
     error: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class RatesNominal(Fact):
     """Samples are taken to be at their nominal rates; no interval includes that error."""
 
     name: ClassVar[str] = "rates-nominal"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class ClocksMayExplain(Fact):
     """Clocks are so little known that findings may come from them alone; `error` in s rms."""
 
@@ -392,14 +395,14 @@ class ClocksMayExplain(Fact):
     error: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class NoEstimateAbove(Fact):
     """There is no estimate in `band`, where resampling attenuates."""
 
     name: ClassVar[str] = "no-estimate-above"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class ModelUntested(Fact):
     """Whether one common motion explains the averages was not tested.
 
@@ -419,7 +422,7 @@ class ModelUntested(Fact):
     dims: tuple[int, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class ModelPasses(Fact):
     """The model test passes in all bands."""
 
@@ -428,7 +431,7 @@ class ModelPasses(Fact):
     dims: tuple[int, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class DimensionsChosen(Fact):
     """The dimensions of the motion were chosen by band.
 
@@ -448,7 +451,7 @@ class DimensionsChosen(Fact):
     elsewhere: bool
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class DimensionsUnexplained(Fact):
     """No dimension that the sensors allow explains the averages in `bands` (Hz)."""
 
@@ -456,7 +459,7 @@ class DimensionsUnexplained(Fact):
     bands: tuple[tuple[float, float], ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class DimensionsUndetermined(Fact):
     """More dimensions explain the averages in `bands` (Hz), but are not told from noise."""
 
@@ -466,7 +469,7 @@ class DimensionsUndetermined(Fact):
     n_sensors: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class SharedNoiseNotSearched(Fact):
     """Noise that two channels share is not searched for among so many channels."""
 
@@ -475,7 +478,7 @@ class SharedNoiseNotSearched(Fact):
     most: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class SteadinessNotTested(Fact):
     """Whether the noise changes during the recording is not tested; `causes` are why."""
 
@@ -483,14 +486,14 @@ class SteadinessNotTested(Fact):
     causes: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class LikeChannelsAssumed(Fact):
     """The two-channel method assumes parallel like channels with known gains."""
 
     name: ClassVar[str] = "like-channels-assumed"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class DirectionsPooled(Fact):
     """Directions of the motion come from neighbouring frequencies, at `n` of `n_frequencies`."""
 
@@ -499,7 +502,7 @@ class DirectionsPooled(Fact):
     n_frequencies: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class ValuesBelowZero(Fact):
     """Values of the noise PSD are at or below zero, `n` of `n_values`."""
 
@@ -508,7 +511,7 @@ class ValuesBelowZero(Fact):
     n_values: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class IntervalsWidened(Fact):
     """What intervals of the table include beside scatter.
 
@@ -522,7 +525,7 @@ class IntervalsWidened(Fact):
     shares: Mapping[Source, float]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class TargetMissed(Fact):
     """The wanted precision is not reached.
 
@@ -539,7 +542,7 @@ class TargetMissed(Fact):
     total: float | None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class WrongSensitivity(Fact):
     """Channels of a sensor read more or less of the common motion than the other sensors.
 
@@ -565,7 +568,7 @@ class WrongSensitivity(Fact):
         return math.exp(math.fsum(map(math.log, self.gains)) / len(self.gains))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class LimitUndecided(Fact):
     """Something keeps `channels` (empty: all) from a decision on `limits`, by their names."""
 
@@ -574,7 +577,7 @@ class LimitUndecided(Fact):
     limits: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class LimitNotJudged(Fact):
     """A limit goes beyond the spectrum, and is not judged there.
 
@@ -592,7 +595,7 @@ class LimitNotJudged(Fact):
     judged: tuple[float, float]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class SensorOverdue(Fact):
     """A sensor of a running test is late or lost; of a closed one, it was lost before the end.
 
@@ -614,7 +617,7 @@ class SensorOverdue(Fact):
     is_closed: bool
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class ChannelsStuck(Fact):
     """Channels of a running test have a constant count, now or for some time earlier."""
 
@@ -622,7 +625,7 @@ class ChannelsStuck(Fact):
     is_now: bool
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class SensorClipping(Fact):
     """A sensor of a running test reaches the end of its range; `are_kept`: segments with that."""
 
@@ -630,7 +633,7 @@ class SensorClipping(Fact):
     are_kept: bool
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class RecordingsLeftOut(Fact):
     """An archive leaves out `recordings`, in which the clocks of `sensors` are not understood."""
 
@@ -638,7 +641,7 @@ class RecordingsLeftOut(Fact):
     recordings: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class SpectraUnreadable(Fact):
     """Files of an archive cannot be read, and are left out; a sentence for each."""
 
@@ -646,7 +649,7 @@ class SpectraUnreadable(Fact):
     files: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class ChangesUndecided(Fact):
     """An archive has too few days for drift and changes.
 
@@ -661,7 +664,21 @@ class ChangesUndecided(Fact):
     needed: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
+class AbsencesNotUsed(Fact):
+    """Segments that some channels lack are not in the archive, for no channel.
+
+    Attributes
+    ----------
+    n_segments : tuple of int
+        Segments that each of `channels` lacks and other channels have.
+    """
+
+    name: ClassVar[str] = "absences-not-used"
+    n_segments: tuple[int, ...]
+
+
+@record
 class StretchesLeftOut(Fact):
     """Stretches with less than half of their segments are not in the probability density."""
 
@@ -669,7 +686,7 @@ class StretchesLeftOut(Fact):
     n_stretches: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class NightsNotCompared(Fact):
     """No channel has `needed` days with working hours and nights, which are not compared."""
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.clocks.clock_model import ClockSource
+from daq.estimation.noise_estimates import BY_MOTION
 from daq.results.band_summary import band_of, channel_means, highest_known
 from daq.results.clock_effect import reference
 from daq.results.facts import (
@@ -86,9 +87,8 @@ if TYPE_CHECKING:
 
 LEAST_SHARE = 0.01
 """Share of the noise from which a contribution to an interval is a fact; of the time, too."""
-LEAST_SECONDS, DELAYING_SHARE = 30.0, 0.1
-"""Time by which a sensor shortens an estimate, from which that is a fact; and share of the time of
-the estimate from which it delays the result."""
+DELAYING_SHARE = 0.1
+"""Share of the time of the estimate from which a sensor that shortens it delays the result."""
 WITHOUT_ESTIMATE = (
     Flag.DEAD_CHANNEL
     | Flag.DUPLICATE
@@ -172,34 +172,27 @@ def _recording(snapshot: Snapshot) -> Iterator[Fact]:
                 n_gaps=sensor.n_gaps,
                 n_samples=sensor.n_missing,
             )
-    for at_end in (False, True) if snapshot.closed else (False,):
-        yield from _shortened(snapshot, at_end=at_end)
+    yield from _shortened(snapshot)
     if left_out := snapshot.not_estimated:
         n_all = len(snapshot.sensor_names) + len(left_out)
         yield NotInLiveEstimate(rank=Rank.TO_KNOW, sensors=tuple(left_out), n_all=n_all)
 
 
-def _shortened(snapshot: Snapshot, *, at_end: bool) -> Iterator[SpanShortened]:
-    """Yield that sensors shorten the time of the estimate, where its end is theirs."""
-    sensors = [each for each in snapshot.sensors if math.isfinite(each.last_seen)]
-    if not sensors or (at_end and any(each.is_lost for each in sensors)):  # a fact of its own
-        return
-    sign = -1.0 if at_end else 1.0
-    seen = [sign * (each.last_seen if at_end else each.began) for each in sensors]
-    begin = snapshot.start_utc_ns * 1e-9 + (snapshot.elapsed if at_end else 0.0)
-    least = max(LEAST_SECONDS, LEAST_SHARE * snapshot.elapsed)
-    seconds = max(seen) - min(seen)
-    if seconds > least and abs(sign * begin - max(seen)) < least:
-        yield SpanShortened(
-            rank=Rank.DELAYS if seconds > DELAYING_SHARE * snapshot.elapsed else Rank.TO_KNOW,
-            sensors=tuple(
-                each.name
-                for each, own in zip(sensors, seen, strict=True)
-                if own > min(seen) + least
-            ),
-            seconds=seconds,
-            at_end=at_end,
-        )
+def _shortened(snapshot: Snapshot) -> Iterator[SpanShortened]:
+    """Yield which sensors shorten the time of the estimate, at its begin and at its end."""
+    for at_end in (False, True):
+        if at_end and any(each.is_lost for each in snapshot.sensors):  # a fact of its own
+            continue
+        seconds = {sensor: both[at_end] for sensor, both in snapshot.shortened.items()}
+        sensors = tuple(sensor for sensor, own in seconds.items() if own)
+        longest = max(seconds.values(), default=0.0)
+        if sensors and longest > LEAST_SHARE * snapshot.elapsed:
+            yield SpanShortened(
+                rank=Rank.DELAYS if longest > DELAYING_SHARE * snapshot.elapsed else Rank.TO_KNOW,
+                sensors=sensors,
+                seconds=longest,
+                at_end=at_end,
+            )
 
 
 def _lost(snapshot: Snapshot, sensor: SensorTotals) -> SensorLost:
@@ -255,6 +248,7 @@ def _segments(snapshot: Snapshot) -> Iterator[Fact]:
             channels=tuple(snapshot.channels[n].name for n in fewer),
             n_segments=tuple(counts[n] for n in fewer),
             most=max(counts),
+            complete_only=tuple(name for name in snapshot.results if name not in BY_MOTION),
         )
     if snapshot.octaves:
         lowest = snapshot.octaves[0]

@@ -13,13 +13,13 @@ from daq.bench.units import canonical, conversion
 from daq.results.band_summary import band_of, correlation_of, judged_method
 from estimator.errors import InsufficientDataError
 from estimator.levels.bands import band_edges, band_levels
-from estimator.noise_parameters.allan import AllanDeviation, allan_deviation
-from estimator.noise_parameters.fit import NoiseParameters, fit
 
 if TYPE_CHECKING:
     from daq.bench.model import Bench, DataSheet
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import ChannelLabel, Snapshot
+    from estimator.noise_parameters.allan import AllanDeviation
+    from estimator.noise_parameters.fit import NoiseParameters
     from estimator.types import FloatArray
 
 QUANTISATION_SHARE = 0.5
@@ -115,6 +115,10 @@ def noise_parameters(
     They are fitted to the whole usable spectrum: slopes show over decades, not in a band. None of
     a snapshot in which that method has no result.
     """
+    # every estimate asks for the shares of quantisation below, few for these
+    from estimator.noise_parameters.allan import allan_deviation  # noqa: PLC0415
+    from estimator.noise_parameters.fit import fit  # noqa: PLC0415
+
     noise = snapshot.results.get(judged_method(snapshot, settings))
     if noise is None:
         return ()

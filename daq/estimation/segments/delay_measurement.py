@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.clocks.delay_estimation import MIN_SEGMENTS, REFERENCES, DelayEstimator
+from daq.clocks.departures import departing
 from estimator.median import median
 from estimator.spectra.windows import gap_window, get_window, without_trend
 
@@ -18,13 +19,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.clocks.aligned_recording import AlignedRecording
-    from estimator.spectra.welch import WelchSettings
+    from estimator.spectra.welch import SegmentSpectra, WelchSettings
 
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
     BoolArray = NDArray[np.bool_]
 
 _HELD = 6  # segments that are measured together while a recording is followed
+_SHOWN = 0.5  # samples; a delay that must show in any segment
+_FAR_OFF, _LEAST_OFF = 6.0, 1e-6  # standard deviations, of so many s at least
 _TOGETHER = 24  # segments whose spectra are measured together
 _HELD_VALUES = 1 << 19  # samples times channels that may wait for that: 4 MB
 
@@ -106,6 +109,36 @@ class DelayMeasurement:
     def precision(self) -> float | None:
         """Standard deviation of a delay, usually, in s; None if none is known."""
         return float(median(np.array(self._spreads))) if self._spreads else None
+
+    def suspects(self, single: SegmentSpectra) -> IntArray | None:
+        """Return which of the kept segments may be off the clocks that they were taken by.
+
+        None where most segments would not show it.
+        """
+        if self._meter is None:
+            return None
+        spectra = single.values().astype(np.complex128).transpose(1, 0, 2)
+        rate, length = self._welch.sampling_rate, self._welch.segment_length
+        omega = np.asarray(2 * np.pi * rate / length * single.bins, dtype=np.float64)
+        reference, others = self._meter.compared
+        found = np.zeros(spectra.shape[1], dtype=np.bool_)
+        for columns in others:
+            departs = departing(
+                spectra[:, :, reference], spectra[:, :, columns], omega, precise=_SHOWN / rate
+            )
+            if departs is None:
+                return None
+            found |= departs
+        return np.flatnonzero(found)
+
+    def are_off(self, spectra: NDArray[np.complex128]) -> bool:
+        """Return whether any segment has a delay that the clocks have not."""
+        if self._meter is None:
+            return False
+        delays, std = self._meter.measure_spectra(spectra)
+        measured = np.isin(np.arange(delays.shape[1]), self._meter.measured)
+        off = ~(np.abs(delays) <= _FAR_OFF * np.maximum(std, _LEAST_OFF)) | ~np.isfinite(std)
+        return bool(off[:, measured].any())
 
     def _wanted_meter(self) -> DelayEstimator | None:
         if not (self._is_wanted and self._aligned.measurable):

@@ -57,9 +57,8 @@ class OwnSpectra:
         orders = [order_of(float(np.abs(own.drift).max()), length) for own in sensors]
         n_channels = sum(own.samples.shape[1] for own in sensors)
         spectra = np.empty((n_segments, length // 2 + 1, n_channels), np.complex128)
-        raw = np.empty((n_segments * welch.hop, n_channels))
+        raw = np.empty((n_channels, n_segments * welch.hop)).T
         basis = trends(welch.detrend, length)
-        fit = basis / np.sum(basis**2, axis=1, keepdims=True)
         column = 0
         for own, order in zip(sensors, orders, strict=True):
             if order is None:
@@ -68,13 +67,11 @@ class OwnSpectra:
             column = columns.stop
             few = own.samples[: len(raw)]  # a slow clock may have one sample less
             raw[: len(few), columns], raw[len(few) :, columns] = few, few[-1]
-            by_channel = np.ascontiguousarray(own.samples.T)
-            segments = np.lib.stride_tricks.sliding_window_view(by_channel, length, axis=1)
-            segments = np.ascontiguousarray(segments[:, own.rows].swapaxes(0, 1))
-            for line, slope in zip(basis, fit, strict=True):
-                segments -= (segments @ slope)[..., None] * line
+            samples = own.samples.T
             if welch.detrend != "none":  # the rounding of a mean is no signal
-                segments[:, stands_still(by_channel.T)] = 0.0
-            found = shifted_spectra(segments, own.shift, own.drift, order=order)
-            spectra[:, :, columns] = found.swapaxes(1, 2)
+                samples[stands_still(own.samples)] = 0.0
+            found = spectra[:, :, columns]
+            shifted_spectra(
+                samples, own.rows, own.shift, own.drift, order=order, trends=basis, out=found
+            )
         return cls(spectra, raw)

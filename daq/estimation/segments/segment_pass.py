@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from daq.clocks.aligned_recording import AlignedRecording
+from daq.clocks.grid import OwnSamples
 from daq.clocks.growing_rows import GrowingRows
 from daq.estimation.segments.clipping import in_clipped_blocks
 from daq.estimation.segments.delay_measurement import DelayMeasurement
@@ -49,6 +50,8 @@ def whole_segments(
     usable: NDArray[np.bool_], starts: NDArray[np.int64], length: int
 ) -> NDArray[np.bool_]:
     """Return which segments have usable samples only."""
+    if usable.all():
+        return np.ones(len(starts), dtype=np.bool_)
     missing = np.concatenate([[0], np.cumsum(~usable)])
     return np.asarray(missing[starts + length] == missing[starts])
 
@@ -97,7 +100,7 @@ class NewestSamples:
             samples, valid = self._aligned.read(begin, end)
         if samples.size <= MOST_VALUES:
             self._begin, self._n_settings = begin, self._aligned.n_settings
-            self._samples, self._valid = samples.copy(), valid
+            self._samples, self._valid = samples.copy(order="K"), valid
         return samples, valid
 
 
@@ -146,15 +149,18 @@ OCTAVES = 12
 """Stages of the multi-resolution mode: those without segments cost nothing."""
 _MOST_PASSES = 4
 _FINAL_TOLERANCE = 1e-7  # seconds rms that clocks may move before segments are taken again
-_SURVEY_EVERY, _SURVEYED = 4, 80
+_SURVEYS, _SURVEYED = (4,), 80
 """Segments of which one is surveyed, at most, and how many are, at least."""
-_READ_TOGETHER = 8  # segments of a survey
+_READ_TOGETHER = 24  # segments of a survey
+_GOLDEN = 0.6180339887498949
 _SURVEY_TOLERANCE = 0.25
 """By how much two surveys may differ, as a share of the error of one delay.
 
 Synchronisation this good adds to the noise less than half the square of that share where one line
 holds all that is known of the delay, and a thousandth of this in broad-band motion.
 """
+_MOST_SUSPECTS = 0.02  # share of segments, and
+_SOME_SUSPECTS = 8
 _MATERIAL_CONSTANT = 0.02  # samples of constant delay, of which a window forgives more
 
 
@@ -363,8 +369,9 @@ class Pass:
         self._survey()
         self.advance(progress)
         for _ in range(_MOST_PASSES - 1):
+            departs = self._departs()
             self.set_clocks()
-            if not self.is_outdated(self._tolerance):
+            if not (departs or self.is_outdated(self._tolerance)):
                 break
             self._every, self._tolerance = 1, _FINAL_TOLERANCE
             if repeating is not None:
@@ -416,35 +423,62 @@ class Pass:
         """Set free clocks from a few segments, before all are taken.
 
         Where these clocks prove straight between the segments surveyed, the pass that follows
-        measures as few, half-way between them: two independent measurements, of which the one is
-        the check of the other. If they differ, delays are measured in every segment after all.
+        measures as few others: two independent measurements, of which the one is the check of the
+        other. If they differ, delays are measured in every segment after all.
         """
-        every = min(_SURVEY_EVERY, self.n_complete // _SURVEYED)
         wanted = self._delays.fewest and not self.n_seen and self.aligned.is_unbroken
-        if every < 2 or not wanted or self._why_on_grid():
+        if not wanted or self._why_on_grid():
             return
-        surveyed = np.arange(0, self.n_complete, every)
-        for first in range(0, len(surveyed), _READ_TOGETHER):
-            begins = surveyed[first : first + _READ_TOGETHER] * self.welch.hop
-            found = self._own_spectra(begins)
-            if found is not None:
-                self._delays.measure_spectra(found.spectra, begins)
-                continue
-            for begin in np.split(begins, len(begins)):  # one of them has a gap
-                found = self._own_spectra(begin)
-                if found is not None:
-                    self._delays.measure_spectra(found.spectra, begin)
-        self.set_clocks()
+        for every in sorted({min(most, self.n_complete // _SURVEYED) for most in _SURVEYS})[::-1]:
+            if every < 2:
+                return
+            precision = self._surveyed(every)
+            if precision is None:
+                return
+            tolerance = max(_FINAL_TOLERANCE, _SURVEY_TOLERANCE * precision)
+            delays = self._positions(np.arange(0, self.n_complete, every))
+            delays -= delays.mean(axis=1, keepdims=True)
+            bend = (delays[2:] - 2 * delays[1:-1] + delays[:-2]) / 8  # from a line, half-way
+            if np.sqrt(np.mean(bend**2, axis=0)).max() <= tolerance:
+                self._every, self._tolerance = every, tolerance
+                return
+
+    def _surveyed(self, every: int) -> float | None:
+        """Set clocks from one segment in `every`; return the error of one delay, in s."""
+        numbers = np.arange(self.n_complete)
+        begins = numbers[_is_picked(numbers, every)] * self.welch.hop
+        for first in range(0, len(begins), _READ_TOGETHER):
+            some = begins[first : first + _READ_TOGETHER]
+            whole, spectra = self._spectra_apart(some)
+            if spectra is not None:
+                self._delays.measure_spectra(spectra, some[whole])
+        self.set_clocks(slips=False)  # these are found in all segments, and better dated
         precision = self._delays.precision
         self.restart()
-        if precision is None:
-            return
-        tolerance = max(_FINAL_TOLERANCE, _SURVEY_TOLERANCE * precision)
-        delays = self._positions(surveyed)
-        delays -= delays.mean(axis=1, keepdims=True)
-        bend = (delays[2:] - 2 * delays[1:-1] + delays[:-2]) / 8  # from a line, half-way
-        if np.sqrt(np.mean(bend**2, axis=0)).max() <= tolerance:
-            self._every, self._tolerance = every, tolerance
+        return precision
+
+    def _departs(self) -> bool:
+        """Return whether any segment is off the clocks, though delays are measured in few only."""
+        if self._every == 1 or self.single is None or not len(self.single):
+            return False
+        suspects = self._delays.suspects(self.single)
+        if suspects is None or len(suspects) > _SOME_SUSPECTS + _MOST_SUSPECTS * self.n_seen:
+            return True
+        _, spectra = self._spectra_apart(self.kept_at[suspects])
+        return spectra is not None and self._delays.are_off(spectra)
+
+    def _spectra_apart(self, begins: NDArray[np.int64]) -> tuple[BoolArray, ComplexArray | None]:
+        """Return which segments, far apart, are whole in each sensor's own samples; their spectra.
+
+        None where there are none.
+        """
+        length = self.welch.segment_length
+        parts = [self.aligned.own_samples(begin, length) for begin in begins[:, None]]
+        whole = np.array([part is not None for part in parts], dtype=np.bool_)
+        sensors = zip(*(part for part in parts if part is not None), strict=True)
+        own = [OwnSamples.joined(each) for each in sensors]
+        found = OwnSpectra.of(own, self.welch) if own else None
+        return whole, None if found is None else found.spectra
 
     def _own_spectra(self, begins: NDArray[np.int64]) -> OwnSpectra | None:
         """Return spectra of segments in each sensor's own samples; None where that is not so."""
@@ -523,7 +557,7 @@ class Pass:
         self._take_whole(spectra, begins)
         self._n_taken += len(spectra)
         self._taken_at.add(self._positions(np.arange(first, first + count)))
-        some = begins // hop % self._every == self._every // 2
+        some = _is_picked(begins // hop, self._every, again=True)
         self._delays.measure_spectra(spectra[some], begins[some])
 
     def _silence(self, samples: FloatArray) -> None:
@@ -546,10 +580,14 @@ class Pass:
         """Return which grid samples lie in blocks that are clipped; None if none do."""
         if self._settings.reject is False:
             return None
-        at = np.arange(start, start + n_samples, dtype=np.float64)
-        origin = self.aligned.start_utc_ns - self.recording.created_at.utc_ns
-        seconds = origin * 1e-9 + at / self.welch.sampling_rate
-        return in_clipped_blocks(self._sensors, lambda: seconds[:, None] - self.aligned.delays(at))
+
+        def times() -> FloatArray:
+            at = np.arange(start, start + n_samples, dtype=np.float64)
+            origin = self.aligned.start_utc_ns - self.recording.created_at.utc_ns
+            seconds = origin * 1e-9 + at / self.welch.sampling_rate
+            return np.asarray(seconds[:, None] - self.aligned.delays(at))
+
+        return in_clipped_blocks(self._sensors, times)
 
     @property
     def awaited(self) -> int:
@@ -567,11 +605,14 @@ class Pass:
         moved = self._positions(np.arange(len(before))) - before
         return np.asarray(moved - moved.mean(axis=1, keepdims=True))
 
-    def set_clocks(self) -> None:
-        """Set the clocks by the delays measured in the segments taken."""
+    def set_clocks(self, *, slips: bool = True) -> None:
+        """Set the clocks by the delays measured in the segments taken.
+
+        `slips`: whether samples that were lost without being counted are looked for in them.
+        """
         if self._delays.has_begun:
             self._delays.learn_held()
-            self.aligned.set_clocks()
+            self.aligned.set_clocks(slips=slips)
 
     @property
     def shows_drifts(self) -> bool:
@@ -620,6 +661,15 @@ class Pass:
         """Return the middles of segments, in samples of the grid."""
         middle = segments * float(self.welch.hop) + self.welch.segment_length / 2 + self.reach
         return np.asarray(middle, dtype=np.float64)
+
+
+def _is_picked(numbers: NDArray[np.int64], every: int, *, again: bool = False) -> BoolArray:
+    """Return which segments are measured: one in `every`, `again` another one, at uneven distances.
+
+    A clock that moves in cycles of the even distance would look straight.
+    """
+    place = (every * (_GOLDEN * (numbers // every) ** 2 % 1)).astype(np.int64)
+    return np.asarray(numbers % every == (place + again * (every // 2)) % every)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

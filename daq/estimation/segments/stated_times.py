@@ -86,7 +86,8 @@ def compare(aligned: AlignedRecording, settings: Settings, welch: WelchSettings)
     drift, reference = _drifts(aligned, welch, sensors, most=settings.bridge, longest=longest)
     unknown = sum(not math.isfinite(each) for each in drift.values())
     short = settings.segment
-    of_short = aligned.n_available / welch.sampling_rate / _PIECES
+    first, last = aligned.common
+    of_short = (last - first) / welch.sampling_rate / _PIECES
     if unknown and short < min(longest, of_short):  # gaps may leave nothing of long pieces
         found, against = _drifts(aligned, welch, sensors, most=settings.bridge, longest=short)
         if sum(not math.isfinite(each) for each in found.values()) < unknown:
@@ -124,7 +125,8 @@ def agree(
     if any(aligned.clocks[n].ppm or aligned.clocks[n].wander_ppm for n in sensors):
         return False
     edges = np.cumsum([0, *aligned.dims])
-    part = np.minimum(at * _PARTS // max(aligned.n_available, 1), _PARTS - 1)
+    first, last = aligned.common
+    part = np.clip((at - first) * _PARTS // max(last - first, 1), 0, _PARTS - 1)
     n_first = int(edges[sensors[0] + 1] - edges[sensors[0]])
     if np.bincount(part, minlength=_PARTS).min() < max(_FEWEST, n_first):
         return False
@@ -200,7 +202,7 @@ def _drifts(
     order = np.argsort(at)
     at, delays, std = at[order] / welch.sampling_rate, delays[order], std[order]
     is_reference = (std == 0).all(axis=0) & (len(at) > 0)
-    duration = aligned.n_available / welch.sampling_rate
+    duration = (pieces.end - pieces.start) / welch.sampling_rate
     drift = {}
     for column, number in enumerate(sensors):
         clock, mine = aligned.clocks[number], (at, delays[:, column], std[:, column])
@@ -318,19 +320,20 @@ class _Pieces:
         longest: float,
     ) -> None:
         self._aligned, self._most = aligned, most
+        self.start, self.end = aligned.common
         edges = np.cumsum([0, *aligned.dims])
         self._columns = tuple(slice(int(edges[n]), int(edges[n + 1])) for n in sensors)
         self._n_channels = int(edges[-1])
         fewest = DelayEstimator(welch.sampling_rate, np.empty(0), self._columns).min_segments
         n_first = max(2 * fewest, 3 * _PARTS)
         length = min(
-            aligned.n_available / _PIECES,
+            (self.end - self.start) / _PIECES,
             longest * welch.sampling_rate,
             _MOST_VALUES / (n_first * self._n_channels),
         )
         self._welch = replace(welch, segment_length=max(round(length), _SHORTEST), overlap=0.5)
         hop, length = self._welch.hop, self._welch.segment_length
-        self.total = max(0, (aligned.n_available - length) // hop + 1)
+        self.total = max(0, (self.end - self.start - length) // hop + 1)
         self.first = np.arange(min(n_first, self.total))
 
     def begin(self) -> list[Delays]:
@@ -363,12 +366,12 @@ class _Pieces:
             kept = [samples for samples in parts if samples is not None]
             if kept:
                 starts = np.arange(len(kept)) * length
-                at = some[known] * self._welch.hop + length / 2
+                at = self.start + some[known] * self._welch.hop + length / 2
                 found.append((at, *self.meter.measure(np.concatenate(kept), starts)))
         return found
 
     def _piece(self, number: int) -> FloatArray | None:
-        begin = number * self._welch.hop
+        begin = self.start + number * self._welch.hop
         if begin + self._welch.segment_length > self._aligned.n_available:
             return None  # clocks that have been set may end earlier
         samples, valid = self._aligned.read(begin, begin + self._welch.segment_length)

@@ -35,6 +35,68 @@ def test_samples_of_one_clock_are_bit_exact_for_any_division_of_reads(tmp_path: 
         assert np.array_equal(aligned.read(1234, 4321)[0], whole[1234:4321])
 
 
+LATE, EARLY, N = 7000, 13_000, 20_000  # samples at 100 Hz: more than a minute from either end
+
+
+def with_one_apart(names: str, *, utc: bool) -> dict[str, Sensor]:
+    """Return sensors of which the last begins late and ends early; they state UTC or run freely."""
+    sensors = {n: Sensor(counts(N, 1, ord(n)), clock=n, utc=utc) for n in names[:-1]}
+    last = names[-1]
+    sensors[last] = Sensor(counts(EARLY - LATE, 1, 1), clock=last, utc=utc, start=LATE / 100)
+    return sensors
+
+
+def test_a_fourth_sensor_that_begins_late_and_ends_early_is_absent_meanwhile(
+    tmp_path: Path,
+) -> None:
+    path = write(tmp_path / "r.h5", with_one_apart("abcd", utc=True))
+    with Recording.open(path) as recording:
+        aligned = AlignedRecording(recording)
+        assert not aligned.measurable
+        assert aligned.n_available == N
+        samples, valid = aligned.read(0, N)
+        assert np.isfinite(samples[:, :3]).all()
+        np.testing.assert_array_equal(np.flatnonzero(valid), np.arange(LATE, EARLY))
+        np.testing.assert_array_equal(np.isfinite(samples[:, 3]), valid)
+        assert aligned.common == (LATE, EARLY)
+        assert aligned.shortened == {}
+        begin = aligned.start_utc_ns + 10 * 10**9
+        assert AlignedRecording(recording, start_utc_ns=begin).start_utc_ns == begin
+
+
+@pytest.mark.parametrize(("names", "utc"), [("abc", True), ("abcd", False)])
+def test_two_sensors_and_free_clocks_have_the_common_span_which_is_shorter(
+    tmp_path: Path, names: str, utc: bool
+) -> None:
+    path = write(tmp_path / "r.h5", with_one_apart(names, utc=utc))
+    with Recording.open(path) as recording:
+        aligned = AlignedRecording(recording)
+        assert aligned.n_available == pytest.approx(EARLY - LATE, abs=2 * reach() + 1)
+        assert list(aligned.shortened) == [names[-1]]
+        late, early = aligned.shortened[names[-1]]
+        assert late == pytest.approx(70.0, abs=0.01)
+        assert early == pytest.approx(70.0, abs=0.01)
+        begin = aligned.start_utc_ns
+        only = AlignedRecording(recording, start_utc_ns=begin, end_utc_ns=begin + 10**10)
+        assert only.shortened == {}  # nothing else is wanted
+
+
+def test_a_growing_recording_waits_for_samples_of_all_sensors(tmp_path: Path) -> None:
+    sensors = with_one_apart("abcd", utc=True)
+    writer = create(tmp_path / "r.h5", sensors)
+    for name, sensor in sensors.items():
+        for block in blocks(name, sensor):
+            writer.append(block)
+    writer.commit()
+    with Recording.open(tmp_path / "r.h5") as recording:
+        aligned = AlignedRecording(recording)
+        assert aligned.n_available == EARLY
+        assert aligned.shortened == {}
+        writer.close()
+        aligned.refresh()
+        assert aligned.n_available == N
+
+
 @pytest.mark.parametrize("shared", [True, False])
 def test_a_gap_is_invalid_for_all_sensors_and_other_samples_are_valid(
     tmp_path: Path, shared: bool

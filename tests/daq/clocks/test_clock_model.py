@@ -11,7 +11,7 @@ from daq.clocks.arrival_times import ArrivalTimes
 from daq.clocks.clock_model import (
     MeasuredDelays,
 )
-from daq.clocks.kalman import Observations, smooth
+from daq.clocks.kalman import Observations, Smoothed, smooth
 from daq.clocks.lower_envelope import supporting_line
 from daq.clocks.slips import Step, lost_by_delays
 from daq.clocks.usb_polling import Polls
@@ -235,6 +235,36 @@ def test_delays_from_the_samples_outweigh_arrivals_up_to_their_constant() -> Non
     assert np.std(alone) > 1e-5
     assert abs(np.mean(error)) < 1e-6  # the constant is that of the samples
     assert refined.state.residual < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("std", "hole", "sparse"),
+    [(1e-6, (0.0, 0.0), True), (1e-3, (0.0, 0.0), False), (1e-6, (500.0, 900.0), False)],
+)
+def test_arrivals_are_as_sparse_as_delays_that_far_outweigh_them(
+    monkeypatch: pytest.MonkeyPatch, std: float, hole: tuple[float, float], *, sparse: bool
+) -> None:
+    rng = np.random.default_rng(3)
+    taken = last_samples(24_000, 15.0)
+    arrivals = ArrivalTimes(RATE, 0, 0)
+    arrivals.add(block_rows(taken + rng.exponential(1e-3, len(taken))))
+    index = np.arange(2000.0, 478_000.0, 8000.0)
+    index = index[(index / RATE < hole[0]) | (index / RATE > hole[1])]
+    seconds = index / (RATE * (1 + 15e-6))
+    late = std * rng.standard_normal(len(index))
+    measured = MeasuredDelays(index, seconds + late, np.full(len(index), std))
+    rows: list[int] = []
+
+    def counted(observations: Observations, **options: float) -> Smoothed:
+        rows.append(int((~observations.from_samples).sum()))
+        return smooth(observations, **options)
+
+    monkeypatch.setattr("daq.clocks.kalman.smooth", counted)
+    clock = arrivals.solve("a", measured)
+    assert (rows[0] < 70) == sparse  # of 240
+    if std < 1e-5:
+        assert np.std(clock.at(index) - seconds) < 1e-6
+        assert clock.state.residual < 1e-6
 
 
 def test_an_epoch_shorter_than_a_segment_does_not_spoil_the_others() -> None:

@@ -114,6 +114,7 @@ def test_sensors_without_utc_are_in_the_time_of_those_with_it(
     assert other.residual < 1e-4  # 5e-3 is what 30 ppm would leave
 
 
+@pytest.mark.long
 def test_utc_that_drifts_is_corrected_though_the_computer_has_another_date(tmp_path: Path) -> None:
     sensor = {"sampling_rate": 50.0, "noise": [{"shape": "white", "level": 1e-12}]}
     scenario = Scenario.from_dict(

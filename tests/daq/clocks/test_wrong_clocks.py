@@ -21,10 +21,14 @@ from tests.known_clocks import NOISE, Oscillator, Scene, growing, record, second
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from daq.clocks.clock_model import ClockState
     from daq.estimation.snapshot import Snapshot
     from tests.known_clocks import Motion, Truth
 
 SETTINGS = Settings(equalise="off")
+LONG = pytest.mark.long
+SECONDS, LATER = 200.0, 100.0
+"""Of most recordings, and when something happens in them."""
 EDGES = (0.02, 0.1, 0.25, 0.43)
 """Of bands, as fractions of the sampling rate."""
 
@@ -32,6 +36,16 @@ EDGES = (0.02, 0.1, 0.25, 0.43)
 def estimated(path: Path, scene: Scene) -> tuple[Snapshot, Truth]:
     truth = record(path / "r.h5", scene)
     return estimate([path / "r.h5"], SETTINGS), truth
+
+
+def clocks_of(
+    path: Path, settings: Settings = SETTINGS, sensors: set[str] | None = None
+) -> tuple[ClockState, ...]:
+    """Return the clocks that an estimate would have, without its noise."""
+    with Recording.open(path) as recording:
+        part = Pass(recording, settings, sensors=sensors)
+        part.finish()
+        return tuple(part.aligned.clocks)
 
 
 def errors(snapshot: Snapshot, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -50,11 +64,11 @@ def assert_right(error: np.ndarray, holds: np.ndarray) -> None:
     assert (abs(error)[~holds] < 0.6).all()
 
 
-@pytest.mark.parametrize("snr", [3.0, 1e4])
+@pytest.mark.parametrize("snr", [3.0, pytest.param(1e4, marks=LONG)])
 def test_the_stated_residual_of_a_good_clock_is_that_of_its_filter(
     tmp_path: Path, snr: float
 ) -> None:
-    scene = Scene(snr=snr, seconds=300.0)
+    scene = Scene(snr=snr, seconds=SECONDS)
     snapshot, truth = estimated(tmp_path, scene)
     assert all(clock.is_understood for clock in snapshot.clocks)
     assert not clock_facts(snapshot)
@@ -70,7 +84,7 @@ WARMING = Oscillator(15.0, 30.0, 180.0)
 
 @pytest.mark.parametrize(
     ("snr", "polled"),
-    [(1e2, True), (1e4, False), pytest.param(1e6, True, marks=pytest.mark.long)],
+    [(1e2, True), *(pytest.param(*each, marks=LONG) for each in ((1e4, False), (1e6, True)))],
 )
 def test_the_residual_of_a_rate_that_moves_with_the_temperature_is_true(
     tmp_path: Path, snr: float, *, polled: bool
@@ -111,21 +125,19 @@ def test_samples_lost_all_the_time_are_not_taken_for_a_fast_clock(tmp_path: Path
     assert fact.ppm == pytest.approx(-985, abs=1)
 
 
-LATER = 150.0
-LONG = pytest.mark.long
-
-
 @pytest.mark.parametrize(
     ("scene", "lost"),
     [
         pytest.param({"slips": {1: [(LATER, 1)]}}, {1: 1}, id="one sample"),
         pytest.param({"slips": {2: [(LATER, -1)]}}, {2: -1}, id="one counted twice", marks=LONG),
-        pytest.param({"slips": {1: [(LATER, 100)]}}, {1: 100}, id="a block"),
+        pytest.param({"slips": {1: [(LATER, 100)]}}, {1: 100}, id="a block", marks=LONG),
         pytest.param({"slips": {1: [(20.0, 100)]}}, {1: 100}, id="a block at first", marks=LONG),
         pytest.param({"leaps": {1: [(LATER, 37)]}}, {1: -37}, id="a gap that is none"),
         pytest.param({"slips": {0: [(LATER, 2)]}}, {0: 2}, id="in the reference"),
         pytest.param({"slips": {1: [(LATER, 1)]}, "polled": True}, {1: 1}, id="polled", marks=LONG),
-        pytest.param({"slips": {1: [(LATER, 1)]}, "snr": 3.0}, {1: 1}, id="weak motion"),
+        pytest.param(
+            {"slips": {1: [(LATER, 1)]}, "snr": 3.0}, {1: 1}, id="weak motion", marks=LONG
+        ),
         pytest.param(
             {"slips": {1: [(LATER, 1)]}, "rates": (100.0, 250.0, 200.0)},
             {1: 1},
@@ -137,7 +149,7 @@ LONG = pytest.mark.long
 def test_samples_lost_without_being_counted_are_found_and_corrected(
     tmp_path: Path, scene: dict[str, Any], lost: dict[int, int]
 ) -> None:
-    made = Scene(**{"seconds": 300.0, **scene})
+    made = Scene(**{"seconds": SECONDS, **scene})
     snapshot, truth = estimated(tmp_path, made)
     found = [tuple(slip.n_samples for slip in clock.slips) for clock in snapshot.clocks]
     assert found == [(lost[n],) if n in lost else () for n in range(3)]
@@ -156,6 +168,7 @@ def test_samples_lost_without_being_counted_are_found_and_corrected(
     assert (fact.sensors, fact.slips) == ((name,), (slip,))
 
 
+@LONG
 def test_a_sample_lost_every_minute_is_found_every_time(tmp_path: Path) -> None:
     slips = {1: [(60.0 * n, 1) for n in range(1, 5)]}
     scene = Scene(seconds=300.0, slips=slips)
@@ -170,7 +183,7 @@ def test_a_sample_lost_every_minute_is_found_every_time(tmp_path: Path) -> None:
 
 def test_a_sample_lost_near_the_end_is_part_of_the_residual(tmp_path: Path) -> None:
     """Too few segments are left to tell a slip from false delays."""
-    scene = Scene(seconds=300.0, slips={1: [(290.0, 1)]})
+    scene = Scene(seconds=SECONDS, slips={1: [(SECONDS - 10.0, 1)]})
     snapshot, _ = estimated(tmp_path, scene)
     assert not any(clock.slips for clock in snapshot.clocks)
     stated = snapshot.diagnostics.synchronisation.residual["B"]
@@ -181,13 +194,11 @@ def test_a_sample_lost_near_the_end_is_part_of_the_residual(tmp_path: Path) -> N
 
 def test_between_two_sensors_arrivals_say_which_lost_samples(tmp_path: Path) -> None:
     for slipped in (0, 1):
-        scene = Scene(seconds=300.0, slips={slipped: [(LATER, 8)]})
+        scene = Scene(seconds=SECONDS, slips={slipped: [(LATER, 8)]})
         record(tmp_path / f"{slipped}.h5", scene)
         settings = replace(SETTINGS, methods=("two-channel",))
-        with Recording.open(tmp_path / f"{slipped}.h5") as recording:
-            part = Pass(recording, settings, sensors={"A", "B"})
-            part.finish()
-            found = [[slip.n_samples for slip in clock.slips] for clock in part.aligned.clocks]
+        clocks = clocks_of(tmp_path / f"{slipped}.h5", settings, sensors={"A", "B"})
+        found = [[slip.n_samples for slip in clock.slips] for clock in clocks]
         assert found == [[8] * (slipped == 0), [8] * (slipped == 1)]
 
 
@@ -209,10 +220,10 @@ def test_no_slip_is_found_in_a_healthy_recording(
     warm = (Oscillator(5.0, 10.0, 120.0), Oscillator(60.0), Oscillator(-40.0, 10.0, 120.0, 2.0))
     for snr in (0.3, 30.0, 1e5):
         scene = Scene(seconds=240.0, snr=snr, motion=motion, polled=polled, clocks=warm, seed=3)
-        snapshot, _ = estimated(tmp_path, scene)
-        assert not any(clock.slips for clock in snapshot.clocks)
-        assert all(clock.is_understood for clock in snapshot.clocks)
-        (tmp_path / "r.h5").unlink()
+        record(tmp_path / f"{snr}.h5", scene)
+        clocks = clocks_of(tmp_path / f"{snr}.h5")
+        assert not any(clock.slips for clock in clocks)
+        assert all(clock.is_understood for clock in clocks)
 
 
 @pytest.mark.parametrize(("snr", "polled"), [(1e4, True), pytest.param(3.0, False, marks=LONG)])
@@ -244,14 +255,15 @@ def test_sensors_that_all_restart_are_aligned_or_left_out(tmp_path: Path, seed: 
     assert_right(*errors(snapshot, scene))
 
 
+@LONG  # of one sensor: tests/daq/estimation/test_follow.py
 def test_slips_are_the_same_in_a_recording_that_was_followed(tmp_path: Path) -> None:
-    scene = Scene(seconds=300.0, slips={1: [(LATER, 1)], 2: [(200.0, 100)]})
+    scene = Scene(seconds=SECONDS, slips={1: [(LATER, 1)], 2: [(130.0, 100)]})
     path = tmp_path / "r.h5"
     following: Estimation | None = None
     for seconds in growing(path, scene, every=20.0):
         following = following or Estimation([path], SETTINGS)
         following.update()
-        if seconds > 270.0:
+        if seconds > 170.0:
             clocks = following.snapshot().clocks
     assert following is not None
     with following:

@@ -17,6 +17,8 @@ from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
 from daq.formats.importer import import_files
 from daq.recording.reader import Recording
+from daq.results.facts import ChannelsAbsent, SpanShortened
+from daq.results.known_facts import facts_of
 from estimator.checks.advice import Untested
 from estimator.levels.pooled import blocks_of
 from estimator.self_noise.result import Flag, SelfNoise, combined
@@ -74,9 +76,15 @@ NEVER_TOGETHER = {"A2": [0, 1], "B0": [2, 3]}
 WHOLE_SENSORS = {"A0": [1], "A1": [1], "A2": [1], "B0": [2], "B1": [2], "B2": [2]}
 
 
-@pytest.mark.parametrize("octaves", [False, True])
 @pytest.mark.parametrize(
-    ("names", "lacking"), [("ABC", DAYS), ("ABC", NEVER_TOGETHER), ("ABCD", WHOLE_SENSORS)]
+    ("names", "lacking", "octaves"),
+    [
+        ("ABC", DAYS, False),
+        ("ABC", DAYS, True),
+        ("ABC", NEVER_TOGETHER, False),
+        ("ABC", NEVER_TOGETHER, True),
+        ("ABCD", WHOLE_SENSORS, False),
+    ],
 )
 def test_noise_is_right_where_channels_lack_samples(
     names: str, lacking: dict[str, list[int]], octaves: bool
@@ -145,6 +153,46 @@ def test_octaves_of_few_complete_segments_are_those_of_the_sets() -> None:
     assert len(snapshot.octaves) > 2
     assert np.isfinite(snapshot.results["three-sensor"].noise_psd[1:-1]).all()
     assert sum(snapshot.left_out.values()) == snapshot.n_dropped > 4
+
+
+@pytest.mark.parametrize(
+    ("methods", "only"),
+    [(("three-sensor",), ()), (("all",), ("two-channel", "three-channel"))],
+)
+def test_methods_that_pair_channels_by_number_are_named(
+    methods: tuple[str, ...], only: tuple[str, ...]
+) -> None:
+    snapshot = estimated("ABC", {"B0": [1]}, settings=replace(SETTINGS, methods=methods))
+    (fact,) = [each for each in facts_of(snapshot) if isinstance(each, ChannelsAbsent)]
+    assert set(fact.complete_only) == set(only)
+
+
+@pytest.mark.parametrize(
+    ("parts", "octaves"), [([0], False), ([3], False), ([0, 3], True)], ids=str
+)
+def test_a_sensor_that_begins_late_or_ends_early_costs_three_others_nothing(
+    parts: list[int], octaves: bool
+) -> None:
+    lacking = {f"D{column}": parts for column in range(3)}
+    snapshot = estimated("ABCD", lacking, settings=replace(SETTINGS, octaves=octaves))
+    off = deviations(snapshot)
+    assert np.abs(off).max() < 4
+    assert np.sqrt(np.mean(off**2)) < 1.7
+    assert snapshot.elapsed == N_PARTS * PART / RATE
+    per_part = PART / RATE / SETTINGS.segment * 2
+    counts = np.array(snapshot.channel_segments)
+    np.testing.assert_allclose(counts[:9], N_PARTS * per_part, atol=N_PARTS)
+    np.testing.assert_allclose(counts[9:], (N_PARTS - len(parts)) * per_part, atol=N_PARTS)
+    assert not [fact for fact in facts_of(snapshot) if isinstance(fact, SpanShortened)]
+
+
+def test_a_third_sensor_that_begins_late_shortens_the_estimate_and_is_named() -> None:
+    snapshot = estimated("ABC", {f"B{column}": [0] for column in range(3)})
+    assert snapshot.elapsed == (N_PARTS - 1) * PART / RATE
+    (fact,) = [fact for fact in facts_of(snapshot) if isinstance(fact, SpanShortened)]
+    assert (fact.sensors, fact.seconds, fact.at_end) == (("B",), PART / RATE, False)
+    whole = estimated("ABC", {})
+    assert whole.shortened == {}
 
 
 def test_a_live_estimate_has_them_too(tmp_path: Path) -> None:

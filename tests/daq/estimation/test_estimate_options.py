@@ -213,7 +213,7 @@ def test_a_channel_that_was_dead_for_a_while_is_named_and_its_sensitivity_is_not
 
 def test_octaves_join_at_the_true_noise_from_far_below_one_over_the_segment(tmp_path: Path) -> None:
     snapshot = estimate(
-        [write(tmp_path / "r.h5", bench(n_samples=60_000))], replace(SETTINGS, octaves=True)
+        [write(tmp_path / "r.h5", bench(n_samples=40_000))], replace(SETTINGS, octaves=True)
     )
     assert snapshot.octaves[0].segment >= 16 * snapshot.octaves[-1].segment == 16.0
     assert all(o.n_effective >= 20 for o in snapshot.octaves)
@@ -231,7 +231,7 @@ def test_octaves_join_at_the_true_noise_from_far_below_one_over_the_segment(tmp_
 
 
 def test_octaves_of_several_recordings_add(tmp_path: Path) -> None:
-    sensors = bench()
+    sensors = bench(n_samples=6000)
     paths = [write(tmp_path / name, sensors) for name in ("1.h5", "2.h5")]
     settings = replace(SETTINGS, octaves=True)
     once, twice = estimate(paths[:1], settings), estimate(paths, settings)

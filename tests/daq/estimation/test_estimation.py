@@ -118,7 +118,7 @@ def test_what_is_shown_live_at_the_end_is_the_estimate_from_the_file(
         assert live.snapshot().results == {}
         for number, block in enumerate(arriving):
             writer.append(block)
-            if number % 50 == 49:
+            if number % 90 == 89:
                 writer.commit()
                 live.recordings[0].refresh()
                 had, lacked = live.n_seen, [live.lacking(live.n_seen + n) for n in range(1, 4)]

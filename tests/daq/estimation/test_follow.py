@@ -160,7 +160,7 @@ async def test_samples_that_a_sensor_does_not_count_become_an_event_of_the_recor
 ) -> None:
     monkeypatch.setattr(following, "LOOK_SHARE", 1e9)  # nobody waits here
     path, heard = tmp_path / "run.h5", list[str]()
-    scene = Scene(rates=(50.0, 50.0, 50.0), seconds=300.0, slips={1: [(150.0, 1)]})
+    scene = Scene(rates=(50.0, 50.0, 50.0), seconds=200.0, slips={1: [(100.0, 1)]})
 
     async def answer(command: Command, text: str) -> dict[str, Any]:
         heard.extend([text] * (command is Command.UNCOUNTED))
@@ -177,7 +177,7 @@ async def test_samples_that_a_sensor_does_not_count_become_an_event_of_the_recor
     (said,) = heard
     utc_ns, within, n_samples, sensor = said.split()
     assert (sensor, n_samples) == ("B", "1")
-    assert abs(known_clocks.seconds_of(int(utc_ns)) - 150.0) <= float(within) < 15.0
+    assert abs(known_clocks.seconds_of(int(utc_ns)) - 100.0) <= float(within) < 15.0
     assert result is not None
     (event,) = uncounted_events(result.clocks)
     assert event.sensor == "B"
@@ -306,7 +306,7 @@ def test_what_the_disk_refused_is_followed_into_the_next_file(
 def test_more_sensors_than_memory_allows_wait_for_the_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(memory, "LARGE", 0.0)
+    monkeypatch.setattr(memory, "LIVE", 0.0)
     monkeypatch.setattr(memory, "PART_BYTES", 0.0)
     monkeypatch.setattr(memory, "MIN_SENSORS", 2)
     with growing(tmp_path / "run.h5") as writer:
@@ -328,7 +328,7 @@ def test_more_sensors_than_memory_allows_wait_for_the_result(
 def test_an_observer_that_decides_by_the_estimate_gets_all_sensors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("LARGE", "PART_BYTES", "MIN_SENSORS"):
+    for name in ("LIVE", "PART_BYTES", "MIN_SENSORS"):
         monkeypatch.setattr(memory, name, 0)
     with growing(tmp_path / "run.h5") as writer:
         noted = Noted()

@@ -47,24 +47,25 @@ def test_freed_arrays_go_back_to_the_system_while_small_ones_stay() -> None:
 
 def test_segments_are_divided_without_a_copy_of_all_residuals() -> None:
     rng = np.random.default_rng(0)
-    n_segments, n_kept, p = 2000, 48, 9
+    n_segments, n_kept, p = 1000, 48, 9
     motion = 30 * rng.standard_normal((n_segments, n_kept, 1))
     noise = rng.standard_normal((n_segments, n_kept, p, 2)) @ np.array([1, 1j])
     spectra = (motion + noise).astype(np.complex64)
     exact = spectra.astype(np.complex128)
     maximum = maximise(np.einsum("sfp,sfq->fpq", exact, exact.conj(), optimize=True), 1)
-    course = SegmentCourse(spectra, np.arange(n_kept), np.arange(2000.0), np.zeros(2000, np.int64))
+    times, recording = np.arange(float(n_segments)), np.zeros(n_segments, np.int64)
+    course = SegmentCourse(spectra, np.arange(n_kept), times, recording)
     frequency = np.arange(1.0, n_kept + 1)
 
     def divide() -> None:
-        found = stability(course, maximum, frequency, n_effective=1000.0, neighbours=HANN_HALF)
+        found = stability(course, maximum, frequency, n_effective=500.0, neighbours=HANN_HALF)
         assert found is not None
 
     assert peak_of(divide) < 2 * spectra.nbytes
 
 
 def test_a_clock_is_smoothed_with_one_set_of_states() -> None:
-    n = 2048
+    n = 1024
     seconds = np.linspace(0.0, 10.0 * (n - 1), n)
     lateness = 1e-5 * np.random.default_rng(0).standard_normal(n)
     from_samples = np.arange(n) % 2 == 0
@@ -82,7 +83,7 @@ def test_a_clock_is_smoothed_with_one_set_of_states() -> None:
 
 @pytest.mark.parametrize(
     ("n_channels", "measured", "most"),
-    [(48, 596e6, 1.2), (72, 522e6, 5.0)],  # the second with too few averages for tables of pairs
+    [(48, 229e6, 1.4), (64, 422e6, 1.5), (72, 372e6, 2.3)],  # none of them has shared noise
 )
 def test_the_memory_of_a_result_is_predicted(n_channels: int, measured: float, most: float) -> None:
     """Measured values are those of docs/validation/torture.md, without the program."""

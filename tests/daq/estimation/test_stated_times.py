@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import replace
 from types import SimpleNamespace
@@ -14,6 +15,7 @@ from benchmarks.studies.synthesis import synthesise
 from daq.clocks.aligned_recording import take_drift
 from daq.clocks.clock_model import ClockSource
 from daq.estimation.estimation import Estimation, estimate
+from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.segments.stated_times import compare, drift_of
 from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
     from daq.clocks.aligned_recording import AlignedRecording
     from estimator.spectra.welch import WelchSettings
 
+LONG = pytest.mark.long
 SETTINGS = Settings(segment=2.0, methods=("three-sensor",))
 RATE, SECONDS, NOISE = 50.0, 480.0, 1e-6  # unit²/Hz
 PPM = (0.0, 1.0, -2.0)
@@ -44,6 +47,14 @@ BAND = slice(2, 40)  # 1 to 20 Hz
 
 def huddle(snr: float, ppm: tuple[float, ...]) -> dict[str, Sensor]:
     """Return sensors of one motion that state the UTC of their nominal rate."""
+    return {
+        name: Sensor(counts.copy(), rate=RATE, utc=True)
+        for name, counts in _counts(snr, ppm).items()
+    }
+
+
+@functools.cache
+def _counts(snr: float, ppm: tuple[float, ...]) -> dict[str, np.ndarray]:
     scenario = Scenario.from_dict(
         {
             "seed": 6,
@@ -59,14 +70,13 @@ def huddle(snr: float, ppm: tuple[float, ...]) -> dict[str, Sensor]:
         }
     )
     world = World(scenario)
-    counts = {name: world.samples(name, 0, round(SECONDS * RATE)) for name in scenario.names}
     return {
-        name: Sensor(np.round(1e6 * found).astype(np.int32), rate=RATE, utc=True)
-        for name, found in counts.items()
+        name: np.round(1e6 * world.samples(name, 0, round(SECONDS * RATE))).astype(np.int32)
+        for name in scenario.names
     }
 
 
-@pytest.mark.parametrize("snr", [1e3, 1e5])
+@pytest.mark.parametrize("snr", [1e3, pytest.param(1e5, marks=LONG)])
 def test_sensors_whose_stated_times_drift_are_aligned_by_the_motion(
     tmp_path: Path, snr: float
 ) -> None:
@@ -168,7 +178,7 @@ def test_stated_times_that_agree_with_the_motion_are_used_as_they_are(tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("ppm", "every"), [(PPM, 3000), pytest.param((*PPM, 0.0), 600, marks=pytest.mark.long)]
+    ("ppm", "every"), [(PPM, 3000), pytest.param((*PPM, 0.0), 600, marks=LONG)]
 )
 def test_drift_is_corrected_while_the_recording_grows(
     tmp_path: Path, ppm: tuple[float, ...], every: int
@@ -283,7 +293,7 @@ def test_single_delays_of_a_part_are_not_a_drift() -> None:
     assert drift(at, late, std) == 0
 
 
-@pytest.mark.parametrize("seed", [200, 203, 206])
+@pytest.mark.parametrize("seed", [200, *(pytest.param(seed, marks=LONG) for seed in (203, 206))])
 def test_exact_times_of_sensors_in_weak_motion_do_not_drift(tmp_path: Path, seed: int) -> None:
     scenario = {
         "seed": seed,
@@ -308,7 +318,7 @@ def test_exact_times_of_sensors_in_weak_motion_do_not_drift(tmp_path: Path, seed
 def pieces_are_read(
     path: Path, monkeypatch: pytest.MonkeyPatch, settings: Settings = SETTINGS
 ) -> bool:
-    """Return whether an estimate reads pieces of the recording, to measure delays in them."""
+    """Return whether a pass reads pieces of the recording, to measure delays in them."""
     read: list[bool] = []
 
     def compared(aligned: AlignedRecording, settings: Settings, welch: WelchSettings) -> bool:
@@ -316,11 +326,15 @@ def pieces_are_read(
         return compare(aligned, settings, welch)
 
     monkeypatch.setattr("daq.estimation.segments.segment_pass.compare", compared)
-    estimate([path], settings)
+    with Recording.open(path) as recording:
+        part = Pass(recording, settings)
+        if part.shows_drifts:
+            part.finish()
+        part.doubt_stated_times()
     return bool(read)
 
 
-@pytest.mark.parametrize("snr", [10.0, 1e3, 1e5])
+@pytest.mark.parametrize("snr", [10.0, pytest.param(1e3, marks=LONG), 1e5])
 @pytest.mark.parametrize("window", ["hann", "rectangular"])
 def test_times_that_agree_are_not_read_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, snr: float, window: str
@@ -338,8 +352,8 @@ def delayed(counts: np.ndarray, n_samples: float) -> np.ndarray:
     return np.round(np.fft.irfft(spectrum, len(counts), axis=0)).astype(np.int32)
 
 
-@pytest.mark.parametrize("segment", [2.0, 10.0])
-@pytest.mark.parametrize("n_samples", [0.01, 0.2, 3.0, 17.0])
+@pytest.mark.parametrize("segment", [2.0, pytest.param(10.0, marks=LONG)])
+@pytest.mark.parametrize("n_samples", [0.01, 3.0, 17.0])
 def test_steps_of_any_size_are_looked_at_closely(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_samples: float, segment: float
 ) -> None:
@@ -352,7 +366,13 @@ def test_steps_of_any_size_are_looked_at_closely(
 
 @pytest.mark.parametrize("is_stated", [False, True])
 @pytest.mark.parametrize(
-    ("n_samples", "is_measured"), [(3.0, True), (40.0, True), (-150.0, False), (400.0, False)]
+    ("n_samples", "is_measured"),
+    [
+        (3.0, True),
+        pytest.param(40.0, True, marks=LONG),
+        (-150.0, False),
+        pytest.param(400.0, False, marks=LONG),
+    ],
 )
 def test_a_step_in_the_middle_is_not_taken_for_noise(
     tmp_path: Path, n_samples: float, *, is_measured: bool, is_stated: bool
@@ -386,7 +406,9 @@ def test_a_step_in_the_middle_is_not_taken_for_noise(
         assert all(math.isfinite(each.error) for each in may)
 
 
-@pytest.mark.parametrize("ppm", [0.3, 3.0, 60.0, 500.0])
+@pytest.mark.parametrize(
+    "ppm", [0.3, *(pytest.param(ppm, marks=LONG) for ppm in (3.0, 60.0)), 500.0]
+)
 def test_drifts_of_any_rate_are_looked_at_closely(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ppm: float
 ) -> None:

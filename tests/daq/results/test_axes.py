@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -14,6 +15,9 @@ from daq.formats.arrays import recording_of_arrays
 from daq.results.band_summary import channel_means
 from estimator.checks.advice import SharedNoise
 from estimator.levels.contributions import across
+
+if TYPE_CHECKING:
+    from daq.estimation.snapshot import Snapshot
 
 RATE, SNR = 100.0, 5e4
 BANDS = ((2.0, 10.0), (10.0, 30.0), (5.0, 6.0))
@@ -30,8 +34,12 @@ def leaning(n_sensors: int, degrees: float, seed: int, snr: float = SNR) -> dict
 
 
 def covered(samples: dict[str, np.ndarray], settings: Settings) -> tuple[float, float]:
+    """Estimate; return the share of intervals that hold the truth, and the median upper end."""
+    return held_by(estimate([recording_of_arrays(samples, RATE)], settings), settings)
+
+
+def held_by(snapshot: Snapshot, settings: Settings) -> tuple[float, float]:
     """Return the share of intervals that hold the truth, and the median upper end over it."""
-    snapshot = estimate([recording_of_arrays(samples, RATE)], settings)
     assert not any(isinstance(each, SharedNoise) for each in snapshot.diagnostics.advice)
     (noise,) = snapshot.results.values()
     truth = 2 / RATE
@@ -46,7 +54,7 @@ def covered(samples: dict[str, np.ndarray], settings: Settings) -> tuple[float, 
     return float(held.mean()), float(np.median(ends[:, 1]))
 
 
-@pytest.mark.parametrize("n_sensors", [3, 5, 12])
+@pytest.mark.parametrize("n_sensors", [3, 5, pytest.param(12, marks=pytest.mark.long)])
 def test_no_interval_excludes_the_truth_of_sensors_off_plumb(n_sensors: int) -> None:
     shares, ends = zip(
         *(covered(leaning(n_sensors, 1.0, seed), Settings(segment=2.0)) for seed in range(3)),
@@ -61,13 +69,14 @@ def test_axes_that_lean_are_no_gradients_of_the_motion() -> None:
     """Positions fitted to leans would be wrong at all frequencies alike."""
     shares = []
     for seed in range(2):
-        samples = leaning(6, 0.6, seed, snr=7e3)
-        snapshot = estimate([recording_of_arrays(samples, RATE)], Settings(segment=2.0))
+        recording = recording_of_arrays(leaning(6, 0.6, seed, snr=7e3), RATE)
+        snapshot = estimate([recording], Settings(segment=2.0))
         assert not any(each.gradients for each in snapshot.diagnostics.dimensions)
-        shares.append(covered(samples, Settings(segment=2.0))[0])
+        shares.append(held_by(snapshot, Settings(segment=2.0))[0])
     assert np.mean(shares) >= 0.93
 
 
+@pytest.mark.long
 def test_leans_that_no_test_of_the_model_sees_widen_intervals() -> None:
     shares = [covered(leaning(7, 0.15, seed, 2e3), Settings(segment=2.0))[0] for seed in range(3)]
     assert np.mean(shares) >= 0.93

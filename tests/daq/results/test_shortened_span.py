@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
 
 SETTINGS = Settings(segment=2.0)
-RATE, SECONDS = 20.0, 600.0
+RATE, SECONDS = 20.0, 1200.0
 
 
 def estimated(path: Path, *, begin: float = 0.0, end: float = SECONDS) -> Snapshot:
@@ -42,9 +42,9 @@ def shortened(snapshot: Snapshot) -> list[SpanShortened]:
 @pytest.mark.parametrize(
     ("begin", "end", "seconds", "rank"),
     [
-        (200.0, 600.0, 200.0, Rank.DELAYS),
-        (0.0, 450.0, 150.0, Rank.DELAYS),
-        (50.0, 600.0, 50.0, Rank.TO_KNOW),
+        (200.0, 1200.0, 200.0, Rank.DELAYS),
+        (0.0, 1050.0, 150.0, Rank.DELAYS),
+        (100.0, 1200.0, 100.0, Rank.TO_KNOW),
     ],
 )
 def test_what_others_have_beyond_a_sensor_is_said(
@@ -57,5 +57,5 @@ def test_what_others_have_beyond_a_sensor_is_said(
     assert fact.seconds == pytest.approx(seconds, abs=1.0)
 
 
-def test_seconds_are_no_fact(tmp_path: Path) -> None:
-    assert shortened(estimated(tmp_path / "r.h5", begin=8.0, end=590.0)) == []
+def test_less_than_a_minute_is_no_fact(tmp_path: Path) -> None:
+    assert shortened(estimated(tmp_path / "r.h5", begin=50.0, end=1150.0)) == []

@@ -16,8 +16,7 @@ from daq.estimation.snapshot_diagnostics import Synchronisation
 from daq.results.band_summary import channel_means
 from daq.results.decision.limits import judge
 from estimator.checks.advice import Level, ModelMisfit
-from estimator.decision.comparison import MIN_AVERAGES
-from estimator.decision.verdict import Obstacle, Verdict
+from estimator.decision.verdict import MIN_AVERAGES, Obstacle, Verdict
 from estimator.levels.contributions import Source
 from estimator.likelihood.dimension import BandDimension
 from estimator.likelihood.goodness_of_fit import BandTest
