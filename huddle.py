@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:  # as in tui/resources/huddle.pyi
     from daq.errors import HuddleError
     from estimator.errors import EstimatorError
+    from tui.notebook.archives import archive
     from tui.notebook.estimates import estimate, self_noise
     from tui.notebook.options import EstimateOptions
     from tui.notebook.planning import RecordingPlan, plan
@@ -36,7 +37,7 @@ if TYPE_CHECKING:  # as in tui/resources/huddle.pyi
     )
     from tui.notebook.result import Result
     from tui.notebook.simulation import Simulation, simulate
-    from tui.notebook.verbs import archive, calibrate, export, load, noise_model, report
+    from tui.notebook.verbs import calibrate, export, load, noise_model, report
 
 __all__ = [
     "EstimateOptions",
@@ -70,7 +71,7 @@ _MODULES = {
     "Result": "tui.notebook.result",
     "Simulation": "tui.notebook.simulation",
     "Waveforms": "tui.notebook.recording",
-    "archive": "tui.notebook.verbs",
+    "archive": "tui.notebook.archives",
     "calibrate": "tui.notebook.verbs",
     "estimate": "tui.notebook.estimates",
     "export": "tui.notebook.verbs",

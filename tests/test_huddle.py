@@ -109,7 +109,7 @@ def test_arrays_give_the_numbers_of_the_command_to_the_bit(
 
 
 def test_the_three_sensor_estimate_is_the_closed_form_of_scipys_spectra() -> None:
-    sensors = triaxial()
+    sensors = triaxial(5000)
     result = huddle.self_noise(sensors, fs=RATE, segment="4s", correct=False)
     columns = np.hstack(list(sensors.values()))
     pairs = [
@@ -174,11 +174,11 @@ def test_counts_are_not_called_motion(tmp_path: Path) -> None:
     station = inventory.Station("ABC", 0, 0, 0, channels=[channel])
     found = inventory.Inventory([inventory.Network("XX", [station])], source="test")
     found.write(str(tmp_path / "a.xml"), format="STATIONXML")
+    plain = huddle.self_noise(sensors, fs=RATE, segment="1s")
     for given in (tmp_path / "a.xml", str(tmp_path / "a.xml"), found, [found]):
         result = huddle.self_noise(
             sensors, fs=RATE, unit="m/s", segment="1s", response={"*": given}
         )
-        plain = huddle.self_noise(sensors, fs=RATE, segment="1s")
         s = 2j * np.pi * result.frequency[1:]
         at_10 = 20j * np.pi
         size = np.abs(s**2 / ((s + 20 - 20j) * (s + 20 + 20j)))
@@ -203,11 +203,9 @@ def test_data_arrays_keep_their_unit_and_times() -> None:
             for name, array in triaxial().items()
         }
     )
+    expected = huddle.self_noise(triaxial(), fs=RATE, sample_unit="mm/s", unit="m/s²", segment="1s")
     for given in (dataset, dict(dataset.data_vars)):
         found = huddle.self_noise(given, unit="m/s²", segment="1s")
-        expected = huddle.self_noise(
-            triaxial(), fs=RATE, sample_unit="mm/s", unit="m/s²", segment="1s"
-        )
         np.testing.assert_array_equal(found.noise_psd, expected.noise_psd)
         assert found.snapshot.start_utc_ns == int(start.astype(np.int64))
     assert huddle.self_noise(dataset, sample_unit="nm/s", segment="1s").unit == "nm/s"
@@ -215,9 +213,12 @@ def test_data_arrays_keep_their_unit_and_times() -> None:
 
 def test_all_sensors_in_one_are_the_sensors_one_by_one() -> None:
     sensors = triaxial()
-    expected = huddle.self_noise(sensors, fs=RATE, channels="XYZ", sample_unit="m/s²").noise_psd
+    settings: dict[str, Any] = {"segment": "1s"}
+    expected = huddle.self_noise(
+        sensors, fs=RATE, channels="XYZ", sample_unit="m/s²", **settings
+    ).noise_psd
     whole = np.stack(list(sensors.values()))
-    of_array = huddle.self_noise(whole, fs=RATE, sample_unit="m s-2")
+    of_array = huddle.self_noise(whole, fs=RATE, sample_unit="m s-2", **settings)
     assert of_array.sensors == ("1", "2", "3")
     assert of_array.unit == "m/s²"
     np.testing.assert_array_equal(of_array.noise_psd, expected)
@@ -229,7 +230,7 @@ def test_all_sensors_in_one_are_the_sensors_one_by_one() -> None:
     )
     frame.attrs["units"] = "m s-2"
     timed = {name: frame[name] for name in sensors}
-    results = [huddle.self_noise(each) for each in (array, frame, timed)]
+    results = [huddle.self_noise(each, **settings) for each in (array, frame, timed)]
     for each in results:
         assert [label.name for label in each.channels][:4] == ["A.X", "A.Y", "A.Z", "B.X"]
         assert each.unit == "m/s²"
@@ -240,10 +241,15 @@ def test_all_sensors_in_one_are_the_sensors_one_by_one() -> None:
         huddle.self_noise(whole[0], fs=RATE)
 
 
+def test_the_sampling_rate_by_another_name_is_refused_with_its_name() -> None:
+    with pytest.raises(WrongSettingError, match="the sampling rate of arrays is fs"):
+        huddle.self_noise(np.zeros((3, 100, 1)), sampling_rate=100.0)  # type: ignore[call-arg]  # it has none
+
+
 def test_a_window_may_be_a_tuple_of_scipy() -> None:
     sensors = triaxial()
     tuples, texts = (
-        huddle.self_noise(sensors, fs=RATE, window=window).noise_psd
+        huddle.self_noise(sensors, fs=RATE, segment="1s", window=window).noise_psd
         for window in (("kaiser", 8.5), "kaiser,8.5")
     )
     np.testing.assert_array_equal(tuples, texts)
@@ -276,10 +282,10 @@ def test_sensors_may_have_different_numbers_of_channels() -> None:
     sensors = triaxial()
     sensors["D"] = sensors.pop("C")[:, :1] + sensors["A"][:, :1]
     sensors["E"] = triaxial()["C"]
-    result = huddle.self_noise(sensors, fs=RATE)
-    assert result.noise_psd.shape == (501, 10)
+    result = huddle.self_noise(sensors, fs=RATE, segment="1s")
+    assert result.noise_psd.shape == (51, 10)
     dataset = result.to_xarray()
-    assert dataset.noise_psd.sizes == {"estimate": 1, "trace": 10, "frequency": 501}
+    assert dataset.noise_psd.sizes == {"estimate": 1, "trace": 10, "frequency": 51}
     np.testing.assert_array_equal(
         dataset.noise_psd.sel(estimate="three-sensor", trace="D.1"),
         result["D", "1"].noise_psd,
@@ -320,8 +326,9 @@ def test_too_few_sensors_are_refused_by_name() -> None:
         huddle.self_noise(two, fs=RATE)
     with pytest.raises(ValueError, match=r"1 sensor \(A\): two-channel takes at least 2"):
         huddle.self_noise({"A": sensors["A"]}, fs=RATE, method="two-channel")
-    assert huddle.self_noise(two, fs=RATE, method="two-channel").methods == ("two-channel",)
-    assert huddle.self_noise(two, fs=RATE, method="all").methods == ("two-channel",)
+    for method in ("two-channel", "all"):
+        found = huddle.self_noise(two, fs=RATE, method=method, segment="1s")
+        assert found.methods == ("two-channel",)
 
 
 def test_too_few_averages_are_refused_with_the_reason() -> None:

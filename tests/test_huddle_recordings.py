@@ -11,12 +11,15 @@ import pytest
 
 import huddle
 from daq.errors import ArrayError, WrongSettingError
+from tests.daq.archive.day_files import write_station
 from tests.test_huddle import RATE, command, imported, triaxial
 from tui.output.console import finite
 from tui.output.json_document import calibration_document
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from tui.notebook.options import EstimateOptions
 
 
 def test_a_recording_is_opened_read_and_estimated(tmp_path: Path) -> None:
@@ -36,12 +39,12 @@ def test_a_recording_is_opened_read_and_estimated(tmp_path: Path) -> None:
             recording.samples("Z")
         assert [event.kind for event in recording.events] == []
         created = recording.created
-        result = recording.estimate(start="20s", end=created.replace(minute=2))
-        same = huddle.estimate(recording, start="20s", end="2min")
+        result = recording.estimate(start="20s", end=created.replace(minute=2), segment="2s")
+        same = huddle.estimate(recording, start="20s", end="2min", segment="2s")
         np.testing.assert_array_equal(same.noise_psd, result.noise_psd)
     assert created == datetime(1970, 1, 1, tzinfo=UTC)
     assert result.snapshot.elapsed == pytest.approx(100)
-    same = huddle.estimate([path], start=20.0, end="1970-01-01T00:02:00")
+    same = huddle.estimate([path], start=20.0, end="1970-01-01T00:02:00", segment="2s")
     np.testing.assert_array_equal(same.noise_psd, result.noise_psd)
     with pytest.raises(WrongSettingError, match="start='soon': expected UTC as in"):
         huddle.estimate(path, start="soon")
@@ -109,10 +112,10 @@ def test_read_takes_responses_by_code(tmp_path: Path) -> None:
 
 
 def test_a_simulation_is_estimated_from_memory_and_from_its_recording(tmp_path: Path) -> None:
-    simulation = huddle.simulate("fig9", duration="4min")
+    simulation = huddle.simulate("fig9", duration="2min")
     assert simulation.fs == {"i": 200.0, "j": 200.0, "k": 200.0}
-    assert {array.shape for array in simulation.values()} == {(48_000, 2)}
-    result = huddle.self_noise(simulation, fs=simulation.fs, sample_unit="m/s²", segment="2s")
+    assert {array.shape for array in simulation.values()} == {(24_000, 2)}
+    result = huddle.self_noise(simulation, fs=simulation.fs, sample_unit="m/s²", segment="1s")
     band = result.band(5, 60)
     inside = (result.frequency >= 5) & (result.frequency <= 60)
     truth = simulation.true_noise_psd(result.frequency[inside]).mean(axis=0)
@@ -124,7 +127,7 @@ def test_a_simulation_is_estimated_from_memory_and_from_its_recording(tmp_path: 
         half_a_count = 0.5001 / sensor.channels[0].sensitivity
         found = recording.samples(sensor.name)
         np.testing.assert_allclose(found, simulation[sensor.name], rtol=0, atol=half_a_count)
-    of_file = huddle.estimate(recording, segment="2s")
+    of_file = huddle.estimate(recording, segment="1s")
     np.testing.assert_allclose(of_file.band(5, 60).noise_psd, band.noise_psd, rtol=1e-3)
 
 
@@ -191,19 +194,19 @@ def test_a_plan_is_that_of_the_command(tmp_path: Path) -> None:
 
 def test_commands_are_functions_with_their_numbers(tmp_path: Path) -> None:
     path = tmp_path / "fig9.h5"
-    huddle.simulate("fig9", duration="2min").write(path)
-    result = huddle.estimate(path, segment="2s")
-    told = json.loads(command("calibrate", str(path), "--segment", "2s", "--json", "-"))
+    huddle.simulate("fig9", duration="40s").write(path)
+    result = huddle.estimate(path, segment="1s")
+    told = json.loads(command("calibrate", str(path), "--segment", "1s", "--json", "-"))
     found = huddle.calibrate(result)
     assert found.reference == 0
-    again = huddle.calibrate(path, segment="2s", confidence=0.99)
+    again = huddle.calibrate(path, segment="1s", confidence=0.99)
     assert again.confidence == 0.99
     stated = finite(calibration_document(found, result.snapshot))
     assert json.loads(json.dumps(stated)) == told
     for suffix in (".csv", ".npz", ".nc"):
         huddle.export(result, tmp_path / f"a{suffix}")
         kind = "netcdf" if suffix == ".nc" else suffix[1:]
-        command("export", str(path), "--segment", "2s", "--format", kind, "-o",
+        command("export", str(path), "--segment", "1s", "--format", kind, "-o",
                 str(tmp_path / f"b{suffix}"))  # fmt: skip
     assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
     with np.load(tmp_path / "a.npz") as ours, np.load(tmp_path / "b.npz") as theirs:
@@ -225,7 +228,7 @@ def test_commands_are_functions_with_their_numbers(tmp_path: Path) -> None:
         huddle.export(result, tmp_path / "c.mseed")
     with pytest.raises(WrongSettingError, match="segment with a Result"):
         huddle.calibrate(result, segment="1s")
-    arrays = huddle.self_noise(triaxial(), fs=RATE)
+    arrays = huddle.self_noise(triaxial(2000), fs=RATE, segment="1s")
     with pytest.raises(WrongSettingError, match="the estimate is of arrays"):
         huddle.report(arrays, tmp_path / "b.html")
 
@@ -234,13 +237,13 @@ def test_an_archive_answers_as_the_command(tmp_path: Path) -> None:
     folder = tmp_path / "runs"
     folder.mkdir()
     for seed in (1, 2):
-        huddle.simulate("fig9", duration="1min", seed=seed).write(folder / f"{seed}.h5")
+        huddle.simulate("fig9", duration="30s", seed=seed).write(folder / f"{seed}.h5")
     (folder / "broken.h5").write_bytes(b"no recording")
-    ours = huddle.archive(folder, store=tmp_path / "ours", segment="2s")
+    ours = huddle.archive(folder, store=tmp_path / "ours", segment="1s")
     assert "broken.h5" in ours.problems[0]
     again = huddle.archive(store=tmp_path / "ours")
     (folder / "broken.h5").unlink()
-    command("archive", str(folder), "--store", str(tmp_path / "theirs"), "--segment", "2s")
+    command("archive", str(folder), "--store", str(tmp_path / "theirs"), "--segment", "1s")
     theirs = huddle.archive(store=tmp_path / "theirs")
     assert not theirs.problems
     for each in (ours, again):
@@ -252,3 +255,30 @@ def test_an_archive_answers_as_the_command(tmp_path: Path) -> None:
         huddle.archive(folder, time_zone="Nowhere")
     with pytest.raises(huddle.HuddleError, match="no archive there"):
         huddle.archive(store=tmp_path / "none")
+
+
+def test_an_archive_takes_waveform_files_by_station(tmp_path: Path) -> None:
+    sds, store = tmp_path / "sds", tmp_path / "store"
+    for seed, station in enumerate(("ABC", "DEF")):
+        write_station(sds, station, days=0.5, seed=seed)
+    options: EstimateOptions = {"segment": "60s", "method": "three-sensor"}
+    with pytest.raises(WrongSettingError, match=r"2 stations: XX\.ABC XX\.DEF; expected one"):
+        huddle.archive(f"sds://{sds}", store=store, **options)
+    assert not store.exists()
+    one = huddle.archive(f"sds://{sds}", store=store, channels=["XX.ABC.*"], **options)
+    found = huddle.archive(f"sds://{sds}", store=store, by_station=True, **options)
+    assert (list(found), found.problems) == (["XX.ABC", "XX.DEF"], ())
+    again = huddle.archive(store=store, by_station=True)
+    alone = huddle.archive(store=store / "XX.DEF")
+    for ours, theirs in (
+        (one, found["XX.ABC"]),
+        (found["XX.DEF"], alone),
+        (alone, again["XX.DEF"]),
+    ):
+        np.testing.assert_array_equal(ours.levels.mean, theirs.levels.mean)
+    with pytest.raises(WrongSettingError, match="response: for waveform files"):
+        huddle.archive(store=store, response="stations.xml")
+    with pytest.raises(WrongSettingError, match="expected a path"):
+        huddle.archive(f"sds://{sds}", store=store, response=object())
+    with pytest.raises(huddle.HuddleError, match=r"no\.xml"):
+        huddle.archive(f"sds://{sds}", store=store, by_station=True, response="no.xml")

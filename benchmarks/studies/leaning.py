@@ -1,6 +1,6 @@
 """Sensors of one and two channels off plumb before motion in three dimensions.
 
-``python -m benchmarks.studies.leaning [BENCHES]`` prints the tables of
+``python -m benchmarks.studies.leaning [BENCHES [SEED]]`` prints the tables of
 ``docs/validation/levels.md``: coverage, verdicts on limits 3 dB above and below the truth, and the
 half-width with twelve sensors. Nothing but the recording of arrays is shared with the estimator.
 """
@@ -46,12 +46,12 @@ def leaning(
     return samples
 
 
-def random_benches(n_benches: int) -> None:
+def random_benches(n_benches: int, seed: int) -> None:
     """Print coverage and verdicts of benches drawn at random."""
     held: list[float] = []
     wrong = decided = total = 0
     for number in range(n_benches):
-        rng = np.random.default_rng([23, number])
+        rng = np.random.default_rng([seed, number])
         n_sensors, n_channels = int(rng.integers(3, 13)), int(rng.integers(1, 3))
         samples = leaning(
             rng,
@@ -118,5 +118,7 @@ def plumb() -> None:
 
 
 if __name__ == "__main__":
-    plumb()
-    random_benches(int(sys.argv[1]) if len(sys.argv) > 1 else 200)
+    n_benches, seed = [*map(int, sys.argv[1:]), *(200, 23)[len(sys.argv) - 1 :]]
+    if seed == 23:
+        plumb()
+    random_benches(n_benches, seed)

@@ -40,7 +40,7 @@ def _power(true: ComplexArray, pair: tuple[int, int], amount: float, n: int) -> 
     if scores is None:
         return 0.0
     own = int(np.flatnonzero((scores.pairs == pair).all(axis=1))[0])
-    mean = amount * np.sqrt(scores.averages * scores.information[own, own])
+    mean = amount * np.sqrt(scores.averages * scores.power[own])
     limit = NormalDist().inv_cdf(1 - LEVEL / len(scores.pairs) / 2)
     return NormalDist().cdf(float(mean) - limit)
 

@@ -5,23 +5,25 @@ The whole is the average of all spectra, a day that of its own; densities count 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections import Counter
+from dataclasses import dataclass, fields, replace
 from datetime import UTC
 from functools import reduce
 from operator import add
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from daq.archive.averages import Average, Estimator
 from daq.archive.changes import MIN_CONTRAST_DAYS, MIN_DAYS, courses
 from daq.archive.density import MIN_BINS
-from daq.archive.rollup import MEAN
 from daq.archive.spectra_file import unpacked
-from daq.archive.years import Years, density_of
+from daq.archive.years import Years, density_of, read_series
 from daq.errors import ArchiveError
+from daq.estimation.blas_threads import one_blas_thread
 from daq.results.band_summary import band_within, judged_method
 from daq.results.facts import (
+    AbsencesNotUsed,
     ChangesUndecided,
     NightsNotCompared,
     Rank,
@@ -31,7 +33,7 @@ from daq.results.facts import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from datetime import tzinfo
 
     import h5py
@@ -40,7 +42,7 @@ if TYPE_CHECKING:
     from daq.archive.changes import Course
     from daq.archive.density import Density
     from daq.archive.index import Entry
-    from daq.archive.rollup import Grid
+    from daq.archive.rollup import Grid, Series
     from daq.archive.spectra_file import Described
     from daq.archive.store import Store
     from daq.estimation.settings import Settings
@@ -95,6 +97,8 @@ class Answer:
         What could not be read.
     doubted : tuple of Described
         Of recordings that are left out, because the clock of a sensor is not understood.
+    lacking : mapping of str to int
+        Segments that other channels have and a channel lacks, by its name: they are not used.
     """
 
     pooled: Snapshot
@@ -112,8 +116,10 @@ class Answer:
     spectrogram: NDArray[np.float32]
     problems: tuple[str, ...]
     doubted: tuple[Described, ...]
+    lacking: Mapping[str, int]
 
 
+@one_blas_thread()
 def answer(
     store: Store,
     entries: Sequence[Entry],
@@ -165,19 +171,24 @@ def answer(
     years = Years(store, known, settings, zone=zone, progress=progress)
     usable = min(entry.described.usable for entry in known)
     tally = _Tally(years.grid, _bands(settings, years.grid.frequency, usable))
-    pooled = Average()
-    for file in years.each():
+    usual = _bands(plan.noise_settings(settings), years.grid.frequency, usable)
+    pooled, lacking = Average(), Counter[int]()
+    for file in years.each([years.grid.span(band) for band in usual]):
         pooled.add_sum(unpacked(file["total"][...]), int(file.attrs["n_segments"]))
         tally.take(file)
     for entry in known:
         if entry.described.origin.run_id not in years.damaged:
-            about = replace(entry.described, rounded=years.is_rounded(entry))
+            about = entry.described
+            if about.rounded != years.is_rounded(entry):
+                about = replace(about, rounded=not about.rounded)
             pooled.add_segments(about, entry.start_utc_ns or 0, entry.n_segments)
             pooled.add_totals(entry.described)
-    if not tally.days:
+            lacking.update(entry.described.lacking)
+    if not tally.series:
         raise ArchiveError("\n".join(years.problems))
     snapshot = every.snapshot(pooled, diagnose=True)
-    days, levels = np.concatenate(tally.days), tally.levels()
+    days = tally.of_all("days")
+    levels = Levels(*(tally.of_all(each.name) for each in fields(Levels)))
     n_series = levels.mean.shape[1] * levels.mean.shape[2]
     mean, spread = (each.reshape(-1, n_series) for each in (levels.mean, levels.spread))
     parts = {day: (n, total.reshape(3, n_series)) for day, (n, total) in tally.local.items()}
@@ -187,16 +198,17 @@ def answer(
         method=judged_method(snapshot, plan.noise_settings(settings)),
         bands=tally.bands,
         days_utc_ns=days,
-        n_segments=np.concatenate(tally.segments),
+        n_segments=tally.of_all("day_segments"),
         levels=levels,
         courses=courses(days, mean, spread, parts, false_alarm=false_alarm),
         false_alarm=false_alarm,
         density=reduce(add, tally.noise),
         recorded=reduce(add, tally.recorded),
         fine_hz=years.grid.frequency[years.grid.edges],
-        spectrogram=np.concatenate(tally.noise_of_days),
+        spectrogram=tally.of_all("noise"),
         problems=tuple(years.problems),
         doubted=doubted,
+        lacking={snapshot.channels[column].name: lacking[column] for column in sorted(lacking)},
     )
 
 
@@ -213,6 +225,9 @@ def facts_of_archive(found: Answer) -> Iterator[Fact]:
     if not any(each.decided for each in found.courses):
         n_days = len(found.days_utc_ns)
         yield ChangesUndecided(rank=Rank.DELAYS, n_days=n_days, needed=MIN_DAYS)
+    if found.lacking:
+        channels, n_segments = tuple(found.lacking), tuple(found.lacking.values())
+        yield AbsencesNotUsed(rank=Rank.TO_KNOW, channels=channels, n_segments=n_segments)
     if n_short := found.density.n_short:
         yield StretchesLeftOut(rank=Rank.TO_KNOW, n_stretches=n_short)
     segments = [segment for course in found.courses for segment in course.segments]
@@ -224,15 +239,12 @@ class _Tally:
     """What is gathered from the files of years: their fine bands would fill the memory."""
 
     def __init__(self, grid: Grid, bands: Sequence[tuple[float, float]]) -> None:
-        self._grid, self._spans = grid, [grid.span(band) for band in bands]
+        self._grid, self.spans = grid, [grid.span(band) for band in bands]
         self.bands = tuple(
             band if grid.has(band) else grid.ends(span)
-            for band, span in zip(bands, self._spans, strict=True)
+            for band, span in zip(bands, self.spans, strict=True)
         )
-        self.days: list[IntArray] = []
-        self.segments: list[IntArray] = []
-        self._levels: list[Levels] = []
-        self.noise_of_days: list[NDArray[np.float32]] = []
+        self.series: list[Series] = []
         self.noise: list[Density] = []
         self.recorded: list[Density] = []
         self.local: dict[int, tuple[FloatArray, FloatArray]] = {}
@@ -242,29 +254,18 @@ class _Tally:
         """Take a year."""
         self.noise.append(density_of(file["noise"]))
         self.recorded.append(density_of(file["recorded"]))
-        for name in sorted(file["months"]):
-            month = file["months"][name]
-            self.days.append(month["days"][...])
-            self.segments.append(month["day_segments"][...])
-            rows = month["levels"][...]
-            self.noise_of_days.append(rows[MEAN].copy())  # a view would keep all of the rows
-            found = self._grid.levels(rows, self._spans)
-            self._levels.append(Levels(found.mean, found.of_scatter.spread, *found.ends()))
-            self._take_parts(month)
-
-    def _take_parts(self, month: h5py.Group) -> None:
-        noise, n_segments = month["part_noise"][...], month["part_segments"][...]
-        bands = self._grid.average(noise, self._spans)
-        weighted = np.where(n_segments[..., None, None] > 0, bands, 0.0)
+        found = read_series(file, self._grid, self.spans)
+        self.series.append(found)
+        n_segments = found.part_segments
+        weighted = np.where(n_segments[..., None, None] > 0, found.part_noise, 0.0)
         weighted *= n_segments[..., None, None]
-        for row, day in enumerate(month["local_days"][...].tolist()):
+        for row, day in enumerate(found.local_days.tolist()):
             before, total = self.local.get(day, (0.0, 0.0))  # days that two months share
             self.local[day] = before + n_segments[row], total + weighted[row]
 
-    def levels(self) -> Levels:
-        """Return the levels of all days."""
-        every = ((each.mean, each.spread, each.low, each.high) for each in self._levels)
-        return Levels(*(np.concatenate(each) for each in zip(*every, strict=True)))
+    def of_all(self, name: str) -> NDArray[Any]:
+        """Return a field of `Series` of all years."""
+        return np.concatenate([getattr(each, name) for each in self.series])
 
 
 def _bands(

@@ -175,6 +175,7 @@ class Estimator:
             across_axes=axes,
             rounding=ROUNDING if average.is_rounded else 0.0,
             simulated=average.is_simulated,
+            shortened=average.shortened,
         )
         return with_contributions(snapshot)
 
@@ -204,6 +205,7 @@ class Average:
         self.left_out: Counter[Reason] = Counter()
         self.clipped: dict[int, float] = {}
         self.stood_still: dict[int, float] = {}
+        self.shortened: dict[str, tuple[float, float]] = {}
 
     def add(
         self, described: Described, start_utc_ns: int, n_segments: int, csm: ComplexArray
@@ -238,6 +240,9 @@ class Average:
             self.clipped[column] = max(share, self.clipped.get(column, 0.0))
         for column, seconds in described.stood_still.items():
             self.stood_still[column] = seconds + self.stood_still.get(column, 0.0)
+        for sensor, (late, early) in described.shortened.items():
+            before = self.shortened.get(sensor, (0.0, 0.0))
+            self.shortened[sensor] = before[0] + late, before[1] + early
 
     @property
     def residual(self) -> dict[str, float]:
@@ -258,10 +263,11 @@ class Average:
         if self._sum is None:
             raise InsufficientDataError("no segment in the archive")
         welch = estimator.welch
-        n_effective = sum(
-            effective_averages(estimator.window, welch.hop, count)
-            for count in self._counts.values()
-        )
+        own = {  # most recordings have as many segments as others
+            count: effective_averages(estimator.window, welch.hop, count)
+            for count in set(self._counts.values())
+        }
+        n_effective = sum(own[count] for count in self._counts.values())
         csm = self._sum / self.n_segments
         return Band(welch, welch.frequencies, csm, self.n_segments, n_effective)
 

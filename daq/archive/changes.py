@@ -21,7 +21,7 @@ from daq.results.change_test import changes
 from estimator.levels.interval import CERTAIN, NORMAL_95
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
 
@@ -41,6 +41,10 @@ LASTING = 1.7
 """Differences of a week over those of a day, above which scatter lasts."""
 _MOST_POINTS = 256
 """Means of days that are tested: a test of more takes too long."""
+_MANY = 6
+"""Changes from which on a series is looked at for drift, before the others are found."""
+_KNOWN_DAY = 10.0
+"""Standard deviations of each day in its level, from which a course is one of decibels."""
 _EPOCH = date(1970, 1, 1).toordinal()
 
 
@@ -222,12 +226,16 @@ def _borders(at: FloatArray, y: FloatArray, s: FloatArray, rate: float) -> list[
     mean = float(np.average(y, weights=weight))
     if mean <= CERTAIN / math.sqrt(float(weight.sum())):
         return None
-    x, deviation = y / mean, s / mean
+    x, deviation = (np.log(y / mean), s / y) if _in_decibels(y, s) else (y / mean, s / mean)
     deviation = deviation * math.sqrt(max(1.0, _scatter(x, deviation)) * _lasting(x, deviation))
-    found = _changes(x, deviation, rate)
+    found = _changes(x, deviation, rate, _MANY)
+    if len(found) == _MANY:
+        slope, level = np.polyfit(at, x, 1, w=1 / deviation)
+        if not _changes(x - level - slope * at, deviation, rate, 1):
+            return []  # a drift, the staircase of which takes long to find
+        found = _changes(x, deviation, rate)
     if not found:
         return []
-    line = _line(at, x, deviation)
     misfit = [
         float(
             np.sum(
@@ -236,11 +244,20 @@ def _borders(at: FloatArray, y: FloatArray, s: FloatArray, rate: float) -> list[
         )
         for a, b in pairwise([0, *found, n])
     ]
-    of_line = float(np.sum((line / deviation) ** 2))
+    of_line = float(_misfit_of_lines(at, x, deviation)(np.array([0]), np.array([n]))[0])
     # a drift is not a staircase: Bayes' information criterion, two parameters a change
     if of_line + math.log(n) <= sum(misfit) + 2 * len(found) * math.log(n):
         return []
     return _without_drift(at, x, deviation, found, rate)
+
+
+def _in_decibels(y: FloatArray, s: FloatArray) -> bool:
+    """Whether every day is known well enough for its logarithm, in which a drift is a line.
+
+    A drift of several dB is none in power. The logarithm of a level that is hardly known is wrong
+    by half of its relative variance, and the weight of a day would follow its error.
+    """
+    return bool(np.all(y > _KNOWN_DAY * s))
 
 
 def _scatter(x: FloatArray, deviation: FloatArray) -> float:
@@ -282,40 +299,51 @@ def _without_drift(
     """Leave out changes that one line through both of their segments explains as well."""
     n = len(x)
     least = 2 * math.log(n) - 2 * math.log(rate)
-    while len(found) > 1:
-        ends = [0, *found, n]
-        losses = []
-        for a, b, c in zip(ends, ends[1:], ends[2:], strict=False):
-            one, two, both = (
-                float(np.sum((_line(at[i:j], x[i:j], deviation[i:j]) / deviation[i:j]) ** 2))
-                for i, j in ((a, b), (b, c), (a, c))
-            )
-            losses.append(both - one - two)
+    misfit = _misfit_of_lines(at, x, deviation)
+    ends = np.array([0, *found, n])
+    while len(ends) > 3:
+        a, b, c = ends[:-2], ends[1:-1], ends[2:]
+        losses = misfit(a, c) - misfit(a, b) - misfit(b, c)
         k = int(np.argmin(losses))
         if losses[k] >= least:
             break
-        found = [*found[:k], *found[k + 1 :]]
-    return found
+        ends = np.delete(ends, k + 1)
+    return [int(end) for end in ends[1:-1]]
 
 
-def _line(at: FloatArray, x: FloatArray, deviation: FloatArray) -> FloatArray:
-    """Return what is left of a weighted line."""
+def _misfit_of_lines(
+    at: FloatArray, x: FloatArray, deviation: FloatArray
+) -> Callable[[IntArray, IntArray], FloatArray]:
+    """Return what gives, for rows from one up to another, the misfit of their weighted line.
+
+    A drift of years is a staircase of many changes at first, so that lines are many: each takes
+    differences of sums, not a pass over its rows.
+    """
     weight = deviation**-2
-    t = at - np.average(at, weights=weight)
-    rest = x - np.average(x, weights=weight)
-    square = float(np.sum(weight * t**2))
-    slope = float(np.sum(weight * t * rest)) / square if square > 0 else 0.0
-    return np.asarray(rest - slope * t)
+    t, y = (each - np.average(each, weights=weight) for each in (at, x))
+    terms = np.stack([np.ones_like(t), t, y, t * t, t * y, y * y]) * weight
+    sums = np.concatenate([np.zeros((len(terms), 1)), np.cumsum(terms, axis=1)], axis=1)
+
+    def misfit(begin: IntArray, end: IntArray) -> FloatArray:
+        w, t, y, tt, ty, yy = sums[:, end] - sums[:, begin]
+        square, pair = tt - t * t / w, ty - t * y / w
+        line = np.where(end - begin > 1, pair**2 / np.where(end - begin > 1, square, 1.0), 0.0)
+        return np.asarray(yy - y * y / w - line)
+
+    return misfit
 
 
-def _changes(x: FloatArray, deviation: FloatArray, rate: float) -> list[int]:
+def _changes(
+    x: FloatArray, deviation: FloatArray, rate: float, most: int | None = None
+) -> list[int]:
     """Return the first rows after changes: found in means of days, then dated to the day."""
     n = len(x)
     step = -(-n // _MOST_POINTS)
     starts = np.arange(0, n, step)
     weight = np.add.reduceat(deviation**-2, starts)
     means = np.add.reduceat(x * deviation**-2, starts) / weight
-    coarse = [step * each.first for each in changes(means, weight**-0.5, false_alarms=rate)]
+    of_means = changes(means, weight**-0.5, false_alarms=rate, most=most)
+    coarse = [step * each.first for each in of_means]
     found: list[int] = []
     for number, border in enumerate(coarse):
         begin = found[-1] if found else 0
@@ -362,9 +390,10 @@ def drift(days: FloatArray, level: FloatArray, spread: FloatArray) -> Drift:
 
     Notes
     -----
-    Weighted least squares. The variance of the slope is the largest of three: that of the spreads,
-    that of the scatter about the line, and that of Newey and West [1]_, which allows for scatter
-    that lasts for days. The interval is Student's.
+    Weighted least squares, in decibels where every day is known to a tenth: a constant drift is a
+    line there. Else in power, over the mean. The variance of the slope is the largest of three:
+    that of the spreads, that of the scatter about the line, and that of Newey and West [1]_, which
+    allows for scatter that lasts for days. The interval is Student's.
 
     References
     ----------
@@ -378,6 +407,8 @@ def drift(days: FloatArray, level: FloatArray, spread: FloatArray) -> Drift:
         if n < MIN_DAYS:
             continue
         at, y, s = days[known], level[known, series], spread[known, series]
+        if in_decibels := _in_decibels(y, s):
+            y, s = np.log(y), s / y
         weight = 1 / s**2
         centre = np.average(at, weights=weight)
         mean = float(np.average(y, weights=weight))
@@ -393,10 +424,10 @@ def drift(days: FloatArray, level: FloatArray, spread: FloatArray) -> Drift:
             pair = float(np.sum(score[lag:] * score[:-lag]))
             lasting += 2 * (1 - lag / (lags + 1)) * pair
         variance = max(1 / square, scatter / square, n / (n - 2) * lasting / square**2)
-        if mean <= CERTAIN / math.sqrt(float(np.sum(weight))):
+        if not in_decibels and mean <= CERTAIN / math.sqrt(float(np.sum(weight))):
             continue  # no level, and so none in dB
         half = float(stdtrit(n - 2, 0.975)) * math.sqrt(variance)
-        year = 10 / math.log(10) * DAYS_PER_YEAR / mean
+        year = 10 / math.log(10) * DAYS_PER_YEAR / (1.0 if in_decibels else mean)
         found[:, series] = np.array([slope, slope - half, slope + half]) * year
     return Drift(*found)
 

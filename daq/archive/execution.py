@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import logging
 import queue
 import subprocess
 import threading
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import asdict
 from ipaddress import ip_address
 from typing import TYPE_CHECKING, Any
@@ -23,7 +24,7 @@ from daq.python_process import python_command
 from daq.recording.reader import Recording
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterator, Sequence
+    from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
     from datetime import datetime
     from pathlib import Path
     from types import ModuleType
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 
 _LOGGER = logging.getLogger(__name__)
 CONNECT_SECONDS = 10.0
+_AHEAD = 1000
+"""Tasks that a scheduler has at a time."""
 
 
 def begun(
@@ -94,16 +97,19 @@ def failure_of(outcome: Outcome) -> str:
     return failure if not failure or source in failure else f"{source}: {failure}"
 
 
-def carried_out(tasks: Sequence[Task], *, jobs: int = 1) -> Generator[Outcome]:
+def carried_out(tasks: Iterable[Task], *, jobs: int = 1) -> Generator[Outcome]:
     """Yield the outcome of each task as it comes, from this process or from several.
 
-    A process that is killed costs its task, which is reported as failed.
+    Tasks are taken as they are needed: those of years need not be in memory together. A process
+    that is killed costs its task, which is reported as failed.
     """
-    if jobs == 1 or len(tasks) < 2:
-        for task in tasks:
-            yield Outcome(**json.loads(run(json.dumps(asdict(task)))))
+    coming = iter(tasks)
+    first = list(itertools.islice(coming, 2 * jobs))
+    if jobs == 1 or len(first) < 2:
+        for task in itertools.chain(first, coming):
+            yield Outcome.read(run(json.dumps(asdict(task))))
         return
-    workers = [_Worker() for _ in range(min(jobs, len(tasks)))]
+    workers = [_Worker() for _ in range(min(jobs, len(first)))]
     idle: queue.SimpleQueue[_Worker] = queue.SimpleQueue()
     for worker in workers:
         idle.put(worker)
@@ -116,12 +122,15 @@ def carried_out(tasks: Sequence[Task], *, jobs: int = 1) -> Generator[Outcome]:
             idle.put(worker)
 
     pool = ThreadPoolExecutor(len(workers))
-    futures = [pool.submit(hand_over, task) for task in tasks]
+    waiting = {pool.submit(hand_over, task) for task in first}
     try:
-        for future in as_completed(futures):
-            yield future.result()
+        while waiting:
+            done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+            waiting |= {pool.submit(hand_over, t) for t in itertools.islice(coming, len(done))}
+            for future in done:
+                yield future.result()
     finally:
-        for future in futures:
+        for future in waiting:
             future.cancel()
         for worker in workers:
             worker.kill()
@@ -131,7 +140,7 @@ def carried_out(tasks: Sequence[Task], *, jobs: int = 1) -> Generator[Outcome]:
 
 
 def on_cluster(
-    tasks: Sequence[Task],
+    tasks: Iterable[Task],
     scheduler: str,
     distributed: ModuleType,
     *,
@@ -141,8 +150,8 @@ def on_cluster(
 
     Parameters
     ----------
-    tasks : sequence of Task
-        Their paths must mean the same on every worker.
+    tasks : iterable of Task
+        Their paths must mean the same on every worker. The scheduler has a thousand at a time.
     scheduler : str
         Address, such as ``tcp://host:8786``.
     distributed : module
@@ -170,15 +179,25 @@ def on_cluster(
         ) from error
     with client:
         connected(str(client.dashboard_link), len(client.scheduler_info()["workers"]))
-        futures: dict[Any, Task] = {
-            client.submit(run, json.dumps(asdict(task)), pure=False): task for task in tasks
-        }
-        for future in distributed.as_completed(list(futures)):
+        coming, futures = iter(tasks), dict[Any, Task]()
+
+        def submit(number: int) -> list[Any]:
+            new = {
+                client.submit(run, json.dumps(asdict(task)), pure=False): task
+                for task in itertools.islice(coming, number)
+            }
+            futures.update(new)
+            return list(new)
+
+        results = distributed.as_completed(submit(_AHEAD))
+        for future in results:
+            task = futures.pop(future)
+            results.update(submit(1))
             failed = future.exception()
             if failed is not None:
-                yield Outcome(futures[future].source, failure=f"on the cluster: {failed!r}")
+                yield Outcome(task.source, failure=f"on the cluster: {failed!r}")
             else:
-                yield Outcome(**json.loads(future.result()))
+                yield Outcome.read(future.result())
 
 
 def is_exposed(address: str) -> bool:
@@ -220,7 +239,7 @@ class _Worker:
                 process.stdin.flush()
                 line = process.stdout.readline()
         if line.endswith("\n"):
-            return Outcome(**json.loads(line))
+            return Outcome.read(line)
         with self._lock:
             code = process.wait()
             if not self._killed:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import os
 import sqlite3
 from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any, Self
@@ -89,6 +90,7 @@ class Index:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
+        self._prefix = f"{folder}{os.sep}"
         self._known: dict[str, tuple[int, int, str]] = {}
         self._channels: dict[str, tuple[tuple[str, Channel], ...]] = {}
         self._new: list[tuple[str, int, int, str]] = []
@@ -121,7 +123,7 @@ class Index:
         """Return a file's entry; None if it is not known, or has changed."""
         try:
             about = path.stat()
-            n_bytes, modified_ns, text = self._known[str(path.relative_to(self._folder))]
+            n_bytes, modified_ns, text = self._known[self._name(path)]
             if (n_bytes, modified_ns) != (about.st_size, about.st_mtime_ns):
                 return None
             found: dict[str, Any] = json.loads(text)
@@ -131,6 +133,8 @@ class Index:
                 left_out={Reason(k): v for k, v in found.pop("left_out").items()},
                 clipped={int(k): v for k, v in found.pop("clipped").items()},
                 stood_still={int(k): v for k, v in found.pop("stood_still").items()},
+                lacking={int(k): v for k, v in found.pop("lacking").items()},
+                shortened={k: (v[0], v[1]) for k, v in found.pop("shortened").items()},
                 not_understood=tuple(found.pop("not_understood")),
                 **{name: found.pop(name) for name in PLAIN},
             )
@@ -158,8 +162,12 @@ class Index:
             "daily": entry.daily,
             "single": entry.single,
         }
-        name = str(entry.path.relative_to(self._folder))
+        name = self._name(entry.path)
         self._new.append((name, about.st_size, about.st_mtime_ns, json.dumps(document)))
+
+    def _name(self, path: Path) -> str:
+        """Return the key of a file: its path in the folder."""
+        return str(path).removeprefix(self._prefix)
 
     def _write(self) -> None:
         with self._open() as database, database:

@@ -172,12 +172,9 @@ class Plan:
                     f"{source}: format version {version} is newer than {FORMAT_VERSION}, which this"
                     " version of huddle reads; update huddle"
                 )
-            settings = {
-                name: OPTIONS[name].check(value) for name, value in found["settings"].items()
-            }
             STRETCHES[found["stretch"]]
             return cls(
-                settings=Settings(**settings),  # type: ignore[arg-type]  # checked, of several types
+                settings=settings_from(found["settings"]),
                 stretch=found["stretch"],
                 sampling_rate=float(found["sampling_rate"]),
                 sensors=tuple(
@@ -199,6 +196,18 @@ def settings_document(settings: Settings) -> dict[str, object]:
     """Return settings as JSON has them."""
     values = ((each.name, getattr(settings, each.name)) for each in fields(EstimateSettings))
     return {name: OPTIONS[name].show(value) for name, value in values if value is not None}
+
+
+def settings_from(document: Mapping[str, Any]) -> Settings:
+    """Return the settings of a `settings_document`.
+
+    Raises
+    ------
+    KeyError, ValueError
+        A name or a value is none of a setting.
+    """
+    checked = {name: OPTIONS[name].check(value) for name, value in document.items()}
+    return Settings(**checked)  # type: ignore[arg-type]  # checked, of several types
 
 
 def described(each: Pass) -> tuple[tuple[str, tuple[tuple[str, str], ...]], ...]:

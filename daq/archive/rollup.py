@@ -12,7 +12,7 @@ neighbouring bins.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import reduce
 from operator import add
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from datetime import tzinfo
 
+    import h5py
     from numpy.typing import NDArray
 
     from daq.archive.density import Density
@@ -76,6 +77,8 @@ class Grid:
     correlation: FloatArray
     _known: list[FloatArray] = field(default_factory=list)
     """Correlations of fine bands, once they are needed."""
+    _parts: dict[tuple[int, int], Grid] = field(default_factory=dict)
+    """Grids of some of the bands, by first and last: a year after another asks for the same."""
 
     @classmethod
     def of(cls, estimator: Estimator) -> Self:
@@ -126,6 +129,14 @@ class Grid:
         begin = min(int(at[0]), len(self.edges) - 2)
         return slice(begin, max(int(at[1]), begin + 1))
 
+    def within(self, fine: slice) -> Grid:
+        """Return some of the bands."""
+        ends = fine.start, fine.stop
+        if ends not in self._parts:
+            edges = self.edges[fine.start : fine.stop + 1]
+            self._parts[ends] = replace(self, edges=edges, _known=[], _parts={})
+        return self._parts[ends]
+
     def has(self, band: tuple[float, float]) -> bool:
         """Return whether the ends of a band are edges."""
         return bool(np.isin(band_edges(self.frequency, band), self.edges).all())
@@ -133,12 +144,9 @@ class Grid:
     def average(self, psd: SmallArray, spans: Sequence[slice]) -> FloatArray:
         """Return means over the known bands of `spans`, of (…, n_fine, n_channels)."""
         known = np.isfinite(psd)
-        weight = np.where(known, self.n_bins[:, None], 0)
+        weight = known * self.n_bins[:, None].astype(np.float64)
         weighted = np.where(known, psd, 0.0) * weight
-        total, weight = (
-            np.stack([each[..., span, :].sum(axis=-2) for span in spans], axis=-2)
-            for each in (weighted, weight)
-        )
+        total, weight = (_sums(each, spans) for each in (weighted, weight))
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(total / weight)
 
@@ -156,29 +164,28 @@ class Grid:
         spans : sequence of slice
             Bands: they take the place of the fine ones.
         """
-        # Fine bands first: sums over them then run through the memory in order.
-        own = np.ascontiguousarray(np.moveaxis(days, -2, 1), np.float64)
+        own = np.asarray(days, np.float64)
         known = np.isfinite(own[MEAN]) & np.isfinite(own[DEVIATION])
-        bins = np.where(known, _along_first(self.n_bins, known), 0)
-        own = np.where(known, own, 0.0)
+        if not known.all():
+            own = np.where(known, own, 0.0)
         unbounded = ~(own[BOUND] > 0)
+        bins = self.n_bins[:, None].astype(np.float64)
         deviation = own[DEVIATION] * bins
         of_bound = np.where(unbounded, 0.0, own[BOUND_DEVIATION]) * bins
         mean, square = own[MEAN] * bins, deviation**2
         size = np.abs(mean)
         with np.errstate(invalid="ignore"):
             below, above, share = (
-                np.where(by > 0, own[field] * by, 0.0)
-                for field, by in ((BELOW, bins), (ABOVE, bins), (SHARE, size))
+                np.where(by > 0, own[field] * by, 0.0) if own[field].any() else np.zeros(by.shape)
+                for field, by in ((BELOW, known * bins), (ABOVE, known * bins), (SHARE, size))
             )
         parts = (
-            *(bins, mean, square, own[SKEWNESS] * (square * deviation), own[TAIL] * square**2),
-            *(below, above, size, share, np.where(unbounded, 0.0, own[BOUND]) * bins),
-            *(of_bound**2, ~known, unbounded),
+            *(known * bins, mean, square, own[SKEWNESS] * (square * deviation)),
+            *(own[TAIL] * square**2, below, above, size, share),
+            *(np.where(unbounded, 0.0, own[BOUND]) * bins, of_bound**2, ~known, unbounded),
         )
         total, mean, t2, t3, t4, below, above, size, share, bound, spread, n_unknown, n_open = (
-            np.stack([part[span].sum(axis=0, dtype=np.float64) for span in spans], axis=-2)
-            for part in parts
+            _sums(np.asarray(part, np.float64), spans) for part in parts
         )
         with np.errstate(invalid="ignore", divide="ignore"):
             more = self._pairs(deviation, spans)
@@ -201,16 +208,11 @@ class Grid:
         )
 
     def _pairs(self, deviation: FloatArray, spans: Sequence[slice]) -> FloatArray:
-        """Return what the correlation of bins adds to the variance of sums over fine bands.
-
-        `deviation` has these first.
-        """
-        total = np.zeros((*deviation.shape[1:-1], len(spans), deviation.shape[-1]))
+        """Return what the correlation of bins adds to the variance of sums over fine bands."""
+        total = np.zeros((*deviation.shape[:-2], len(spans), deviation.shape[-1]))
         for lag, factor in enumerate(self._factors(), 1):
-            pairs = deviation[lag:] * deviation[:-lag] * _along_first(factor, deviation)
-            for number, span in enumerate(spans):
-                inside = slice(span.start, max(span.stop - lag, span.start))
-                total[..., number, :] += pairs[inside].sum(axis=0)
+            pairs = deviation[..., lag:, :] * deviation[..., :-lag, :] * factor[:, None]
+            total += _sums(pairs, [slice(s.start, max(s.stop - lag, s.start)) for s in spans])
         return total
 
     def _factors(self) -> list[FloatArray]:
@@ -232,9 +234,14 @@ class Grid:
         return self._known
 
 
-def _along_first(values: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:
-    """Return one value for each item of the first axis of another array."""
-    return values.reshape(-1, *(1 for _ in other.shape[1:]))
+def _sums(values: FloatArray, spans: Sequence[slice]) -> FloatArray:
+    """Return sums over fine bands, of shape (…, n_spans, n_channels)."""
+    if not np.isfinite(values).all():  # infinite in one span, and in no other
+        return np.stack([values[..., span, :].sum(axis=-2) for span in spans], axis=-2)
+    inside = np.zeros((len(spans), values.shape[-2]))
+    for row, span in zip(inside, spans, strict=True):
+        row[span] = 1.0
+    return np.asarray(inside @ values)
 
 
 def _usual(frequency: FloatArray) -> tuple[float, float]:
@@ -387,6 +394,71 @@ class Rollup:
     recorded: Density
     total: ComplexArray
     n_segments: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Series:
+    """Levels of bands by day: what most answers show.
+
+    Attributes
+    ----------
+    days, day_segments : int64, shape (n_days,)
+    mean, spread, low, high : float64, shape (n_days, n_bands, n_channels)
+        Noise in unit²/Hz, its standard deviation, and its 95 % interval.
+    noise : float32, shape (n_days, n_fine, n_channels)
+        In fine bands.
+    local_days : int64, shape (n_local,)
+        A day that two months share is there twice.
+    part_segments : int64, shape (n_local, 3)
+    part_noise : float64, shape (n_local, 3, n_bands, n_channels)
+    """
+
+    days: IntArray
+    day_segments: IntArray
+    mean: FloatArray
+    spread: FloatArray
+    low: FloatArray
+    high: FloatArray
+    noise: SmallArray
+    local_days: IntArray
+    part_segments: IntArray
+    part_noise: FloatArray
+
+
+def series_of(months: Sequence[h5py.Group], grid: Grid, spans: Sequence[slice]) -> Series:
+    """Return the series of bands.
+
+    Parameters
+    ----------
+    months : sequence of h5py.Group
+        In order of time, with the arrays of a `Rollup` by their names; one at least.
+    grid : Grid
+    spans : sequence of slice
+        Of each band (`Grid.span`).
+    """
+    names = ("days", "day_segments", "local_days", "part_segments")
+    made: dict[str, Any] = {
+        name: np.concatenate([month[name][...] for month in months]) for name in names
+    }
+    made["noise"] = np.concatenate([month["levels"][MEAN] for month in months])
+    return Series(**made, **levels_of(months, grid, spans))
+
+
+def levels_of(months: Sequence[h5py.Group], grid: Grid, spans: Sequence[slice]) -> dict[str, Any]:
+    """Return the fields of `Series` that are of bands; no other fine bands are read."""
+    fine = slice(min(each.start for each in spans), max(each.stop for each in spans))
+    spans = [slice(each.start - fine.start, each.stop - fine.start) for each in spans]
+    grid = grid.within(fine)
+    found = []
+    for month in months:
+        own = grid.levels(month["levels"][:, :, fine], spans)
+        parts = grid.average(month["part_noise"][:, :, fine], spans)
+        found.append((own.mean, own.of_scatter.spread, *own.ends(), parts))
+    names = ("mean", "spread", "low", "high", "part_noise")
+    return {
+        name: np.concatenate(each)
+        for name, each in zip(names, zip(*found, strict=True), strict=True)
+    }
 
 
 def rolled_up(

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 
 from daq.archive.store import FOLDER, PLAN_FILE
 from daq.archive.task import origin_of
-from daq.errors import HuddleError, RecordingError
+from daq.errors import HuddleError, RecordingError, WrongArchiveError
+from daq.formats.readers.miniseed import is_miniseed
+from daq.formats.sources import SCHEME
 from daq.recording.reader import Recording
 
 if TYPE_CHECKING:
@@ -37,11 +39,11 @@ class Sorted:
     failures: list[str] = field(default_factory=list)
 
 
-def folder_for(sources: Sequence[Path]) -> Path:
-    """Return where the archive of recordings is, or is to be, unless said otherwise."""
+def folder_for(sources: Sequence[Path | str]) -> Path:
+    """Return where the archive of sources is, or is to be, unless said otherwise."""
     if not sources:
         return Path(FOLDER)
-    first = sources[0]
+    first = Path(str(sources[0]).removeprefix(SCHEME))
     return (first if first.is_dir() else first.parent) / FOLDER
 
 
@@ -60,18 +62,54 @@ def recordings_in(sources: Iterable[Path], *, leave_out: Path) -> list[Path]:
                 raise RecordingError(f"{source}: no such file or folder")
             found[source] = None
             continue
-        # without spectra of other archives
-        inside = [
-            path
-            for path in sorted(source.rglob("*.h5"))
-            if leave_out not in path.parents
-            and not path.name.startswith(".")
-            and not any((place / PLAN_FILE).exists() for place in list(path.parents)[:2])
-        ]
+        inside = _recordings_of(source, leave_out)
         if not inside:
             raise RecordingError(f"{source}: no recording (*.h5) in this folder")
         found.update(dict.fromkeys(inside))
     return list(found)
+
+
+def _recordings_of(folder: Path, leave_out: Path) -> list[Path]:
+    """Return recordings in a folder, without spectra of archives."""
+    return [
+        path
+        for path in sorted(folder.rglob("*.h5"))
+        if leave_out not in path.parents
+        and not path.name.startswith(".")
+        and not any((place / PLAN_FILE).exists() for place in list(path.parents)[:2])
+    ]
+
+
+def are_waveforms(sources: Sequence[str]) -> bool:
+    """Whether sources are waveform files: ``sds://ROOT``, miniSEED, or folders of these.
+
+    A folder that has a recording is one of recordings.
+
+    Raises
+    ------
+    WrongArchiveError
+        Some are recordings.
+    RecordingError
+        If a file cannot be read.
+    """
+    kinds = {_is_waveforms(source) for source in sources}
+    if len(kinds) > 1:
+        raise WrongArchiveError("expected recordings, or waveform files: not both in one archive")
+    return kinds == {True}
+
+
+def _is_waveforms(source: str) -> bool:
+    path = Path(source)
+    if source.startswith(SCHEME):
+        return True
+    try:
+        if not path.is_dir():
+            return path.is_file() and is_miniseed(path)
+        if _recordings_of(path, path / FOLDER):
+            return False
+        return any(is_miniseed(each) for each in path.rglob("*") if each.is_file())
+    except OSError as error:
+        raise RecordingError(str(error)) from error
 
 
 def sort(paths: Sequence[Path], entries: Iterable[Entry]) -> Sorted:

@@ -61,6 +61,11 @@ class Origin:
     n_samples : int
         Of all sensors.
     closed : bool
+    files : str
+        SHA-256 of names, sizes and times of its files, if it is a day of several.
+    responses : str
+        SHA-256 of what files of responses said of its channels on this day; empty without such
+        files.
     """
 
     run_id: str
@@ -69,6 +74,8 @@ class Origin:
     modified_ns: int
     n_samples: int
     closed: bool
+    files: str = ""
+    responses: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +98,10 @@ class Described:
         Sensors whose clock is not understood.
     clipped, stood_still : mapping of int to float
         As in `daq.estimation.snapshot.SnapshotDiagnostics`.
+    lacking : mapping of int to int
+        Segments that other channels have and a channel lacks, by its column: they are not kept.
+    shortened : mapping of str to (float, float)
+        As in `daq.estimation.snapshot.Snapshot`.
     rounded : bool
         Whether estimates are made of matrices that were kept in single precision.
     simulated : bool
@@ -106,6 +117,8 @@ class Described:
     not_understood: tuple[str, ...] = ()
     clipped: Mapping[int, float] = field(default_factory=dict)
     stood_still: Mapping[int, float] = field(default_factory=dict)
+    lacking: Mapping[int, int] = field(default_factory=dict)
+    shortened: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     rounded: bool = False
     simulated: bool = False
 
@@ -245,6 +258,8 @@ class SpectraWriter:
                 "source_modified_ns": origin.modified_ns,
                 "source_samples": origin.n_samples,
                 "source_closed": int(origin.closed),
+                "source_files": origin.files,
+                "source_responses": origin.responses,
                 "sensors": list(groups),
                 "usable": described.usable,
                 "elapsed": described.elapsed,
@@ -254,6 +269,8 @@ class SpectraWriter:
                 "clipped": json.dumps(dict(described.clipped)),
                 "stood_still": json.dumps(dict(described.stood_still)),
                 "simulated": int(described.simulated),
+                "lacking": json.dumps(dict(described.lacking)),
+                "shortened": json.dumps(dict(described.shortened)),
                 "daily": int(self._daily),
                 "single": int(self._single),
             }
@@ -313,6 +330,11 @@ class SpectraFile:
                 modified_ns=int(number(attributes, "source_modified_ns")),
                 n_samples=int(number(attributes, "source_samples")),
                 closed=bool(number(attributes, "source_closed")),
+                **{
+                    name: text(attributes, f"source_{name}")
+                    for name in ("files", "responses")
+                    if f"source_{name}" in attributes  # since days of stations
+                },
             ),
             channels=channels,
             usable=float(number(attributes, "usable")),
@@ -323,6 +345,13 @@ class SpectraFile:
             clipped={int(k): float(v) for k, v in _table(attributes, "clipped").items()},
             stood_still={int(k): float(v) for k, v in _table(attributes, "stood_still").items()},
             simulated=bool(attributes.get("simulated", 0)),
+            lacking={
+                int(k): int(v) for k, v in _table(attributes, "lacking", optional=True).items()
+            },
+            shortened={
+                sensor: (float(late), float(early))
+                for sensor, (late, early) in _table(attributes, "shortened", optional=True).items()
+            },
         )
         self.stretches: NDArray[np.void] = dataset(file, "stretches", STRETCH_DTYPE)[...]
         self.is_daily = bool(attributes.get("daily", 0))

@@ -7,6 +7,7 @@
         index.sqlite        what the files of recordings say of these
         2026/RUN.h5         spectra and summaries of one recording (`daq.archive.spectra_file`),
                             in the year in which it begins; without a year in older archives
+        2026/2026-11-01.h5  of a day, where waveform files are taken by station and day
         2026/rollup-KEY.h5  months and year (`daq.archive.years`)
 
 A file is replaced whole. One command at a time adds recordings; others may read. The index and the
@@ -127,7 +128,7 @@ class Store:
     def files(self) -> list[Path]:
         """Return the files of recordings."""
         found = [*self.folder.glob("*.h5"), *self.folder.glob("[0-9][0-9][0-9][0-9]/*.h5")]
-        return sorted(path for path in found if not path.name.startswith((".", ROLLUP)))
+        return sorted((p for p in found if not p.name.startswith((".", ROLLUP))), key=str)
 
     def entries(self) -> tuple[tuple[Entry, ...], tuple[str, ...]]:
         """Return the recordings of the archive in order of time, and a message for each bad file.

@@ -2,6 +2,7 @@
 
 A file is one of settings and a time zone, which are in its name. It is made again of what has
 changed: each month has the hash of what it was made of. So the file can be deleted at any time.
+Beside its months it has the series of the archive's usual bands.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import uuid
 from dataclasses import fields, replace
 from functools import reduce
 from operator import add
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
@@ -22,7 +23,16 @@ from daq.archive.averages import Estimator, converted
 from daq.archive.density import Density
 from daq.archive.index import ROLLUP
 from daq.archive.plan import settings_document
-from daq.archive.rollup import Grid, Rollup, month_of, rolled_up, summaries
+from daq.archive.rollup import (
+    Grid,
+    Rollup,
+    Series,
+    levels_of,
+    month_of,
+    rolled_up,
+    series_of,
+    summaries,
+)
 from daq.archive.spectra_file import SUMMARY_VERSION, SpectraFile, packed, to_disk
 from daq.errors import ArchiveError
 
@@ -35,6 +45,9 @@ if TYPE_CHECKING:
     from daq.archive.spectra_file import Summary
     from daq.archive.store import Store
     from daq.estimation.settings import Settings
+
+SERIES = "series"
+"""Group of a year's file: levels of the usual bands, so that most answers read no fine bands."""
 
 
 class Years:
@@ -82,8 +95,11 @@ class Years:
         self._reference = hashlib.sha256(reference.encode()).hexdigest()
         self._n_read = self._n_all = 0
 
-    def each(self) -> Iterator[h5py.File]:
-        """Yield the open file of every year, in order."""
+    def each(self, usual: Sequence[slice]) -> Iterator[h5py.File]:
+        """Yield the open file of every year, in order.
+
+        `usual` are the bands that most answers are about: files that are made have their series.
+        """
         wanted = {month: self._digest(month) for month in sorted(self._months)}
         years = sorted({month[:4] for month in wanted})
         current = {year: self._current(year) for year in years}
@@ -92,7 +108,7 @@ class Years:
         for year in years:
             own = {month: digest for month, digest in wanted.items() if month[:4] == year}
             if current[year] != own:
-                with self._made(year, own, current[year]) as file:
+                with self._made(year, own, current[year], usual) as file:
                     if file is not None:
                         yield file
             else:
@@ -115,7 +131,11 @@ class Years:
 
     @contextlib.contextmanager
     def _made(
-        self, year: str, wanted: Mapping[str, str], current: Mapping[str, str]
+        self,
+        year: str,
+        wanted: Mapping[str, str],
+        current: Mapping[str, str],
+        usual: Sequence[slice],
     ) -> Iterator[h5py.File | None]:
         """Make the file of a year, of months that it has and of recordings; it is then kept.
 
@@ -143,6 +163,13 @@ class Years:
                             group.attrs["digest"] = digest
                 if file.require_group("months"):
                     _write_totals(file)
+                    group = file.create_group(SERIES)
+                    group.attrs["spans"] = _text_of(usual)
+                    made = series_of(_months_of(file), self.grid, usual)
+                    for each in fields(made):
+                        group.create_dataset(
+                            each.name, data=getattr(made, each.name), chunks=True, fletcher32=True
+                        )
                     file.flush()
                     yield file
                 else:
@@ -197,6 +224,24 @@ class Years:
                     found = found.of_days
         response = self._estimator.responses(described.channels)
         return replace(found, total=converted(found.total, response))
+
+
+def read_series(file: h5py.File, grid: Grid, spans: Sequence[slice]) -> Series:
+    """Return the series of bands in a year: those that the file has, or made of its months."""
+    if SERIES not in file:  # of an older version
+        return series_of(_months_of(file), grid, spans)
+    kept: dict[str, Any] = {name: values[...] for name, values in file[SERIES].items()}
+    if file[SERIES].attrs["spans"] != _text_of(spans):
+        kept |= levels_of(_months_of(file), grid, spans)
+    return Series(**kept)
+
+
+def _months_of(file: h5py.File) -> list[h5py.Group]:
+    return [file["months"][month] for month in sorted(file["months"])]
+
+
+def _text_of(spans: Sequence[slice]) -> str:
+    return json.dumps([(span.start, span.stop) for span in spans])
 
 
 def density_of(group: h5py.Group) -> Density:

@@ -5,15 +5,25 @@
 from __future__ import annotations
 
 import zoneinfo
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from daq.errors import ArchiveError
 from tui.commands.options import (
+    FILES_PANEL,
+    ChannelsOption,
     CsvOption,
     JsonOption,
+    LocationOption,
     ModelsOption,
+    NetworkOption,
+    ResponseForOption,
+    ResponseOption,
+    StationOption,
     examples,
     with_estimate_options,
     with_logging,
@@ -22,7 +32,7 @@ from tui.output.exit_codes import ExitCode
 from tui.output.extras import load, require
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
     from datetime import tzinfo
 
     from rich.console import Console
@@ -30,10 +40,13 @@ if TYPE_CHECKING:
     from daq.archive.answers import Answer
     from daq.archive.index import Entry
     from daq.archive.plan import Plan
-    from daq.archive.sources import Sorted
+    from daq.archive.stations import Run
     from daq.archive.store import Store
     from daq.archive.task import Outcome
+    from daq.archive.waveforms import Found, Reading
+    from daq.bench.masks.mask import Mask
     from daq.estimation.settings import Settings
+    from daq.formats.sources import Selection
 
 
 @examples(
@@ -41,15 +54,17 @@ if TYPE_CHECKING:
     "huddle archive recordings/ --stretch day --segment 100s --store slow",
     "huddle archive day-*.h5 --scheduler tls://10.0.0.1:8786 --store /shared/archive",
     "huddle archive --store recordings/huddle-archive --band 1:20 --json - --csv days.csv",
+    "huddle archive sds:///data/sds --net XX --response stations.xml --jobs 4 --store archive",
 )
 @with_logging
 @with_estimate_options
 def archive(
     sources: Annotated[
-        list[Path] | None,
+        list[str] | None,
         typer.Argument(
             metavar="SRC",
-            help="Recordings, or folders of them. Without SRC, show what the archive holds.",
+            help="Recordings, miniSEED files, folders of either, or sds://ROOT for an archive of"
+            " day files. Without SRC, show what the archive holds.",
         ),
     ] = None,
     *,
@@ -127,6 +142,50 @@ def archive(
             " and days.",
         ),
     ] = 0.01,
+    response: ResponseOption = None,
+    response_for: ResponseForOption = None,
+    channels: ChannelsOption = None,
+    net: NetworkOption = "*",
+    sta: StationOption = "*",
+    loc: LocationOption = "*",
+    group: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--group",
+            metavar="NAME=PATTERN",
+            rich_help_panel=FILES_PANEL,
+            help="Sensors of several stations that stand together, as in 'LAB=XX.TST?.*';"
+            " repeatable. Default: the sensors of a station.",
+        ),
+    ] = None,
+    start: Annotated[
+        str | None,
+        typer.Option(
+            "--start",
+            metavar="UTC",
+            rich_help_panel=FILES_PANEL,
+            help="First time to take, such as 2026-11-21; its day is taken whole.",
+        ),
+    ] = None,
+    end: Annotated[
+        str | None,
+        typer.Option(
+            "--end",
+            metavar="UTC",
+            rich_help_panel=FILES_PANEL,
+            help="End of the time to take; the day before it is taken whole.",
+        ),
+    ] = None,
+    file_overlap: Annotated[
+        str,
+        typer.Option(
+            "--file-overlap",
+            metavar="refuse|first|last",
+            rich_help_panel=FILES_PANEL,
+            help="Where files overlap with different samples: refuse the channel of this day, or"
+            " keep the samples of the file that starts first or last.",
+        ),
+    ] = "refuse",
     json: JsonOption = None,
     csv: CsvOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
@@ -139,70 +198,151 @@ def archive(
     recordings together and of every day, its drift, changes beyond
     uncertainty, and the difference between working hours and nights.
 
+    Of waveform files, each station has an archive of its own in the folder,
+    and a day of a station is the unit of work.
+
     Options that shape spectra (--segment, …) cannot be changed later.
     """
-    from daq.archive.execution import begun
     from daq.archive.plan import STRETCHES
-    from daq.archive.sources import folder_for, recordings_in
-    from daq.archive.store import Store
+    from daq.archive.sources import are_waveforms, folder_for
     from daq.bench.masks.mask_file import masks_named
-    from tui.output.archive.document import archive_document, days_csv
-    from tui.output.console import (
-        check_places,
-        for_people,
-        notices,
-        write_json,
-        write_text,
-    )
-    from tui.runs.estimate_settings import settings_for
+    from tui.output.console import check_places
 
     sources = sources or []
     check_places(json, csv)
     if stretch not in {None, *STRETCHES}:
         raise typer.BadParameter(f"--stretch {stretch}: expected hour or day")
-    zone = _zone(time_zone)
     if thin_hours and thin_after is None:
         raise typer.BadParameter("--thin-hours: give --thin-after DAYS also")
     if out is not None:
         require("matplotlib")
     if scheduler is not None:
         require("distributed")
-    masks = masks_named(models)
+    asked = _Asked(
+        wanted=wanted,
+        stretch=stretch,
+        masks=masks_named(models),
+        zone=_zone(time_zone),
+        false_alarm=false_alarm,
+        thin=(thin_after, thin_hours),
+        json=json,
+        csv=csv,
+        out=out,
+        run=_runner(jobs, scheduler),
+    )
+    folder = folder_for(sources) if store is None else store
+    options = {
+        "--response": response,
+        "--response-for": response_for,
+        "--channels": channels,
+        "--net": net != "*",
+        "--sta": sta != "*",
+        "--loc": loc != "*",
+        "--group": group,
+        "--start": start,
+        "--end": end,
+        "--file-overlap": file_overlap != "refuse",
+    }
+    if are_waveforms(sources):
+        selection, reading = _reading(
+            channels=channels,
+            codes=(net, sta, loc),
+            span=(start, end),
+            file_overlap=file_overlap,
+            response=response,
+            response_for=response_for,
+        )
+        groups = [_group(text) for text in group or []]
+        archives, failures = _filled_by_days(
+            asked, sources, folder, selection, reading=reading, groups=groups
+        )
+    elif given := [flag for flag, value in options.items() if value]:
+        raise typer.BadParameter(f"{', '.join(given)}: for waveform files, such as sds://ROOT")
+    else:
+        archives, failures = _filled_by_recordings(asked, list(map(Path, sources)), folder)
+    if len(archives) == 1:
+        _show_one(asked, archives[0], failures)
+    else:
+        _show_stations(asked, archives, failures)
 
-    def checked(plan: Plan) -> Settings:
-        settings = plan.changed(wanted, stretch)
-        for mask in masks:
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """What is asked of archives, whatever they are filled with."""
+
+    wanted: Mapping[str, Any]
+    stretch: str | None
+    masks: Sequence[Mask]
+    zone: zoneinfo.ZoneInfo
+    false_alarm: float
+    thin: tuple[int | None, bool]
+    json: str | None
+    csv: str | None
+    out: Path | None
+    run: Run
+
+    def checked(self, plan: Plan) -> Settings:
+        """Return the settings of an answer; refuse options that do not fit the archive."""
+        settings = plan.changed(self.wanted, self.stretch)
+        for mask in self.masks:
             mask.check_unit(settings.unit or plan.sensors[0][1][0][1])
         return settings
 
-    folder = folder_for(sources) if store is None else store
+
+def _filled_by_recordings(
+    asked: _Asked, sources: Sequence[Path], folder: Path
+) -> tuple[list[Store], list[str]]:
+    """Take new recordings; return the archive, or those of stations, and what failed."""
+    from daq.archive.execution import begun
+    from daq.archive.sources import recordings_in
+    from daq.archive.stations import archives_in
+    from daq.archive.store import Store
+    from tui.runs.estimate_settings import settings_for
+
     paths = recordings_in(sources, leave_out=folder)
     archive = Store.open(folder)
     if archive is None and not paths:
-        raise typer.BadParameter(f"{folder}: no archive there; give recordings to begin one")
+        inside = [found for each in archives_in(folder) if (found := Store.open(each))]
+        if not inside:
+            raise typer.BadParameter(f"{folder}: no archive there; give recordings to begin one")
+        return inside, []
     archive = archive or begun(
         folder,
         paths,
-        stretch,
-        lambda path: settings_for(path, **wanted)[0],
-        checked,
+        asked.stretch,
+        lambda path: settings_for(path, **asked.wanted)[0],
+        asked.checked,
     )
-    settings = checked(archive.plan)
+    asked.checked(archive.plan)
+    return [archive], _take_new(archive, paths, asked.run) if paths else []
 
-    failures = _take_new(archive, paths, jobs=jobs, scheduler=scheduler) if paths else []
-    _thin(archive, thin_after, single=thin_hours)
+
+def _show_one(asked: _Asked, archive: Store, failures: Sequence[str]) -> None:
+    """Print and write the answer of an archive.
+
+    Raises
+    ------
+    typer.Exit
+        With the code of trouble, if something failed.
+    """
+    from tui.output.archive.document import archive_json, days_csv
+    from tui.output.console import for_people, notices, write_text
+
+    settings = asked.checked(archive.plan)
+    _thin(archive, asked.thin[0], single=asked.thin[1])
     entries, bad = archive.entries()
-    found = _answered(archive, entries, settings, zone=zone, false_alarm=false_alarm)
-    screen = for_people(json, csv)
-    _show(screen, found, settings, time_zone)
-    write_json(json, archive_document(found, archive, len(entries)))
-    if csv is not None:
-        write_text(csv, days_csv(found))
-    if out is not None:
+    found = _answered(archive, entries, settings, zone=asked.zone, false_alarm=asked.false_alarm)
+    screen = for_people(asked.json, asked.csv)
+    _show(screen, found, settings, str(asked.zone))
+    if asked.json is not None:
+        write_text(asked.json, archive_json(found, archive, len(entries)) + "\n")
+    if asked.csv is not None:
+        write_text(asked.csv, days_csv(found))
+    if asked.out is not None:
         from tui.report.figures.archive import write_figures
 
         with notices().status("drawing"):
-            written = write_figures(found, out, masks)
+            written = write_figures(found, asked.out, asked.masks)
         screen.print(", ".join(map(str, written)) + " written", soft_wrap=True)
     wrong = [*failures, *bad]
     for line in wrong:
@@ -269,11 +409,9 @@ def _show(screen: Console, found: Answer, settings: Settings, time_zone: str) ->
         screen.print(line)
 
 
-def _take_new(
-    archive: Store, paths: Sequence[Path], *, jobs: int, scheduler: str | None
-) -> list[str]:
+def _take_new(archive: Store, paths: Sequence[Path], run: Run) -> list[str]:
     """Take what is new; returns a message for each recording that failed."""
-    from daq.archive.execution import failure_of
+    from daq.archive.execution import failure_of, tasks_of
     from daq.archive.sources import sort
     from tui.output.console import notices
     from tui.wording.formatting import several
@@ -291,7 +429,12 @@ def _take_new(
             " already"
         )
         failures = list(found.failures)
-        for outcome in _with_progress(archive, found, jobs=jobs, scheduler=scheduler):
+        tasks = tasks_of(archive, found.new)
+        sizes = {
+            task.source: path.stat().st_size
+            for task, (_, path, _) in zip(tasks, found.new, strict=True)
+        }
+        for outcome in _with_progress(run(tasks), sizes, "recordings") if tasks else ():
             if outcome.failure:
                 failures.append(failure_of(outcome))
             elif not outcome.closed:
@@ -316,38 +459,41 @@ def _thin(archive: Store, days: int | None, *, single: bool) -> None:
 
 
 def _with_progress(
-    archive: Store, found: Sorted, *, jobs: int, scheduler: str | None
+    outcomes: Iterable[Outcome], sizes: Mapping[str, int], noun: str
 ) -> Iterator[Outcome]:
     """Carry out tasks, showing how many are done and the time left."""
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    from daq.archive.execution import carried_out, on_cluster, tasks_of
     from tui.output.console import progress
 
-    tasks = tasks_of(archive, found.new)
-    if not tasks:
-        return
-    sizes = {
-        task.source: path.stat().st_size
-        for task, (_, path, _) in zip(tasks, found.new, strict=True)
-    }
-    outcomes = (
-        carried_out(tasks, jobs=jobs)
-        if scheduler is None
-        else on_cluster(tasks, scheduler, load("distributed"), connected=_connected)
-    )
     with progress(
         TextColumn("spectra"),
         BarColumn(),
-        TextColumn("{task.fields[done]} of {task.fields[all]} recordings"),
+        TextColumn("{task.fields[done]} of {task.fields[all]} " + noun),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
     ) as bar:
-        shown = bar.add_task("", total=sum(sizes.values()), done=0, all=len(tasks))
+        shown = bar.add_task("", total=sum(sizes.values()), done=0, all=len(sizes))
         for number, outcome in enumerate(outcomes, 1):
             bar.update(shown, advance=sizes[outcome.source], done=number)
             yield outcome
+
+
+def _runner(jobs: int, scheduler: str | None) -> Run:
+    """Return what carries out tasks: processes here, or the workers of a cluster."""
+    from daq.archive.execution import carried_out, on_cluster
+
+    if scheduler is None:
+        return lambda tasks: carried_out(tasks, jobs=jobs)
+    address, told = scheduler, list[str]()
+
+    def connected(dashboard: str, n_workers: int) -> None:
+        if not told:
+            _connected(dashboard, n_workers)
+        told.append(dashboard)
+
+    return lambda tasks: on_cluster(tasks, address, load("distributed"), connected=connected)
 
 
 def _connected(dashboard: str, n_workers: int) -> None:
@@ -358,3 +504,223 @@ def _connected(dashboard: str, n_workers: int) -> None:
     notices().print(
         f"{several(n_workers, 'worker')}{waiting}; dashboard: {dashboard}", soft_wrap=True
     )
+
+
+def _reading(
+    *,
+    channels: Sequence[str] | None,
+    codes: tuple[str, str, str],
+    span: tuple[str | None, str | None],
+    file_overlap: str,
+    response: Sequence[Path] | None,
+    response_for: Sequence[str] | None,
+) -> tuple[Selection, Reading]:
+    """Return which days and channels are wanted, and how they are read."""
+    from daq.archive.waveforms import Reading
+    from tui.commands.import_ import assigned, selected
+
+    if file_overlap not in {"refuse", "first", "last"}:
+        raise typer.BadParameter(f"--file-overlap {file_overlap}: expected refuse, first or last")
+    selection = selected(
+        channels=channels or [], start=span[0], end=span[1], overlap=file_overlap, codes=codes
+    )
+    pairs = [assigned(text) for text in response_for or []]
+    for path in [*(response or []), *(path for _, path in pairs)]:
+        if not path.exists():
+            raise typer.BadParameter(f"--response {path}: no such file or folder")
+    return selection, Reading(
+        tuple(str(path.resolve()) for path in response or []),
+        tuple((pattern, str(path.resolve())) for pattern, path in pairs),
+        selection.overlap,
+    )
+
+
+def _group(text: str) -> tuple[str, str]:
+    """Return name and pattern of ``NAME=PATTERN``."""
+    name, equals, pattern = text.partition("=")
+    if not equals or not pattern or not all(c.isalnum() or c in "._-" for c in name.strip(".")):
+        raise typer.BadParameter(f"--group {text}: expected NAME=PATTERN, as in 'LAB=XX.TST?.*'")
+    return name, pattern
+
+
+def _filled_by_days(
+    asked: _Asked,
+    sources: Sequence[str],
+    folder: Path,
+    selection: Selection,
+    *,
+    reading: Reading,
+    groups: Sequence[tuple[str, str]],
+) -> tuple[list[Store], list[str]]:
+    """Take new days of all stations; return their archives, and what failed."""
+    from daq.archive.stations import begun, check_responses
+    from daq.archive.waveforms import Contents, stations_in
+    from daq.estimation.settings import Settings
+    from tui.output.console import notices
+    from tui.runs.estimate_settings import chosen
+
+    settings = chosen(Settings(), **asked.wanted)
+    known = Contents(folder)
+    with notices().status("looking for files"):
+        found = stations_in(
+            sources, selection, groups=groups, known=known, segment=settings.segment
+        )
+    if not found.stations:
+        raise typer.BadParameter(_nothing(found))
+    check_responses(found.stations, reading)
+    stores, failures = begun(
+        folder,
+        found.stations,
+        settings,
+        asked.stretch or "hour",
+        reading=reading,
+        run=asked.run,
+        check=asked.checked,
+    )
+    failures = [*found.problems, *failures]
+    if not stores:
+        raise ArchiveError("\n".join(failures))
+    known.save()
+    failures += _take_days(found, stores, reading, asked.run)
+    return [store for _, store in sorted(stores.items())], failures
+
+
+def _take_days(found: Found, stores: Mapping[str, Store], reading: Reading, run: Run) -> list[str]:
+    """Take the days that are new; returns a message for each that failed."""
+    from daq.archive.execution import failure_of
+    from daq.archive.stations import work
+    from tui.output.console import notices
+    from tui.wording.formatting import several
+
+    screen = notices()
+    with ExitStack() as stack:
+        n_unfinished = sum(stack.enter_context(each.writing()) for each in stores.values())
+        if n_unfinished:
+            screen.print(
+                f"{several(n_unfinished, 'file')} left unfinished by an interrupted command"
+                " removed; their days are taken again"
+            )
+        to_take = work(found.stations, stores, reading)
+        failures = list(to_take.failures)
+        alone = f"; left aside, with one sensor: {' '.join(found.alone)}" if found.alone else ""
+        screen.print(
+            f"{several(len(stores), 'station')}: {several(to_take.n_days, 'day')} to take,"
+            f" {to_take.n_current} in the archive already{alone}",
+            soft_wrap=True,
+        )
+        outcomes = run(to_take.tasks(stores, reading)) if to_take.n_days else ()
+        for outcome in _with_progress(outcomes, to_take.sizes, "days"):
+            failures += [f"{outcome.source}: {problem}" for problem in outcome.problems]
+            if outcome.failure:
+                failures.append(failure_of(outcome))
+    return failures
+
+
+def _show_stations(asked: _Asked, archives: Sequence[Store], failures: Sequence[str]) -> None:
+    """Print a line for each station, and write their answers.
+
+    Raises
+    ------
+    typer.Exit
+        With the code of trouble, if something failed.
+    """
+    from daq.archive.execution import failure_of
+    from daq.archive.stations import summaries
+    from tui.output.archive.tables import stations_table
+    from tui.output.console import for_people, hint, notices
+
+    by_name = {store.folder.name: store for store in archives}
+    folder = archives[0].folder.parent
+    settings = {name: asked.checked(store.plan) for name, store in by_name.items()}
+    for store in archives:
+        _thin(store, asked.thin[0], single=asked.thin[1])
+    wrong, found = list(failures), {}
+    tasks = summaries(by_name, settings, str(asked.zone), asked.false_alarm)
+    for outcome in _with_progress(asked.run(tasks), dict.fromkeys(by_name, 1), "stations"):
+        wrong += outcome.problems
+        if outcome.failure:
+            wrong.append(failure_of(outcome))
+        elif outcome.summary is not None:
+            found[outcome.source] = outcome.summary
+    screen = for_people(asked.json, asked.csv)
+    if found:
+        screen.print(stations_table(dict(sorted(found.items()))))
+    summed_up = {name: by_name[name] for name in sorted(found)}
+    if any(each is not None for each in (asked.json, asked.csv, asked.out)):
+        _write_stations(asked, summed_up, settings, wrong)
+    hint(f"next: huddle archive --store {folder / min(by_name)}")
+    for line in wrong:
+        notices().print(line, style="red", soft_wrap=True)
+    if wrong:
+        raise typer.Exit(ExitCode.TROUBLE)
+
+
+def _write_stations(
+    asked: _Asked,
+    archives: Mapping[str, Store],
+    settings: Mapping[str, Settings],
+    problems: list[str],
+) -> None:
+    """Write the answers of stations, one after another, from the roll-ups that they have now.
+
+    Adds what fails to `problems`, which the JSON has at its end.
+    """
+    from daq.archive.answers import answer
+    from tui.output.archive.document import (
+        STATIONS_HEADER,
+        archive_json,
+        stations_csv,
+        stations_json,
+    )
+    from tui.output.console import for_people, growing, progress
+    from tui.output.csv_text import csv_text
+    from tui.wording.formatting import several
+
+    n_figures = 0
+    with ExitStack() as stack:
+        add = stack.enter_context(stations_json(asked.json, problems))
+        write = stack.enter_context(growing(asked.csv))
+        write(csv_text(STATIONS_HEADER, ()))
+        bar = stack.enter_context(progress("answers", "{task.completed} of {task.total} stations"))
+        shown = bar.add_task("", total=len(archives))
+        for name, archive in archives.items():
+            entries, _ = archive.entries()
+            try:
+                found = answer(
+                    archive,
+                    entries,
+                    settings[name],
+                    zone=asked.zone,
+                    false_alarm=asked.false_alarm,
+                )
+            except ArchiveError as error:  # of an archive that another command has changed
+                problems.append(f"{name}: {error}")
+                bar.advance(shown)
+                continue
+            if asked.json is not None:
+                add(name, archive_json(found, archive, len(entries)))
+            if asked.csv is not None:
+                write(stations_csv(name, found))
+            if asked.out is not None:
+                from tui.report.figures.archive import write_figures
+
+                n_figures += len(write_figures(found, asked.out / name, asked.masks))
+            bar.advance(shown)
+    if asked.out is not None:
+        for_people(asked.json, asked.csv).print(
+            f"{several(n_figures, 'file')} of {several(len(archives), 'station')} written:"
+            f" {asked.out / min(archives, default='')}, …",
+            soft_wrap=True,
+        )
+
+
+def _nothing(found: Found) -> str:
+    """Return why there is nothing to take."""
+    if found.problems:
+        return "\n".join(found.problems)
+    if found.alone:
+        return (
+            f"one sensor each: {' '.join(found.alone)}; expected two or more that stand together."
+            " If they are of several stations, say so: --group 'LAB=XX.TST?.*'"
+        )
+    return "no miniSEED files found for these codes and times; check the folder, --start and --end"

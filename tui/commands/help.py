@@ -8,6 +8,7 @@ module of a command is imported when the command is used, or asked for its help.
 
 from __future__ import annotations
 
+from enum import Enum
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -121,6 +122,7 @@ class _Converter:
 
     def __init__(self, declared: Any, of_typer: Callable[[], Any]) -> None:
         self._plain = _plain_type(declared)
+        self._type = declared.annotation if _has_no_text(declared) else None
         self._of_typer = of_typer
 
     def itself(self) -> _Converter:
@@ -132,11 +134,21 @@ class _Converter:
         several = param.multiple or param.nargs == -1
         if value is None:
             return () if several else None
+        if self._type is not None and type(value) is self._type:
+            return value  # a default, or whether a flag is there
         if self._plain is not None and isinstance(value, str):
             return self._plain(value)
         if self._plain is not None and several and isinstance(value, (list, tuple)):
             return [self._plain(each) for each in value]
         return self._of_typer().coerce(value, param=param, ctx=ctx)
+
+
+def _has_no_text(declared: Any) -> bool:
+    """Whether no value from the command line has the type of a parameter: that is a text."""
+    kind = declared.annotation
+    return not declared.is_list and (
+        kind in {bool, int, float} or (isinstance(kind, type) and issubclass(kind, Enum))
+    )
 
 
 def _plain_type(declared: Any) -> type[str] | type[Path] | None:

@@ -39,6 +39,48 @@ def duration(value: str | float) -> float:
         raise typer.BadParameter(f"{value!r}: {error}") from None
 
 
+FILES_PANEL = "Files of other programs"
+"""Of options about responses and channels of these."""
+
+
+def _of_files(flag: str, metavar: str, text: str) -> Any:  # noqa: ANN401 - as typer has it
+    return typer.Option(flag, metavar=metavar, help=text, rich_help_panel=FILES_PANEL)
+
+
+ResponseOption: TypeAlias = Annotated[
+    list[Path] | None,
+    _of_files(
+        "--response",
+        "FILE",
+        "Instrument responses: RESP or StationXML files, or folders of them; repeatable. Each"
+        " channel takes the response of its code and date.",
+    ),
+]
+ResponseForOption: TypeAlias = Annotated[
+    list[str] | None,
+    _of_files(
+        "--response-for",
+        "PATTERN=FILE",
+        "Response for channels of another code, as in 'XX.ABC.*=FILE'; repeatable. A sensor and its"
+        " digitizer may be in two files.",
+    ),
+]
+ChannelsOption: TypeAlias = Annotated[
+    list[str] | None,
+    _of_files(
+        "--channels",
+        "PATTERN",
+        "Channels to take, such as 'HH?' or 'XX.ABC.*.HHZ,XX.DEF.*.HHZ'. Default: all but those of"
+        " the instrument's state of health.",
+    ),
+]
+NetworkOption: TypeAlias = Annotated[
+    str, _of_files("--net", "CODE", "Network in an SDS archive, or a pattern.")
+]
+StationOption: TypeAlias = Annotated[str, _of_files("--sta", "CODE", "Station, or a pattern.")]
+LocationOption: TypeAlias = Annotated[
+    str, _of_files("--loc", "CODE", "Location, or a pattern; -- if empty.")
+]
 BenchArgument: TypeAlias = Annotated[
     Path, typer.Argument(metavar="BENCH", help="Bench file (TOML); huddle init writes one.")
 ]

@@ -91,12 +91,17 @@ def moment(key: str, value: Time | None, created: datetime) -> datetime | None:
         raise WrongSettingError(f"{key}={error}") from None
 
 
+_SAMPLING_RATES = frozenset({"sampling_rate", "sample_rate", "sampling_frequency", "rate", "sr"})
+
+
 def _known(key: str) -> str:
     known = (*table_keys(), "start", "end")
     if key in table_keys():
         return key
     close = difflib.get_close_matches(key, known, n=1)
     hint = f" (did you mean {close[0]!r}?)" if close else ""
+    if key in _SAMPLING_RATES:
+        hint = " (the sampling rate of arrays is fs)"
     raise WrongSettingError(f"option {key!r}: expected one of {', '.join(known)}{hint}")
 
 

@@ -386,10 +386,7 @@ def read(
                 " its noise"
             )
     some, assigned = response_sources(response)
-    began, ended = (
-        None if at is None else round(at.timestamp() * 1e6) * 1000
-        for at in (_utc("start", start), _utc("end", end))
-    )
+    began, ended = nanoseconds("start", start), nanoseconds("end", end)
     folder = mkdtemp(prefix="huddle-")
     try:
         recording, result = open_files(
@@ -408,8 +405,16 @@ def read(
     return Waveforms(recording, result)
 
 
-def _utc(key: str, given: str | datetime | None) -> datetime | None:
-    return moment(key, given, datetime.fromtimestamp(0, tz=UTC))
+def nanoseconds(key: str, given: str | datetime | None) -> int | None:
+    """Return an instant of UTC in ns since 1970.
+
+    Raises
+    ------
+    WrongSettingError
+        With the key and what was expected.
+    """
+    at = moment(key, given, datetime.fromtimestamp(0, tz=UTC))
+    return None if at is None else round(at.timestamp() * 1e6) * 1000
 
 
 def open(path: PathLike) -> RecordingFile:  # noqa: A001 - of huddle.open

@@ -1,4 +1,4 @@
-"""Commands as functions: calibrate, export, report, archive; noise models, and saved results.
+"""Commands as functions: calibrate, export, report; noise models, and saved results.
 
 Each takes a `Result`, or the recordings and options from which `huddle.estimate` makes one, and has
 the numbers of the command.
@@ -7,28 +7,18 @@ the numbers of the command.
 from __future__ import annotations
 
 import os
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, Unpack
-from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 
-from daq.archive.answers import FALSE_ALARM, answer
-from daq.archive.execution import begun, carried_out, failure_of, tasks_of
-from daq.archive.plan import STRETCHES
-from daq.archive.sources import folder_for, recordings_in, sort
-from daq.archive.store import Store
 from daq.bench.masks.mask_file import masks_named
 from daq.errors import WrongSettingError
-from daq.estimation.settings import Settings, check_fit
-from daq.recording.reader import Recording
 from daq.results.calibration import CONFIDENCE
 from daq.results.calibration import calibrate as calibrated
 from daq.results.sources import sources
 from tui.notebook.curve_files import MINISEED, WRITERS, write_curves, write_samples
 from tui.notebook.estimates import PathLike, estimate
-from tui.notebook.options import called, changes_of, settings_of
 from tui.notebook.result import Result
 from tui.output.extras import load as package
 from tui.output.extras import require
@@ -40,7 +30,6 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import ArrayLike
 
-    from daq.archive.answers import Answer
     from daq.results.calibration import Calibration
     from estimator.types import FloatArray
     from tui.notebook.options import EstimateOptions
@@ -198,80 +187,6 @@ def report(
 
     masks = masks_named(models if isinstance(models, str) else ",".join(models))
     write(found.snapshot, out, recordings=found.recordings, settings=found.settings, models=masks)
-
-
-def archive(
-    *recordings: PathLike,
-    store: PathLike | None = None,
-    stretch: str | None = None,
-    jobs: int = 1,
-    time_zone: str = "UTC",
-    false_alarm: float = FALSE_ALARM,
-    **options: Unpack[EstimateOptions],
-) -> Answer:
-    """Add new recordings to an archive and return its answers, as ``huddle archive`` does.
-
-    Parameters
-    ----------
-    *recordings : path
-        Recordings, or folders of them; none to ask an archive without adding any.
-    store : path, optional
-        Folder of the archive; beside the first recording, if not given.
-    stretch : str, optional
-        Time whose spectra are kept together: ``"hour"`` (default) or ``"day"``.
-    jobs : int
-        Processes.
-    time_zone : str
-        Of working hours and nights, such as ``"Europe/London"``.
-    false_alarm : float
-        Probability of a change that is none, in the whole archive.
-    **options
-        Options of the estimate: those of `huddle.estimate`.
-
-    Returns
-    -------
-    Answer
-        Noise of all recordings together (`pooled`), by day (`levels`), its drift, changes and
-        probability density; `problems` lists recordings that could not be read.
-
-    Raises
-    ------
-    HuddleError
-        If there is nothing to answer from, or options need other spectra than the archive has.
-    """
-    if stretch not in {None, *STRETCHES}:
-        raise WrongSettingError(f"stretch={stretch!r}: expected one of {', '.join(STRETCHES)}")
-    try:
-        zone = ZoneInfo(time_zone)
-    except (ZoneInfoNotFoundError, ValueError):
-        raise WrongSettingError(
-            f"time_zone={time_zone!r}: expected a name such as Europe/London"
-        ) from None
-    wanted = changes_of(options)
-    given = [Path(each) for each in recordings]
-    folder = folder_for(given) if store is None else Path(store)
-    paths = recordings_in(given, leave_out=folder)
-
-    def settings_for(path: Path) -> Settings:
-        with Recording.open(path) as recording:
-            settings = settings_of(Settings.of(recording.bench), options)
-            check_fit(settings, recording.sensors, called=called)
-            return settings
-
-    kept = Store.open(folder) or begun(
-        folder, paths, stretch, settings_for, lambda plan: plan.changed(wanted, stretch)
-    )
-    settings = kept.plan.changed(wanted, stretch)
-    failures: list[str] = []
-    if paths:
-        with kept.writing():
-            found = sort(paths, kept.entries()[0])
-            failures += found.failures
-            tasks = tasks_of(kept, found.new)
-            failures += filter(None, map(failure_of, carried_out(tasks, jobs=jobs)))
-    entries, bad = kept.entries()
-    answered = answer(kept, entries, settings, zone=zone, false_alarm=false_alarm)
-    return replace(answered, problems=(*failures, *bad, *answered.problems))
 
 
 def noise_model(name: str, frequency: ArrayLike, *, unit: str = "m/s²") -> FloatArray:

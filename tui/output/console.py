@@ -10,6 +10,7 @@ import json
 import math
 import os
 import sys
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -19,7 +20,7 @@ from rich.console import Console
 from rich.segment import Segment
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from rich.console import ConsoleOptions, RenderableType
     from rich.progress import Progress, ProgressColumn
@@ -167,10 +168,75 @@ def write_whole(path: Path, content: bytes) -> None:
         part.unlink(missing_ok=True)
 
 
+@contextmanager
+def growing(file: str | None) -> Iterator[Callable[[str], object]]:
+    """Return what adds text to a file, or to standard output; to nothing without a file.
+
+    The file is complete when it has its name, and an earlier one stays until then.
+
+    Raises
+    ------
+    OSError
+        With the name of the file, which the error of a full disk lacks.
+    """
+    if file is None:
+        yield lambda text: None  # noqa: ARG005 - it goes nowhere
+        return
+    path = Path(file)
+    part = path.with_name(f".{path.name}.part")
+    try:
+        if file == STANDARD_OUTPUT:
+            yield sys.stdout.write
+            sys.stdout.flush()
+        elif path.exists() and not path.is_file():
+            with path.open("a", encoding="utf-8") as out:
+                yield out.write
+        else:
+            with part.open("w", encoding="utf-8") as out:
+                yield out.write
+                out.flush()
+                os.fsync(out.fileno())
+            part.replace(path)
+    except OSError as error:
+        if error.filename is None:
+            error.filename = "standard output" if file == STANDARD_OUTPUT else file
+        raise
+    finally:
+        if file != STANDARD_OUTPUT:
+            part.unlink(missing_ok=True)
+
+
+def json_text(document: Any) -> str:  # noqa: ANN401 - any JSON value
+    """Return a document as one line of JSON; infinite numbers become null."""
+    return json.dumps(finite(document), ensure_ascii=False, allow_nan=False)
+
+
 def write_json(file: str | None, document: Mapping[str, Any]) -> None:
     """Write a document as one line of JSON, if a file is given; infinite numbers become null."""
-    if file is not None:
-        write_text(file, json.dumps(finite(document), ensure_ascii=False, allow_nan=False) + "\n")
+    if file is None:
+        return
+    with growing(file) as write:
+        for part in _json_parts(document, depth=_IN_PARTS):
+            write(part)
+        write("\n")
+
+
+_IN_PARTS = 4  # depth to which JSON is written in parts: by frequency in tables of all pairs
+
+
+def _json_parts(value: Any, *, depth: int) -> Iterator[str]:  # noqa: ANN401 - any JSON value
+    """Yield `json_text` in parts: of many sensors all of it takes more memory than the numbers."""
+    is_list = isinstance(value, list)
+    first = value[0] if is_list and value else None
+    if not (depth and value and (isinstance(value, dict) or isinstance(first, (dict, list)))):
+        yield json_text(value)
+        return
+    for number, entry in enumerate(value):
+        yield (", " if number else "[" if is_list else "{")
+        if not is_list:
+            yield f"{json_text(str(entry))}: "
+        yield from _json_parts(entry if is_list else value[entry], depth=depth - 1)
+    yield "]" if is_list else "}"
 
 
 def finite(value: Any) -> Any:  # noqa: ANN401 - any JSON value
@@ -180,6 +246,9 @@ def finite(value: Any) -> Any:  # noqa: ANN401 - any JSON value
     if isinstance(value, dict):
         return {key: finite(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):  # of numbers, mostly: no call for each
+        with suppress(TypeError, OverflowError):  # texts, nulls, lists; large integers
+            if all(map(math.isfinite, value)):
+                return value
         return [
             (entry if math.isfinite(entry) else None) if type(entry) is float else finite(entry)
             for entry in value

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 from dataclasses import fields
 from datetime import UTC, datetime
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from daq.bench.estimate_settings import table_keys
@@ -19,6 +18,7 @@ from daq.results.facts import Fact, Finding
 from daq.results.sources import conditions
 from estimator.checks.advice import Advice
 from estimator.self_noise.result import Flag
+from tui import __version__
 from tui.output.calibration import channels_of
 from tui.output.json_diagnostics import diagnostics_document, dimension_document, slip_document
 from tui.output.json_values import plain
@@ -95,7 +95,7 @@ def document(
     documents = [result_document(snapshot, method) for method in snapshot.results]
     whole = {
         "schema_version": SCHEMA_VERSION,
-        "software": {"name": "huddle-bench", "version": version("huddle-bench")},
+        "software": {"name": "huddle-bench", "version": __version__},
         "run_id": sources[-1].run_id if sources else None,
         "recordings": [_recording(source) for source in sources],
         "settings": _settings(settings, snapshot),
@@ -129,7 +129,7 @@ def provenance(
     ]
     return {
         "title": "Self-noise of sensors, from a huddle test",
-        "source": f"huddle-bench {version('huddle-bench')}",
+        "source": f"huddle-bench {__version__}",
         "time_coverage_start": _instant(start_ns),
         "time_coverage_end": _instant(start_ns + round(snapshot.elapsed * 1e9)),
         "confidence_of_intervals": "0.95",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 from typing import TYPE_CHECKING
 
@@ -88,6 +87,8 @@ def _not_a_formula(text: str) -> str:
 
 def curves_csv(snapshot: Snapshot) -> str:
     """Return all curves as CSV: a row per frequency, a group of columns per channel and method."""
+    import csv  # noqa: PLC0415 - most results are shown, or written as JSON
+
     header = ["frequency (Hz)"]
     columns = [snapshot.frequency]
     for number, label in enumerate(snapshot.channels):

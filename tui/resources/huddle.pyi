@@ -5,6 +5,7 @@ A single module cannot hold the marker ``py.typed`` (PEP 561).
 
 from daq.errors import HuddleError as HuddleError
 from estimator.errors import EstimatorError as EstimatorError
+from tui.notebook.archives import archive as archive
 from tui.notebook.estimates import estimate as estimate
 from tui.notebook.estimates import self_noise as self_noise
 from tui.notebook.options import EstimateOptions as EstimateOptions
@@ -17,7 +18,6 @@ from tui.notebook.recording import read as read
 from tui.notebook.result import Result as Result
 from tui.notebook.simulation import Simulation as Simulation
 from tui.notebook.simulation import simulate as simulate
-from tui.notebook.verbs import archive as archive
 from tui.notebook.verbs import calibrate as calibrate
 from tui.notebook.verbs import export as export
 from tui.notebook.verbs import load as load

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import h5py
@@ -23,7 +24,7 @@ from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from datetime import datetime
     from pathlib import Path
 
@@ -46,9 +47,13 @@ def record(
     names: str = "ABC",
     free: bool = False,
     unit: str = "m/s²",
+    absent: Mapping[str, Sequence[tuple[int, int, int]]] = MappingProxyType({}),
+    late: Mapping[str, int] = MappingProxyType({}),
 ) -> Path:
     """Write a recording: one motion, noise of its own in each sensor.
 
+    `absent` has columns and their first and last rows without samples, by sensor; `late` the
+    rows before a sensor begins.
     Where `free`, times come from arrivals only, so that clocks have to be estimated.
     """
     rng = np.random.default_rng(seed)
@@ -56,18 +61,26 @@ def record(
     motion = rng.normal(size=(n, 2)) * motion_counts
     channels = tuple(Channel(name=c, sensitivity=1e6, unit=unit) for c in "XY")
     layouts = [
-        SensorLayout(name, channels, RATE, np.dtype("<i4"), clock=name if free else "")
+        SensorLayout(
+            name,
+            channels,
+            RATE,
+            np.dtype("<i4"),
+            clock=name if free else "",
+            absent=np.array(absent[name], np.int64) if name in absent else None,
+        )
         for name in names
     ]
     with ArrayWriter(path, None, sensors=layouts, created=HostTime(begin_ns, begin_ns)) as writer:
         for name in names:
             counts = np.rint(motion + noise * rng.normal(size=motion.shape)).astype("<i4")
             block_rows = 600 if free else 4096
-            rows = [*range(0, n, block_rows), n]
+            begin = late.get(name, 0)
+            rows = [*range(begin, n, block_rows), n]
             times = [round(row / RATE * 1e9) for row in rows]
             writer.samples(
                 name,
-                counts,
+                counts[begin:],
                 block_rows=block_rows,
                 received_ns=times[1:],
                 utc_ns=None if free else times[:-1],

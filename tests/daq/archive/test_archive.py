@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 import pytest
 
-from daq.archive.answers import answer
+from daq.archive.answers import answer, facts_of_archive
 from daq.archive.density import LOWEST_DB, Density
 from daq.archive.execution import carried_out, is_exposed
 from daq.archive.index import FILE as INDEX
@@ -28,7 +28,10 @@ from daq.errors import ArchiveError, RecordingError, WrongArchiveError, WrongSet
 from daq.estimation.contributions import contributions
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.results import known_facts
+from daq.results.facts import AbsencesNotUsed, SpanShortened
 from estimator.levels.contributions import Source
+from estimator.spectra.segment_rejection import Reason
 from tests import known_clocks
 from tests.daq.archive.months import (
     HOUR_NS,
@@ -209,17 +212,17 @@ def test_impossible_settings_are_refused(
 def test_recordings_of_other_sensors_are_reported_and_the_rest_processed(
     paths: list[Path], tmp_path: Path
 ) -> None:
-    other = record(tmp_path / "other.h5", names="ABD")
+    other = record(tmp_path / "other.h5", hours=0.1, names="ABD")
     text = tmp_path / "text.h5"
     text.write_text("no recording")
     store = store_for(tmp_path / "store", paths[0])
-    failures = fill(store, [other, text, *paths])
+    failures = fill(store, [other, text, paths[0]])
     assert [("text.h5" in each, "other.h5" in each) for each in failures] == [
         (True, False),
         (False, True),
     ]
     assert "D (X in m/s²" in failures[1]
-    assert len(store.entries()[0]) == len(paths)
+    assert len(store.entries()[0]) == 1
 
 
 def test_newer_formats_are_refused_by_name(copy: Store) -> None:
@@ -346,7 +349,7 @@ def test_a_scheduler_in_the_open_is_named(address: str, *, exposed: bool) -> Non
     assert is_exposed(address) is exposed
 
 
-@pytest.mark.parametrize("alone", [False, True])
+@pytest.mark.parametrize("alone", [pytest.param(False, marks=pytest.mark.long), True])
 def test_recordings_whose_clocks_are_not_understood_are_left_out(
     tmp_path: Path, *, alone: bool
 ) -> None:
@@ -370,6 +373,44 @@ def test_recordings_whose_clocks_are_not_understood_are_left_out(
     assert (left.origin.path, left.not_understood) == (str(bad), ("B",))
     only = answer(store, [one for one in entries if one.described != left], settings)
     np.testing.assert_array_equal(found.levels.mean, only.levels.mean)
+
+
+@pytest.mark.parametrize("reject", [False, True])
+def test_segments_that_a_channel_lacks_are_named(tmp_path: Path, *, reject: bool) -> None:
+    n, third = round(0.9 * 3600 * RATE), round(0.3 * 3600 * RATE)
+    path = record(tmp_path / "r.h5", hours=0.9, absent={"B": [(1, third, 2 * third)]})
+    other = record(tmp_path / "other.h5", hours=0.9, begin_ns=START_NS + 3 * HOUR_NS, seed=2)
+    store = store_for(tmp_path / "store", path, replace(SETTINGS, reject=reject))
+    assert fill(store, [path, other]) == []
+    for entries, _ in (store.entries(), store.entries()):  # from files, and from the index
+        found = answer(store, entries, SETTINGS)
+        assert list(found.lacking) == ["B.Y"]
+        assert found.lacking["B.Y"] == pytest.approx(third / (5 * RATE), abs=3)
+        dropped = found.pooled.left_out[Reason.GAP]
+        assert dropped == pytest.approx(found.lacking["B.Y"], abs=3)
+        (fact,) = [each for each in facts_of_archive(found) if isinstance(each, AbsencesNotUsed)]
+        assert (fact.channels, fact.n_segments) == (("B.Y",), tuple(found.lacking.values()))
+    kept = sum(entry.n_segments for entry in entries)
+    assert kept + found.lacking["B.Y"] == pytest.approx(2 * n / (5 * RATE), rel=0.02)
+
+
+def test_a_sensor_that_shortens_recordings_is_named(tmp_path: Path) -> None:
+    late = round(600 * RATE)
+    paths = [
+        record(tmp_path / "a.h5", hours=0.6, late={"C": late}),
+        record(
+            tmp_path / "b.h5", hours=0.6, begin_ns=START_NS + 3 * HOUR_NS, seed=2, late={"C": late}
+        ),
+        record(tmp_path / "c.h5", hours=0.6, begin_ns=START_NS + 6 * HOUR_NS, seed=3),
+    ]
+    store = store_for(tmp_path / "store", paths[0])
+    assert fill(store, paths) == []
+    for entries, _ in (store.entries(), store.entries()):  # from files, and from the index
+        found = answer(store, entries, SETTINGS)
+        facts = known_facts.facts_of(found.pooled)
+        (fact,) = [each for each in facts if isinstance(each, SpanShortened)]
+        assert (fact.sensors, fact.at_end) == (("C",), False)
+        assert fact.seconds == pytest.approx(1200.0, abs=1.0)
 
 
 def test_a_recording_from_1970_is_in_the_answer(tmp_path: Path) -> None:
@@ -472,14 +513,16 @@ def test_hours_in_single_precision_answer_as_before_in_half_of_the_room(copy: St
     assert copy.thin(0) == n_old  # days of these
 
 
-@pytest.mark.parametrize("single", [True, False], ids=["hours", "days"])
+@pytest.mark.parametrize(
+    "single", [True, pytest.param(False, marks=pytest.mark.long)], ids=["hours", "days"]
+)
 def test_intervals_know_what_matrices_in_single_precision_cannot_tell(
     tmp_path: Path, *, single: bool
 ) -> None:
     """Noise 80 dB below the motion is as small as the rounding."""
     settings = replace(SETTINGS, axis_tolerance={"": 0.0})
     paths = [
-        record(tmp_path / f"{n}.h5", begin_ns=START_NS + n * 30 * HOUR_NS, seed=n,
+        record(tmp_path / f"{n}.h5", hours=0.75, begin_ns=START_NS + n * 30 * HOUR_NS, seed=n,
                noise=1e4, motion_counts=1e8)
         for n in range(2)
     ]  # fmt: skip

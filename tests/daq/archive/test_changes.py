@@ -28,10 +28,10 @@ def course_of(level: np.ndarray, spread: np.ndarray, rate: float = 0.01) -> tupl
     return courses(days, level, spread, {}, false_alarm=rate)
 
 
-@pytest.mark.parametrize("scatter", [1.0, 4.0])
+@pytest.mark.parametrize("scatter", [1.0, pytest.param(4.0, marks=pytest.mark.long)])
 def test_false_alarms_are_rarer_than_stated(scatter: float) -> None:
     rng = np.random.default_rng(5)
-    n, rate = 150, 0.05
+    n, rate = 100, 0.05
     alarms = sum(
         any(each.steps for each in course_of(*series(rng, scatter=scatter), rate)) for _ in range(n)
     )
@@ -76,6 +76,26 @@ def test_a_drift_is_no_staircase() -> None:
         assert each.segments[0].drift.value == pytest.approx(per_year, rel=0.1)
 
 
+def test_a_drift_of_ten_years_is_one_of_decibels() -> None:
+    """5 dB are no line in power: that would be a staircase."""
+    level, spread = series(np.random.default_rng(14), n_days=3653, n_series=2)
+    factor = 10 ** (0.05 * np.arange(3653)[:, None] / DAYS_PER_YEAR)
+    for each in course_of(level * factor, spread * factor):
+        assert not each.steps
+        assert each.segments[0].drift.low < 0.5 < each.segments[0].drift.high
+        assert each.segments[0].drift.value == pytest.approx(0.5, abs=1e-3)
+
+
+def test_a_day_that_is_hardly_known_is_not_taken_into_a_logarithm() -> None:
+    """The courses are those of powers: an error of a day moves neither its weight nor the mean."""
+    level, spread = series(np.random.default_rng(15), n_days=400, n_series=1)
+    level[200] = 0.01 * spread[200]  # 500 standard deviations below
+    spread[200] = 1.0
+    (found,) = course_of(level, spread)
+    assert not found.steps
+    assert found.segments[0].drift.low < 0 < found.segments[0].drift.high
+
+
 def test_few_days_give_no_decision() -> None:
     level, spread = series(np.random.default_rng(8), n_days=7)
     level[4:] *= 3
@@ -92,8 +112,8 @@ def test_a_level_that_may_be_zero_is_not_decided() -> None:
 
 def test_the_slope_is_that_of_the_line() -> None:
     spread = np.ones((40, 1))
-    level = 100 + 0.02 * (DAYS - DAYS.mean())[:, None]
-    found = drift(DAYS, level, spread)
+    level = 100 * np.exp(2e-4 * (DAYS - DAYS.mean())[:, None])
+    found = drift(DAYS, level, spread * level / 100)
     per_day = 10 / np.log(10) * 0.02 / 100
     assert found.slope[0] == pytest.approx(per_day * DAYS_PER_YEAR)
     # Student's quantile, 38 degrees of freedom, times the spread of the slope

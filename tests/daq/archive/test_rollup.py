@@ -87,15 +87,16 @@ def test_days_in_several_recordings_become_one() -> None:
     np.testing.assert_allclose(one.of_scatter.cumulants[1:], two.of_scatter.cumulants[1:], rtol=0.5)
 
 
+@pytest.mark.long
 def test_the_interval_of_a_band_of_merged_days_covers_the_truth() -> None:
     """Of noise drawn without the code under test: 95 % of the intervals hold it."""
     rng = np.random.default_rng(3)
     grid = Grid.of(ESTIMATOR)
     inside = []
-    for _ in range(60):
+    for _ in range(40):
         parts = [summary_of([drawn(rng)], first_hour=k) for k in range(3)]
         rows = np.concatenate([each.levels for each in parts], axis=1)
         merged = merged_levels(rows, np.full(3, N_SEGMENTS))
         low, high = grid.levels(merged[:, None], [grid.span((1.0, 4.0))]).ends()
         inside.append((low[0, 0] <= np.arange(1.0, 4)) & (high[0, 0] >= np.arange(1.0, 4)))
-    assert np.mean(inside) > 0.9  # binomial, 180 draws of .95; Hann's correlation only widens
+    assert np.mean(inside) > 0.9  # binomial, 120 draws of .95; Hann's correlation only widens

@@ -27,6 +27,7 @@ from daq.bench.masks.mask_file import masks_named
 from daq.estimation.snapshot import Snapshot
 from daq.python_process import python_command
 from tests import known_clocks
+from tests.daq.archive.day_files import append, write_station
 from tests.daq.archive.months import (
     HOUR_NS,
     SETTINGS,
@@ -41,6 +42,7 @@ from tests.daq.archive.months import (
 from tests.known_clocks import Oscillator, Scene
 from tests.tui.output.test_result_schema import SCHEMA as RESULT
 from tests.tui.output.test_result_schema import strict
+from tests.tui.thinned import thinned
 from tests.waiting import finish, wait_until
 from tui.commands.main import app
 from tui.report.figures import drawing
@@ -51,6 +53,9 @@ if TYPE_CHECKING:
 
 SCHEMA: dict[str, Any] = json.loads(
     (resources.files("tui.resources") / "archive-2.schema.json").read_text("utf-8")
+)
+STATIONS: dict[str, Any] = json.loads(
+    (resources.files("tui.resources") / "archive-stations-1.schema.json").read_text("utf-8")
 )
 OPTIONS = ("--segment", "10s", "--method", "three-sensor")
 PLAIN = ("--equalise", "off", "--bridge", "0")
@@ -78,7 +83,7 @@ def validate(document: dict[str, Any]) -> None:
     """Compare a document with the published schema, which has all of its keys."""
     registry = Registry().with_resource("result-2.schema.json", Resource.from_contents(RESULT))
     assert document.keys() == SCHEMA["properties"].keys()
-    Draft202012Validator(strict(SCHEMA), registry=registry).validate(document)
+    Draft202012Validator(strict(SCHEMA), registry=registry).validate(thinned(document))
 
 
 @pytest.fixture(scope="module")
@@ -182,29 +187,50 @@ def test_killed_and_started_again_it_goes_on(folder: Path, tmp_path: Path) -> No
 @pytest.mark.long
 def test_the_workers_of_a_cluster_write_the_same_values(folder: Path, tmp_path: Path) -> None:
     pytest.importorskip("distributed")
-    store, address = tmp_path / "store", tmp_path / "scheduler.json"
+    store = tmp_path / "store"
+    code, said = on_cluster(tmp_path, folder, "--store", store, *OPTIONS)
+    assert code == 0, said
+    assert "dashboard: http" in said
+    assert_same(Store.open(store), Store.open(folder / "huddle-archive"))  # type: ignore[arg-type]  # there is one
+
+
+@pytest.mark.long
+def test_the_workers_of_a_cluster_take_days_of_all_stations(sds: Path, tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    whole, store = tmp_path / "whole", tmp_path / "store"
+    said = huddle(f"sds://{sds}", "--store", whole, *DAYS)
+    assert said.exit_code == 0
+    code, errors = on_cluster(tmp_path, f"sds://{sds}", "--store", store, *DAYS)
+    assert code == 0, errors
+    assert errors.count("dashboard: http") == 1
+    for name in ("XX.ABC", "XX.DEF"):
+        assert_same(Store.open(store / name), Store.open(whole / name))  # type: ignore[arg-type]  # there are
+    assert huddle("--store", store).stdout == said.stdout
+
+
+def on_cluster(folder: Path, *arguments: object) -> tuple[int, str]:
+    """Archive by a scheduler and a worker of Dask; returns exit code and standard error."""
+    address = folder / "scheduler.json"
     with ExitStack() as stack:
         process = stack.enter_context(
             subprocess.Popen(
                 [sys.executable, "-P", "-c", CLUSTER, str(address)],
-                cwd=tmp_path,
+                cwd=folder,
                 stderr=subprocess.DEVNULL,
             )
         )
         stack.callback(process.kill)
         wait_until(lambda: address.exists() and address.read_text().endswith("}"), "a scheduler")
         scheduler = json.loads(address.read_text())["address"]
-        command = [*python_command("tui"), "archive", str(folder), "--store", str(store)]
+        command = [*python_command("tui"), "archive", *map(str, arguments)]
         with subprocess.Popen(
-            [*command, *OPTIONS, "--scheduler", scheduler],
+            [*command, "--scheduler", scheduler],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
         ) as huddle_command:
             code, _, said = finish(huddle_command)
-    assert code == 0, said
-    assert "dashboard: http" in said
-    assert_same(Store.open(store), Store.open(folder / "huddle-archive"))  # type: ignore[arg-type]
+    return code, said
 
 
 @pytest.mark.long
@@ -310,3 +336,140 @@ def test_a_recording_whose_clock_is_not_understood_is_named(tmp_path: Path) -> N
     assert fact["numbers"] == {"recordings": [bad]}
     assert fact["action"].startswith("Check whether samples are lost")
     assert facts["changes-undecided"]["numbers"] == {"n_days": 1, "needed": 8}
+
+
+DAYS = ("--segment", "60s", "--method", "three-sensor")
+
+
+@pytest.fixture(scope="module")
+def sds(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write day files of two stations, and of one with a single sensor."""
+    root = tmp_path_factory.mktemp("sds")
+    write_station(root, "ABC", days=1.6, seed=1)
+    write_station(root, "DEF", days=1.0, seed=2)
+    write_station(root, "ONE", days=0.1, seed=3, locations=("",))
+    return root
+
+
+def test_stations_have_an_archive_each_and_a_line_in_the_table(sds: Path, tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    said = huddle(f"sds://{sds}", "--store", store, *DAYS)
+    assert said.exit_code == 0, said.output
+    assert "2 stations: 3 days to take, 0 in the archive already" in said.stderr
+    assert "left aside, with one sensor: XX.ONE" in said.stderr
+    lines = [line.split() for line in said.stdout.splitlines()]
+    assert [line[:5] for line in lines[1:]] == [
+        ["XX.ABC", "3", "2", "2026-01-01", "2026-01-02"],
+        ["XX.DEF", "3", "1", "2026-01-01", "2026-01-01"],
+    ]
+    assert (store / "XX.ABC" / "2026" / "2026-01-02.h5").exists()
+    again = huddle(f"sds://{sds}", "--store", store)
+    assert "2 stations: 0 days to take, 3 in the archive already" in again.stderr
+    assert huddle("--store", store).stdout == again.stdout == said.stdout
+    one = huddle("--store", store / "XX.ABC", "--json", "-")
+    assert one.exit_code == 0, one.output
+    assert json.loads(one.stdout)["days"]["date"] == ["2026-01-01", "2026-01-02"]
+    every = huddle("--store", store, "--json", "-", "--csv", tmp_path / "days.csv")
+    assert every.exit_code == 0, every.output
+    document = json.loads(every.stdout)
+    registry = Registry().with_resources(
+        (name, Resource.from_contents(schema))
+        for name, schema in (("result-2.schema.json", RESULT), ("archive-2.schema.json", SCHEMA))
+    )
+    assert document.keys() == STATIONS["properties"].keys()
+    Draft202012Validator(strict(STATIONS), registry=registry).validate(thinned(document))
+    assert [each["station"] for each in document["stations"]] == ["XX.ABC", "XX.DEF"]
+    assert document["stations"][0]["answer"] == json.loads(one.stdout)
+    rows = list(csv.DictReader((tmp_path / "days.csv").read_text("utf-8").splitlines()))
+    days = {(row["station"], row["date"]) for row in rows}
+    assert days == {("XX.ABC", "2026-01-01"), ("XX.ABC", "2026-01-02"), ("XX.DEF", "2026-01-01")}
+    psd = document["stations"][1]["answer"]["days"]["noise_psd"][0][0][0]
+    assert float(next(r for r in rows if r["station"] == "XX.DEF")["noise PSD (unit²/Hz)"]) == psd
+
+
+@pytest.mark.long
+def test_figures_of_stations_have_a_folder_each(sds: Path, tmp_path: Path) -> None:
+    said = huddle(f"sds://{sds}", "--store", tmp_path / "store", *DAYS, "-o", tmp_path / "out")
+    assert said.exit_code == 0, said.output
+    for name in ("XX.ABC", "XX.DEF"):
+        assert (tmp_path / "out" / name / "days.png").stat().st_size > 5000
+        assert (tmp_path / "out" / name / "figures.npz").exists()
+
+
+def test_a_single_station_is_answered(sds: Path, tmp_path: Path) -> None:
+    said = huddle(f"sds://{sds}", "--sta", "DEF", "--store", tmp_path, *DAYS, "--json", "-")
+    assert said.exit_code == 0, said.output
+    document = json.loads(said.stdout)
+    assert document["archive"]["recordings"] == 1
+    assert document["pooled"]["segments"] == 2879
+    validate(document)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--sta", "ONE"], "one sensor each: XX.ONE; expected two or more"),
+        (["--sta", "NO"], "no miniSEED files found for these codes and times"),
+        (["--file-overlap", "0.5"], "expected refuse, first or last"),
+        (["--group", "LAB"], "--group LAB: expected NAME=PATTERN"),
+        (["--group", "../x=XX.*"], "expected NAME=PATTERN"),
+        (["--response", "no.xml"], "no.xml: no such file"),
+        (["--start", "2026-01-02", "--end", "2026-01-01"], "expected a time after --start"),
+        (["--unit", "m/s²"], "'counts'"),
+    ],
+)
+def test_what_cannot_be_taken_of_waveform_files_is_refused_before_work(
+    sds: Path, tmp_path: Path, arguments: list[str], message: str
+) -> None:
+    result = huddle(f"sds://{sds}", "--store", tmp_path / "store", *DAYS, *arguments)
+    assert result.exit_code in {2, 3}, result.output
+    assert message in " ".join(result.stderr.split())
+    assert not (tmp_path / "store").exists()
+
+
+def test_channels_without_a_response_are_named_before_work(sds: Path, tmp_path: Path) -> None:
+    obspy = pytest.importorskip("obspy")
+    path = tmp_path / "stations.xml"
+    obspy.read_inventory().write(str(path), "STATIONXML")
+    result = huddle(
+        f"sds://{sds}", "--response", path, "--store", tmp_path / "store", "--sta", "ABC", *DAYS
+    )
+    assert result.exit_code == 3
+    for location in ("00", "10", "20"):
+        assert f"no response for XX.ABC.{location}.LHZ" in result.stderr
+    assert not (tmp_path / "store").exists()
+
+
+def test_options_of_waveform_files_are_not_for_recordings(folder: Path, tmp_path: Path) -> None:
+    result = huddle(folder, "--store", tmp_path / "store", "--group", "LAB=XX.*", "--net", "XX")
+    assert result.exit_code == 2
+    assert "--net, --group: for waveform files" in result.stderr
+
+
+def test_damage_in_a_file_is_named_and_the_day_is_taken(tmp_path: Path) -> None:
+    root = tmp_path / "sds"
+    write_station(root, days=0.5)
+    path = append(root, "ABC", "10", 20_454 * 86400 * 10**9, np.arange(3, dtype=np.int32))
+    content = bytearray(path.read_bytes())
+    content[2048:2056] = b"\xff" * 8
+    path.write_bytes(content)
+    result = huddle(f"sds://{root}", "--store", tmp_path / "store", *DAYS)
+    assert result.exit_code == 3
+    assert f"XX.ABC 2026-01-01: {path}" in " ".join(result.stderr.split())
+    assert "Noise by day" in result.stdout
+
+
+@pytest.mark.long
+def test_days_of_stations_survive_kills_of_the_command(sds: Path, tmp_path: Path) -> None:
+    whole, store = tmp_path / "whole", tmp_path / "store"
+    assert huddle(f"sds://{sds}", "--store", whole, *DAYS).exit_code == 0
+    command = [*python_command("tui"), "archive", f"sds://{sds}", "--store", str(store), *DAYS]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen([*command, "--jobs", "2"], **quiet) as process:  # type: ignore[call-overload]
+        wait_until(lambda: any(store.glob("*/*/*.h5")), "the first day in the archive")
+        process.send_signal(signal.SIGKILL)
+    result = huddle(f"sds://{sds}", "--store", store, "--jobs", "2")
+    assert result.exit_code == 0, result.output
+    assert "0 days to take" not in result.stderr
+    for name in ("XX.ABC", "XX.DEF"):
+        assert_same(Store.open(store / name), Store.open(whole / name))  # type: ignore[arg-type]  # there are

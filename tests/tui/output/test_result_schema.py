@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 import huddle
 from daq.bench.estimate_settings import table_keys
 from tests.tui.night_recording import HOSTILE, record
+from tests.tui.thinned import thinned
 from tui.commands.main import app
 from tui.output.json_document import SCHEMA_VERSION
 
@@ -93,8 +94,18 @@ def test_the_schema_refuses_what_is_wrong(written: Written) -> None:
     assert not validator.is_valid(bare)
 
 
+@pytest.mark.parametrize("wrong", ["nan", [1.0], True])
+def test_one_wrong_number_of_many_is_refused(written: Written, wrong: object) -> None:
+    """Also of an array that was thinned."""
+    channel = copy.deepcopy(written.document["channels"][0])
+    numbers = next(each for each in channel.values() if isinstance(each, list) and len(each) > 20)
+    numbers[17] = wrong
+    document = written.document | {"channels": [channel]}
+    assert not Draft202012Validator(strict(SCHEMA)).is_valid(thinned(document))
+
+
 def test_one_method_with_limits_gaps_and_noise_parameters(written: Written) -> None:
-    Draft202012Validator(strict(SCHEMA)).validate(written.document)
+    Draft202012Validator(strict(SCHEMA)).validate(thinned(written.document))
     assert written.document["method"] == "maximum-likelihood"  # four sensors leave room
     assert written.document["verdict"] == "not-decided"
     assert len(written.document["noise_parameters"]) == 8
@@ -102,7 +113,7 @@ def test_one_method_with_limits_gaps_and_noise_parameters(written: Written) -> N
 
 def test_several_methods(written: Written) -> None:
     document = estimated(written.recording, "--method", "all", "--octaves", "--dimension", "auto")
-    Draft202012Validator(strict(SCHEMA)).validate(document)
+    Draft202012Validator(strict(SCHEMA)).validate(thinned(document))
     methods = [each["method"] for each in document["results"]]
     assert document["settings"]["method"] == methods
     assert {each["method"] for each in document["band_means"]} == set(methods)
@@ -113,7 +124,7 @@ def test_arrays_have_no_recording() -> None:
     model = huddle.simulate("fig9", duration="1min")
     document = huddle.self_noise(model, fs=model.fs, segment="2s").to_dict()
     found = json.loads(json.dumps(document, default=str))
-    Draft202012Validator(strict(SCHEMA)).validate(found)
+    Draft202012Validator(strict(SCHEMA)).validate(thinned(found))
     assert found["run_id"] is None
     assert found["recordings"] == []
 
@@ -162,7 +173,7 @@ def test_band_means_are_those_of_the_table(written: Written) -> None:
 def test_a_growing_recording_has_no_checksum(tmp_path: Path) -> None:
     recording, found = tmp_path / "live.h5", []
     record(recording, before_end=lambda: found.append(estimated(recording)))
-    Draft202012Validator(strict(SCHEMA)).validate(found[0])
+    Draft202012Validator(strict(SCHEMA)).validate(thinned(found[0]))
     assert found[0]["recordings"][0]["sha256"] is None
     assert found[0]["recordings"][0]["state"] == "growing"
 

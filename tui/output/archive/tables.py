@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 from rich.text import Text
@@ -16,7 +16,7 @@ from tui.wording.facts import worded
 from tui.wording.formatting import percent, several, signed, span
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from daq.archive.answers import Answer
     from daq.archive.changes import Interval, Segment
@@ -28,6 +28,26 @@ LARGE = 8
 def day_text(utc_ns: int) -> str:
     """Return the date of an instant."""
     return f"{datetime.fromtimestamp(utc_ns / 1e9, UTC):%Y-%m-%d}"
+
+
+def stations_table(found: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Return a line for each station, of its summary (`daq.archive.task`)."""
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for name in ("station", "channels", "days", "from", "to", "band", "noise (dB)", "changes"):
+        table.add_column(name, justify="right" if name in {"channels", "days"} else "left")
+    for name, each in found.items():
+        low, high = each["lowest_db"], each["highest_db"]
+        table.add_row(
+            name,
+            str(each["n_channels"]),
+            str(each["n_days"]),
+            day_text(each["first_day_ns"]),
+            day_text(each["last_day_ns"]),
+            span(*each["band_hz"]),
+            "?" if low is None else f"{low:+.1f} to {high:+.1f} re 1 ({each['unit']})²/Hz",
+            several(each["n_changed"], "channel") if each["n_changed"] else "none",
+        )
+    return table
 
 
 def course_title(answer: Answer) -> Text:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.dates import AutoDateLocator
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
@@ -242,7 +243,7 @@ def _draw_spectrogram(axes: Axes, answer: Answer, column: int) -> QuadMesh:
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
-    _date_axis(axes)
+    _date_axis(axes, days)
     return image
 
 
@@ -263,13 +264,15 @@ def _draw_days(axes: Axes, answer: Answer, column: int) -> None:
         slope = segment.drift.value
         slope = slope if np.isfinite(slope) else 0.0
         line = middle + slope / DAYS_PER_YEAR * (own - own.mean())
-        axes.plot(own, line, color=drawing.INK, lw=0.7, label="mean and drift of a segment")
+        axes.plot(
+            own, line, color=drawing.INK, lw=0.9, zorder=4, label="mean and drift of a segment"
+        )
         if number:
             axes.axvline(
                 own[0], color=drawing.LIMIT, lw=0.9, dashes=(4, 1.5),
                 label="change beyond uncertainty",
             )  # fmt: skip
-    _date_axis(axes)
+    _date_axis(axes, days)
     axes.yaxis.set_major_locator(MaxNLocator(nbins=5))
     axes.yaxis.set_major_formatter(
         FuncFormatter(lambda value, _: f"{value:.3f}".rstrip("0").rstrip(".").replace("-", "−"))
@@ -280,9 +283,17 @@ def _draw_days(axes: Axes, answer: Answer, column: int) -> None:
         axes.set_yticks([])
 
 
-def _date_axis(axes: Axes) -> None:
-    axes.xaxis.set_major_locator(MaxNLocator(nbins=3, integer=True))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda day, _: day_text(int(day * DAY_NS))))
+def _date_axis(axes: Axes, days: NDArray[Any]) -> None:
+    """Label dates: years where there are three, months where there are three, or else days."""
+    n_days = float(days[-1] - days[0])
+    fewest = next((n for n in (3 * 366, 3 * 31) if n_days > n), 0)
+    if not fewest:
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=3, integer=True))
+    else:
+        locator = AutoDateLocator(minticks=3, maxticks=5)  # type: ignore[no-untyped-call]
+        axes.xaxis.set_major_locator(locator)
+    kept = {3 * 366: 4, 3 * 31: 7, 0: None}[fewest]
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda day, _: day_text(int(day * DAY_NS))[:kept]))
 
 
 def _figure(answer: Answer, width: float, height: float) -> Figure:

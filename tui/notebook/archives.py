@@ -1,0 +1,348 @@
+"""Archives as ``huddle archive`` makes them: of recordings, or of waveform files by station."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, Unpack, overload
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
+
+from daq.archive import stations
+from daq.archive.answers import FALSE_ALARM, answer
+from daq.archive.execution import begun, carried_out, failure_of, tasks_of
+from daq.archive.plan import STRETCHES
+from daq.archive.sources import are_waveforms, folder_for, recordings_in, sort
+from daq.archive.store import Store
+from daq.archive.waveforms import Contents, Reading, stations_in
+from daq.errors import ArchiveError, WrongSettingError
+from daq.estimation.settings import Settings, check_fit
+from daq.formats.sources import Selection
+from daq.recording.reader import Recording
+from tui.notebook.estimates import PathLike, response_sources
+from tui.notebook.options import called, changes_of, settings_of
+from tui.notebook.recording import nanoseconds
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+    from datetime import datetime
+
+    from daq.archive.answers import Answer
+    from daq.archive.task import Outcome, Task
+    from daq.formats.channel_runs import Overlap
+    from tui.notebook.options import EstimateOptions
+
+
+class StationAnswers(Mapping[str, "Answer"]):
+    """Answers of archives of stations, by name; each is made when it is asked for.
+
+    Attributes
+    ----------
+    problems : tuple of str
+        What could not be taken or read of all stations.
+    """
+
+    def __init__(self, kept: Mapping[str, _Kept], problems: Sequence[str]) -> None:
+        self._kept = dict(sorted(kept.items()))
+        self.problems = tuple(problems)
+
+    def __getitem__(self, station: str) -> Answer:
+        return self._kept[station].answer()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._kept)
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def __repr__(self) -> str:
+        return f"<answers of {len(self)} stations: {' '.join(self)}>"
+
+
+class _Kept:
+    """An archive, and how it is asked."""
+
+    def __init__(self, store: Store, settings: Settings, zone: ZoneInfo, rate: float) -> None:
+        self._store, self._settings, self._zone, self._rate = store, settings, zone, rate
+
+    def answer(self, failures: Sequence[str] = ()) -> Answer:
+        entries, bad = self._store.entries()
+        found = answer(
+            self._store, entries, self._settings, zone=self._zone, false_alarm=self._rate
+        )
+        return replace(found, problems=(*failures, *bad, *found.problems))
+
+
+@overload
+def archive(
+    *sources: PathLike,
+    store: PathLike | None = None,
+    stretch: str | None = None,
+    jobs: int = 1,
+    time_zone: str = "UTC",
+    false_alarm: float = FALSE_ALARM,
+    response: object = None,
+    channels: Sequence[str] = (),
+    groups: Mapping[str, str] | None = None,
+    start: str | datetime | None = None,
+    end: str | datetime | None = None,
+    file_overlap: Overlap = "refuse",
+    by_station: Literal[False] = False,
+    **options: Unpack[EstimateOptions],
+) -> Answer: ...
+
+
+@overload
+def archive(
+    *sources: PathLike,
+    store: PathLike | None = None,
+    stretch: str | None = None,
+    jobs: int = 1,
+    time_zone: str = "UTC",
+    false_alarm: float = FALSE_ALARM,
+    response: object = None,
+    channels: Sequence[str] = (),
+    groups: Mapping[str, str] | None = None,
+    start: str | datetime | None = None,
+    end: str | datetime | None = None,
+    file_overlap: Overlap = "refuse",
+    by_station: Literal[True],
+    **options: Unpack[EstimateOptions],
+) -> StationAnswers: ...
+
+
+def archive(
+    *sources: PathLike,
+    store: PathLike | None = None,
+    stretch: str | None = None,
+    jobs: int = 1,
+    time_zone: str = "UTC",
+    false_alarm: float = FALSE_ALARM,
+    response: object = None,
+    channels: Sequence[str] = (),
+    groups: Mapping[str, str] | None = None,
+    start: str | datetime | None = None,
+    end: str | datetime | None = None,
+    file_overlap: Overlap = "refuse",
+    by_station: bool = False,
+    **options: Unpack[EstimateOptions],
+) -> Answer | StationAnswers:
+    """Add what is new to an archive and return its answers, as ``huddle archive`` does.
+
+    Parameters
+    ----------
+    *sources : path
+        Recordings, or folders of them; or miniSEED files, folders of these, and ``sds://ROOT``.
+        None to ask an archive without adding any.
+    store : path, optional
+        Folder of the archive; beside the first source, if not given.
+    stretch : str, optional
+        Time whose spectra are kept together: ``"hour"`` (default) or ``"day"``.
+    jobs : int
+        Processes.
+    time_zone : str
+        Of working hours and nights, such as ``"Europe/London"``.
+    false_alarm : float
+        Probability of a change that is none, in the whole archive.
+    response : path, sequence or mapping of them, optional
+        RESP or StationXML of waveform files, or folders of them; as a mapping, patterns of channels
+        with the file of their response.
+    channels : sequence of str, optional
+        Patterns of channels of waveform files, such as ``"XX.ABC.*.HH?"``.
+    groups : mapping of str to str, optional
+        Names of groups with patterns of ``NET.STA.LOC``: sensors of several stations that stand
+        together.
+    start, end : str or datetime, optional
+        UTC; the days of waveform files that this span touches are taken whole.
+    file_overlap : str
+        Which samples count where waveform files overlap and differ: ``"first"`` or ``"last"``;
+        refused by default.
+    by_station : bool
+        Whether to return the answers of all stations of waveform files, by name.
+    **options
+        Options of the estimate: those of `huddle.estimate`.
+
+    Returns
+    -------
+    Answer or mapping of str to Answer
+        Noise of all recordings together (`pooled`), by day (`levels`), its drift, changes and
+        probability density; `problems` lists what could not be read. By station, each answer is
+        made when it is asked for, and the mapping has the `problems` of all.
+
+    Raises
+    ------
+    HuddleError
+        If there is nothing to answer from, options need other spectra than the archive has, or
+        there are several stations and not `by_station`.
+
+    Examples
+    --------
+    Noise of each station of an SDS archive over all of its days::
+
+        found = huddle.archive(
+            "sds:///data/sds", response="stations.xml", store="archive", by_station=True
+        )
+        {name: each.levels.mean[:, 0] for name, each in found.items()}
+    """
+    if stretch not in {None, *STRETCHES}:
+        raise WrongSettingError(f"stretch={stretch!r}: expected one of {', '.join(STRETCHES)}")
+    try:
+        zone = ZoneInfo(time_zone)
+    except (ZoneInfoNotFoundError, ValueError):
+        raise WrongSettingError(
+            f"time_zone={time_zone!r}: expected a name such as Europe/London"
+        ) from None
+    given = [os.fspath(each) for each in sources]
+    folder = folder_for(given) if store is None else Path(store)
+    filling = _Filling(folder, changes_of(options), options, stretch, jobs)
+    if are_waveforms(given):
+        selection = Selection(
+            tuple(channels), nanoseconds("start", start), nanoseconds("end", end), file_overlap
+        )
+        stores, failures = filling.by_days(
+            given, selection, _reading(response, file_overlap), groups or {}, several=by_station
+        )
+    else:
+        of_files = {"response": response, "channels": channels, "groups": groups}
+        of_files |= {"start": start, "end": end}
+        wrong = [name for name, value in of_files.items() if value]
+        if wrong:
+            raise WrongSettingError(
+                f"{', '.join(wrong)}: for waveform files, such as sds://ROOT; the sources are"
+                " recordings"
+            )
+        stores, failures = filling.by_recordings([Path(each) for each in given])
+    kept = {
+        name: _Kept(each, each.plan.changed(filling.wanted, stretch), zone, false_alarm)
+        for name, each in stores.items()
+    }
+    if by_station:
+        return StationAnswers(kept, failures)
+    _check_one(kept)
+    return kept.popitem()[1].answer(failures)
+
+
+def _check_one(names: Iterable[str]) -> None:
+    found = sorted(names)
+    if len(found) != 1:
+        raise WrongSettingError(
+            f"{len(found)} stations: {' '.join(found)}; expected one, by channels= such as"
+            f" '{found[0]}.*', or by_station=True, which returns the answers of all"
+        )
+
+
+def _reading(response: object, overlap: Overlap) -> Reading:
+    some, assigned = response_sources(response)
+    for each in (*some, *(path for _, path in assigned)):
+        if not isinstance(each, Path):
+            raise WrongSettingError(
+                f"response of type {type(each).__name__}; expected a path: processes that take"
+                " days read the file"
+            )
+    return Reading(
+        tuple(str(each.resolve()) for each in some),
+        tuple((pattern, str(path.resolve())) for pattern, path in assigned),
+        overlap,
+    )
+
+
+class _Filling:
+    """Adds what is new to the archive, or archives, in a folder."""
+
+    def __init__(
+        self,
+        folder: Path,
+        wanted: Mapping[str, object],
+        options: EstimateOptions,
+        stretch: str | None,
+        jobs: int,
+    ) -> None:
+        self._folder, self._options, self._stretch, self._jobs = folder, options, stretch, jobs
+        self.wanted = wanted
+
+    def by_recordings(self, given: Sequence[Path]) -> tuple[dict[str, Store], list[str]]:
+        """Take new recordings; returns the archive by its name, and what failed."""
+        paths, folder = recordings_in(given, leave_out=self._folder), self._folder
+        kept = Store.open(folder)
+        if kept is None and not paths:
+            inside = stations.archives_in(folder)
+            found = {each.name: store for each in inside if (store := Store.open(each))}
+            if found:
+                return found, []
+        kept = kept or begun(
+            folder,
+            paths,
+            self._stretch,
+            self._settings_for,
+            lambda plan: plan.changed(self.wanted, self._stretch),
+        )
+        kept.plan.changed(self.wanted, self._stretch)
+        failures: list[str] = []
+        if paths:
+            with kept.writing():
+                new = sort(paths, kept.entries()[0])
+                failures += new.failures
+                failures += filter(None, map(failure_of, self._run(tasks_of(kept, new.new))))
+        return {folder.resolve().name: kept}, failures
+
+    def by_days(
+        self,
+        given: Sequence[str],
+        selection: Selection,
+        reading: Reading,
+        groups: Mapping[str, str],
+        *,
+        several: bool,
+    ) -> tuple[dict[str, Store], list[str]]:
+        """Take new days of waveform files; returns archives of stations, and what failed."""
+        settings = settings_of(Settings(), self._options)
+        known = Contents(self._folder)
+        found = stations_in(
+            given, selection, groups=list(groups.items()), known=known, segment=settings.segment
+        )
+        if not found.stations:
+            raise ArchiveError(
+                "\n".join(found.problems)
+                or (
+                    f"one sensor each: {' '.join(found.alone)}; expected two or more that stand"
+                    " together: groups= joins those of several stations"
+                    if found.alone
+                    else "no miniSEED files found for these channels and times"
+                )
+            )
+        if not several:
+            _check_one(station.name for station in found.stations)
+        stations.check_responses(found.stations, reading)
+        stores, failures = stations.begun(
+            self._folder,
+            found.stations,
+            settings,
+            self._stretch or "hour",
+            reading=reading,
+            run=self._run,
+            check=lambda plan: plan.changed(self.wanted, self._stretch),
+        )
+        failures = [*found.problems, *failures]
+        if not stores:
+            raise ArchiveError("\n".join(failures))
+        known.save()
+        with ExitStack() as stack:
+            for each in stores.values():
+                stack.enter_context(each.writing())
+            new = stations.work(found.stations, stores, reading)
+            failures += new.failures
+            for outcome in self._run(new.tasks(stores, reading)):
+                failures += [f"{outcome.source}: {problem}" for problem in outcome.problems]
+                failures += filter(None, [failure_of(outcome)])
+        return stores, failures
+
+    def _run(self, tasks: Iterable[Task]) -> Iterator[Outcome]:
+        return carried_out(tasks, jobs=self._jobs)
+
+    def _settings_for(self, path: Path) -> Settings:
+        with Recording.open(path) as recording:
+            settings = settings_of(Settings.of(recording.bench), self._options)
+            check_fit(settings, recording.sensors, called=called)
+            return settings
