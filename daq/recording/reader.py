@@ -337,8 +337,7 @@ def control_address(path: str | Path) -> tuple[int, str] | None:
     superblock = Superblock.of(path)
     if not is_being_written(path):
         trial.tried(path)
-    source = source_of(path, superblock)
-    with damage_named(path), h5py.File(source, "r") as file:
+    with damage_named(path), h5py.File(source_of(path, superblock), "r") as file:
         check_format(path, file)
         committed = dataset(file, "committed", np.dtype("<i8"))
         if committed[-1, file_format.CLOSED] or "control_port" not in file.attrs:

@@ -371,11 +371,15 @@ def main() -> None:
     task, *paths = sys.argv[1:]
     _print_progress()
     for path in map(Path, paths):
-        try:
-            found = _opened(path) if task == "open" else _verified(path)
-        except (HuddleError, OSError) as error:
-            found = {"error": str(error)}
-        print(json.dumps(found), flush=True)
+        print(json.dumps(found_in(path, task)), flush=True)
+
+
+def found_in(path: Path, task: str) -> dict[str, Any]:
+    """Return what a task finds in a file that may hold this process up."""
+    try:
+        return _opened(path) if task == "open" else _verified(path)
+    except (HuddleError, OSError) as error:
+        return {"error": str(error)}
 
 
 def _opened(path: Path) -> dict[str, Any]:

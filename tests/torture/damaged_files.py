@@ -8,6 +8,7 @@ little. Files whose outcome is a fault are kept in FOLDER.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import itertools
 import logging
@@ -49,7 +50,23 @@ _FILES = 200
 
 
 def make_recording(path: Path, names: str = "ab") -> None:
-    """Write a closed recording that has something of everything; sensor b is polled."""
+    """Write a closed recording that has something of everything; sensor b is polled.
+
+    All of the same sensors are the same bytes: most tests of files begin with one.
+    """
+    path.write_bytes(_recording(names))
+
+
+@functools.cache
+def _recording(names: str) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "made.h5"
+        write_recording(path, names)
+        return path.read_bytes()
+
+
+def write_recording(path: Path, names: str = "ab") -> None:
+    """Write that recording as a recorder does, of a run of its own."""
     rng = np.random.default_rng(1)
     channels = tuple(Channel(name=name, sensitivity=1e6) for name in "xyz")
     sensors = [

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("kind", "n"), [("bits", 80), ("blocks", 80), ("heaps", 20), ("sectors", 80)]
+    ("kind", "n"), [("bits", 50), ("blocks", 50), ("heaps", 15), ("sectors", 50)]
 )
 def test_no_change_is_taken_for_data_or_stops_the_reader(tmp_path: Path, kind: str, n: int) -> None:
     whole = tmp_path / "whole.h5"

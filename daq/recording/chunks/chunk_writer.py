@@ -74,11 +74,13 @@ class TableBuffer:
         self.written = b""
         if not self._waiting:
             return
-        rows = np.concatenate(self._waiting)
+        # np.concatenate would look for a common type of each two rows.
+        content = b"".join(row.tobytes() for row in self._waiting)
+        rows = np.frombuffer(content, self._waiting[0].dtype)
         repeated(lambda: self._rows.extend(self.n_rows + len(rows)))
         repeated(lambda: self._rows.write(self.n_rows, rows))
         self.n_rows += len(rows)
-        self.written = rows.tobytes()
+        self.written = content
         self.sha256.update(self.written)
         self._waiting.clear()
 
@@ -169,7 +171,7 @@ class ChunkBuffer:
             report(error)
             repeated(self.write_again)
         self.n_written += len(rows)
-        self.sha256.update(np.ascontiguousarray(rows, self.dataset.dtype).data)
+        self.sha256.update(np.ascontiguousarray(rows, self._buffer.dtype).data)
 
     def _store(self, rows: NDArray[Any]) -> None:
         """Write rows as chunks, which HDF5 takes as they are; the last is filled up with zeros."""

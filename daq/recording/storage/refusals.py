@@ -7,6 +7,7 @@ follow a link, open another file, load a filter, or allocate more memory than th
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 from typing import TYPE_CHECKING, Any
 
@@ -41,15 +42,20 @@ def damage_named(path: Path) -> Iterator[None]:
 
 def member(group: h5py.Group, name: str) -> Any:  # noqa: ANN401 - h5py is untyped
     """Return a group or dataset stored in the file itself."""
-    where = f"{group.file.filename}: {group.name.rstrip('/')}/{name}"
     if "/" in name or name in {"", ".", ".."}:
-        raise NotARecordingError(f"{where}: not a name")
+        raise NotARecordingError(f"{_place(group, name)}: not a name")
     link = group.get(name, getlink=True)
     if link is None:
         raise KeyError(f"{group.name.rstrip('/')}/{name} is missing")
     if not isinstance(link, h5py.HardLink):
-        raise NotARecordingError(f"{where}: a link; a recording has none, and it is not followed")
+        raise NotARecordingError(
+            f"{_place(group, name)}: a link; a recording has none, and it is not followed"
+        )
     return group[name]
+
+
+def _place(group: h5py.Group, name: str) -> str:
+    return f"{group.file.filename}: {group.name.rstrip('/')}/{name}"
 
 
 def dataset(group: h5py.Group, name: str, dtype: np.dtype[Any] | None = None) -> h5py.Dataset:
@@ -62,25 +68,30 @@ def dataset(group: h5py.Group, name: str, dtype: np.dtype[Any] | None = None) ->
         longer than the file can hold.
     """
     found = member(group, name)
-    where = f"{group.file.filename}: {group.name.rstrip('/')}/{name}"
     if not isinstance(found, h5py.Dataset):
-        raise NotARecordingError(f"{where}: not a dataset")
-    created = found.id.get_create_plist()
-    if created.get_external_count() or found.is_virtual:
-        raise NotARecordingError(f"{where}: stored in other files; they are not opened")
-    filters = {created.get_filter(number)[0] for number in range(created.get_nfilters())}
-    if not filters <= _FILTERS:
-        raise NotARecordingError(f"{where}: filters {sorted(filters)}; expected gzip")
-    found_type = found.dtype
-    kinds = {found_type[n].kind for n in found_type.names} if found_type.names else found_type.kind
-    if found_type.hasobject or not set(kinds) <= set("iufS"):
-        raise NotARecordingError(f"{where}: of type {found_type}; expected numbers")
-    if dtype is not None and found_type != dtype:
-        raise NotARecordingError(f"{where}: of type {found_type}; expected {dtype}")
-    if found.chunks and np.prod(found.chunks, dtype=float) * found_type.itemsize > MAX_CHUNK:
-        raise NotARecordingError(f"{where}: chunks of shape {found.chunks}; expected smaller ones")
+        raise NotARecordingError(f"{_place(group, name)}: not a dataset")
+    if fault := _fault(found, dtype):
+        raise NotARecordingError(f"{_place(group, name)}: {fault}")
     check_length(found)
     return found
+
+
+def _fault(found: h5py.Dataset, dtype: np.dtype[Any] | None) -> str:
+    created = found.id.get_create_plist()
+    if created.get_external_count() or found.is_virtual:
+        return "stored in other files; they are not opened"
+    filters = {created.get_filter(number)[0] for number in range(created.get_nfilters())}
+    if not filters <= _FILTERS:
+        return f"filters {sorted(filters)}; expected gzip"
+    found_type, chunks = found.dtype, found.chunks
+    kinds = {found_type[n].kind for n in found_type.names} if found_type.names else found_type.kind
+    if found_type.hasobject or not set(kinds) <= set("iufS"):
+        return f"of type {found_type}; expected numbers"
+    if dtype is not None and found_type != dtype:
+        return f"of type {found_type}; expected {dtype}"
+    if chunks and math.prod(chunks) * found_type.itemsize > MAX_CHUNK:
+        return f"chunks of shape {chunks}; expected smaller ones"
+    return ""
 
 
 def check_length(found: h5py.Dataset) -> None:
@@ -91,12 +102,13 @@ def check_length(found: h5py.Dataset) -> None:
     NotARecordingError
         If it is longer than its file can hold.
     """
-    n_bytes = float(np.prod(found.shape, dtype=float)) * found.dtype.itemsize
+    size, chunks = found.dtype.itemsize, found.chunks
+    n_bytes = math.prod(found.shape) * size
+    of_chunk = math.prod(chunks) * size if chunks else 0
+    if n_bytes <= of_chunk:  # of most tables
+        return
     held = _n_bytes(found.file)
-    room = held * (_MAX_INFLATION if found.compression else 1)
-    if found.chunks:
-        room += float(np.prod(found.chunks, dtype=float)) * found.dtype.itemsize
-    if n_bytes > room:
+    if n_bytes > held * (_MAX_INFLATION if found.compression else 1) + of_chunk:
         raise NotARecordingError(
             f"{found.file.filename}: {found.name}: {found.shape[0]} rows, more than a file of"
             f" {held} bytes can hold"

@@ -104,7 +104,9 @@ def make(path: Path, n_rows: int = 250) -> np.ndarray[tuple[int, int], np.dtype[
     return counts
 
 
-@pytest.mark.parametrize("n_lines", [3, 12, 31])
+@pytest.mark.parametrize(
+    "n_lines", [12, *(pytest.param(n, marks=pytest.mark.long) for n in (3, 31))]
+)
 def test_a_kill_loses_no_acknowledged_rows(tmp_path: Path, n_lines: int) -> None:
     path = tmp_path / "r.h5"
     acknowledged = killed(path, n_lines)

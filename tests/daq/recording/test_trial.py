@@ -14,11 +14,13 @@ from daq.recording.reader import Recording, control_address
 from daq.recording.repair import repair, verify
 from daq.recording.storage import trial
 from tests.daq.recording.version_1 import with_heap_loop
-from tests.torture.damaged_files import make_recording
+from tests.torture.damaged_files import make_recording, write_recording
 from tests.waiting import limit
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+pytestmark = pytest.mark.trial
 
 
 @pytest.fixture
@@ -71,7 +73,7 @@ def test_a_file_that_crashes_the_child_is_damaged(
 
 def test_a_file_is_tried_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, copy = tmp_path / "a.h5", tmp_path / "b.h5"
-    make_recording(path)
+    write_recording(path)
     shutil.copyfile(path, copy)
     Recording.open(copy).close()
     monkeypatch.setattr(trial, "_CHILD", "no.such.module")
