@@ -1,9 +1,10 @@
 """The estimate from the file: decompression, alignment, spectra, noise; diagnosis; the command.
 
-Three kinds of file: as the recorder leaves it, in chunks of one to two seconds; as it is imported,
-in chunks of 4096 rows, by one clock; and a real import from `.npz`, whose sensors have clocks of
-their own and stated times. Ratios are of processor times within one run, all threads and processes
-together. Notes give what no reader can save: inflating, and the imports.
+Files of three sensors: as the recorder leaves it, in chunks of one to two seconds; as it is
+imported, in chunks of 4096 rows, by one clock; and a real import from `.npz`, whose sensors have
+clocks of their own and stated times. Two files of more sensors show how cost grows with them, by
+the method that is the default for many sensors. Ratios are of processor times within one run, all
+threads and processes together. Notes give what no reader can save: inflating, and the imports.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from isal import isal_zlib
 from benchmarks.row import Row, least_work
 from daq.bench.channel import Channel
 from daq.clocks.resampling import resample
-from daq.estimation.estimation import Estimation, estimate
+from daq.estimation.estimation import MIN_SENSORS, Estimation, estimate
 from daq.estimation.settings import Settings
 from daq.protocols.block import HostTime
 from daq.recording.array_writer import BLOCK_ROWS, ArrayWriter
@@ -33,6 +34,7 @@ from daq.results.store import store_results
 
 RATE, LENGTH, HOURS = 200, 2000, 3
 SLOW_RATE, SLOW_LENGTH, SLOW_HOURS = 40, 400, 24
+FEW, MANY, MANY_RATE, MANY_HOURS = 8, 16, 100, 0.5
 REPEATS = 3
 ESTIMATE = (
     "rich.table, daq.estimation.estimation, tui.output.results, tui.output.diagnosis,"
@@ -41,6 +43,18 @@ ESTIMATE = (
 """Modules that ``huddle estimate`` imports when it runs."""
 SHORT = 0.05
 """Hours of the smallest form."""
+ALONE, ALONE_HOURS = 64, 0.5
+"""Sensors of one channel whose result is to take little memory, at `RATE`."""
+COMMAND_MEMORY = """
+import sys
+from benchmarks.row import peak_memory
+from tui.commands.main import main
+try:
+    main()
+except SystemExit:
+    pass
+print(peak_memory())
+"""
 MEMORY = """
 import sys
 from benchmarks.row import peak_memory
@@ -58,6 +72,8 @@ def run(*, smallest: bool = False) -> list[Row]:
         return [
             *_three_hours(Path(folder), SHORT if smallest else HOURS, repeats),
             *_a_day(Path(folder), SHORT if smallest else SLOW_HOURS, repeats),
+            *_many_sensors(Path(folder), SHORT if smallest else MANY_HOURS, repeats),
+            _memory_of_many(Path(folder), MIN_SENSORS if smallest else ALONE),
         ]
 
 
@@ -188,15 +204,61 @@ def _a_day(folder: Path, hours: float, repeats: int) -> list[Row]:
     return [*rows, Row(f"memory of an estimate, {hours:g} h", memory, "MB", at_most=250.0)]
 
 
+def _many_sensors(folder: Path, hours: float, repeats: int) -> list[Row]:
+    few, many = (
+        recorded_file(
+            folder / f"{number}.h5",
+            sensor_samples(hours, rate=MANY_RATE, ppm=(0.0,) * number),
+            rate=MANY_RATE,
+            ppm=(0.0,) * number,
+            chunk_rows=BLOCK_ROWS,
+        )
+        for number in (FEW, MANY)
+    )
+    of_few, of_many = least_work(
+        lambda: estimate([few], Settings()), lambda: estimate([many], Settings()), repeats=repeats
+    )
+    return [
+        Row(
+            f"{hours:g} h × {MANY_RATE} Hz, diagnosis included: {MANY} triaxial sensors against"
+            f" {FEW}",
+            of_many / of_few,
+            "×",
+            at_most=2.4,
+            note=f"{of_many:.2f} s",
+        )
+    ]
+
+
+def _memory_of_many(folder: Path, n_sensors: int) -> Row:
+    samples = sensor_samples(ALONE_HOURS if n_sensors == ALONE else SHORT, ppm=(0.0,) * n_sensors)
+    path = recorded_file(
+        folder / "alone.h5",
+        samples[:, ::3],
+        ppm=(0.0,) * n_sensors,
+        chunk_rows=BLOCK_ROWS,
+        axes="x",
+    )
+    memory = _run("-c", COMMAND_MEMORY, "estimate", str(path), "--json", f"{path}.json")
+    matrix = 16 * (LENGTH // 2 + 1) * n_sensors**2 / 1e6
+    return Row(
+        f"memory of the whole command, {n_sensors} sensors of one channel × {RATE} Hz",
+        float(memory.split()[-1]),
+        "MB",
+        at_most=500.0,
+        note=f"all cross-spectra alone take {matrix:.0f} MB",
+    )
+
+
 def sensor_samples(
     hours: float, *, rate: int = RATE, ppm: tuple[float, ...] = (0.0, 0.0, 0.0)
 ) -> np.ndarray:
-    """Three triaxial sensors on one white motion, in counts, each sampled by its own clock."""
+    """Triaxial sensors on one white motion, in counts, each sampled by its own clock."""
     rng = np.random.default_rng(0)
     n_samples = round(hours * 3600 * rate)
     motion = rng.standard_normal((n_samples, 3), dtype=np.float32)
-    samples = np.empty((n_samples, 9), dtype=np.int32)
-    for sensor in range(3):
+    samples = np.empty((n_samples, 3 * len(ppm)), dtype=np.int32)
+    for sensor in range(len(ppm)):
         turn = np.linalg.qr(rng.standard_normal((3, 3)))[0].astype(np.float32)
         felt = motion @ turn
         if ppm[sensor]:
@@ -213,18 +275,19 @@ def recorded_file(
     rate: int = RATE,
     ppm: tuple[float, ...] = (0.0, 0.0, 0.0),
     chunk_rows: int | None = None,
+    axes: str = "xyz",
 ) -> Path:
-    """Write the samples as a recording of three sensors, by one clock or by three."""
+    """Write the samples as a recording of sensors of these axes, by one clock or by one each."""
     shared = len(set(ppm)) == 1
     layouts = [
         SensorLayout(
             name,
-            tuple(Channel(name=axis, sensitivity=1e5) for axis in "xyz"),
+            tuple(Channel(name=axis, sensitivity=1e5) for axis in axes),
             float(rate),
             np.dtype(np.int32),
             clock="one" if shared else name,
         )
-        for name in "abc"
+        for name in (f"s{number:02}" for number in range(len(ppm)))
     ]
     created = HostTime(10**12, 1_790_000_000 * 10**9)
     seconds = 1.0 if chunk_rows is None else chunk_rows / rate
@@ -237,7 +300,7 @@ def recorded_file(
             delays = np.random.default_rng(0 if shared else number).exponential(1e-3, len(begins))
             writer.samples(
                 layout.name,
-                samples[: len(begins) * length, 3 * number : 3 * number + 3],
+                samples[: len(begins) * length, len(axes) * number : len(axes) * (number + 1)],
                 block_rows=length,
                 received_ns=[
                     round(((first + length - 1) / own_rate + delay) * 1e9)

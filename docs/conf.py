@@ -36,6 +36,7 @@ html_show_sourcelink = False
 html_extra_path = [
     "../tui/resources/result-2.schema.json",
     "../tui/resources/archive-2.schema.json",
+    "../tui/resources/archive-stations-1.schema.json",
 ]
 
 default_role = "py:obj"

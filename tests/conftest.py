@@ -12,18 +12,20 @@ import signal
 import sys
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import HealthCheck, settings
 
+from daq.recording import repair
+from daq.recording.storage import trial
 from tests import devices
 from tests.devices import device_loop
 from tests.virtual_time import VirtualTimeLoop
 from tests.waiting import limit
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Generator, Iterator
+    from collections.abc import Awaitable, Callable, Generator, Iterator, Sequence
 
 USGS_RECORDING = "usgs-tst-huddle"
 FIRST = (
@@ -38,29 +40,32 @@ FIRST = (
 )
 """Modules that take longest: with the others behind them, all workers end at the same time."""
 
+GARBAGE = (20_000, 20, 20)
+"""Objects, and collections of younger ones, between two collections."""
 
-def _open_descriptors() -> dict[int, str]:
+
+def _open_descriptors() -> dict[str, str]:
     """Descriptors of sockets, pseudo-terminals and regular files of this process, by number."""
-    links: dict[int, str] = {}
-    folder = Path("/proc/self/fd")
-    if not folder.exists():  # not Linux: threads and children are still watched
-        return links
-    for entry in folder.iterdir():
-        try:
-            target = str(entry.readlink())
-        except OSError:  # closed between listing and looking
-            continue
-        if target.startswith(("socket:", "/dev/pt")) or target.endswith(".h5"):
-            links[int(entry.name)] = target
+    links: dict[str, str] = {}
+    with contextlib.suppress(FileNotFoundError):  # not Linux: threads and children are watched
+        for number in os.listdir("/proc/self/fd"):  # noqa: PTH208 - for every test: as fast as can
+            try:
+                target = os.readlink(f"/proc/self/fd/{number}")  # noqa: PTH115
+            except OSError:  # closed between listing and looking
+                continue
+            if target.startswith(("socket:", "/dev/pt")) or target.endswith(".h5"):
+                links[number] = target
     return links
 
 
 def _children() -> set[str]:
     """Process numbers of this process's children, ended but unreaped ones included."""
     found: set[str] = set()
-    for children in Path("/proc/self/task").glob("*/children"):
-        with contextlib.suppress(OSError):  # a thread that ended between listing and looking
-            found.update(children.read_text().split())
+    with contextlib.suppress(FileNotFoundError):  # not Linux
+        for thread in os.listdir("/proc/self/task"):  # noqa: PTH208
+            # A thread may end between listing and looking.
+            with contextlib.suppress(OSError), open(f"/proc/self/task/{thread}/children") as of:  # noqa: PTH123
+                found.update(of.read().split())
     return found
 
 
@@ -86,6 +91,24 @@ def nothing_left_behind() -> Iterator[None]:
     opened = {n: t for n, t in _open_descriptors().items() if descriptors.get(n) != t}
     if opened:
         pytest.fail(f"descriptors left open: {opened}")
+
+
+@pytest.fixture(autouse=True)
+def files_read_at_once(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Open and verify files in this process alone: a child before takes longer than most tests.
+
+    Tests of this child are marked ``trial``, and children of tests have theirs. What a test makes
+    of a file does not hold HDF5 up; if it did, the time limit would end the test.
+    """
+    if not request.node.get_closest_marker("trial"):
+        monkeypatch.setattr(trial, "tried", lambda _: None)
+        monkeypatch.setattr(trial, "_trials", _trials_here)
+        monkeypatch.setattr(repair, "_print_progress", lambda: None)
+
+
+def _trials_here(paths: Sequence[Path], task: str) -> Iterator[dict[str, Any]]:
+    for path in paths:
+        yield repair.found_in(path, task)
 
 
 def _leaving_no_task(test: Callable[..., Awaitable[None]]) -> Callable[..., Awaitable[None]]:
@@ -142,13 +165,16 @@ def pytest_sessionfinish() -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """Keep what was collected out of the garbage collector: a tenth of the time of all tests."""
+    """Keep what was collected out of the garbage collector, which then looks less often.
+
+    Each took a tenth of the time of all tests.
+    """
     gc.disable()
     try:
         return (yield)
     finally:
-        gc.collect()
-        gc.freeze()
+        gc.freeze()  # with its garbage: to find some 10 MB takes most of a second of each worker
+        gc.set_threshold(*GARBAGE)
         gc.enable()
 
 

@@ -32,6 +32,8 @@ MAX_UNREAD = 1 << 20
 """Number of unread bytes above which further units are lost."""
 LOOK_INTERVAL = 0.02
 """Interval of checks of a pseudo-terminal without a reader, s."""
+TURNS, TURN = 10, 0.005
+"""Looks, and s between them, at whether the client before has left, before another is refused."""
 
 
 class Listener(Protocol):
@@ -230,6 +232,11 @@ class TcpPort:
         self.address = f"{self._scheme}://127.0.0.1:{self._server.sockets[0].getsockname()[1]}"
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        for _ in range(
+            TURNS
+        ):  # a client that connects again may be accepted before its end is read
+            if self._writer is not None:
+                await asyncio.sleep(TURN)
         if self._writer is not None or self._down:
             writer.transport.abort()
             return

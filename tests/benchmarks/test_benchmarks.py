@@ -18,8 +18,10 @@ if TYPE_CHECKING:
 
     from benchmarks.row import Row
 
-OF_PROCESSES = {"application", "command_start", "estimate_file", "following", "recorder"}
-"""Benchmarks that run whole processes: they take long."""
+LONG = {"application", "command_start", "estimate_file", "following", "recorder"}
+"""Benchmarks that run whole processes."""
+LONG |= {"gaps", "likelihood", "resampler", "spectra"}
+"""Also those that take half a second and more."""
 NAMES = sorted(
     {module.name for module in pkgutil.iter_modules(benchmarks.__path__) if not module.ispkg}
 )
@@ -28,7 +30,7 @@ NAMES = sorted(
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.long if name in OF_PROCESSES else ())
+        pytest.param(name, marks=pytest.mark.long if name in LONG else ())
         for name in NAMES
         if name not in {"__main__", "row"}
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import shutil
 import subprocess
@@ -13,7 +14,7 @@ import pytest
 from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.devices.registry import driver_type
-from daq.protocols.block import Block
+from daq.protocols.block import Block, Event, EventKind
 from sim_devices.world.world import World
 from tests.devices import host_clock, serving
 from tests.peers.libmodbus import build, ready, running, serial_cable
@@ -124,6 +125,11 @@ def test_minimalmodbus_reads_our_slave(
 
 
 async def _polled(port: str, settings: dict[str, Any]) -> list[list[int]]:
+    """Return the rows of 100 requests, of which each was answered once.
+
+    Register 0 counts the requests. A busy computer may answer late: the driver asks again, and
+    says that the device stalled, once for several requests.
+    """
     sensor = Sensor(
         name="A",
         driver="registers",
@@ -133,12 +139,22 @@ async def _polled(port: str, settings: dict[str, Any]) -> list[list[int]]:
         channels=tuple(Channel(name=name, sensitivity=1.0) for name in ("n", "a", "b")),
     )
     rows: list[list[int]] = []
+    has_stalled = False
     async with driver_type("registers").open([sensor], host_clock()) as session:
         async for item in session.read():
-            assert isinstance(item, Block), item
-            rows += item.counts.tolist()
+            if isinstance(item, Block):
+                rows += item.counts.tolist()
+            else:
+                assert isinstance(item, Event), item
+                assert item.kind == EventKind.STALLED, item
+                has_stalled = True
             if len(rows) >= 100:
-                return rows
+                break
+    counts = [row[0] for row in rows]
+    assert len(counts) >= 100
+    assert all(before < after for before, after in itertools.pairwise(counts))
+    n_asked_again = counts[-1] - counts[0] - (len(counts) - 1)
+    assert n_asked_again == 0 or (has_stalled and n_asked_again < 10)
     return rows
 
 
@@ -148,8 +164,6 @@ async def test_our_driver_reads_a_libmodbus_server_over_tcp(peer: Path, function
         port = server.stdout.readline().strip() if server.stdout else ""
         settings = {"function": function, "addresses": [0, 7, 9], "device_id": 255}
         rows = await _polled(f"modbus-tcp://127.0.0.1:{port}", settings)
-    counts = [row[0] for row in rows]
-    assert counts == list(range(counts[0], counts[0] + len(rows)))  # every request once
     assert {tuple(row[1:]) for row in rows} == {(21, 27)}
 
 
@@ -159,6 +173,4 @@ async def test_our_driver_reads_a_libmodbus_server_over_rtu(peer: Path, tmp_path
         ready(str(peer), "serve", "rtu", theirs),
     ):
         rows = await _polled(ours, {"addresses": [0, 7, 9], "device_id": 5, "baud_rate": 115200})
-    counts = [row[0] for row in rows]
-    assert counts == list(range(counts[0], counts[0] + len(rows)))
     assert {tuple(row[1:]) for row in rows} == {(21, 27)}

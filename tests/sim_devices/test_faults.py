@@ -60,8 +60,8 @@ def test_samples_are_lost_or_counted_twice_without_the_counter_saying_so() -> No
     whole = np.concatenate([slipped.counts("A", k, 50) for k in range(0, 600, 50)])
     true = sound.counts("A", 0, 700)
     expected = [*range(200), *range(203, 400), *range(380, 400), *range(400, 583)]
-    np.testing.assert_array_equal(whole, true[expected])
-    np.testing.assert_array_equal(slipped.counts("A", 390, 20), whole[390:410])
+    np.testing.assert_allclose(whole, true[expected], rtol=1e-12)  # products of matrices
+    np.testing.assert_allclose(slipped.counts("A", 390, 20), whole[390:410], rtol=1e-12)
     times, true_times = slipped.times("A", 0, 600), sound.times("A", 0, 700)
     at = np.array(expected)
     at[397:417] = 399  # what is counted again comes at once

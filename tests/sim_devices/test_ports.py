@@ -13,7 +13,7 @@ import pytest
 
 from sim_devices.devices.interface import NEVER, Line
 from sim_devices.faults import LineFaults, parse
-from sim_devices.server.ports import PseudoTerminal
+from sim_devices.server.ports import PseudoTerminal, TcpPort
 from sim_devices.server.serve import Served, WorldClock
 
 if TYPE_CHECKING:
@@ -57,6 +57,43 @@ async def test_the_address_is_removed_before_the_terminal(monkeypatch: pytest.Mo
         patched.setattr("sim_devices.server.ports.os.close", watched)
         await line.close()
     assert not any(there)
+
+
+class _Echo(Deaf):
+    """A device that says what it hears."""
+
+    def __init__(self) -> None:
+        self.port = TcpPort(self, "tcp")
+        self.left = asyncio.Event()
+
+    def disconnected(self) -> None:
+        """Say that the client has left."""
+        self.left.set()
+
+    def received(self, data: bytes) -> None:
+        """Say it."""
+        self.port.send([data])
+
+
+async def test_a_client_that_connects_before_its_end_is_read_is_served() -> None:
+    echo = _Echo()
+    port = echo.port
+    await port.open()
+    number = int(port.address.rpartition(":")[2])
+    _, before = await asyncio.open_connection("127.0.0.1", number)
+    before.write(b"a")
+    reader, again = await asyncio.open_connection("127.0.0.1", number)
+    before.close()  # the server has accepted the other by now, or will in this turn
+    again.write(b"b")
+    assert await reader.read(1) == b"b"
+    other, refused = await asyncio.open_connection("127.0.0.1", number)
+    with contextlib.suppress(ConnectionError):
+        assert await other.read(1) == b""
+    echo.left.clear()
+    for writer in (again, refused):
+        writer.close()
+    await echo.left.wait()
+    await port.close()
 
 
 class _Flood:

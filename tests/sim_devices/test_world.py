@@ -73,8 +73,8 @@ def test_motion_and_noise_have_the_requested_psd_within_statistical_error() -> N
 
 def test_the_motion_ends_below_nyquist_and_noise_does_not() -> None:
     model = scenario({"A": {}, "N": {"noise": white(1.0), "gain": 0.0}})
-    frequency, moved, _ = csm(*World(model).samples("A", 0, 200_000).T)
-    _, noise, n = csm(*World(model).samples("N", 0, 200_000).T)
+    frequency, moved, _ = csm(World(model).samples("A", 0, 100_000)[:, 0])
+    _, noise, n = csm(World(model).samples("N", 0, 100_000)[:, 0])
     # the last hertz holds no more than what interpolation and the cosine's end leave
     assert np.all(moved[frequency > 99.9, 0, 0].real < 1e-3)
     near = noise[(frequency > 90) & (frequency < 99.8), 0, 0].real
@@ -84,7 +84,7 @@ def test_the_motion_ends_below_nyquist_and_noise_does_not() -> None:
 def test_cross_psd_follows_the_mixing_matrix() -> None:
     mixing = [[1.0, 0.0], [0.6, 0.8], [-0.5, 2.0]]
     model = scenario({"A": {}}, spectra=[white(1.0), white(2.0)], mixing=mixing)
-    frequency, matrix, n = csm(*World(model).samples("A", 0, 200_000).T)
+    frequency, matrix, n = csm(*World(model).samples("A", 0, 100_000).T)
     band = (frequency > 1) & (frequency < 85)
     wanted = np.array(mixing) @ np.diag([1.0, 2.0]) @ np.array(mixing).T
     error = np.sqrt(np.outer(np.diag(wanted), np.diag(wanted)) * 1.94 / (n * band.sum()))
@@ -97,7 +97,7 @@ def test_sensors_measure_one_motion_at_any_rate_and_clock() -> None:
         "B": {"sampling_rate": 333.0, "clock": {"offset": 0.123, "ppm": 40.0, "wander": 1.0}},
     }
     world = World(scenario(sensors))
-    times = np.random.default_rng(0).uniform(-300.0, 4000.0, 500)
+    times = np.random.default_rng(0).uniform(-300.0, 700.0, 500)
     assert np.array_equal(world.motion("A").at(times), world.motion("B").at(times))
     at_b = world.sample_times("B", 1_000_000, 300)
     assert np.array_equal(world.samples("B", 1_000_000, 300), world.motion("A").at(at_b))
@@ -178,7 +178,7 @@ def test_a_response_filters_the_motion() -> None:
     low_pass = {"poles": [[-corner, 0.0]], "normalised_at": 0.001}
     model = scenario({"A": {}, "B": {"response": low_pass}})
     frequency, matrix, _ = csm(
-        World(model).samples("A", 0, 200_000)[:, 0], World(model).samples("B", 0, 200_000)[:, 0]
+        World(model).samples("A", 0, 100_000)[:, 0], World(model).samples("B", 0, 100_000)[:, 0]
     )
     band = (frequency > 0.5) & (frequency < 80)
     found = matrix[band, 1, 0] / matrix[band, 0, 0]
@@ -188,10 +188,10 @@ def test_a_response_filters_the_motion() -> None:
 def test_noise_is_independent_between_sensors_and_channels() -> None:
     own = {"noise": white(1.0), "gain": 0.0}
     model = scenario({"A": own, "B": own, "C": {**own, "seed": 5}, "D": {**own, "seed": 6}})
-    channels = np.concatenate([World(model).samples(n, 0, 100_000).T for n in model.names])
+    channels = np.concatenate([World(model).samples(n, 0, 50_000).T for n in model.names])
     correlation = np.corrcoef(channels)
     off = correlation[~np.eye(len(correlation), dtype=bool)]
-    assert np.max(np.abs(off)) < 5 / np.sqrt(100_000)
+    assert np.max(np.abs(off)) < 5 / np.sqrt(50_000)
 
 
 def test_the_samples_have_the_true_cross_spectral_matrix() -> None:
@@ -200,7 +200,7 @@ def test_the_samples_have_the_true_cross_spectral_matrix() -> None:
         "B": {"rotation": [40, 20, 0], "delay": 0.004, "noise": white(2.0), "gain": 1.5},
     }
     model = scenario(sensors, spectra=[white(1.0), white(2.0), white(0.5)])
-    channels = np.concatenate([World(model).samples(name, 0, 400_000) for name in "AB"], axis=1)
+    channels = np.concatenate([World(model).samples(name, 0, 200_000) for name in "AB"], axis=1)
     frequency, matrix, n = csm(*channels.T)
     band = np.flatnonzero((frequency > 1) & (frequency < 88))[::2]
     true = World(model).true_csm(("A", "B"), frequency[band])

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def test_samples_that_are_not_counted_are_events_of_the_result(tmp_path: Path) -> None:
-    scene = Scene(rates=(50.0,) * 3, seconds=300.0, slips={1: [(100.0, 1), (200.0, 2)]})
+    scene = Scene(rates=(50.0,) * 3, seconds=200.0, slips={1: [(70.0, 1), (130.0, 2)]})
     path = tmp_path / "r.h5"
     record(path, scene)
     result = huddle.estimate(path)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from daq.protocols.block import UNCOUNTED_CHECK
 from daq.results.facts import (
+    AbsencesNotUsed,
     BlocksDamaged,
     ChangesUndecided,
     ChannelsAbsent,
@@ -66,8 +67,7 @@ from daq.results.facts import (
 )
 from daq.results.known_facts import facts_of, facts_of_sensors, facts_of_verdict
 from estimator.checks.advice import Untested
-from estimator.decision.comparison import MIN_AVERAGES
-from estimator.decision.verdict import Obstacle
+from estimator.decision.verdict import MIN_AVERAGES, Obstacle
 from estimator.spectra.segment_rejection import Reason
 from tui.wording.findings import Names, alert, explain, model, together
 from tui.wording.formatting import clock_time, listed, percent, roughly, several, signed, span
@@ -280,7 +280,7 @@ def _lost(fact: SensorLost, names: Names) -> Wording:
     text = f"{sensor} was lost {clock_time(fact.missing)} before the end"
     return Wording(
         f"{text}: check power and cable",
-        f"{text}, at {_time_of_day(since)} UTC. Segments after that are excluded.",
+        f"{text}, at {_time_of_day(since)} UTC. No segment after that counts for it.",
         do,
     )
 
@@ -341,16 +341,21 @@ def _excluded(fact: SegmentsExcluded, names: Names) -> Wording:
 @word.register(ChannelsAbsent)
 def _absent(fact: ChannelsAbsent, names: Names) -> Wording:
     del names
+    but = (
+        f" {listed(fact.complete_only)}: only segments that all channels have."
+        if fact.complete_only
+        else ""
+    )
     if not fact.channels:
         text = "Every channel has no samples in some segments, which count for the others"
-        return Wording(text, f"{text}: {fact.most} for each.")
+        return Wording(text, f"{text}: {fact.most} for each.{but}")
     found = ", ".join(
         f"{channel} {count}" for channel, count in zip(fact.channels, fact.n_segments, strict=True)
     )
     return Wording(
         f"Channels without samples in some segments: {listed(fact.channels)}",
         f"Segments behind channels that have no samples in some: {found}; behind the others"
-        f" {fact.most}. Segments that a channel lacks count for the other channels.",
+        f" {fact.most}. Segments that a channel lacks count for the other channels.{but}",
     )
 
 
@@ -864,6 +869,19 @@ def _changes(fact: ChangesUndecided, names: Names) -> Wording:
         " an estimate are needed"
     )
     return Wording(text, f"{text}.")
+
+
+@word.register(AbsencesNotUsed)
+def _absences(fact: AbsencesNotUsed, names: Names) -> Wording:
+    del names
+    each = zip(fact.channels, fact.n_segments, strict=True)
+    found = ", ".join(f"{channel} {count}" for channel, count in each)
+    text = "Segments that a channel lacks are not used for the others either"
+    return Wording(
+        text,
+        f"{text}: {found}.",
+        "huddle estimate of the recordings uses them for the channels that have them.",
+    )
 
 
 @word.register(StretchesLeftOut)

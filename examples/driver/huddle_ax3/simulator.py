@@ -28,6 +28,8 @@ NOISE_PSD = 1e-9
 """(m/s²)²/Hz, of each channel."""
 SEND_INTERVAL = 0.05
 """Seconds."""
+COUNTER_OF_RESTART = 30_000
+"""Samples further on: a counter that began at 0 could be one that overflowed."""
 _CHUNK = 1024
 
 
@@ -106,9 +108,9 @@ class Simulator:
             self._counter += len(again)
 
     def restart(self) -> None:
-        """Restart: nothing is sampled for a second, and the counter begins again."""
+        """Restart: nothing is sampled for a second, and the counter begins elsewhere."""
         self.sent += round(self.rate)
-        self._counter = 0
+        self._counter += COUNTER_OF_RESTART
 
     def truth(self) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
         """Return all samples since START, and the time of each by the clock of the event loop."""

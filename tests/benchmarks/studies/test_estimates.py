@@ -25,7 +25,14 @@ def test_averages_scatter_about_the_true_matrix_as_so_many_do() -> None:
     np.testing.assert_allclose(drawn.var(axis=0), power**2 / 20, rtol=5 * np.sqrt(3 / 4000))
 
 
-@pytest.mark.parametrize("name", ["small-samples", "quiet", "unequal", "contrasts"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "small-samples",
+        "unequal",
+        *(pytest.param(each, marks=pytest.mark.long) for each in ("quiet", "contrasts")),
+    ],
+)
 def test_short_studies_agree(name: str) -> None:
     study = STUDIES[name](quiet, 0.02)
     assert study.name == name

@@ -166,8 +166,8 @@ async def test_a_sensor_in_trouble_says_why_and_ports_are_searched_again(tmp_pat
         await until(pilot, lambda: controls.asked == [PORTS[-1]])  # the others are known
 
 
-@pytest.mark.parametrize("typed", ["1e6", "1"])  # 1: it sends physical units
-async def test_what_a_device_does_not_state_is_asked_for(tmp_path: Path, typed: str) -> None:
+async def test_what_a_device_does_not_state_is_asked_for(tmp_path: Path) -> None:
+    typed = {"A": "1e6", "B": "1", "C": "2e6"}  # B sends physical units
     path = tmp_path / "lab.toml"
     controls = Prepared(path, draft(path), writes_text=True)
     app = FirstBenchApp(controls)
@@ -177,7 +177,7 @@ async def test_what_a_device_does_not_state_is_asked_for(tmp_path: Path, typed: 
             await until(pilot, lambda: screen_text(app).count("● live") >= 2)
             await pilot.press("enter")
             await until(pilot, lambda n=name: f"sensor {n}, driver text" in screen_text(app))  # type: ignore[misc]
-            app.screen.query_one("#sensitivity", Input).value = typed
+            app.screen.query_one("#sensitivity", Input).value = typed[name]
             await pilot.press("enter")
         await until(pilot, lambda: "enter goes on" in screen_text(app))
         await pilot.press("enter", "enter")
@@ -187,9 +187,7 @@ async def test_what_a_device_does_not_state_is_asked_for(tmp_path: Path, typed: 
     for sensor in load(path).sensors:
         assert sensor.sampling_rate == 100.0
         assert [(c.name, c.sensitivity) for c in sensor.channels] == [
-            ("c0", float(typed)),
-            ("c1", float(typed)),
-            ("c2", float(typed)),
+            (channel, float(typed[sensor.name])) for channel in ("c0", "c1", "c2")
         ]
 
 

@@ -117,7 +117,9 @@ def test_an_estimate_loads_no_more_than_it_needs(tmp_path: Path) -> None:
     assert not loaded & unwanted
 
 
-@pytest.mark.parametrize("scenario", ["fig9", "tui/resources/demo.toml"])
+@pytest.mark.parametrize(
+    "scenario", ["fig9", pytest.param("tui/resources/demo.toml", marks=pytest.mark.long)]
+)
 def test_an_estimate_loads_no_masked_arrays(scenario: str, tmp_path: Path) -> None:
     """``np.median``, ``np.quantile`` and most uses of ``np.unique`` load ``numpy.ma``."""
     path = tmp_path / "short.h5"

@@ -96,6 +96,7 @@ async def one_run(steps: ProcessSteps, bench: Bench) -> tuple[Outcome, str]:
     return outcome, part
 
 
+@pytest.mark.long
 def test_the_installed_command_and_all_that_it_starts_run_none(record: Path) -> None:
     command = Path(sys.executable).with_name("huddle")
     done = subprocess.run(

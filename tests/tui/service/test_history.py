@@ -77,6 +77,22 @@ def test_the_evidence_is_the_likelihood_ratio() -> None:
     assert evidence(levels, deviations)[-1] == pytest.approx(expected, rel=1e-4)
 
 
+def test_evidence_that_is_too_little_is_not_computed() -> None:
+    """Where it is, it is the same; where it is not, it is below what was asked for."""
+    rng = np.random.default_rng(18)
+    n_left_out = 0
+    for step in (0.0, 0.02, 0.1):
+        deviations = rng.uniform(0.05, 0.3, 500)
+        levels = rng.normal(0.0, deviations) + step * (np.arange(500) > 300)
+        every = evidence(levels, deviations)
+        some = np.concatenate(list(Evidence().add(levels, deviations, least=1e4)))
+        left_out = some == 0
+        assert some[~left_out] == pytest.approx(every[~left_out])
+        assert np.all(every[left_out] < 1e4)
+        n_left_out += int(left_out.sum())
+    assert n_left_out > 500
+
+
 def exact_sum(levels: FloatArray, deviations: FloatArray) -> float:
     """Return the mean likelihood ratio of all changes from the means before and after each."""
     n, weights = len(levels), deviations**-2.0

@@ -70,8 +70,12 @@ def test_what_a_model_of_too_few_dimensions_says_contradicts_the_bound() -> None
     assert not any(each.contradicts for each in levels("b", estimate([one], settings), settings))
 
 
-def test_a_folder_of_counts_without_responses(tmp_path: Path) -> None:
+def test_a_folder_of_counts_without_responses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("matplotlib")
+    # Drawing takes most of the time; the next test draws.
+    monkeypatch.setattr("tui.studies.figures.save", lambda *_: (tmp_path / "png", tmp_path / "svg"))
     folder = tmp_path / "own"
     folder.mkdir()
     np.savez(folder / "a.npz", sampling_rate=RATE, **verticals(4, 1, 20_000)[0])  # type: ignore[arg-type]  # arrays

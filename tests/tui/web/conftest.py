@@ -34,9 +34,9 @@ def server(folder: Path) -> Iterator[Server]:
         yield found
 
 
-@pytest.fixture
-def browser() -> Iterator[Browser]:
-    """Start Chromium; skip the test where there is none."""
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Browser]:
+    """Start Chromium, once for a module; skip its tests where there is none."""
     if CHROMIUM is None:
         pytest.skip("no Chromium: apt-get install chromium, or HUDDLE_CHROMIUM=PATH")
     if find_spec("playwright") is None:
@@ -47,6 +47,14 @@ def browser() -> Iterator[Browser]:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         yield browser
         browser.close()
+
+
+@pytest.fixture
+def browser(chromium: Browser) -> Iterator[Browser]:
+    """Yield the browser; forget the visitors of the test, with their cookies, when it ends."""
+    yield chromium
+    for context in chromium.contexts:
+        context.close()
 
 
 @pytest.fixture

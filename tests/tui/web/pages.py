@@ -5,21 +5,26 @@ from __future__ import annotations
 import http.client
 import os
 import subprocess
-import sys
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 from urllib.parse import urlencode, urlsplit
 
+from daq.python_process import python_command
 from tests.tui.night_recording import record
 from tests.waiting import limit, wait_until
-from tui.web.access import password_hash, token_hash
+from tui.web.access import token_hash
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from pathlib import Path
 
 READER, STEERER = "a token of who looks at pages", "a password of who steers"
+STEERER_HASH = (
+    "scrypt:19477e2e6b908813dd60db9391fc17b8"
+    ":5b72f738381982fe7d7e85598d6554049c9685fc959bde4fdad7539835f95dc9"
+)
+"""What `password_hash` made of it once: to hash it takes time in all who collect tests."""
 BENCH = """
 name = "cellar <b>"
 sampling_rate = 100.0
@@ -35,7 +40,7 @@ channels = [{{name = "X", sensitivity = 1e6}}]
 SECRETS = f"""
 [web]
 read = "{token_hash(READER)}"
-steer = "{password_hash(STEERER)}"
+steer = "{STEERER_HASH}"
 """
 
 
@@ -117,7 +122,7 @@ def serving(bench: Path, *, port: int = 0) -> Iterator[Server]:
     """Serve the pages of a bench until the context ends."""
     log = bench.with_suffix(".log")
     out = bench.with_suffix(".out")
-    command = [sys.executable, "-m", "tui", "web", str(bench), "--port", str(port)]
+    command = python_command("tui", "web", str(bench), "--port", str(port))
     with out.open("wb") as stdout, log.open("ab") as stderr:
         process = subprocess.Popen(
             command, stdout=stdout, stderr=stderr, env=os.environ | {"PYTHONUNBUFFERED": "1"}

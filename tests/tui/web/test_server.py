@@ -23,10 +23,12 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
+from typer.testing import CliRunner
 
 from tests.tui.night_recording import HOSTILE
 from tests.tui.web.pages import READER, SECRETS, STEERER, Server, Visit, bench_file, serving
 from tests.waiting import limit, wait_until
+from tui.commands.main import app
 from tui.web.access import token_hash
 
 if TYPE_CHECKING:
@@ -99,15 +101,8 @@ def test_a_test_has_verdict_table_picture_facts_and_settings(server: Server) -> 
 
 def test_the_downloads_are_those_of_the_command(server: Server, folder: Path) -> None:
     recording = folder / "recordings" / "night.h5"
-    subprocess.run(
-        [
-            *(sys.executable, "-m", "tui", "estimate", str(recording)),
-            *("--json", str(folder / "night.json"), "--csv", str(folder / "night.csv")),
-        ],
-        check=False,
-        capture_output=True,
-        env=os.environ | {"PYTHONUNBUFFERED": "1"},
-    )
+    asked = ("--json", str(folder / "night.json"), "--csv", str(folder / "night.csv"))
+    CliRunner().invoke(app, ["estimate", str(recording), *asked])
     visit = server.visit()
     found = visit.get("/tests/night.h5/result.json")
     assert found.headers["content-disposition"] == "attachment; filename*=UTF-8''night.json"
@@ -117,11 +112,15 @@ def test_the_downloads_are_those_of_the_command(server: Server, folder: Path) ->
     assert visit.get("/tests/night.h5/report.pdf").content.startswith(b"%PDF-")
 
 
-def test_certificates_of_a_test_are_read(server: Server, folder: Path) -> None:
+def test_certificates_of_a_test_are_read(
+    server: Server, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Curves take most of a certificate's time.
+    monkeypatch.setattr("tui.report.figures.drawing.draw", lambda *_, **__: None)
     recording = folder / "recordings" / "night.h5"
     assert "Certificate" not in server.visit().get("/tests/night.h5").text
     issue = ("issue", str(recording), "--by", "Ada", "--allow-incomplete")
-    subprocess.run([sys.executable, "-m", "tui", *issue], check=False, capture_output=True)
+    CliRunner().invoke(app, issue)
     (issued,) = (folder / "recordings" / "certificates").glob("*.pdf")
     visit = server.visit()
     assert re.search(
@@ -208,9 +207,8 @@ def test_nobody_steers_an_open_server(server: Server) -> None:
 
 
 def test_an_address_that_others_reach_needs_a_secret(folder: Path) -> None:
-    command = [sys.executable, "-m", "tui", "web", str(bench_file(folder)), "--address", "0.0.0.0"]  # noqa: S104
-    ended = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert ended.returncode == 2
+    ended = CliRunner().invoke(app, ["web", str(bench_file(folder)), "--address", "0.0.0.0"])  # noqa: S104
+    assert ended.exit_code == 2
     assert "address 0.0.0.0: other computers reach it; expected read =" in ended.stderr
 
 

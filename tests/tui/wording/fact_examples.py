@@ -49,7 +49,13 @@ EXAMPLES: tuple[Fact, ...] = (
     facts.SamplesMissing(rank=Rank.TO_KNOW, sensors=A, n_gaps=2, n_samples=40),
     facts.SegmentsExcluded(rank=Rank.TO_KNOW, n_segments=3, reasons={Reason.CLIPPED: 3}),
     facts.GapsBridged(rank=Rank.TO_KNOW, n_segments=4, lost=0.02, leakage=0.01),
-    facts.ChannelsAbsent(rank=Rank.TO_KNOW, channels=("A.X",), n_segments=(40,), most=60),
+    facts.ChannelsAbsent(
+        rank=Rank.TO_KNOW,
+        channels=("A.X",),
+        n_segments=(40,),
+        most=60,
+        complete_only=("two-channel", "three-channel"),
+    ),
     facts.OctaveSegments(
         rank=Rank.TO_KNOW, longest=80.0, n_effective=12.0, below=1.0, only_one=False
     ),
@@ -122,6 +128,7 @@ EXAMPLES: tuple[Fact, ...] = (
     facts.RecordingsLeftOut(rank=Rank.DELAYS, sensors=A, recordings=("/archive/night.h5",)),
     facts.SpectraUnreadable(rank=Rank.DELAYS, files=("Damaged.",)),
     facts.ChangesUndecided(rank=Rank.DELAYS, n_days=2, needed=8),
+    facts.AbsencesNotUsed(rank=Rank.TO_KNOW, channels=("A.X", "B.Y"), n_segments=(120, 40)),
     facts.StretchesLeftOut(rank=Rank.TO_KNOW, n_stretches=6),
     facts.NightsNotCompared(rank=Rank.TO_KNOW, needed=3),
 )

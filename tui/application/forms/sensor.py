@@ -123,6 +123,7 @@ class SensorForm(Form[str]):
     ) -> None:
         self._text, self._driver, self._replaces = text, driver, replaces
         self._faults_before = _faults(text)
+        self._edited_of = ("", text)
         self._checked: tuple[object, tuple[FileFault, ...]] = (None, ())
         channels, given = values.get("channels", []), values.get("settings", {})
         self._settings = {
@@ -223,7 +224,10 @@ class SensorForm(Form[str]):
                 one["name"]: _value(self.value(name)) for name, one in self._settings.items()
             },
         }
-        return with_sensor(self._text, values, replaces=self._replaces)
+        typed = repr(values)  # 1 and 1.0 are equal, and written differently
+        if self._edited_of[0] != typed:  # every field asks for it when the form is saved
+            self._edited_of = typed, with_sensor(self._text, values, replaces=self._replaces)
+        return self._edited_of[1]
 
 
 def sensor_table(text: str, name: str) -> Mapping[str, Any]:

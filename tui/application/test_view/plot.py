@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from tui.application.test_view.curves import Curve, Line
 
 DOTS_PER_ROW = 4  # of a Braille character
+ROUNDING = 1e-6  # of a dot
 MARKED, STEPS_MARKED = 12, 5  # points from one mark of a curve to the next; and steps
 LEAST_LAG = 1.0  # µs: what is less is not worth a picture that fills the screen
 SHORT, LONG, DAYS = 2.0, 300.0, 7200.0  # minutes: below seconds, from there on hours, days
@@ -144,7 +145,8 @@ class FullPlot(PlotWidget, can_focus=False):
         box = self._scale_rectangle
         x = box.x + (dataset.x - self._x_min) * box.width / (self._x_max - self._x_min)
         y = box.bottom - (dataset.y - self._y_min) * box.height / (self._y_max - self._y_min)
-        return np.floor(2 * x), np.floor(4 * y)
+        # what is on the border of two dots, to rounding, is in one whatever its last bit
+        return np.floor(2 * x + ROUNDING), np.floor(4 * y + ROUNDING)
 
     def _set_dots(self, x: FloatArray, y: FloatArray, style: str) -> None:
         canvas = self.query_one("#plot", Canvas)
