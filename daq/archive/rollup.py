@@ -14,8 +14,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from functools import reduce
-from operator import add
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -480,24 +478,16 @@ def rolled_up(
     """
     days, day_segments, rows = _merged_days(found)
     local: dict[int, tuple[IntArray, FloatArray]] = {}
-    densities: list[tuple[Density, Density]] = []
+    noise = recorded = None
     for each in found:
         enough = each.n_segments >= whole / 2
         estimated = enough & np.isfinite(each.noise).any(axis=(1, 2))
-        densities.append(
-            tuple(  # type: ignore[arg-type]  # of two
-                counted(
-                    np.asarray(psd[some], np.float64),
-                    grid.frequency,
-                    grid.edges,
-                    n_short=int(np.sum(~some)),
-                )
-                for psd, some in ((each.noise, estimated), (each.recorded, enough))
-            )
-        )
+        noise = _counted_too(noise, each.noise, estimated, grid)
+        recorded = _counted_too(recorded, each.recorded, enough, grid)
         if hours:
             _count_parts(local, each, zone)
-    noise, recorded = (reduce(add, each) for each in zip(*densities, strict=True))
+    if noise is None or recorded is None:
+        raise ValueError("a month without recordings")
     ordinals = sorted(local)
     shape = (len(ordinals), 3, *rows.shape[2:])
     parts = np.zeros(shape)
@@ -518,6 +508,15 @@ def rolled_up(
         total=np.sum([each.total for each in found], axis=0),
         n_segments=int(sum(each.day_segments.sum() for each in found)),
     )
+
+
+def _counted_too(
+    sum_: Density | None, psd: SmallArray, some: NDArray[np.bool_], grid: Grid
+) -> Density:
+    """Return the sum with these stretches of a recording; the others are too short for it."""
+    own = np.asarray(psd[some], np.float64)
+    found = counted(own, grid.frequency, grid.edges, n_short=int(np.sum(~some)))
+    return found if sum_ is None else sum_ + found
 
 
 def _count_parts(

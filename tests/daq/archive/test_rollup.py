@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from datetime import UTC
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,14 +11,17 @@ import pytest
 
 from daq.archive.averages import Average, Estimator
 from daq.archive.plan import Plan
-from daq.archive.rollup import Grid, merged_levels, summaries
+from daq.archive.rollup import Grid, merged_levels, rolled_up, summaries
 from daq.archive.spectra_file import Described, Origin, Summary
 from daq.bench.channel import Channel
 from daq.estimation.settings import Settings
 from daq.results.band_summary import channel_means
+from tests.traced_memory import peak_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from daq.archive.rollup import Rollup
 
 RATE = 20.0
 CHANNELS = tuple((s, Channel(name="X", sensitivity=1.0, unit="m/s²")) for s in "ABC")
@@ -85,6 +90,20 @@ def test_days_in_several_recordings_become_one() -> None:
     np.testing.assert_allclose(one.of_scatter.spread, two.of_scatter.spread, rtol=0.1)
     np.testing.assert_allclose(one.ends()[1], two.ends()[1], rtol=0.02)
     np.testing.assert_allclose(one.of_scatter.cumulants[1:], two.of_scatter.cumulants[1:], rtol=0.5)
+
+
+def test_a_month_takes_no_more_memory_than_a_few_days() -> None:
+    day = summary_of([drawn(np.random.default_rng(4))])
+    month = [replace(day, days=day.days + k) for k in range(31)]
+    grid = Grid.of(ESTIMATOR)
+
+    def made(n_days: int) -> Rollup:
+        return rolled_up(month[:n_days], grid, zone=UTC, whole=N_SEGMENTS, hours=True)
+
+    one = made(1).noise.counts
+    np.testing.assert_array_equal(made(31).noise.counts, 31 * one)
+    # a density alone takes 20 times the levels of a day
+    assert peak_of(lambda: made(31)) < peak_of(lambda: made(4)) + 5 * one.nbytes
 
 
 @pytest.mark.long
