@@ -472,7 +472,7 @@ def check_truth(
     received = np.array([block.received.monotonic_ns * 1e-9 for block in blocks])
     late = received - sent.due[last]
     assert late.min() >= -EARLY, f"{name}: received {-late.min():.3f} s before it was sampled"
-    usual = np.median(late)
+    usual = np.quantile(late, 0.25)  # a busy computer delays some, a driver all
     assert usual <= latency, f"{name}: received {usual:.3f} s after the last sample"
     if len(late) >= 2 * MIN_HALF:  # the least of a half: others may have been held up
         halves = np.split(late, [len(late) // 2])

@@ -287,13 +287,12 @@ def test_a_demo_ended_by_ctrl_c_says_so_and_still_compares(tmp_path: Path) -> No
 def test_demo_shows_which_estimate_is_right() -> None:
     document = huddle("demo", "--duration", "40s", "--speed", "8", "--json", "-").stdout
     channels = json.loads(document)["channels"]
-    covers = {
-        method: [entry["covers"] for entry in channels if entry["method"] == method]
-        for method in ("three-channel", "three-sensor")
-    }
-    assert len(covers["three-sensor"]) == 9
-    assert sum(covers["three-sensor"]) >= 8  # all nine at once in 95 % of runs
-    assert sum(covers["three-channel"]) <= 1
-    for entry in channels:
-        if entry["method"] == "three-channel" and entry["noise_psd"] > 0:
-            assert entry["noise_psd"] > 2 * entry["true_noise_psd"]
+    right, wrong = (
+        [entry for entry in channels if entry["method"] == method]
+        for method in ("three-sensor", "three-channel")
+    )
+    assert len(right) == len(wrong) == 9
+    assert sum(entry["covers"] for entry in right) >= 8, document  # all nine at once in 95 %
+    # Their intervals hold the truth only where a model test that fails by chance widens them.
+    for entry in wrong:
+        assert not 0 < entry["noise_psd"] < 2 * entry["true_noise_psd"], document
