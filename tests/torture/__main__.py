@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -97,15 +98,34 @@ class Row:
 
 
 def torture(share: float, folder: Path, only: str = "") -> list[Row]:
-    """Do all of it, or a share, or what has a word in its name; return the rows of the table."""
+    """Do all of it, or a share, or what has a word in its name; return the rows of the table.
+
+    Kinds that wait for a clock run beside the others.
+    """
+    chosen = [name for name in _KINDS if only in name]
+    rows: dict[str, list[Row]] = {name: [] for name in chosen}
+    with ThreadPoolExecutor(len(_WAITING)) as beside:
+        waiting = {
+            name: beside.submit(_rows_of, name, share, folder)
+            for name in _WAITING
+            if name in chosen
+        }
+        for name in chosen:
+            if name not in waiting:
+                rows[name] += _rows_of(name, share, folder)
+        for name, found in waiting.items():
+            rows[name] += found.result()
+    return [row for name in chosen for row in rows[name]]
+
+
+def _rows_of(name: str, share: float, folder: Path) -> list[Row]:
+    """Do a kind of torture, print its rows as they come, and return them."""
+    of_kind = folder / name.replace(" ", "-")
+    of_kind.mkdir()
     rows = []
-    for name, kind in _KINDS.items():
-        if only in name:
-            of_kind = folder / name.replace(" ", "-")
-            of_kind.mkdir()
-            for row in kind(share, of_kind):
-                print(row, flush=True)
-                rows.append(row)
+    for row in _KINDS[name](share, of_kind):
+        print(row, flush=True)
+        rows.append(row)
     return rows
 
 
@@ -183,6 +203,7 @@ _KINDS = {
     "starved recorder": _starved,
     "accelerated day": _day,
 }
+_WAITING = ("clocks", "accelerated day")
 
 
 def _share(n: int, share: float) -> int:
