@@ -18,7 +18,7 @@ from scipy.special import chdtri, stdtrit
 from daq.archive.rollup import EARLY, LATE, WORK
 from daq.archive.spectra_file import DAY_NS
 from daq.results.change_test import changes
-from estimator.levels.interval import CERTAIN, NORMAL_95
+from estimator.levels.interval import CERTAIN
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -45,6 +45,9 @@ _MANY = 6
 """Changes from which on a series is looked at for drift, before the others are found."""
 _KNOWN_DAY = 10.0
 """Standard deviations of each day in its level, from which a course is one of decibels."""
+_FAR_WORSE = 2.0
+"""Times the usual deviation, up to which days count as equal in power."""
+_DB = 10 / math.log(10)
 _EPOCH = date(1970, 1, 1).toordinal()
 
 
@@ -66,7 +69,8 @@ class Segment:
     begin, end : int
         Rows of the first day, and after the last one.
     mean : float
-        In unit²/Hz, days weighted by their precision.
+        In unit²/Hz; of decibels where every day is known to a tenth, as the drift is. Days are
+        weighted by their relative precision.
     drift : Interval
         In dB a year.
     contrast : Interval
@@ -94,7 +98,7 @@ class Course:
     segments : tuple of Segment
         In order, at least one.
     steps : tuple of Interval
-        Between segments, in dB: one less.
+        Between the lines of segments, on the day of the change, in dB: one less.
     """
 
     decided: bool
@@ -102,16 +106,53 @@ class Course:
     steps: tuple[Interval, ...]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Drift:
-    """Slope of a level against time, in dB a year, with its 95 % interval.
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A level with a constant drift, in natural logarithms of power.
 
-    Each of shape (n_series,); NaN where it is not decided.
+    Attributes
+    ----------
+    mean : float
+        Power in unit²/Hz, in the middle of all days.
+    centre : float
+        The day on which the errors of level and slope are independent.
+    level, level_variance : float
+        Of the power on that day; NaN where it may be zero.
+    slope, slope_variance : float
+        A day; zero and no drift where days are too few.
+    freedom : float
+        Degrees of freedom of both; infinite where days are too few for their scatter.
+    drifts : bool
+        Whether days are enough for a slope.
     """
 
-    slope: FloatArray
-    low: FloatArray
-    high: FloatArray
+    mean: float = math.nan
+    centre: float = math.nan
+    level: float = math.nan
+    level_variance: float = math.nan
+    slope: float = 0.0
+    slope_variance: float = 0.0
+    freedom: float = math.inf
+    drifts: bool = False
+
+    @property
+    def drift(self) -> Interval:
+        """The slope in dB a year."""
+        if not self.drifts or math.isnan(self.level):
+            return Interval()
+        half = float(stdtrit(self.freedom, 0.975)) * math.sqrt(self.slope_variance)
+        year = _DB * DAYS_PER_YEAR
+        return Interval(
+            *(year * each for each in (self.slope, self.slope - half, self.slope + half))
+        )
+
+    def on(self, day: float) -> tuple[float, float]:
+        """Return the logarithm of the power on a day, and its variance."""
+        ahead = day - self.centre
+        return (
+            self.level + self.slope * ahead,
+            self.level_variance + self.slope_variance * ahead**2,
+        )
 
 
 def courses(
@@ -158,21 +199,23 @@ def courses(
         decided = borders is not None
         inner = [] if borders is None else [int(known[border]) for border in borders]
         ends = [0, *inner, len(y)]
-        segments = []
+        segments, lines = [], []
         for begin, end in pairwise(ends):
-            rows = slice(begin, end)
-            slope = drift(
-                at[rows], level[rows, series : series + 1], spread[rows, series : series + 1]
-            )
             # Days of a change have both levels.
             first = ordinals[begin] + (begin > 0)
             last = ordinals[end - 1] - (end < len(y))
             some = noise[(local >= first) & (local <= last), :, series]
             own = known[(known >= begin) & (known < end)]
-            mean = float(np.average(y[own], weights=s[own] ** -2)) if len(own) else math.nan
-            of_slope = Interval(*(float(each[0]) for each in (slope.slope, slope.low, slope.high)))
-            segments.append(Segment(begin, end, mean, of_slope, contrast(some), len(some)))
-        steps = tuple(_step(y, s, known, one, two) for one, two in pairwise(segments))
+            fitted = line(at[own], y[own], s[own])
+            lines.append(fitted)
+            segments.append(
+                Segment(begin, end, fitted.mean, fitted.drift, contrast(some), len(some))
+            )
+        borders_at = ((at[begin - 1] + at[begin]) / 2 for begin in inner)
+        steps = tuple(
+            _step(one, two, float(day))
+            for (one, two), day in zip(pairwise(lines), borders_at, strict=True)
+        )
         found.append(Course(decided, tuple(segments), steps))
     return tuple(found)
 
@@ -222,11 +265,14 @@ def _borders(at: FloatArray, y: FloatArray, s: FloatArray, rate: float) -> list[
     n = len(y)
     if n < MIN_DAYS:
         return None
+    in_decibels = _in_decibels(y, s)
+    if not in_decibels:
+        s = _evened(s)
     weight = s**-2
     mean = float(np.average(y, weights=weight))
     if mean <= CERTAIN / math.sqrt(float(weight.sum())):
         return None
-    x, deviation = (np.log(y / mean), s / y) if _in_decibels(y, s) else (y / mean, s / mean)
+    x, deviation = (np.log(y / mean), s / y) if in_decibels else (y / mean, s / mean)
     deviation = deviation * math.sqrt(max(1.0, _scatter(x, deviation)) * _lasting(x, deviation))
     found = _changes(x, deviation, rate, _MANY)
     if len(found) == _MANY:
@@ -258,6 +304,15 @@ def _in_decibels(y: FloatArray, s: FloatArray) -> bool:
     by half of its relative variance, and the weight of a day would follow its error.
     """
     return bool(np.all(y > _KNOWN_DAY * s))
+
+
+def _evened(s: FloatArray) -> FloatArray:
+    """Return deviations of days in power that are equal, unless one is far worse.
+
+    A day's deviation goes with its level: weights by it would follow errors to lower levels.
+    """
+    usual = s <= _FAR_WORSE * float(np.median(s))
+    return np.where(usual, np.sqrt(np.mean(s[usual] ** 2)), s)
 
 
 def _scatter(x: FloatArray, deviation: FloatArray) -> float:
@@ -357,80 +412,86 @@ def _changes(
     return found
 
 
-def _step(y: FloatArray, s: FloatArray, known: IntArray, one: Segment, two: Segment) -> Interval:
-    """Return by how much the mean of one segment is above that of the one before, in dB."""
-    variance = 0.0
-    for segment in (one, two):
-        rows = known[(known >= segment.begin) & (known < segment.end)]
-        weight = s[rows] ** -2
-        scatter = 1.0
-        if len(rows) > 1:
-            scatter = float(np.sum(weight * (y[rows] - segment.mean) ** 2)) / (len(rows) - 1)
-        variance += max(1.0, scatter) / float(weight.sum()) / segment.mean**2
-    if not (one.mean > 0 and two.mean > 0):
-        return Interval()
-    middle = _db(two.mean / one.mean)
-    half = NORMAL_95 * 10 / math.log(10) * math.sqrt(variance)
-    return Interval(middle, middle - half, middle + half)
+def _step(one: Line, two: Line, day: float) -> Interval:
+    """Return by how much one line is above that of the segment before on a day, in dB."""
+    (before, variance), (after, further) = one.on(day), two.on(day)
+    middle = after - before
+    half = float(stdtrit(min(one.freedom, two.freedom), 0.975)) * math.sqrt(variance + further)
+    return Interval(*(_DB * each for each in (middle, middle - half, middle + half)))
 
 
-def drift(days: FloatArray, level: FloatArray, spread: FloatArray) -> Drift:
-    """Fit a line to each series.
+def line(at: FloatArray, level: FloatArray, spread: FloatArray) -> Line:
+    """Fit a line to a series.
 
     Parameters
     ----------
-    days : float64, shape (n_days,)
+    at : float64, shape (n_days,)
         Time in days.
-    level, spread : float64, shape (n_days, n_series)
-        Levels (power, linear), and their standard deviations; NaN where a day has none.
+    level, spread : float64, shape (n_days,)
+        Levels (power, linear), and their standard deviations.
 
     Returns
     -------
-    Drift
+    Line
+        A constant where days are too few for a slope.
 
     Notes
     -----
     Weighted least squares, in decibels where every day is known to a tenth: a constant drift is a
-    line there. Else in power, over the mean. The variance of the slope is the largest of three:
-    that of the spreads, that of the scatter about the line, and that of Newey and West [1]_, which
-    allows for scatter that lasts for days. The interval is Student's.
+    line there. Else in power, over the mean, where days count as equal unless one is far worse.
+    Variances are the largest of three: that of the spreads, that of the scatter about the line, and
+    that of Newey and West [1]_, which allows for scatter that lasts for days. Intervals are
+    Student's.
 
     References
     ----------
     .. [1] W. K. Newey, K. D. West, "A simple, positive semi-definite, heteroskedasticity and
        autocorrelation consistent covariance matrix", Econometrica 55 (1987), 703–708.
     """
-    found = np.full((3, level.shape[1]), np.nan)
-    for series in range(level.shape[1]):
-        known = _known(level[:, series], spread[:, series])
-        n = int(known.sum())
-        if n < MIN_DAYS:
-            continue
-        at, y, s = days[known], level[known, series], spread[known, series]
-        if in_decibels := _in_decibels(y, s):
-            y, s = np.log(y), s / y
-        weight = 1 / s**2
-        centre = np.average(at, weights=weight)
-        mean = float(np.average(y, weights=weight))
-        x = at - centre
-        square = float(np.sum(weight * x**2))
-        slope = float(np.sum(weight * x * y)) / square
-        left = y - mean - slope * x
-        scatter = float(np.sum(weight * left**2)) / (n - 2)
-        score = weight * x * left
-        lags = math.floor(4 * (n / 100) ** (2 / 9))
-        lasting = float(np.sum(score**2))
-        for lag in range(1, lags + 1):
-            pair = float(np.sum(score[lag:] * score[:-lag]))
-            lasting += 2 * (1 - lag / (lags + 1)) * pair
-        variance = max(1 / square, scatter / square, n / (n - 2) * lasting / square**2)
-        if not in_decibels and mean <= CERTAIN / math.sqrt(float(np.sum(weight))):
-            continue  # no level, and so none in dB
-        half = float(stdtrit(n - 2, 0.975)) * math.sqrt(variance)
-        year = 10 / math.log(10) * DAYS_PER_YEAR / (1.0 if in_decibels else mean)
-        found[:, series] = np.array([slope, slope - half, slope + half]) * year
-    return Drift(*found)
+    n = len(level)
+    if n == 0:
+        return Line()
+    if in_decibels := _in_decibels(level, spread):
+        y, s = np.log(level), spread / level
+        weight = s**-2
+    else:
+        y, s = level, spread
+        weight = _evened(s) ** -2
+    centre = float(np.average(at, weights=weight))
+    mean = float(np.average(y, weights=weight))
+    ahead = at - centre
+    square = float(np.sum(weight * ahead**2))
+    drifts = n >= MIN_DAYS
+    slope = float(np.sum(weight * ahead * y)) / square if drifts else 0.0
+    left = y - mean - slope * ahead
+    freedom = n - 1 - drifts
+    of_mean = _variance(weight / weight.sum(), left, s, freedom)
+    of_slope = _variance(weight * ahead / square, left, s, freedom) if drifts else 0.0
+    known = float(freedom) if drifts else math.inf
+    if in_decibels:
+        middle = math.exp(mean + slope * (float(at.mean()) - centre))
+        return Line(middle, centre, mean, of_mean, slope, of_slope, known, drifts)
+    if mean <= CERTAIN * math.sqrt(float(np.sum((weight * s) ** 2))) / float(weight.sum()):
+        return Line(mean)
+    middle = mean + slope * (float(at.mean()) - centre)
+    return Line(
+        middle, centre, math.log(mean), of_mean / mean**2, slope / mean, of_slope / mean**2, known,
+        drifts,
+    )  # fmt: skip
 
 
-def _known(level: FloatArray, spread: FloatArray) -> BoolArray:
-    return np.asarray(np.isfinite(level) & np.isfinite(spread) & (spread > 0))
+def _variance(share: FloatArray, left: FloatArray, s: FloatArray, freedom: int) -> float:
+    """Return the variance of a weighted sum of days: the largest of the three of `line`.
+
+    `share` is each day's in the sum, `left` what the line leaves of it, `s` its deviation.
+    """
+    stated = float(np.sum((share * s) ** 2))
+    if freedom < 1:
+        return stated
+    scatter = stated * float(np.sum((left / s) ** 2)) / freedom
+    n, score = len(left), share * left
+    lasting = float(np.sum(score**2))
+    lags = math.floor(4 * (n / 100) ** (2 / 9))
+    for lag in range(1, lags + 1):
+        lasting += 2 * (1 - lag / (lags + 1)) * float(np.sum(score[lag:] * score[:-lag]))
+    return max(stated, scatter, n / freedom * lasting)

@@ -9,7 +9,7 @@ import pytest
 import scipy.stats
 
 from benchmarks.studies.hours import MONDAY, days_of, drawn
-from daq.archive.changes import DAYS_PER_YEAR, Course, courses, drift
+from daq.archive.changes import DAYS_PER_YEAR, Course, courses, line
 from daq.archive.spectra_file import DAY_NS
 
 DAYS = np.arange(40.0)
@@ -86,6 +86,40 @@ def test_a_drift_of_ten_years_is_one_of_decibels() -> None:
         assert each.segments[0].drift.value == pytest.approx(0.5, abs=1e-3)
 
 
+@pytest.mark.parametrize("per_year", [0.0, 3.0, -6.0])
+def test_a_step_is_that_on_its_day_whatever_drifts(per_year: float) -> None:
+    """Means of segments of years differ by the drift too, here by up to 7 dB."""
+    rng = np.random.default_rng(17)
+    days = np.arange(900)
+    truth = 10 ** (0.1 * (per_year * days / DAYS_PER_YEAR + 2.0 * (days >= 500)))
+    spread = 2e-3 * truth[:, None] * np.ones(40)
+    found = course_of(truth[:, None] + spread * rng.standard_normal((900, 40)), spread)
+    steps = [each.steps for each in found]
+    assert [len(each) for each in steps] == [1] * 40
+    assert sum(step.low < 2.0 < step.high for (step,) in steps) >= scipy.stats.binom.ppf(
+        0.001, 40, 0.95
+    )
+    assert all(step.high - step.low < 0.01 for (step,) in steps)
+
+
+@pytest.mark.parametrize("relative", [0.02, 0.3])
+def test_the_mean_does_not_follow_the_errors_of_days(relative: float) -> None:
+    """Deviations go with levels: by their squares alone, low days would count for more."""
+    rng = np.random.default_rng(18)
+    level = 1 + relative * rng.standard_normal((1000, 20))
+    found = course_of(level, relative * level)
+    assert sum(len(each.segments) > 1 for each in found) <= 1
+    means = [each.segments[0].mean for each in found]
+    assert np.abs(np.array(means) - 1).max() < 5 * relative / np.sqrt(1000)
+
+
+def test_the_mean_of_a_drift_is_that_of_its_middle() -> None:
+    level, spread = series(np.random.default_rng(19), n_days=2001, n_series=1)
+    factor = 10 ** (0.1 * np.arange(-1000, 1001) / DAYS_PER_YEAR)[:, None]
+    (found,) = course_of(level * factor, spread * factor)
+    assert found.segments[0].mean == pytest.approx(1.0, rel=1e-3)
+
+
 def test_a_day_that_is_hardly_known_is_not_taken_into_a_logarithm() -> None:
     """The courses are those of powers: an error of a day moves neither its weight nor the mean."""
     level, spread = series(np.random.default_rng(15), n_days=400, n_series=1)
@@ -113,12 +147,12 @@ def test_a_level_that_may_be_zero_is_not_decided() -> None:
 def test_the_slope_is_that_of_the_line() -> None:
     spread = np.ones((40, 1))
     level = 100 * np.exp(2e-4 * (DAYS - DAYS.mean())[:, None])
-    found = drift(DAYS, level, spread * level / 100)
+    found = line(DAYS, level[:, 0], (spread * level / 100)[:, 0]).drift
     per_day = 10 / np.log(10) * 0.02 / 100
-    assert found.slope[0] == pytest.approx(per_day * DAYS_PER_YEAR)
+    assert found.value == pytest.approx(per_day * DAYS_PER_YEAR)
     # Student's quantile, 38 degrees of freedom, times the spread of the slope
-    half = 2.0244 / np.sqrt(np.sum((DAYS - DAYS.mean()) ** 2)) / 0.02 * found.slope[0]
-    assert found.high[0] - found.slope[0] == pytest.approx(half, rel=1e-3)
+    half = 2.0244 / np.sqrt(np.sum((DAYS - DAYS.mean()) ** 2)) / 0.02 * found.value
+    assert found.high - found.value == pytest.approx(half, rel=1e-3)
 
 
 @pytest.mark.parametrize("scatter", [1.0, 4.0])
@@ -127,8 +161,9 @@ def test_the_interval_of_the_slope_covers_the_truth(scatter: float) -> None:
     n = 60
     covered = 0
     for _ in range(n):
-        found = drift(DAYS, *series(rng, scatter=scatter))
-        covered += int(np.sum((found.low < 0) & (found.high > 0)))
+        for level, spread in zip(*(each.T for each in series(rng, scatter=scatter)), strict=True):
+            found = line(DAYS, level, spread).drift
+            covered += found.low < 0 < found.high
     assert covered >= scipy.stats.binom.ppf(0.001, 8 * n, 0.93)
 
 

@@ -178,6 +178,6 @@ def _with_interval(value: float, high: float, *, plus: bool = False) -> str:
     if math.isnan(value):
         return "?"
     half = high - value
-    digits = max(0, min(4, 1 - math.floor(math.log10(half)))) if half > 0 else 2
+    digits = max(0, min(6, 1 - math.floor(math.log10(half)))) if half > 0 else 2
     spec = f"{'+' if plus else ''}.{digits}f"
     return f"{signed(value, spec)} ±{half:.{digits}f}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import io
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
@@ -38,7 +39,8 @@ if TYPE_CHECKING:
 
 WIDTH, HEIGHT = 2.4, 1.7
 """Of one pair of axes, in inches."""
-RESOLUTION = 200
+RESOLUTION = {"png": 200, "svg": 150, "pdf": 150}
+"""Pixels an inch; of SVG and PDF those of densities and spectrograms, which PDF keeps in memory."""
 PERCENTILES = (10, 50, 90)
 ARRAYS = "figures.npz"
 _ROOM_DB = 3.0
@@ -67,11 +69,13 @@ def write_figures(answer: Answer, folder: Path, models: Sequence[Mask] = ()) -> 
         for name, figure in _figures(answer, models):
             for kind, about in _KINDS:
                 content = io.BytesIO()
-                figure.savefig(content, format=kind, dpi=RESOLUTION, metadata=about)
+                figure.savefig(content, format=kind, dpi=RESOLUTION[kind], metadata=about)
                 figure.set_layout_engine("none")  # found for the first file, it holds for all
                 path = folder / f"{name}.{kind}"
                 write_whole(path, content.getvalue())
                 written.append(path)
+            del figure  # it refers to itself, and would stay
+            gc.collect()
     content = io.BytesIO()
     np.savez_compressed(content, **figure_arrays(answer))  # type: ignore[arg-type]  # arrays
     write_whole(folder / ARRAYS, content.getvalue())
