@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import zoneinfo
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -32,7 +32,7 @@ from tui.output.exit_codes import ExitCode
 from tui.output.extras import load, require
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from datetime import tzinfo
 
     from rich.console import Console
@@ -341,8 +341,8 @@ def _show_one(asked: _Asked, archive: Store, failures: Sequence[str]) -> None:
     if asked.out is not None:
         from tui.report.figures.archive import write_figures
 
-        with notices().status("drawing"):
-            written = write_figures(found, asked.out, asked.masks)
+        with _counting("drawing", "figures") as drawn:
+            written = write_figures(found, asked.out, asked.masks, drawn)
         screen.print(", ".join(map(str, written)) + " written", soft_wrap=True)
     wrong = [*failures, *bad]
     for line in wrong:
@@ -370,26 +370,29 @@ def _answered(
     false_alarm: float,
 ) -> Answer:
     """Return what the archive says, showing how many recordings are estimated."""
+    from daq.archive.answers import answer
+
+    with _counting("roll-ups", "recordings") as estimated:
+        return answer(
+            archive, entries, settings, zone=zone, false_alarm=false_alarm, progress=estimated
+        )
+
+
+@contextlib.contextmanager
+def _counting(what: str, of: str) -> Iterator[Callable[[int, int], None]]:
+    """Show how many of something are done, and the time left; yield what is told so."""
     from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 
-    from daq.archive.answers import answer
     from tui.output.console import progress
 
     with progress(
-        TextColumn("roll-ups"),
+        TextColumn(what),
         BarColumn(),
-        TextColumn("{task.completed} of {task.total} recordings"),
+        TextColumn(f"{{task.completed}} of {{task.total}} {of}"),
         TimeRemainingColumn(),
     ) as bar:
-        task = bar.add_task("")
-        return answer(
-            archive,
-            entries,
-            settings,
-            zone=zone,
-            false_alarm=false_alarm,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
-        )
+        task = bar.add_task("", visible=False)
+        yield lambda done, total: bar.update(task, completed=done, total=total, visible=True)
 
 
 def _show(screen: Console, found: Answer, settings: Settings, time_zone: str) -> None:
@@ -593,7 +596,7 @@ def _take_days(found: Found, stores: Mapping[str, Store], reading: Reading, run:
     from tui.wording.formatting import several
 
     screen = notices()
-    with ExitStack() as stack:
+    with contextlib.ExitStack() as stack:
         n_unfinished = sum(stack.enter_context(each.writing()) for each in stores.values())
         if n_unfinished:
             screen.print(
@@ -677,7 +680,7 @@ def _write_stations(
     from tui.wording.formatting import several
 
     n_figures = 0
-    with ExitStack() as stack:
+    with contextlib.ExitStack() as stack:
         add = stack.enter_context(stations_json(asked.json, problems))
         write = stack.enter_context(growing(asked.csv))
         write(csv_text(STATIONS_HEADER, ()))

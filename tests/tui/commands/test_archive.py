@@ -302,6 +302,11 @@ def test_figures_have_a_panel_a_channel_with_what_was_found(tmp_path: Path) -> N
     for axes in days.axes:
         labels = axes.get_legend_handles_labels()[1]
         assert {"mean and drift of a segment", "change beyond uncertainty"} <= set(labels)
+    low = found.levels.low.copy()
+    low[2] = np.nan  # from zero: drawn to the bottom, which is not far below
+    from_zero = days_figure(replace(found, levels=replace(found.levels, low=low)))
+    lowest = 10 * np.log10(found.levels.mean[:, 0].min(axis=0))
+    assert [axes.get_ylim()[0] for axes in from_zero.axes] == pytest.approx(list(lowest - 10))
     density = density_figure(found, masks_named("nlnm,nhnm"))
     assert [axes.get_title() for axes in density.axes[:6]] == titles
     with drawing.look():

@@ -24,7 +24,7 @@ from tui.report.figures import drawing
 from tui.wording.formatting import span
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
     from matplotlib.artist import Artist
@@ -44,6 +44,9 @@ RESOLUTION = {"png": 200, "svg": 150, "pdf": 150}
 PERCENTILES = (10, 50, 90)
 ARRAYS = "figures.npz"
 _ROOM_DB = 3.0
+_DEEPEST_DB = 10.0
+"""Below the lowest day, to which intervals are drawn."""
+_N_SHEETS = 4
 _MOST_COLUMNS = 500
 """Days, or means of days, that a figure resolves."""
 _KINDS: tuple[tuple[str, dict[str, str | None]], ...] = (
@@ -53,10 +56,16 @@ _KINDS: tuple[tuple[str, dict[str, str | None]], ...] = (
 )
 
 
-def write_figures(answer: Answer, folder: Path, models: Sequence[Mask] = ()) -> list[Path]:
+def write_figures(
+    answer: Answer,
+    folder: Path,
+    models: Sequence[Mask] = (),
+    progress: Callable[[int, int], object] | None = None,
+) -> list[Path]:
     """Write a sheet of all channels for each figure, a page a channel, and their numbers.
 
     Figures are PNG, SVG and PDF; `ARRAYS` has what they show. The folder is made if needed.
+    `progress` gets how many figures are drawn, and of how many.
 
     Raises
     ------
@@ -66,7 +75,10 @@ def write_figures(answer: Answer, folder: Path, models: Sequence[Mask] = ()) -> 
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     with drawing.look(), mpl.rc_context({"svg.fonttype": "path"}):
-        for name, figure in _figures(answer, models):
+        n_figures = _N_SHEETS + len(answer.pooled.channels)
+        for number, (name, figure) in enumerate(_figures(answer, models)):
+            if progress is not None:
+                progress(number, n_figures)
             for kind, about in _KINDS:
                 content = io.BytesIO()
                 figure.savefig(content, format=kind, dpi=RESOLUTION[kind], metadata=about)
@@ -256,7 +268,8 @@ def _draw_days(axes: Axes, answer: Answer, column: int) -> None:
     mean, low, high = (
         levels_db(each[:, 0, column]) for each in (levels.mean, levels.low, levels.high)
     )
-    floor = np.where(np.isnan(low) & ~np.isnan(mean), mean, low)
+    bottom = mean[np.isfinite(mean)].min(initial=np.inf) - _DEEPEST_DB
+    floor = np.where(low > bottom, low, np.where(np.isnan(mean), np.nan, bottom))
     axes.errorbar(
         days, mean, yerr=np.stack([mean - floor, high - mean]), fmt=".", ms=2.5, lw=0.6,
         color=drawing.NOISE, label="day, with its 95 % interval",
@@ -276,6 +289,8 @@ def _draw_days(axes: Axes, answer: Answer, column: int) -> None:
                 own[0], color=drawing.LIMIT, lw=0.9, dashes=(4, 1.5),
                 label="change beyond uncertainty",
             )  # fmt: skip
+    if (floor == bottom).any():
+        axes.set_ylim(bottom=bottom)  # an interval from zero goes on below
     _date_axis(axes, days)
     axes.yaxis.set_major_locator(MaxNLocator(nbins=5))
     axes.yaxis.set_major_formatter(
@@ -330,7 +345,8 @@ def _panels(answer: Answer) -> tuple[Figure, list[Axes]]:
 
 def _labels(figure: Figure, panels: Sequence[Axes], x: str, y: str) -> None:
     figure.supxlabel(x, fontsize=7.5)
-    figure.supylabel(y, fontsize=7.5)
+    tall = figure.get_figheight() > 2 * HEIGHT
+    figure.supylabel(y if tall else y.replace(", ", ",\n", 1), fontsize=7.5)
     _legend(figure, panels)
 
 
