@@ -42,6 +42,8 @@ from tui.service.records.store import RunStore
 from tui.simulation.devices import simulated
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
     from daq.bench.model import Bench
     from tui.service.records.run_state import Run
 
@@ -92,6 +94,7 @@ class Soak:
         self.rng = np.random.default_rng(seed)
         self.kills: Counter[str] = Counter()
         self.usage: list[tuple[float, ...]] = []
+        self.never: list[tuple[datetime, datetime]] = []
         self._n_started = 0
         self._log = (folder / "service.log").open("ab")
         self._service: subprocess.Popen[bytes] | None = None
@@ -149,6 +152,12 @@ class Soak:
             return any(run.due > self.clock.now() for run in runs)
         return False
 
+    def set_clock(self, seconds: float) -> None:
+        """Set the clock by so many seconds, and note the times that it never shows."""
+        before = self.clock.now()
+        self.clock.set_by(seconds)
+        self.never.append((before, self.clock.now()))
+
     def measure(self) -> None:
         """Note memory (MB) and descriptors of the service every ten seconds, once it is warm."""
         now, last = time.monotonic(), self.usage[-1][0] if self.usage else 0.0
@@ -184,9 +193,17 @@ def _is_left(run: Run, until: datetime) -> bool:
 
 
 def faults(
-    bench_path: Path, entry: ScheduledRun, until: datetime, *, has_reports: bool = True
+    bench_path: Path,
+    entry: ScheduledRun,
+    until: datetime,
+    *,
+    has_reports: bool = True,
+    never: Sequence[tuple[datetime, datetime]] = (),
 ) -> list[str]:
-    """Return what is wrong with the runs and recordings of a service."""
+    """Return what is wrong with the runs and recordings of a service.
+
+    `never` are the times that the clock was set beyond: nothing was due in them.
+    """
     bench = load(bench_path)
     store = RunStore(bench.recording_directory)
     runs = store.runs()
@@ -194,7 +211,8 @@ def faults(
     known = {run.due.timestamp() for run in runs}
     # What is due before a service has planned anything, nobody knows of.
     begin = min((run.due for run in runs), default=BEGIN) - timedelta(seconds=1)
-    due = takewhile(lambda at: at < until, due_times(entry, begin))
+    due: Iterable[datetime] = takewhile(lambda at: at < until, due_times(entry, begin))
+    due = (at for at in due if not any(first <= at <= last for first, last in never))
     found += [f"{at:%d %H:%M %Z}: no row" for at in due if at.timestamp() not in known]
     parts = [(part, run) for run in runs if run.removed is None for part in run.parts]
     kept = {part for part, _ in parts}
@@ -265,12 +283,12 @@ def soak(
                     next_kill = time.monotonic() + float(service.rng.exponential(interval))
                 if steps and time.monotonic() > steps[0]:
                     steps.pop(0)
-                    service.clock.set_by(float(service.rng.choice([-1500.0, -40.0, 90.0, 1800.0])))
+                    service.set_clock(float(service.rng.choice([-1500.0, -40.0, 90.0, 1800.0])))
                 time.sleep(0.1)
             until = service.clock.now() - timedelta(minutes=2)
             service.finish(until)
         runs = RunStore(load(folder / "bench.toml").recording_directory).runs()
-        wrong = faults(folder / "bench.toml", ENTRY, until)
+        wrong = faults(folder / "bench.toml", ENTRY, until, never=service.never)
         log = (folder / "service.log").read_text(encoding="utf-8")
     if "Traceback" in log:
         wrong.append("a traceback in the log")
