@@ -221,8 +221,10 @@ def _with_neighbours(
     wanted = (unresolved | often)[number] | further[rows]
     if not wanted.any():
         return found
+    if not wanted.all():
+        matrix = matrix[wanted]
     pooled = pooled_noise(
-        matrix[wanted],
+        matrix,
         number[wanted],
         n_dims[rows][wanted],
         dims=live,

@@ -55,6 +55,7 @@ SAMPLED = 15
 """Sub-blocks of a block by which the number of resolved dimensions is decided."""
 _STEP = 1.5  # of ln psi in one round
 _FLOOR = 1e-7  # of psi over the channel's PSD
+_BYTES_AT_ONCE = 1 << 23  # of the matrices of blocks that are fitted together
 _TRACE_BYTES = 1 << 24  # of products of all channels' differentials that exist together
 
 
@@ -177,25 +178,46 @@ def pooled_noise(
     found = Pooled(np.full((n_freqs, p), np.nan), np.full((3, n_freqs, p), np.nan))
     edges = np.flatnonzero(np.diff(block, prepend=-1, append=-1))
     sizes = np.diff(edges)
-    table = worth(int(sizes.max(initial=1)), correlation)
-    some = np.flatnonzero(n_effective * table[sizes] > 1.2 * p)
-    if not len(some):
-        return found
-    begin, sizes, q = edges[some], sizes[some], n_dims[edges[some]]
+    table = n_effective * worth(int(sizes.max(initial=1)), correlation)
+    some = np.flatnonzero(table[sizes] > 1.2 * p)
     sensor = np.repeat(np.arange(len(dims)), dims)
+    before = np.cumsum(sizes[some]) * matrix[:1].nbytes // _BYTES_AT_ONCE
+    for group in np.split(some, np.flatnonzero(np.diff(before)) + 1):
+        if len(group):
+            q = n_dims[edges[group]]
+            _pool(found, matrix, edges[group], sizes[group], q, sensor=sensor, averages=table)
+    return found
+
+
+def _pool(
+    found: Pooled,
+    matrix: ComplexArray,
+    begin: IntArray,
+    sizes: IntArray,
+    q: IntArray,
+    *,
+    sensor: IntArray,
+    averages: FloatArray,
+) -> None:
+    """Write noise and cumulants of some blocks.
+
+    `begin`, `sizes` and `q` are first bins, numbers of bins and dimensions of the blocks;
+    `averages` are what so many bins are worth.
+    """
+    p, n_effective = matrix.shape[1], float(averages[1])
 
     def cut(of: IntArray, k: IntArray) -> tuple[_Parts, ComplexArray]:
-        parts = _parts(begin[of], sizes[of], k, n_effective * table)
+        parts = _parts(begin[of], sizes[of], k, averages)
         summed = np.add.reduceat(matrix[parts.bins], parts.start)
         return parts, np.asarray(summed / parts.count[:, None, None])
 
-    at = np.arange(len(some))
+    at = np.arange(len(begin))
     parts, mean = cut(at, sizes)
     psi = 1 / np.einsum("bii->bi", np.linalg.inv(mean)).real
     fit = _fitted(mean, parts, q, psi, n_effective=n_effective)
     _read(found, matrix, fit)
     level, psi, best = fit.level.copy(), fit.psi.copy(), fit.resolved.copy()
-    enough = int(np.searchsorted(n_effective * table[1:], max(ENOUGH, 1.5 * p))) + 1
+    enough = int(np.searchsorted(averages[1:], max(ENOUGH, 1.5 * p))) + 1
     k = np.minimum(enough, sizes)
     largest = k * 2 ** np.log2(np.maximum(sizes // (k * LEAST_PARTS), 1)).astype(np.int64)
     # what the largest sub-blocks do not resolve, smaller ones do not either
@@ -219,7 +241,6 @@ def pooled_noise(
             best[here] = fit.resolved[better]
         k[at] *= 2
         at = at[(best[at] < q[at]) & (k[at] <= largest[at])]
-    return found
 
 
 def unresolved_blocks(
