@@ -406,12 +406,21 @@ def opposite(advice: ReversedPolarity, names: Names) -> str:
 
 @explain.register(Gain)
 def _gain(advice: Gain, names: Names) -> Explanation:
+    is_single = _is_single(advice, names)
     return Explanation(
         f"The gain of {names.channels[advice.channel]} is {advice.ratio:.3f} times that of "
         f"{names.channels[advice.counterpart]}: no bias, but one of the two sensitivities is wrong,"
-        " and with it the noise in physical units.",
-        "Check the sensitivities in the bench file.",
+        " and with it the noise in physical units"
+        + (", or their axes point in different directions." if is_single else "."),
+        "Check the sensitivities in the bench file"
+        + (", and the directions of the axes." if is_single else "."),
     )
+
+
+def _is_single(advice: Gain, names: Names) -> bool:
+    """Whether a sensor has one channel, so that its axis and its sensitivity look alike."""
+    own = [dim for dim in names.dims for _ in range(dim)]
+    return any(own[n] == 1 for n in (advice.channel, advice.counterpart))
 
 
 @explain.register(Delay)
@@ -599,9 +608,10 @@ def _short_skewed(advice: NotOrthogonal, names: Names) -> str:
 
 @alert.register(Gain)
 def _short_gain(advice: Gain, names: Names) -> str:
+    what = "sensitivities and axes" if _is_single(advice, names) else "sensitivities"
     return (
         f"{names.channels[advice.channel]} reads {advice.ratio:.3f} of "
-        f"{names.channels[advice.counterpart]}: check both sensitivities"
+        f"{names.channels[advice.counterpart]}: check both {what}"
     )
 
 
@@ -821,7 +831,12 @@ def _several_gains(*found: Gain, names: Names) -> str:
     pairs = _listed(found, names, lambda each: each.ratio, lambda gain: f"{gain:.3f}", usual=1.0)
     return (
         f"Gains differ ({pairs}): no bias, but a sensitivity is wrong, and with it the noise in "
-        "physical units."
+        "physical units"
+        + (
+            ", or axes point in different directions."
+            if any(_is_single(each, names) for each in found)
+            else "."
+        )
     )
 
 
