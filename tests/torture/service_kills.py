@@ -299,7 +299,7 @@ def soak(
         f"{time.monotonic() - begin:.0f} s at {rate:g} times real time",
         f"kills {dict(service.kills)}, {n_steps} clock steps",
         f"runs {dict(states)}, {sum(len(run.parts) > 1 for run in runs)} of several parts",
-        f"reasons {dict(Counter(re.sub(r'[0-9]+', 'N', run.reason)[:100] for run in runs))}",
+        f"reasons {dict(Counter(re.sub(r'/[^ :]+', '…', run.reason)[:100] for run in runs))}",
     ]
     used = np.array(service.usage)
     for column, what, most in ((1, "memory in MB", LEAK * states["done"]), (2, "descriptors", 1)):
