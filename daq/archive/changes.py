@@ -47,6 +47,8 @@ _KNOWN_DAY = 10.0
 """Standard deviations of each day in its level, from which a course is one of decibels."""
 _FAR_WORSE = 2.0
 """Times the usual deviation, up to which days count as equal in power."""
+_LEAST_FREEDOM = 3.0
+"""A correlation that few days only seem to have leaves no less."""
 _DB = 10 / math.log(10)
 _EPOCH = date(1970, 1, 1).toordinal()
 
@@ -121,7 +123,7 @@ class Line:
     slope, slope_variance : float
         A day; zero and no drift where days are too few.
     freedom : float
-        Degrees of freedom of both; infinite where days are too few for their scatter.
+        Degrees of freedom of both; infinite where days are too few to show their scatter.
     drifts : bool
         Whether days are enough for a slope.
     """
@@ -195,7 +197,8 @@ def courses(
     for series in range(level.shape[1]):
         y, s = level[:, series], spread[:, series]
         known = np.flatnonzero(np.isfinite(y) & np.isfinite(s) & (s > 0))
-        borders = _borders(at[known], y[known], s[known], false_alarm / level.shape[1])
+        days = _days(y[known], s[known])
+        borders = None if days is None else _borders(at[known], days, false_alarm / level.shape[1])
         decided = borders is not None
         inner = [] if borders is None else [int(known[border]) for border in borders]
         ends = [0, *inner, len(y)]
@@ -206,7 +209,7 @@ def courses(
             last = ordinals[end - 1] - (end < len(y))
             some = noise[(local >= first) & (local <= last), :, series]
             own = known[(known >= begin) & (known < end)]
-            fitted = line(at[own], y[own], s[own])
+            fitted = line(at[own], y[own], s[own], days)
             lines.append(fitted)
             segments.append(
                 Segment(begin, end, fitted.mean, fitted.drift, contrast(some), len(some))
@@ -257,13 +260,29 @@ def _db(ratio: float) -> float:
     return 10 * math.log10(ratio) if ratio > 0 else math.nan
 
 
-def _borders(at: FloatArray, y: FloatArray, s: FloatArray, rate: float) -> list[int] | None:
-    """Return the first days after changes, as rows; None if nothing is decided.
+@dataclass(frozen=True, slots=True, eq=False)
+class Days:
+    """All days of a series beside its mean, in logarithms or in power.
 
-    Deviations are scaled to the scatter from day to day, if that is larger.
+    Attributes
+    ----------
+    x, deviation : float64, shape (n_days,)
+        Their levels over the mean, and the standard deviations that are stated.
+    scatter : float
+        Variance from day to day over what is stated, 1 at least.
+    correlation : float
+        Of the scatter of successive days, where it lasts; otherwise 0.
     """
-    n = len(y)
-    if n < MIN_DAYS:
+
+    x: FloatArray
+    deviation: FloatArray
+    scatter: float
+    correlation: float
+
+
+def _days(y: FloatArray, s: FloatArray) -> Days | None:
+    """Return the days of a series; None if nothing is decided."""
+    if len(y) < MIN_DAYS:
         return None
     in_decibels = _in_decibels(y, s)
     if not in_decibels:
@@ -273,7 +292,16 @@ def _borders(at: FloatArray, y: FloatArray, s: FloatArray, rate: float) -> list[
     if mean <= CERTAIN / math.sqrt(float(weight.sum())):
         return None
     x, deviation = (np.log(y / mean), s / y) if in_decibels else (y / mean, s / mean)
-    deviation = deviation * math.sqrt(max(1.0, _scatter(x, deviation)) * _lasting(x, deviation))
+    return Days(x, deviation, max(1.0, _scatter(x, deviation)), _correlation(x, deviation))
+
+
+def _borders(at: FloatArray, days: Days, rate: float) -> list[int]:
+    """Return the first days after changes, as rows.
+
+    Deviations are scaled to the scatter from day to day, if that is larger, and lasts.
+    """
+    n, x, rho = len(at), days.x, days.correlation
+    deviation = days.deviation * math.sqrt(days.scatter * (1 + rho)) / (1 - rho)
     found = _changes(x, deviation, rate, _MANY)
     if len(found) == _MANY:
         slope, level = np.polyfit(at, x, 1, w=1 / deviation)
@@ -330,22 +358,20 @@ def _scatter(x: FloatArray, deviation: FloatArray) -> float:
     return mean * freedom / float(chdtri(freedom, 0.95))
 
 
-def _lasting(x: FloatArray, deviation: FloatArray) -> float:
-    """Return by how much more scatter that lasts for days varies the means of many days.
+def _correlation(x: FloatArray, deviation: FloatArray) -> float:
+    """Return the correlation of the scatter from one day to the next, 0 unless it lasts.
 
     Squared differences of a week over those of a day, by medians, which drift and a few changes do
-    not move, are ``1 / (1 - rho)`` for a correlation rho from one day to the next.
+    not move, are ``1 / (1 - rho)``. The variance of means of many days is larger by
+    ``(1 + rho) / (1 - rho)`` than that of independent days.
     """
     if len(x) < MIN_LASTING:
-        return 1.0
+        return 0.0
     differences = (
         (x[k:] - x[:-k]) / np.sqrt(deviation[k:] ** 2 + deviation[:-k] ** 2) for k in (1, 7)
     )
     day, week = (float(np.median((each - np.median(each)) ** 2)) for each in differences)
-    if week < LASTING * day:
-        return 1.0
-    rho = min(1 - day / week, 0.95)
-    return (1 + rho) / (1 - rho) ** 2
+    return min(1 - day / week, 0.95) if week >= LASTING * day else 0.0
 
 
 def _without_drift(
@@ -420,7 +446,7 @@ def _step(one: Line, two: Line, day: float) -> Interval:
     return Interval(*(_DB * each for each in (middle, middle - half, middle + half)))
 
 
-def line(at: FloatArray, level: FloatArray, spread: FloatArray) -> Line:
+def line(at: FloatArray, level: FloatArray, spread: FloatArray, days: Days | None = None) -> Line:
     """Fit a line to a series.
 
     Parameters
@@ -429,6 +455,8 @@ def line(at: FloatArray, level: FloatArray, spread: FloatArray) -> Line:
         Time in days.
     level, spread : float64, shape (n_days,)
         Levels (power, linear), and their standard deviations.
+    days : Days or None
+        The whole series, of which these may be a segment.
 
     Returns
     -------
@@ -439,9 +467,9 @@ def line(at: FloatArray, level: FloatArray, spread: FloatArray) -> Line:
     -----
     Weighted least squares, in decibels where every day is known to a tenth: a constant drift is a
     line there. Else in power, over the mean, where days count as equal unless one is far worse.
-    Variances are the largest of three: that of the spreads, that of the scatter about the line, and
-    that of Newey and West [1]_, which allows for scatter that lasts for days. Intervals are
-    Student's.
+    Variances are the largest of three: that of the spreads, that of the scatter about the line, as
+    it is correlated in the whole series, and that of Newey and West [1]_. A few days do not show
+    their scatter; it is then that of the whole series. Intervals are Student's.
 
     References
     ----------
@@ -464,34 +492,39 @@ def line(at: FloatArray, level: FloatArray, spread: FloatArray) -> Line:
     drifts = n >= MIN_DAYS
     slope = float(np.sum(weight * ahead * y)) / square if drifts else 0.0
     left = y - mean - slope * ahead
-    freedom = n - 1 - drifts
-    of_mean = _variance(weight / weight.sum(), left, s, freedom)
-    of_slope = _variance(weight * ahead / square, left, s, freedom) if drifts else 0.0
-    known = float(freedom) if drifts else math.inf
+    rho = 0.0 if days is None else days.correlation
+    independent = n * (1 - rho) / (1 + rho)
+    freedom = max(_LEAST_FREEDOM, independent - 2) if drifts else math.inf
+    if drifts:
+        scatter = float(np.mean((left / s) ** 2)) * independent / freedom
+    else:
+        scatter = 1.0 if days is None else days.scatter / (1 - rho)
+    scatter = max(1.0, scatter * n / independent)
+    of_mean = _variance(weight / weight.sum(), left, s, scatter)
+    of_slope = _variance(weight * ahead / square, left, s, scatter) if drifts else 0.0
     if in_decibels:
         middle = math.exp(mean + slope * (float(at.mean()) - centre))
-        return Line(middle, centre, mean, of_mean, slope, of_slope, known, drifts)
+        return Line(middle, centre, mean, of_mean, slope, of_slope, freedom, drifts)
     if mean <= CERTAIN * math.sqrt(float(np.sum((weight * s) ** 2))) / float(weight.sum()):
         return Line(mean)
     middle = mean + slope * (float(at.mean()) - centre)
-    return Line(
-        middle, centre, math.log(mean), of_mean / mean**2, slope / mean, of_slope / mean**2, known,
-        drifts,
-    )  # fmt: skip
+    in_logarithms = of_mean / mean**2, slope / mean, of_slope / mean**2
+    return Line(middle, centre, math.log(mean), *in_logarithms, freedom, drifts)
 
 
-def _variance(share: FloatArray, left: FloatArray, s: FloatArray, freedom: int) -> float:
-    """Return the variance of a weighted sum of days: the largest of the three of `line`.
+def _variance(share: FloatArray, left: FloatArray, s: FloatArray, scatter: float) -> float:
+    """Return the variance of a weighted sum of days: the larger of two.
 
-    `share` is each day's in the sum, `left` what the line leaves of it, `s` its deviation.
+    `share` is each day's in the sum, `left` what the line leaves of it, `s` its stated deviation,
+    `scatter` by how much the variance of independent days is larger than stated. The second is that
+    of Newey and West, where there are days enough for a slope.
     """
-    stated = float(np.sum((share * s) ** 2))
-    if freedom < 1:
-        return stated
-    scatter = stated * float(np.sum((left / s) ** 2)) / freedom
-    n, score = len(left), share * left
+    n, stated = len(left), float(np.sum((share * s) ** 2))
+    if n < MIN_DAYS:
+        return stated * scatter
+    score = share * left
     lasting = float(np.sum(score**2))
     lags = math.floor(4 * (n / 100) ** (2 / 9))
     for lag in range(1, lags + 1):
         lasting += 2 * (1 - lag / (lags + 1)) * float(np.sum(score[lag:] * score[:-lag]))
-    return max(stated, scatter, n / freedom * lasting)
+    return max(stated * scatter, n / (n - 2) * lasting)

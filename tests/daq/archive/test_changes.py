@@ -102,6 +102,24 @@ def test_a_step_is_that_on_its_day_whatever_drifts(per_year: float) -> None:
     assert all(step.high - step.low < 0.01 for (step,) in steps)
 
 
+def test_intervals_allow_for_scatter_that_lasts() -> None:
+    """Days that follow each other with a correlation of 0.8: independent ones are a ninth."""
+    rng = np.random.default_rng(21)
+    n_days, n_series, rho = 400, 200, 0.8
+    scatter = rng.standard_normal((n_days, n_series))
+    for day in range(1, n_days):
+        scatter[day] = rho * scatter[day - 1] + np.sqrt(1 - rho**2) * scatter[day]
+    level = 1 + 0.04 * scatter
+    spread = 2e-3 * level
+    steady = [each.segments[0].drift for each in course_of(level, spread) if not each.steps]
+    assert len(steady) > 0.9 * n_series
+    assert np.mean([each.low < 0 < each.high for each in steady]) > 0.87  # without it, 0.79
+    level[200:] *= 10**0.1
+    stepped = [each.steps[0] for each in course_of(level, spread) if len(each.steps) == 1]
+    assert len(stepped) > 0.9 * n_series
+    assert np.mean([each.low < 1 < each.high for each in stepped]) > 0.88  # without it, 0.78
+
+
 @pytest.mark.parametrize("relative", [0.02, 0.3])
 def test_the_mean_does_not_follow_the_errors_of_days(relative: float) -> None:
     """Deviations go with levels: by their squares alone, low days would count for more."""

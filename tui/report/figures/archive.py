@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import io
+from functools import partial
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +25,7 @@ from tui.report.figures import drawing
 from tui.wording.formatting import span
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from matplotlib.artist import Artist
@@ -46,7 +47,6 @@ ARRAYS = "figures.npz"
 _ROOM_DB = 3.0
 _DEEPEST_DB = 10.0
 """Below the lowest day, to which intervals are drawn."""
-_N_SHEETS = 4
 _MOST_COLUMNS = 500
 """Days, or means of days, that a figure resolves."""
 _KINDS: tuple[tuple[str, dict[str, str | None]], ...] = (
@@ -75,10 +75,11 @@ def write_figures(
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     with drawing.look(), mpl.rc_context({"svg.fonttype": "path"}):
-        n_figures = _N_SHEETS + len(answer.pooled.channels)
-        for number, (name, figure) in enumerate(_figures(answer, models)):
+        figures = _figures(answer, models)
+        for number, (name, draw) in enumerate(figures.items()):
             if progress is not None:
-                progress(number, n_figures)
+                progress(number, len(figures))
+            figure = draw()
             for kind, about in _KINDS:
                 content = io.BytesIO()
                 figure.savefig(content, format=kind, dpi=RESOLUTION[kind], metadata=about)
@@ -94,13 +95,18 @@ def write_figures(
     return [*written, folder / ARRAYS]
 
 
-def _figures(answer: Answer, models: Sequence[Mask]) -> Iterator[tuple[str, Figure]]:
-    yield "density", density_figure(answer, models)
-    yield "recorded", density_figure(answer, models, recorded=True)
-    yield "spectrogram", spectrogram_figure(answer)
-    yield "days", days_figure(answer)
-    for column, label in enumerate(answer.pooled.channels):
-        yield f"channel-{label.name}", channel_figure(answer, column, models)
+def _figures(answer: Answer, models: Sequence[Mask]) -> Mapping[str, Callable[[], Figure]]:
+    """Return what draws each figure, by name."""
+    sheets = {
+        "density": partial(density_figure, answer, models),
+        "recorded": partial(density_figure, answer, models, recorded=True),
+        "spectrogram": partial(spectrogram_figure, answer),
+        "days": partial(days_figure, answer),
+    }
+    return sheets | {
+        f"channel-{label.name}": partial(channel_figure, answer, column, models)
+        for column, label in enumerate(answer.pooled.channels)
+    }
 
 
 def figure_arrays(answer: Answer) -> dict[str, NDArray[Any]]:
