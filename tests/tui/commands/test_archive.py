@@ -22,6 +22,7 @@ from referencing import Registry, Resource
 from typer.testing import CliRunner
 
 from daq.archive.answers import answer
+from daq.archive.changes import Interval
 from daq.archive.store import Store
 from daq.bench.masks.mask_file import masks_named
 from daq.estimation.snapshot import Snapshot
@@ -45,6 +46,7 @@ from tests.tui.output.test_result_schema import strict
 from tests.tui.thinned import thinned
 from tests.waiting import finish, wait_until
 from tui.commands.main import app
+from tui.output.archive.tables import course_table
 from tui.report.figures import drawing
 from tui.report.figures.archive import days_figure, density_figure
 
@@ -296,6 +298,13 @@ def test_figures_have_a_panel_a_channel_with_what_was_found(tmp_path: Path) -> N
     for course in found.courses[:6]:
         assert [each.begin for each in course.segments] == [0, 5]
         assert course.steps[0].value == pytest.approx(20 * np.log10(2), abs=0.5)
+    narrow = Interval(0.5, 0.49998, 0.50002)  # narrower than the last digit: not "±0.0000"
+    exact = [
+        replace(each, segments=(*each.segments[:-1], replace(each.segments[-1], drift=narrow)))
+        for each in found.courses
+    ]
+    column = course_table(replace(found, courses=tuple(exact))).columns[4]
+    assert [str(cell) for cell in column.cells] == ["0.5000 ±<0.0001"] * 6
     days = days_figure(found)
     titles = [axes.get_title() for axes in days.axes]
     assert titles == ["A.X", "A.Y", "B.X", "B.Y", "C.X", "C.Y"]

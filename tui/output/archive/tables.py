@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from daq.archive.answers import Answer
     from daq.archive.changes import Interval, Segment
 
+_MOST_DIGITS = 4
 LARGE = 8
 """Changes in single octaves that are listed."""
 
@@ -178,6 +179,7 @@ def _with_interval(value: float, high: float, *, plus: bool = False) -> str:
     if math.isnan(value):
         return "?"
     half = high - value
-    digits = max(0, min(6, 1 - math.floor(math.log10(half)))) if half > 0 else 2
+    digits = max(0, min(_MOST_DIGITS, 1 - math.floor(math.log10(half)))) if half > 0 else 2
     spec = f"{'+' if plus else ''}.{digits}f"
-    return f"{signed(value, spec)} ±{half:.{digits}f}"
+    shown = f"{half:.{digits}f}" if 2 * half >= 10**-digits else f"<{10**-digits:.{digits}f}"
+    return f"{signed(value, spec)} ±{shown}"
