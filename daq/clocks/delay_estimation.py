@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     ComplexArray = NDArray[np.complex128]
 
 _FIRST_ITERATIONS = 5
+_SETTLED = 1e-3  # standard deviations by which no delay moves any more
 _NEWTON_STEPS = 3
 MIN_SEGMENTS = 6
 """Segments of the first batch for each channel of the reference: P is their mean."""
@@ -235,13 +236,17 @@ class DelayEstimator:
         `power` is the sum of the products of x0.
         """
         tau, spread = np.zeros(x0.shape[1]), np.full(x0.shape[1], np.inf)
+        is_last = False
         for number in range(_FIRST_ITERATIONS):
-            frame = _Frame.of(x0, self._advanced(xj, tau), power)
+            before, frame = tau, _Frame.of(x0, self._advanced(xj, tau), power)
             # At first P is a mean over unknown delays, and its peaks are low.
-            is_last = number == _FIRST_ITERATIONS - 1
             tau, spread = self._delays(frame, x0, xj, doubt_cycles=is_last)
             tau = np.where(np.isfinite(spread), tau, 0.0)
             tau -= tau.mean()
+            if is_last:
+                break
+            settled = bool((np.abs(tau - before) <= _SETTLED * spread).all())
+            is_last = settled or number == _FIRST_ITERATIONS - 2
         return tau, spread
 
     def frame_delays(self) -> FloatArray:

@@ -263,6 +263,7 @@ class SensorRecord:
             self.n_samples = self.blocks.n_samples
         if closed:
             self._check_lengths(counts)
+            self._sample_rows.is_closed = self._instant_rows.is_closed = True
         return before != (self.n_samples, self.gap_rows.n_rows)
 
     def _check_lengths(self, counts: NDArray[np.int64]) -> None:

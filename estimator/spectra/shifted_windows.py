@@ -89,7 +89,6 @@ def shifted_spectra(
     n_freqs = length // 2 + 1
     if out is None:
         out = np.empty((n_segments, n_freqs, n_channels), np.complex128)
-    frames = np.lib.stride_tricks.sliding_window_view(samples, length, axis=1).swapaxes(0, 1)
     fit = trends / np.sum(trends**2, axis=1, keepdims=True)
     weights = _weights(shift, drift, length, order)
     derivative = 2j * np.pi / length * np.arange(n_freqs)
@@ -102,7 +101,8 @@ def shifted_spectra(
         some = slice(first, min(first + block, n_segments))
         n = some.stop - first
         own, product, found = segments[:n], products[:n], total[:n]
-        own[:] = frames[rows[some]]
+        for number, row in enumerate(rows[some].tolist()):
+            own[number] = samples[:, row : row + length]
         for trend, slope in zip(trends, fit, strict=True):
             np.subtract(own, np.multiply((own @ slope)[..., None], trend, out=product), out=own)
         windows = weights[:, some] @ _rows(length)
@@ -113,7 +113,8 @@ def shifted_spectra(
                 continue
             found *= derivative
             found += np.fft.rfft(product, axis=-1, out=lower[:n])
-        np.multiply(found.swapaxes(1, 2), turn[some, :, None], out=out[some])
+        found *= turn[some, None]
+        out[some] = found.swapaxes(1, 2)
     return out
 
 

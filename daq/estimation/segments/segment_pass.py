@@ -149,7 +149,7 @@ OCTAVES = 12
 """Stages of the multi-resolution mode: those without segments cost nothing."""
 _MOST_PASSES = 4
 _FINAL_TOLERANCE = 1e-7  # seconds rms that clocks may move before segments are taken again
-_SURVEYS, _SURVEYED = (4,), 80
+_SURVEYS, _SURVEYED = (4, 16), 80
 """Segments of which one is surveyed, at most, and how many are, at least."""
 _READ_TOGETHER = 24  # segments of a survey
 _GOLDEN = 0.6180339887498949

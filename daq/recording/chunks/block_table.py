@@ -40,6 +40,7 @@ class BlockTable:
         self._clipped: list[IntArray] = []
         self._marks: list[int] = []
         self._newest = np.empty(0, dataset.dtype)
+        self._covering: tuple[int, int, NDArray[np.void]] = (0, 0, self._newest)
         self.n_samples = 0
         """Number of rows of samples in these blocks."""
 
@@ -104,7 +105,12 @@ class BlockTable:
         marks = self._marks
         begin = (bisect.bisect_right(marks, first_row) - 1) * _ROWS_PER_MARK
         end = bisect.bisect_left(marks, last_row) * _ROWS_PER_MARK
-        blocks = self[max(0, begin) : end]
+        first, last, _ = slice(max(0, begin), end).indices(self._n_rows)
+        known_first, known_last, blocks = self._covering
+        if not known_first <= first <= last <= known_last:
+            known_first, blocks = first, self._read(first, max(first, last))
+            self._covering = first, first + len(blocks), blocks
+        blocks = blocks[first - known_first : last - known_first]
         ends = blocks["first_row"] + blocks["n_samples"]
         return np.asarray(blocks[(ends > first_row) & (blocks["first_row"] < last_row)])
 

@@ -1,19 +1,69 @@
-"""Reads many small chunks of a dataset together, also from several threads."""
+"""Reads many small chunks of a dataset together, also from several threads.
+
+HDF5 takes longer to fetch a small chunk than to read it. So where a file is closed, the raw chunks
+are located once, and read from the file as they are, many at a time. Checksums are of blocks, so
+whoever reads them finds out what is damaged.
+"""
 
 from __future__ import annotations
 
+import os
 import threading
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daq.recording.chunks.packing import PIPELINE, unpacked
+from daq.recording.chunks.packing import PIPELINE, RAW, unpacked
 
 if TYPE_CHECKING:
     import h5py
     from numpy.typing import NDArray
 
 _KEPT_BYTES = 1 << 20  # of the last read: short recordings are read several times
+_LOCATED_FROM = 1 / 16  # share of the chunks that is fetched before all are located
+
+
+class RawChunks:
+    """Reads chunks that went through no filter from the file itself.
+
+    Parameters
+    ----------
+    dataset : h5py.Dataset
+        Of a closed file, in chunks along its first axis only.
+    """
+
+    def __init__(self, dataset: h5py.Dataset) -> None:
+        self._file, self._length = dataset.file.id, dataset.chunks[0]
+        row_bytes = dataset.dtype.itemsize * int(np.prod(dataset.chunks[1:]))
+        self._n_bytes = self._length * row_bytes
+        self._at = np.full(-(-len(dataset) // self._length), -1, np.int64)
+        """Byte of the file at which each chunk begins; -1 for one that is not raw."""
+        file = dataset.file
+        if file.driver == "sec2" and not file.userblock_size and hasattr(os, "preadv"):
+            dataset.id.chunk_iter(self._note)
+
+    def _note(self, chunk: Any) -> None:  # noqa: ANN401 - h5py names no type
+        if chunk.filter_mask == RAW and chunk.size == self._n_bytes:
+            self._at[chunk.chunk_offset[0] // self._length] = chunk.byte_offset
+
+    def read(self, first: int, rows: NDArray[Any]) -> bool:
+        """Put the contents of chunks, from chunk `first` on, into rows; return False if not all.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be read.
+        """
+        plain = rows.view(np.uint8).reshape(-1).data
+        at = self._at[first : first + len(plain) // self._n_bytes]
+        if len(at) * self._n_bytes < len(plain) or (at < 0).any():
+            return False
+        cuts = np.flatnonzero(np.diff(at) != self._n_bytes) + 1
+        for begin, end in zip([0, *cuts.tolist()], [*cuts.tolist(), len(at)], strict=True):
+            part = plain[begin * self._n_bytes : end * self._n_bytes]
+            if os.preadv(self._file.get_vfd_handle(), [part], int(at[begin])) < len(part):
+                return False
+        return True
 
 
 class ChunkedRows:
@@ -35,6 +85,10 @@ class ChunkedRows:
         self._kept: tuple[int, NDArray[Any]] = (0, np.empty((0, *columns), self._dtype))
         self._lock = threading.Lock()
         self._direct = filters == PIPELINE and tuple(columns) == dataset.shape[1:]
+        self._n_fetched = 0
+        self._raw: RawChunks | None = None
+        self.is_closed = False
+        """Whether the file is closed: its chunks stay where they are."""
 
     def read(self, first_row: int, last_row: int, n_rows: int) -> NDArray[Any]:
         """Return rows, ``last_row`` not included.
@@ -77,14 +131,13 @@ class ChunkedRows:
         The rows after the known ones begin a chunk.
         """
         start = low + len(known)
-        fetch, corner = self._dataset.id.read_direct_chunk, self._corner
-        try:
-            stored = [fetch((row, *corner)) for row in range(start, last_row, self._length)]
-        except (OSError, RuntimeError):
-            return None
-        rows = np.empty((len(known) + len(stored) * self._length, *known.shape[1:]), self._dtype)
+        n_chunks = -(-(last_row - start) // self._length)
+        rows = np.empty((len(known) + n_chunks * self._length, *known.shape[1:]), self._dtype)
         rows[: len(known)] = known
-        if not unpacked(stored, rows[len(known) :]):
+        try:
+            if not self._filled(rows[len(known) :], start):
+                return None
+        except (OSError, RuntimeError):
             return None
         rows = rows[: n_rows - low]
         rows.flags.writeable = False
@@ -93,3 +146,15 @@ class ChunkedRows:
         dropped = -(-excess // (rows.nbytes // len(rows))) if excess > 0 else 0
         self._kept = low + dropped, rows[dropped:].copy() if dropped else rows
         return rows
+
+    def _filled(self, rows: NDArray[Any], start: int) -> bool:
+        """Put whole chunks, from row ``start`` of the dataset on, into rows; return if all are."""
+        self._n_fetched += len(rows) // self._length
+        if self._raw is None and self.is_closed:
+            if self._n_fetched * self._length >= _LOCATED_FROM * len(self._dataset):
+                self._raw = RawChunks(self._dataset)
+        if self._raw is not None and self._raw.read(start // self._length, rows):
+            return True
+        fetch, end = self._dataset.id.read_direct_chunk, start + len(rows)
+        stored = [fetch((row, *self._corner)) for row in range(start, end, self._length)]
+        return unpacked(stored, rows)
