@@ -37,6 +37,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daq.clocks.clock_model import Clock, ClockSource, ClockState, Epoch, MeasuredDelays
+from daq.clocks.departures import agreement
 from daq.clocks.device_utc import corrected, from_device_utc
 from daq.clocks.lower_envelope import least_of_each, levelled, scatter_of_least, supporting_line
 from daq.clocks.quantiles import median
@@ -612,6 +613,7 @@ def _guarded(
 ) -> ClockState:
     """Return a state whose residual is that of the measured delays about the clock they gave.
 
+    Delays about it must not agree with their neighbours: the clock would move and not be followed.
     A clock is not understood if more than a few do not lie on it. Where few are off, these are
     false delays, and say nothing of the clock. Nor is it understood if its rate is no oscillator's:
     samples are then lost one by one, and times are off by up to half a sample.
@@ -625,7 +627,7 @@ def _guarded(
         certain = np.sqrt(variance) < _WELL_KNOWN / sampling_rate  # these are hardly ever false
         used = ~off | certain if is_understood else np.ones(len(off), np.bool_)
         excess = float(np.mean(late_by[used] ** 2 - _SCATTER**2 * variance[used]))
-        residual = max(residual, math.sqrt(max(excess, 0.0)))
+        residual = max(residual, math.sqrt(max(excess, agreement(late_by[used]))))
     if abs(state.ppm) - _CERTAIN * state.ppm_std > _OSCILLATOR:
         is_understood = False
         if len(late_by):

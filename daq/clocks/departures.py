@@ -4,6 +4,9 @@ Where clocks are straight, delays are measured in few segments. A sample that is
 again soon after, may lie between these. So the spectra that are kept of all segments, at a few
 frequencies, are compared: the prediction of one sensor by another, from the whole recording, must
 hold in each. What is found are suspects: disturbances of one sensor look alike.
+
+A clock may also move by less than one segment shows, and back between those that are measured. Then
+the delays of neighbours agree, which errors of measurement do not.
 """
 
 from __future__ import annotations
@@ -22,6 +25,24 @@ if TYPE_CHECKING:
 _FAR = 6.0  # standard deviations
 _FOLLOWS = 0.5  # share of the predicted motion that a segment has at least
 _LEAST = 1e-6  # s; a clock is not known better
+_LAGS = (2, 3, 4, 5)  # segments; the next one overlaps, and shares its error
+_SURE = 4.0  # standard deviations by which neighbours agree
+
+
+def agreement(late: FloatArray) -> float:
+    """Return the variance that neighbours have in common; 0 where that may be chance.
+
+    Parameters
+    ----------
+    late : float64, shape (n,)
+        In order of time, with errors that few neighbours share.
+    """
+    n_pairs = sum(max(0, len(late) - lag) for lag in _LAGS)
+    if n_pairs < len(_LAGS) ** 2:
+        return 0.0
+    late = late - late.mean()
+    common = sum(float(late[lag:] @ late[:-lag]) for lag in _LAGS if lag < len(late)) / n_pairs
+    return common if common > _SURE * float(late @ late) / len(late) / n_pairs**0.5 else 0.0
 
 
 def departing(
@@ -41,7 +62,7 @@ def departing(
     Returns
     -------
     bool, shape (n_segments,), or None
-        None where the motion is too weak for that.
+        All of them where the clock moves slowly; None where the motion is too weak for that.
     """
     adjoint = x0.conj().transpose(0, 2, 1)
     # Least squares of xj on x0, for spectra in rows.
@@ -59,6 +80,9 @@ def departing(
         delay = (omega @ crossed.imag) / info
     if not np.sort(std)[len(std) // 2] * _FAR < precise:
         return None
+    clipped = np.where(info > 0, np.clip(delay / std, -_FAR, _FAR), 0.0)
+    if agreement(clipped):
+        return np.ones(len(std), np.bool_)
     lacking = info - omega**2 @ crossed.real
     certain = _FAR * np.sqrt(omega**4 @ energy / 2)
     return np.asarray(

@@ -317,7 +317,8 @@ def with_gradients(
     A band whose test asks for more dimensions takes gradients if their own test accepts them, at
     the 1 % level, or with five sensors where what they miss is less than half the c.o.v. by free
     factors. It widens the intervals. A band that one motion explains takes gradients if they
-    explain it better by more than chance. They have as many parameters.
+    explain it better by more than chance, which is looked for where one motion explains it worse
+    than usual. They have as many parameters.
     """
     d, n_sensors = dims[0], len(dims)
     given = coherency(csm, dims)
@@ -353,7 +354,8 @@ def with_gradients(
     found = []
     for choice in choices:
         rows = np.flatnonzero(whole & (frequency >= choice.low) & (frequency <= choice.high))
-        if not len(rows):
+        explains_well = choice.test.statistic <= choice.test.degrees
+        if not len(rows) or (_is_usual(choice) and explains_well):
             found.append(choice)
             continue
         stride = -(-len(rows) // MAX_BINS)

@@ -113,9 +113,10 @@ class DelayMeasurement:
     def suspects(self, single: SegmentSpectra) -> IntArray | None:
         """Return which of the kept segments may be off the clocks that they were taken by.
 
-        None where most segments would not show it.
+        None where most segments would not show it, or too few are measured.
         """
-        if self._meter is None:
+        self._learn_held_spectra()
+        if self._meter is None or not self._meter.has_frame:
             return None
         spectra = single.values().astype(np.complex128).transpose(1, 0, 2)
         rate, length = self._welch.sampling_rate, self._welch.segment_length

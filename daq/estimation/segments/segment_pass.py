@@ -159,6 +159,7 @@ _SURVEY_TOLERANCE = 0.25
 Synchronisation this good adds to the noise less than half the square of that share where one line
 holds all that is known of the delay, and a thousandth of this in broad-band motion.
 """
+_SCATTERED = 2.0  # errors of one delay that a surveyed clock may be off
 _MOST_SUSPECTS = 0.02  # share of segments, and
 _SOME_SUSPECTS = 8
 _MATERIAL_CONSTANT = 0.02  # samples of constant delay, of which a window forgives more
@@ -439,9 +440,15 @@ class Pass:
             delays = self._positions(np.arange(0, self.n_complete, every))
             delays -= delays.mean(axis=1, keepdims=True)
             bend = (delays[2:] - 2 * delays[1:-1] + delays[:-2]) / 8  # from a line, half-way
-            if np.sqrt(np.mean(bend**2, axis=0)).max() <= tolerance:
+            is_straight = np.sqrt(np.mean(bend**2, axis=0)).max() <= tolerance
+            if is_straight and self._follow(_SCATTERED * precision):
                 self._every, self._tolerance = every, tolerance
                 return
+
+    def _follow(self, residual: float) -> bool:
+        """Return whether clocks follow their measured delays, but for this residual in s."""
+        refined = [clock for clock in self.aligned.clocks if clock.refined]
+        return all(clock.is_understood and clock.residual <= residual for clock in refined)
 
     def _surveyed(self, every: int) -> float | None:
         """Set clocks from one segment in `every`; return the error of one delay, in s."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from daq.clocks.departures import departing
+from daq.clocks.departures import agreement, departing
 
 RATE = 200.0
 OMEGA = 2 * np.pi * np.geomspace(0.4, 90.0, 48)
@@ -49,3 +49,24 @@ def test_a_disturbance_hides_no_other_segment() -> None:
     assert found is not None
     assert found[17]
     assert found.sum() <= 2
+
+
+@pytest.mark.parametrize(("seconds", "found_all"), [(0.0, False), (6e-6, True)])
+def test_a_clock_that_moves_by_less_than_one_segment_shows_is_found(
+    *, seconds: float, found_all: bool
+) -> None:
+    delays = seconds * np.sin(2 * np.pi * np.arange(600) / 25)
+    found = departing(*spectra(1e4, delays), OMEGA, precise=0.5 / RATE)
+    assert found is not None
+    assert found.all() == found.any() == found_all
+
+
+def test_neighbours_agree_by_what_they_have_in_common() -> None:
+    rng = np.random.default_rng(1)
+    errors = rng.standard_normal((400, 1000))
+    errors[:, 1:] += 0.3 * errors[:, :-1]  # of segments that overlap
+    assert sum(agreement(each) > 0 for each in errors) <= 2  # 4 sigma: 0.013 are expected
+    slow = np.sin(2 * np.pi * np.arange(1000) / 60)
+    common = np.array([agreement(each + slow) for each in errors])
+    assert common.mean() == pytest.approx(0.464, rel=0.02)  # half of 1, and less at the lags
+    assert agreement(errors[0, :4]) == agreement(np.zeros(1)) == 0.0

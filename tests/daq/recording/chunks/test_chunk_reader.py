@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import zlib
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 from daq.recording.chunks import chunk_reader, packing
-from daq.recording.chunks.chunk_reader import ChunkedRows
+from daq.recording.chunks.chunk_reader import ChunkedRows, RawChunks
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -168,3 +169,58 @@ def test_rows_after_those_that_are_final_are_read_again(tmp_path: Path, later: i
         reader.read(0, 130, 135)  # rows of its last chunk are still to be written
         file["rows"][135:] = rows[135:]
         np.testing.assert_array_equal(reader.read(120, later, N_ROWS), rows[120:later])
+
+
+def write_raw(path: Path, rows: np.ndarray[Any, Any]) -> None:
+    """Write chunks that went through no filter, every third one compressed, between others."""
+    write(path, np.zeros_like(rows))
+    with h5py.File(path, "r+") as file:
+        file.create_dataset("others", rows.shape, "<i4", chunks=(LENGTH, *rows.shape[1:]))
+        for first in range(0, N_ROWS, LENGTH):
+            chunk = np.zeros((LENGTH, *rows.shape[1:]), rows.dtype)
+            chunk[: N_ROWS - first] = rows[first : first + LENGTH]
+            content, mask = chunk.tobytes(), packing.RAW
+            if first // LENGTH % 3 == 2:
+                mask = 0b100
+                content = zlib.compress(chunk.reshape(-1).view("u1").reshape(-1, 4).T.tobytes())
+            file["rows"].id.write_direct_chunk((first, 0), content, mask)
+            if first // LENGTH % 4 == 3:
+                file["others"].id.write_direct_chunk((first, 0), chunk.tobytes())
+
+
+def test_raw_chunks_of_a_closed_file_are_read_from_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = ramp("<i4", 3)
+    write_raw(tmp_path / "f.h5", rows)
+    n_read: list[int] = []
+
+    def unpacked(stored: list[Any], into: np.ndarray[Any, Any]) -> bool:
+        n_read.append(len(stored))
+        return packing.unpacked(stored, into)
+
+    monkeypatch.setattr(chunk_reader, "unpacked", unpacked)
+    with h5py.File(tmp_path / "f.h5", "r") as file:
+        reader = ChunkedRows(file["rows"])
+        np.testing.assert_array_equal(reader.read(0, 20, N_ROWS), rows[:20])
+        assert n_read == [2]
+        reader.is_closed = True
+        for first in range(0, N_ROWS - 20, 20):
+            np.testing.assert_array_equal(reader.read(first, first + 20, N_ROWS), rows[first:][:20])
+        assert sum(n_read) < 20  # of 26
+        np.testing.assert_array_equal(reader.read(0, N_ROWS, N_ROWS), rows)
+
+
+def test_a_raw_chunk_that_is_cut_off_is_left_to_hdf5(tmp_path: Path) -> None:
+    rows = np.random.default_rng(0).integers(-(2**31), 2**31, (N_ROWS, 3)).astype("<i4")
+    write_raw(tmp_path / "f.h5", rows)
+    with h5py.File(tmp_path / "f.h5", "r") as file:
+        raw = RawChunks(file["rows"])
+        into = np.empty((LENGTH, 3), "<i4")
+        assert raw.read(0, into)
+        np.testing.assert_array_equal(into, rows[:LENGTH])
+        assert not raw.read(2, into)  # compressed
+        assert not raw.read(25, np.empty((2 * LENGTH, 3), "<i4"))  # beyond the last
+        at = file["rows"].id.get_chunk_info(24).byte_offset
+        os.truncate(tmp_path / "f.h5", at + 5)
+        assert not raw.read(24, into)
