@@ -31,6 +31,7 @@ EDGES = np.array([0.02, 0.05, 0.1, 0.2, 0.3, 0.43])
 WITHIN = 0.3
 """dB of the truth that a level may be off, whatever its interval says."""
 PROCESSES = 2
+SURVEYED = "surveyed"
 
 
 @dataclass
@@ -111,10 +112,23 @@ def faulty() -> Iterator[tuple[str, Scene]]:
         yield "all restart every 20 to 40 s", replace(scene, restarts=every)
 
 
+def surveyed() -> Iterator[tuple[str, Scene]]:
+    """Yield scenes so long, for segments of 2 s, that clocks which prove straight are surveyed.
+
+    Their rates are steady, or go in cycles that only many segments together show.
+    """
+    cycles = ((0.0, 60.0), (0.05, 30.0), (0.2, 60.0), (0.2, 300.0), (1.0, 100.0), (10.0, 120.0))
+    motions: tuple[Motion, ...] = ("white", "red")
+    for (ppm, period), motion, snr in itertools.product(cycles, motions, (1e2, 1e4, 1e6)):
+        clocks = (Oscillator(), Oscillator(15.0, ppm, period, 0.3), Oscillator(-20.0))
+        scene = Scene(seconds=1600.0, motion=motion, snr=snr, clocks=clocks)
+        yield f"{SURVEYED}, {ppm:g} ppm in {period:g} s", scene
+
+
 def one(job: tuple[str, Scene]) -> tuple[str, np.ndarray, np.ndarray, list[float], int, int]:
     """Return what one recording gives."""
     name, scene = job
-    settings = Settings()
+    settings = Settings(segment=2.0) if name.startswith(SURVEYED) else Settings()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "r.h5"
         truth = record(path, scene)
@@ -141,7 +155,7 @@ def main(names: list[str]) -> int:
     """Run all scenes, or those whose names begin like one of these."""
     jobs = [
         job
-        for job in itertools.chain(faulty(), healthy())
+        for job in itertools.chain(faulty(), surveyed(), healthy())
         if not names or any(job[0].startswith(name) for name in names)
     ]
     groups: dict[str, Group] = {}

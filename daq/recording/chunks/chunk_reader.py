@@ -150,9 +150,9 @@ class ChunkedRows:
     def _filled(self, rows: NDArray[Any], start: int) -> bool:
         """Put whole chunks, from row ``start`` of the dataset on, into rows; return if all are."""
         self._n_fetched += len(rows) // self._length
-        if self._raw is None and self.is_closed:
-            if self._n_fetched * self._length >= _LOCATED_FROM * len(self._dataset):
-                self._raw = RawChunks(self._dataset)
+        many = self._n_fetched * self._length >= _LOCATED_FROM * len(self._dataset)
+        if self._raw is None and self.is_closed and many:
+            self._raw = RawChunks(self._dataset)
         if self._raw is not None and self._raw.read(start // self._length, rows):
             return True
         fetch, end = self._dataset.id.read_direct_chunk, start + len(rows)
