@@ -55,8 +55,10 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
     if snapshot.rounding:
         most = snapshot.rounding * np.nan_to_num(snapshot.data_psd)
         found.append(contribution(Source.ROUNDING, shape, below=most, above=most))
-    if dimensions.any():
-        found.append(contribution(Source.DIMENSIONS, shape, share=dimensions[:, None]))
+    below = psd * _left_out(snapshot, method)[:, None]
+    if dimensions.any() or below.any():
+        share = dimensions[:, None]
+        found.append(contribution(Source.DIMENSIONS, shape, below=below, share=share))
     for source, share in _misfits(snapshot, explained).items():
         if share.any():
             found.append(contribution(source, shape, share=share[:, None]))
@@ -118,6 +120,20 @@ def _dimensions(snapshot: Snapshot, method: str) -> tuple[FloatArray, BoolArray]
             edge = 2 * math.sqrt(n_channels / averages) / (n_channels - choice.n_factors)
             share[inside] = np.where(pooled[inside], edge, NORMAL_95 * error)
     return share, explained
+
+
+def _left_out(snapshot: Snapshot, method: str) -> FloatArray:
+    """Return how much of the noise may be motion, where fewer dimensions than usual are fitted.
+
+    As a share of the noise, shape (n_freqs,).
+    """
+    found = np.zeros(len(snapshot.frequency))
+    for choice in snapshot.diagnostics.dimensions if method == "maximum-likelihood" else ():
+        inside = (snapshot.frequency >= choice.low) & (snapshot.frequency <= choice.high)
+        found[inside] = choice.unseen(
+            sum(snapshot.dims), snapshot.n_effective, quantile=NORMAL_95
+        )
+    return found
 
 
 def _unseen(snapshot: Snapshot, method: str) -> FloatArray:
