@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 SECOND_ORDER = 2.5
 """Bias by further dimensions over the squared c.o.v. of one frequency, one standard deviation
 (docs/validation/gradients.md)."""
+MOST_SHARED = 0.99
+"""Part of its noise that a channel shares at most."""
 NOTHING_USEFUL = 1.0
 """Share of the noise by which a model that fails may be off, from which nothing is known."""
 
@@ -59,9 +61,11 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
     if dimensions.any() or below.any():
         share = dimensions[:, None]
         found.append(contribution(Source.DIMENSIONS, shape, below=below, share=share))
+    taken = psd * _taken_for_motion(snapshot, method)
     for source, share in _misfits(snapshot, explained).items():
-        if share.any():
-            found.append(contribution(source, shape, share=share[:, None]))
+        above = taken if source is Source.SHARED_NOISE else 0.0
+        if share.any() or np.any(above):
+            found.append(contribution(source, shape, above=above, share=share[:, None]))
     faulty = [*diagnostics.clipped, *diagnostics.stood_still]
     if faulty:
         below = np.zeros(shape)
@@ -130,9 +134,7 @@ def _left_out(snapshot: Snapshot, method: str) -> FloatArray:
     found = np.zeros(len(snapshot.frequency))
     for choice in snapshot.diagnostics.dimensions if method == "maximum-likelihood" else ():
         inside = (snapshot.frequency >= choice.low) & (snapshot.frequency <= choice.high)
-        found[inside] = choice.unseen(
-            sum(snapshot.dims), snapshot.n_effective, quantile=NORMAL_95
-        )
+        found[inside] = choice.unseen(sum(snapshot.dims), snapshot.n_effective, quantile=NORMAL_95)
     return found
 
 
@@ -156,6 +158,33 @@ def _unseen(snapshot: Snapshot, method: str) -> FloatArray:
                 else misfit(choice.test, sum(snapshot.dims), snapshot.n_effective, NORMAL_95)
             )
     return unseen
+
+
+def shared_parts(snapshot: Snapshot) -> FloatArray:
+    """Return how much of its noise each channel shares with another, (n_freqs, n_channels)."""
+    frequency = snapshot.frequency
+    parts = np.zeros((len(frequency), len(snapshot.channels)))
+    for advice in snapshot.diagnostics.advice:
+        if not isinstance(advice, SharedNoise) or advice.band is None:
+            continue
+        here = (frequency >= advice.band[0]) & (frequency <= advice.band[1])
+        for pair, amount in zip(advice.channels, advice.amounts, strict=True):
+            rows = np.ix_(here, pair)
+            parts[rows] = np.maximum(parts[rows], min(abs(amount), MOST_SHARED))
+    return parts
+
+
+def _taken_for_motion(snapshot: Snapshot, method: str) -> FloatArray:
+    """Return the shared noise that further dimensions may have taken for motion.
+
+    As a share of the noise that is left, shape (n_freqs, n_channels).
+    """
+    frequency, further = snapshot.frequency, np.zeros(len(snapshot.frequency), np.bool_)
+    for choice in snapshot.diagnostics.dimensions if method == "maximum-likelihood" else ():
+        if choice.n_factors > choice.usual:
+            further |= (frequency >= choice.low) & (frequency <= choice.high)
+    parts = shared_parts(snapshot)
+    return np.where(further[:, None], parts / (1 - parts), 0.0)
 
 
 def _misfits(snapshot: Snapshot, explained: BoolArray) -> dict[Source, FloatArray]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.estimation.contributions import contributions
+from daq.estimation.contributions import contributions, shared_parts
 from daq.estimation.noise_estimates import ALL_METHODS
 from estimator.checks.advice import NoSharedMotion
 from estimator.levels.bands import band_edges, band_levels, bin_correlation
@@ -70,7 +70,8 @@ class Levels:
     contributions : tuple of Contribution
         What widens these.
     bound : BandLevels
-        What the other sensors do not predict: the noise is below it by any model.
+        What the other sensors do not predict: the noise is below it by any model; not known where
+        a channel shares noise with others.
     """
 
     of_scatter: BandLevels
@@ -167,6 +168,7 @@ class Spectrum:
         self._width = np.gradient(snapshot.frequency)
         self._correlation = correlation_of(settings)
         self._contributions = contributions(snapshot, noise.method)
+        self._shares = shared_parts(snapshot) > 0
         known = np.isfinite(noise.noise_psd)
         self._weight = np.where(known, self._width[:, None], 0.0)
         self._bound: tuple[slice, FloatArray, FloatArray] = (slice(0, 0), np.empty(0), np.empty(0))
@@ -183,6 +185,7 @@ class Spectrum:
         found = band_levels(noise.noise_psd, noise.cumulants, edges, correlation, weights=width)
         first, rest, scatter = self._unpredicted(int(edges[0]), int(edges[-1]))
         here = slice(first, first + len(rest))
+        rest = np.where(self._shares[here], np.nan, rest)  # others predict noise that they share
         bound = band_levels(rest, scatter, edges - first, correlation, weights=width[here])
         parts = (e.in_bands(edges, self._weight, noise.noise_psd) for e in self._contributions)
         return Levels(found, tuple(parts), bound)

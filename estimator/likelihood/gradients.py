@@ -243,6 +243,9 @@ RESPONSES_TO = 8.0
 What is not seen there is a few per cent of the noise, nine times that here, and bends less."""
 SHAPE_TO = 20.0
 """The same for the space that positions span."""
+MOST_LEVERAGE = 0.9
+"""The part of a sensor's own signal that 1, x and y may explain. Near one, the space that they span
+holds this sensor alone, and takes its noise for motion."""
 _STEPS = 3  # of delays and responses in turn
 _BETTER_BY = 1.0  # standard deviations of the test by which gradients explain a band better
 _HARMLESS = 0.5  # of the c.o.v. by free factors
@@ -308,7 +311,8 @@ def with_gradients(
     -------
     gradients : Gradients or None
         None where they are of no use: sensors with unequal numbers of channels, fewer than four,
-        a channel without signal, or one motion that explains all bands.
+        a channel without signal, one motion that explains all bands, or a space of positions that
+        one sensor determines alone.
     choices : tuple of BandDimension
         With `gradients` set in the bands that they explain.
 
@@ -350,6 +354,8 @@ def with_gradients(
         expected[middle],
         positions=positions,
     )
+    if np.max(np.sum(basis**2, axis=1)) > MOST_LEVERAGE:
+        return None, choices
     loadings = _loadings(response, basis) * late[:, :, None]
     found = []
     for choice in choices:

@@ -1,0 +1,88 @@
+"""Recordings that break an assumption of the model each: their intervals hold the truth."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.formats.arrays import recording_of_arrays
+from daq.results.band_summary import channel_means
+from estimator.checks.advice import SharedNoise
+
+if TYPE_CHECKING:
+    from daq.estimation.snapshot import Snapshot
+
+RATE, N_SAMPLES = 100.0, 60_000
+SETTINGS = Settings(segment=5.0)
+BANDS = ((2.0, 5.0), (5.0, 10.0), (10.0, 20.0), (20.0, 40.0))
+
+
+def felt(rng: np.random.Generator, n_sensors: int, snr: float) -> list[np.ndarray]:
+    """Return one motion, white in three directions, as triaxial sensors of any direction feel it.
+
+    In units of the noise of a channel.
+    """
+    motion = np.sqrt(snr) * rng.standard_normal((N_SAMPLES, 3))
+    return [motion @ np.linalg.qr(rng.standard_normal((3, 3)))[0].T for _ in range(n_sensors)]
+
+
+def estimated(motion: list[np.ndarray], noise: np.ndarray) -> Snapshot:
+    """Return the estimate of motion and noise, the latter of shape (n_sensors, n_samples, 3)."""
+    samples = {f"s{n}": each + own for n, (each, own) in enumerate(zip(motion, noise, strict=True))}
+    return estimate([recording_of_arrays(samples, RATE)], SETTINGS)
+
+
+def held(snapshot: Snapshot, noise: np.ndarray) -> np.ndarray:
+    """Return which intervals hold the true noise, shape (n_bands, n_channels)."""
+    (result,) = snapshot.results.values()
+    truth = noise.transpose(1, 0, 2).reshape(N_SAMPLES, -1).var(axis=0) * 2 / RATE
+    means = [channel_means(result, snapshot, SETTINGS, band) for band in BANDS]
+    return np.array(
+        [
+            [mean.low[0] <= true <= mean.high[0] for mean, true in zip(band, truth, strict=True)]
+            for band in means
+        ]
+    )
+
+
+def white(rng: np.random.Generator, n_sensors: int) -> np.ndarray:
+    return rng.standard_normal((n_sensors, N_SAMPLES, 3))
+
+
+@pytest.mark.parametrize("snr", [0.05, pytest.param(0.02, marks=pytest.mark.long)])
+def test_motion_that_the_test_of_fewer_dimensions_hides_is_in_the_interval(snr: float) -> None:
+    """Of five per cent in all directions, one factor takes up enough to pass, and leaves most."""
+    rng = np.random.default_rng(1)
+    noise = white(rng, 4)
+    snapshot = estimated(felt(rng, 4, snr), noise)
+    fewer = [each.n_factors < each.usual for each in snapshot.diagnostics.dimensions]
+    assert np.mean(fewer) > 0.9  # what this is about
+    assert held(snapshot, noise).mean() >= 0.95
+
+
+def test_noise_that_changes_is_no_gradient_of_the_motion() -> None:
+    """Positions fitted to it would hold one sensor alone, and take its noise for motion."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        noise = white(rng, 5)
+        noise[0, N_SAMPLES // 2 :] *= 4
+        snapshot = estimated(felt(rng, 5, 1e3), noise)
+        assert not any(each.gradients for each in snapshot.diagnostics.dimensions)
+        assert held(snapshot, noise).mean() >= 0.93
+
+
+def test_noise_that_two_channels_share_is_in_their_intervals() -> None:
+    """A further dimension takes it for motion, and the one channel predicts it of the other."""
+    rng = np.random.default_rng(1)
+    noise = white(rng, 5)
+    noise[:2, :, 0] += 0.7 * rng.standard_normal(N_SAMPLES)
+    snapshot = estimated(felt(rng, 5, 1e3), noise)
+    assert any(isinstance(each, SharedNoise) for each in snapshot.diagnostics.advice)
+    assert any(each.n_factors > each.usual for each in snapshot.diagnostics.dimensions)
+    inside = held(snapshot, noise)
+    assert inside[:, [0, 3]].all()
+    assert inside.mean() >= 0.93
