@@ -169,7 +169,7 @@ def shared_parts(snapshot: Snapshot) -> FloatArray:
             continue
         here = (frequency >= advice.band[0]) & (frequency <= advice.band[1])
         for pair, amount in zip(advice.channels, advice.amounts, strict=True):
-            rows = np.ix_(here, pair)
+            rows = np.ix_(here, np.array(pair))
             parts[rows] = np.maximum(parts[rows], min(abs(amount), MOST_SHARED))
     return parts
 
