@@ -318,11 +318,12 @@ def with_gradients(
 
     Notes
     -----
-    A band whose test asks for more dimensions takes gradients if their own test accepts them, at
-    the 1 % level, or with five sensors where what they miss is less than half the c.o.v. by free
-    factors. It widens the intervals. A band that one motion explains takes gradients if they
-    explain it better by more than chance, which is looked for where one motion explains it worse
-    than usual. They have as many parameters.
+    Gradients are looked for where one motion fails in any band, at a level of 1 % for all bands
+    together. A band whose test asks for more dimensions takes them if they cost less precision than
+    free factors, and their own test accepts them, at the 1 % level, or with five sensors where what
+    they miss is less than half the c.o.v. by free factors. It widens the intervals. A band that one
+    motion explains takes gradients if they explain it better by more than chance, which is looked
+    for where one motion explains it worse than usual. They have as many parameters.
     """
     d, n_sensors = dims[0], len(dims)
     given = coherency(csm, dims)
@@ -331,6 +332,8 @@ def with_gradients(
     kind = kinds(given, dims)
     whole = given.valid & (given.flags == 0).all(axis=1) & (frequency > 0)
     if kind.max() >= d or n_effective <= csm.shape[1]:
+        return None, choices
+    if not _are_seen(choices):
         return None, choices
     seen = next((n for n, each in enumerate(choices) if not _is_usual(each)), len(choices))
     top = choices[max(0, seen - 1)].high
@@ -440,6 +443,12 @@ def _is_usual(choice: BandDimension) -> bool:
     return choice.accepted and not choice.gradients and choice.n_factors <= choice.usual
 
 
+def _are_seen(choices: Sequence[BandDimension]) -> bool:
+    """Return whether one motion fails in any band by more than chance allows in so many."""
+    usual = [each.tried[each.usual] for each in choices if len(each.tried) > each.usual]
+    return any(test.p_value < MISFIT_LEVEL / len(choices) for test in usual)
+
+
 def _outer(noise: FloatArray) -> FloatArray:
     root = np.sqrt(noise)
     return np.asarray(root[:, :, None] * root[:, None, :])
@@ -461,6 +470,9 @@ def _chosen(
         return choice
     test = known_loadings_test(fit, n_factors=n_factors, n_effective=n_effective)
     pooled = pool(test, np.ones(len(fit.psi), np.bool_), neighbours=neighbours)
+    cov = float(median((fit.standard_error(n_effective) / fit.psi).ravel()))
+    if choice.accepted and usual is None and cov > choice.cov:
+        return choice  # free factors cost less: the space of positions holds too much noise
     enough = choice.n_sensors >= MIN_DETERMINED_SENSORS
     harmless = misfit(pooled, n_channels, n_effective) < _HARMLESS * choice.cov
     if not (pooled.p_value > MISFIT_LEVEL or (enough and harmless)):
@@ -475,7 +487,7 @@ def _chosen(
         n_factors=n_factors,
         accepted=enough,
         test=pooled,
-        cov=float(median((fit.standard_error(n_effective) / fit.psi).ravel())),
+        cov=cov,
         gradients=True,
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,7 @@ def choice(band: int, *, usual: bool, n_sensors: int = N) -> BandDimension:
         usual=3,
         accepted=True,
         test=test,
-        tried=(test,),
+        tried=(*[test] * 3, test if usual else replace(test, p_value=1e-9)),
         cov=0.035 if usual else 0.15,
         usual_cov=0.035,
         n_sensors=n_sensors,
@@ -115,3 +116,20 @@ def test_three_sensors_and_unequal_ones_have_no_gradients(
     gradients, same = with_gradients(csm, FREQUENCY, choices, dims=dims, n_effective=200)
     assert gradients is None
     assert same == choices
+
+
+def test_one_band_that_fails_by_chance_is_no_sign_of_gradients() -> None:
+    """Positions would be fitted to noise, and hold the noise of some sensors."""
+    rng = np.random.default_rng(1)
+    csm = wishart(turned_bench(rng), 1080, rng)[0]
+    choices = tuple(choice(band, usual=band == 0) for band in range(len(CENTRES)))
+    weak = replace(choices[1].tried[3], p_value=0.02)
+    doubtful = tuple(
+        each if n == 0 else replace(each, tried=(*each.tried[:3], weak))
+        for n, each in enumerate(choices)
+    )
+    known: dict[str, Any] = {"dims": (3,) * N, "n_effective": 1080.0}
+    assert with_gradients(csm, FREQUENCY, doubtful, **known) == (None, doubtful)
+    # nor where free factors cost less
+    cheap = tuple(replace(each, cov=0.01) for each in choices)
+    assert not any(each.gradients for each in with_gradients(csm, FREQUENCY, cheap, **known)[1][1:])
