@@ -276,6 +276,8 @@ class Estimation:
         self._continue()
         for each in self._passes:
             each.aligned.refresh()
+        if not before:
+            self._find_filters_first()
         self._n_taken = [sensor.n_samples for sensor in self._recordings[-1].sensors]
         total, done = sum(each.n_complete for each in self._passes), before
 
@@ -366,10 +368,7 @@ class Estimation:
         if not (is_exact and self._equalisation.is_settled):
             self._equalisation.reset()
         self._filter()
-        is_long = all(each.n_complete >= FILTER_SEGMENTS + PROOF_SEGMENTS for each in self._passes)
-        if is_exact and is_long and not self._equalisation.is_settled:
-            self._find_filters(count)  # before all segments are taken: most are taken once
-            self._equalisation.is_settled = True
+        self._find_filters_first(count)
         for each in self._passes:
             each.finish(count, repeat)
             keep_few([one.single for one in self._passes])
@@ -379,6 +378,14 @@ class Estimation:
             for each in self._passes:
                 each.advance(count)
                 keep_few([one.single for one in self._passes])
+
+    def _find_filters_first(self, count: Callable[[int], None] | None = None) -> None:
+        """Find filters before all segments are taken, if there are enough: most are taken once."""
+        is_long = all(each.n_complete >= FILTER_SEGMENTS + PROOF_SEGMENTS for each in self._passes)
+        is_exact = all(each.aligned.is_exact for each in self._passes)
+        if is_exact and is_long and not self._equalisation.is_settled:
+            self._find_filters(count)
+            self._equalisation.is_settled = True
 
     def _open_continuations(self) -> None:
         for recording in tuple(self._recordings):

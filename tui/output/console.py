@@ -206,9 +206,12 @@ def growing(file: str | None) -> Iterator[Callable[[str], object]]:
             part.unlink(missing_ok=True)
 
 
+_ENCODER = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
+
+
 def json_text(document: Any) -> str:  # noqa: ANN401 - any JSON value
     """Return a document as one line of JSON; infinite numbers become null."""
-    return json.dumps(finite(document), ensure_ascii=False, allow_nan=False)
+    return _ENCODER.encode(finite(document))
 
 
 def write_json(file: str | None, document: Mapping[str, Any]) -> None:
@@ -222,6 +225,7 @@ def write_json(file: str | None, document: Mapping[str, Any]) -> None:
 
 
 _IN_PARTS = 4  # depth to which JSON is written in parts: by frequency in tables of all pairs
+_TOGETHER = 1 << 12  # numbers of a part, about, where entries are alike
 
 
 def _json_parts(value: Any, *, depth: int) -> Iterator[str]:  # noqa: ANN401 - any JSON value
@@ -231,12 +235,26 @@ def _json_parts(value: Any, *, depth: int) -> Iterator[str]:  # noqa: ANN401 - a
     if not (depth and value and (isinstance(value, dict) or isinstance(first, (dict, list)))):
         yield json_text(value)
         return
+    n_together = _TOGETHER // _n_values(first) if is_list else 1
+    if n_together > 1:
+        for begin in range(0, len(value), n_together):
+            text = json_text(value[begin : begin + n_together])
+            yield (", " if begin else "[") + text[1:-1]
+        yield "]"
+        return
     for number, entry in enumerate(value):
         yield (", " if number else "[" if is_list else "{")
         if not is_list:
             yield f"{json_text(str(entry))}: "
         yield from _json_parts(entry if is_list else value[entry], depth=depth - 1)
     yield "]" if is_list else "}"
+
+
+def _n_values(value: Any) -> int:  # noqa: ANN401 - any JSON value
+    """Return about how many values there are, where entries of a list are alike."""
+    if isinstance(value, dict):
+        return 1 + sum(map(_n_values, value.values()))
+    return 1 + len(value) * _n_values(value[0]) if isinstance(value, list) and value else 1
 
 
 def finite(value: Any) -> Any:  # noqa: ANN401 - any JSON value
