@@ -197,7 +197,9 @@ class DelayEstimator:
             frame, xj = self._frames.get(number), sensors[number]
             known = np.isfinite(spread)
             if frame is None or known.any():
-                used = known if known.any() else np.ones(n_segments, dtype=bool)
+                fewest = 1 if frame else x0.shape[2] + xj.shape[2] + 1  # P and R are regular
+                enough = np.count_nonzero(known) >= fewest
+                used = known if enough else np.ones(n_segments, dtype=bool)
                 advanced = self._advanced(xj[:, used], np.where(known, tau, 0.0)[used])
                 new = _Frame.of(x0[:, used], advanced)
                 if frame is None:
@@ -322,16 +324,20 @@ class DelayEstimator:
         met = (crossed * _turn(omega, tau)).real.sum(axis=0)
         # R is an estimate too: correct by the mean of an inverse Wishart matrix.
         freedom = max(frame.n_segments - x0.shape[2], 1)
-        std *= math.sqrt(freedom / max(freedom - xj.shape[2] - 1, 1))
+        inflated = freedom / max(freedom - xj.shape[2] - 1, 1)
+        std *= math.sqrt(inflated)
         known = (2 * total / kappa > _SIGNIFICANT) & (met > _MET * total)
         known &= is_one | (alike < _WEAK)  # else the cycle is chosen by chance
-        far = ~known & (2 * total / kappa > _FAR_SIGNIFICANT) & (self.is_wide and self.has_frame)
+        # What P predicts without its noise, which no sensor follows.
+        by_noise = inflated * x0.shape[2] * xj.shape[2] / freedom * len(omega)
+        meant = total / inflated - by_noise
+        far = ~known & (2 * meant / kappa > _FAR_SIGNIFICANT) & (self.is_wide and self.has_frame)
         if far.any():
             tau[far] = self._highest(crossed[:, far])
             met = (crossed * _turn(omega, tau)).real.sum(axis=0)
             known |= far & (met > _MET * total)
         std = np.where(known, std, np.inf)
-        return tau, np.where(far & ~known, np.nan, std)
+        return tau, np.where(far & ~known & (met <= _MET * meant), np.nan, std)
 
     def _highest(self, crossed: ComplexArray) -> FloatArray:
         """Return the τ of the highest peak of every column, up to half a segment away."""

@@ -424,3 +424,22 @@ def test_weak_motion_and_parts_without_segments_are_looked_at_closely(
     gaps = huddle(1e4, (0.0, 0.0, 0.0))
     gaps["b"].gaps = tuple((first, first + 5) for first in range(6000, 24_000, 60))
     assert pieces_are_read(write(tmp_path / "gaps.h5", gaps), monkeypatch)
+
+
+@pytest.mark.parametrize("burst", [1.0, pytest.param(30.0, marks=LONG)])
+def test_motion_too_weak_to_show_a_delay_puts_no_sensor_elsewhere(
+    tmp_path: Path, burst: float
+) -> None:
+    """What noise predicts is strong where few pieces are known, and no sensor follows it."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        motion = np.sqrt(0.03) * rng.standard_normal((60_000, 3))
+        motion[20_000:26_000] *= burst
+        sensors = {}
+        for name in "abcd":
+            turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+            felt = motion @ turn + rng.standard_normal(motion.shape)
+            sensors[name] = Sensor(np.rint(1000 * felt).astype(np.int32), rate=100.0, utc=True)
+        clocks = estimate([write(tmp_path / f"{seed}.h5", sensors)], Settings()).clocks
+        assert all(each.is_understood for each in clocks)
+        assert any(each.unchecked for each in clocks)
