@@ -328,7 +328,8 @@ class DelayEstimator:
         std *= math.sqrt(inflated)
         known = (2 * total / kappa > _SIGNIFICANT) & (met > _MET * total)
         known &= is_one | (alike < _WEAK)  # else the cycle is chosen by chance
-        # What P predicts without its noise, which no sensor follows.
+        # What P predicts without its noise, which no sensor follows. Of few segments that is hardly
+        # known: as much as R is off by is taken off beside.
         by_noise = inflated * x0.shape[2] * xj.shape[2] / freedom * len(omega)
         meant = total / inflated - by_noise
         far = ~known & (2 * meant / kappa > _FAR_SIGNIFICANT) & (self.is_wide and self.has_frame)

@@ -27,7 +27,8 @@ motion, tilts, gains and linear responses:
     ``1 / (S**-1)_ii * n / (n - m)``
 
 with S of the channel and the m channels of the other sensors. Its scatter is that of a PSD of n - m
-averages. For equal noise it is above the noise by a factor of ``1 + q / (N - 1)``.
+averages. For equal noise it is above the noise by a factor of ``1 + q / (N - 1)``. Noise that two
+sensors share is predicted too: for their channels it is no bound.
 """
 
 from __future__ import annotations
