@@ -13,24 +13,25 @@ import contextlib
 import hashlib
 import itertools
 import json
-import os
-import uuid
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Self
 
-import h5py
 import numpy as np
 
 from daq.errors import ArchiveError, RecordingError, WrongArchiveError
 from daq.recording.file_format import channel_attributes, channels_of
 from daq.recording.storage.opening import open_file
 from daq.recording.storage.refusals import dataset, member, number, text
+from daq.recording.storage.whole_hdf5 import WholeHdf5, little_endian
+from daq.whole_file import replaced
 from estimator.spectra.segment_rejection import Reason
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
+    from types import TracebackType
 
+    import h5py
     from numpy.typing import NDArray
 
     from daq.bench.channel import Channel
@@ -46,6 +47,7 @@ SUMMARY_VERSION = 1
 """Summaries of another version are made again."""
 DAY_NS = 86400 * 10**9
 STRETCH_DTYPE = np.dtype([("start_utc_ns", "<i8"), ("n_segments", "<i8")])
+_SUMMED = {"fletcher32": True, "chunks": True}
 _DAMAGE = (AttributeError, IndexError, KeyError, MemoryError, OSError, RuntimeError, TypeError)
 
 
@@ -194,11 +196,11 @@ class SpectraWriter:
         single: bool = False,
     ) -> None:
         self._daily, self._single = daily, daily or single
-        self._path = path
-        self._part = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
-        self._file = h5py.File(self._part, "w")
+        self._unfinished = contextlib.ExitStack()
+        part = self._unfinished.enter_context(replaced(path))
+        self._hdf5 = self._unfinished.enter_context(WholeHdf5(part))
         shape = (n_freqs, n_channels, n_channels)
-        self._csm = self._file.create_dataset(
+        self._csm = self._hdf5.file.create_dataset(
             "csm",
             shape=(0, *shape),
             maxshape=(None, *shape),
@@ -206,26 +208,30 @@ class SpectraWriter:
             dtype="<f4" if self._single else "<f8",
             fletcher32=True,
         )
-        self._stretches: list[tuple[int, int]] = []
+        self.restart()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
-        self._part.unlink(missing_ok=True)
+    def __exit__(self, _: object, error: BaseException | None, trace: TracebackType | None) -> None:
+        error = GeneratorExit() if error is None else error  # for a file without commit
+        self._unfinished.__exit__(type(error), error, trace)
 
     def restart(self) -> None:
         """Drop all stretches."""
-        self._stretches.clear()
+        self._stretches: list[tuple[int, int]] = []
+        self._contents = hashlib.sha256()
 
     def append(self, start_utc_ns: int, n_segments: int, csm: ComplexArray) -> None:
         """Add a stretch; `csm` of shape (n_freqs, n_channels, n_channels), Hermitian."""
         row = len(self._stretches)
         if row >= len(self._csm):
             self._csm.resize(row + 1, axis=0)
-        self._csm[row] = packed(csm)
+        rows = packed(csm).astype(self._csm.dtype, copy=False)
+        self._csm[row] = rows
+        self._contents.update(little_endian(rows))
         self._stretches.append((start_utc_ns, n_segments))
+        self._hdf5.check()
 
     def rows(self) -> Iterator[tuple[int, int, ComplexArray]]:
         """Yield beginning, segments and matrix of each stretch so far."""
@@ -237,13 +243,13 @@ class SpectraWriter:
 
         `found` are the summaries with their months.
         """
-        file, origin = self._file, described.origin
+        hdf5, file, origin = self._hdf5, self._hdf5.file, described.origin
         for month, summary in found:
-            _write_summary(file.create_group(f"months/{month}"), summary, total=not self._daily)
+            _write_summary(hdf5, f"months/{month}", summary, total=not self._daily)
         self._csm.resize(len(self._stretches), axis=0)
-        file.create_dataset(
-            "stretches", data=np.array(self._stretches, STRETCH_DTYPE), fletcher32=True, chunks=True
-        ) if self._stretches else file.create_dataset("stretches", (0,), STRETCH_DTYPE)
+        hdf5.contents[self._csm.name] = self._contents.digest()
+        stretches = np.array(self._stretches, STRETCH_DTYPE)
+        hdf5.create("stretches", stretches, **_SUMMED if self._stretches else {})
         groups = file.create_group("sensors", track_order=True)
         for name in dict.fromkeys(sensor for sensor, _ in described.channels):
             own = [channel for sensor, channel in described.channels if sensor == name]
@@ -275,10 +281,7 @@ class SpectraWriter:
                 "single": int(self._single),
             }
         )
-        file.close()
-        to_disk(self._part)
-        self._part.replace(self._path)
-        to_disk(self._path.parent)
+        self._unfinished.close()
 
 
 class SpectraFile:
@@ -475,17 +478,17 @@ def unpacked(found: NDArray[np.floating[Any]]) -> ComplexArray:
     return csm
 
 
-def _write_summary(group: h5py.Group, summary: Summary, *, total: bool) -> None:
+def _write_summary(hdf5: WholeHdf5, group: str, summary: Summary, *, total: bool) -> None:
     for each in fields(summary):
         array = getattr(summary, each.name)
         if each.name == "total" and not total:
             continue
         array = packed(array) if each.name == "total" else array
-        group.create_dataset(
-            each.name, data=array, compression="gzip", compression_opts=1, shuffle=True,
+        hdf5.create(
+            f"{group}/{each.name}", array, compression="gzip", compression_opts=1, shuffle=True,
             fletcher32=True, chunks=(1, *array.shape[1:]) if array.ndim > 2 else True,
         )  # fmt: skip
-    group.attrs["sha256"] = summary.sha256
+    hdf5.file[group].attrs["sha256"] = summary.sha256
 
 
 @contextlib.contextmanager
@@ -509,15 +512,3 @@ def _table(
     if not isinstance(found, dict):
         raise TypeError(f"attribute {name}; expected a table")
     return found
-
-
-def to_disk(path: Path) -> None:
-    """Write a file, or the names in a folder, to the disk."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    except OSError:
-        if path.is_file():
-            raise  # some file systems have no fsync of folders
-    finally:
-        os.close(handle)

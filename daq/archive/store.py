@@ -21,7 +21,6 @@ import hashlib
 import os
 import re
 import sys
-import uuid
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -29,6 +28,7 @@ from daq.archive.index import ROLLUP, Entry, Index
 from daq.archive.plan import Plan
 from daq.archive.spectra_file import DAY_NS, SpectraFile, thin
 from daq.errors import ArchiveError, WrongArchiveError
+from daq.whole_file import write_whole
 
 if sys.platform != "win32":
     import fcntl
@@ -82,15 +82,7 @@ class Store:
     def create(cls, folder: Path, plan: Plan) -> Store:
         """Begin an archive in a folder, which is made if needed."""
         folder.mkdir(parents=True, exist_ok=True)
-        part = folder / f".{PLAN_FILE}.{uuid.uuid4().hex}.part"
-        try:
-            with part.open("w", encoding="utf-8") as file:
-                file.write(plan.to_json())
-                file.flush()
-                os.fsync(file.fileno())
-            part.replace(folder / PLAN_FILE)
-        finally:
-            part.unlink(missing_ok=True)
+        write_whole(folder / PLAN_FILE, plan.to_json().encode())
         return cls(folder, plan)
 
     @contextlib.contextmanager

@@ -8,9 +8,10 @@ Beside its months it has the series of the archive's usual bands.
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import json
-import uuid
+import logging
 from dataclasses import fields, replace
 from functools import reduce
 from operator import add
@@ -33,8 +34,10 @@ from daq.archive.rollup import (
     series_of,
     summaries,
 )
-from daq.archive.spectra_file import SUMMARY_VERSION, SpectraFile, packed, to_disk
+from daq.archive.spectra_file import SUMMARY_VERSION, SpectraFile, packed
 from daq.errors import ArchiveError
+from daq.recording.storage.whole_hdf5 import WholeHdf5
+from daq.whole_file import hidden, put_in_place, remove
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -46,6 +49,8 @@ if TYPE_CHECKING:
     from daq.archive.store import Store
     from daq.estimation.settings import Settings
 
+_LOGGER = logging.getLogger(__name__)
+_READ_ONLY = {errno.EACCES, errno.EPERM, errno.EROFS}
 SERIES = "series"
 """Group of a year's file: levels of the usual bands, so that most answers read no fine bands."""
 
@@ -107,12 +112,12 @@ class Years:
         self._n_all = sum(len(self._months[month]) for month in missing)
         for year in years:
             own = {month: digest for month, digest in wanted.items() if month[:4] == year}
-            if current[year] != own:
-                with self._made(year, own, current[year], usual) as file:
-                    if file is not None:
-                        yield file
-            else:
-                with h5py.File(self._path(year)) as file:
+            with contextlib.ExitStack() as closing:
+                if current[year] != own:
+                    file = self._opened(closing, year, own, current[year], usual)
+                else:
+                    file = closing.enter_context(h5py.File(self._path(year)))
+                if "months" in file:
                     yield file
 
     def _path(self, year: str) -> Path:
@@ -129,57 +134,63 @@ class Years:
             return {str(m): str(group.attrs["digest"]) for m, group in f["months"].items()}
         return {}
 
-    @contextlib.contextmanager
-    def _made(
+    def _opened(
         self,
+        closing: contextlib.ExitStack,
         year: str,
         wanted: Mapping[str, str],
         current: Mapping[str, str],
         usual: Sequence[slice],
-    ) -> Iterator[h5py.File | None]:
+    ) -> h5py.File:
         """Make the file of a year, of months that it has and of recordings; it is then kept.
 
-        In a folder that cannot be written, it is made in memory.
+        Where it cannot be written, it is made in memory.
         """
-        path = self._path(year)
-        part = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
+        path, n_problems, n_read = self._path(year), len(self.problems), self._n_read
+        part = hidden(path)
+        closing.callback(remove, part)
         try:
             path.parent.mkdir(exist_ok=True)
-            file = h5py.File(part, "w")
-        except OSError:
-            file = h5py.File(part.name, "w", driver="core", backing_store=False)
-        try:
-            before = len(self.problems)
-            with file:
-                for month, digest in wanted.items():
-                    if current.get(month) == digest:
-                        with h5py.File(path) as old:
-                            old.copy(f"months/{month}", file.require_group("months"))
-                    else:
-                        rollup = self._rolled_up(month)
-                        if rollup is not None:
-                            group = file.create_group(f"months/{month}")
-                            _write(group, rollup)
-                            group.attrs["digest"] = digest
-                if file.require_group("months"):
-                    _write_totals(file)
-                    group = file.create_group(SERIES)
-                    group.attrs["spans"] = _text_of(usual)
-                    made = series_of(_months_of(file), self.grid, usual)
-                    for each in fields(made):
-                        group.create_dataset(
-                            each.name, data=getattr(made, each.name), chunks=True, fletcher32=True
-                        )
-                    file.flush()
-                    yield file
-                else:
-                    yield None
-            if part.exists() and len(self.problems) == before:
-                to_disk(part)
-                part.replace(path)
-        finally:
-            with contextlib.suppress(OSError):
-                part.unlink(missing_ok=True)
+            with WholeHdf5(part) as hdf5:
+                self._fill(hdf5, path, wanted, current, usual)
+            if len(self.problems) == n_problems:
+                put_in_place(part, path)
+                part = path
+            return closing.enter_context(h5py.File(part))
+        except OSError as error:
+            if error.errno not in _READ_ONLY:
+                _LOGGER.warning("%s: not kept: %s", path, error.strerror or error)
+        del self.problems[n_problems:]
+        self._n_read = n_read
+        hdf5 = WholeHdf5(None)
+        closing.callback(hdf5.close)
+        self._fill(hdf5, path, wanted, current, usual)
+        return hdf5.file
+
+    def _fill(
+        self,
+        hdf5: WholeHdf5,
+        path: Path,
+        wanted: Mapping[str, str],
+        current: Mapping[str, str],
+        usual: Sequence[slice],
+    ) -> None:
+        for month, digest in wanted.items():
+            name = f"months/{month}"
+            if current.get(month) == digest:
+                with h5py.File(path) as old:
+                    hdf5.copy(old, name)
+            elif (rollup := self._rolled_up(month)) is not None:
+                _write(hdf5, name, rollup)
+                hdf5.file[name].attrs["digest"] = digest
+        if "months" not in hdf5.file:
+            return
+        _write_totals(hdf5)
+        made = series_of(_months_of(hdf5.file), self.grid, usual)
+        for each in fields(made):
+            values = getattr(made, each.name)
+            hdf5.create(f"{SERIES}/{each.name}", values, chunks=True, fletcher32=True)
+        hdf5.file[SERIES].attrs["spans"] = _text_of(usual)
 
     def _rolled_up(self, month: str) -> Rollup | None:
         found = []
@@ -251,39 +262,38 @@ def density_of(group: h5py.Group) -> Density:
     return Density(frequency, counts.astype(np.int64), below.astype(np.int64), n_stretches, n_short)
 
 
-def _write(group: h5py.Group, rollup: Rollup) -> None:
+def _write(hdf5: WholeHdf5, group: str, rollup: Rollup) -> None:
     for each in fields(rollup):
-        value = getattr(rollup, each.name)
+        value, path = getattr(rollup, each.name), f"{group}/{each.name}"
         if each.name in {"noise", "recorded"}:
-            _write_density(group.create_group(each.name), value)
-        elif each.name == "n_segments":
-            group.attrs["n_segments"] = value
+            _write_density(hdf5, path, value)
         elif each.name == "levels":
-            made = group.create_dataset(
-                "levels", value.shape, value.dtype, chunks=(1, *value.shape[1:]), fletcher32=True
+            made = hdf5.file.create_dataset(
+                path, value.shape, value.dtype, chunks=(1, *value.shape[1:]), fletcher32=True
             )
             for row, some in enumerate(value):
                 if some.any():  # what is zero everywhere takes no room
                     made[row] = some
-        else:
-            value = packed(value) if each.name == "total" else value
-            group.create_dataset(each.name, data=value)
+            hdf5.expect(made, value)
+        elif each.name != "n_segments":
+            hdf5.create(path, packed(value) if each.name == "total" else value)
+    hdf5.file[group].attrs["n_segments"] = rollup.n_segments
 
 
-def _write_density(group: h5py.Group, density: Density) -> None:
-    group.attrs.update(n_stretches=density.n_stretches, n_short=density.n_short)
-    group.create_dataset("frequency", data=density.frequency)
+def _write_density(hdf5: WholeHdf5, group: str, density: Density) -> None:
+    hdf5.create(f"{group}/frequency", density.frequency)
     for name in ("counts", "not_positive"):
         value = getattr(density, name).astype(np.int32)
-        group.create_dataset(name, data=value, compression="gzip", compression_opts=1, shuffle=True)
+        hdf5.create(f"{group}/{name}", value, compression="gzip", compression_opts=1, shuffle=True)
+    attributes = hdf5.file[group].attrs
+    attributes.update(n_stretches=density.n_stretches, n_short=density.n_short)
 
 
-def _write_totals(file: h5py.File) -> None:
+def _write_totals(hdf5: WholeHdf5) -> None:
     """Add the months of a year up."""
-    months = [file["months"][month] for month in sorted(file["months"])]
+    months = _months_of(hdf5.file)
     for name in ("noise", "recorded"):
         total = reduce(add, (density_of(month[name]) for month in months))
-        _write_density(file.create_group(name), total)
-    total = reduce(add, (month["total"][...] for month in months))
-    file.create_dataset("total", data=total)
-    file.attrs["n_segments"] = sum(int(month.attrs["n_segments"]) for month in months)
+        _write_density(hdf5, name, total)
+    hdf5.create("total", reduce(add, (month["total"][...] for month in months)))
+    hdf5.file.attrs["n_segments"] = sum(int(month.attrs["n_segments"]) for month in months)

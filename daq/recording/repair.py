@@ -18,7 +18,6 @@ import json
 import logging
 import shutil
 import sys
-import uuid
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -44,14 +43,15 @@ from daq.recording.file_format import LIBVER, fixed
 from daq.recording.reader import Recording
 from daq.recording.storage.journal import JournalContents, journal_path, read_journal, rebuild
 from daq.recording.storage.locking import is_being_written
-from daq.recording.storage.names import create_private, sync_directory, sync_file
 from daq.recording.storage.opening import open_file
 from daq.recording.storage.refusals import damage_named, text
 from daq.recording.storage.superblock import Superblock
 from daq.recording.storage.trial import remember
+from daq.recording.storage.whole_hdf5 import WholeHdf5
+from daq.whole_file import create_private, replaced
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -194,18 +194,29 @@ def repair(
         else:
             rebuild(path, journal, copy)
             report = verify(copy, progress=progress)
-        with h5py.File(copy, "r+", libver=LIBVER) as file:
+        with WholeHdf5(copy, libver=LIBVER) as hdf5:
             if not report.closed:
-                _cut_to_committed(file, report)
-                _add_last_events(file, report, now)
-            write_checksums(file)
-            write_manifest(file)
-            if RESULTS in file:
-                write_manifest(file, RESULTS_MANIFEST)
+                _cut_to_committed(hdf5.file, report)
+                _add_last_events(hdf5.file, report, now)
+            write_checksums(hdf5.file)
+            write_manifest(hdf5.file)
+            if RESULTS in hdf5.file:
+                write_manifest(hdf5.file, RESULTS_MANIFEST)
+        _check_repaired(path, verify(copy, progress=progress), report)
     if journal is not None:
         journal_path(path).unlink(missing_ok=True)
     _remove_useless_journal(path)
     return verify(path, progress=progress)
+
+
+def _check_repaired(path: Path, found: Verification, report: Verification) -> None:
+    """Refuse a copy that has other rows than what was saved from the recording."""
+    if not found.closed or found.changed or found.sensors != _closed(report.sensors):
+        raise RecordingError(f"{path}: the repaired copy differs from what was saved")
+
+
+def _closed(sensors: Sequence[SensorVerification]) -> tuple[SensorVerification, ...]:
+    return tuple(replace(sensor, n_uncommitted=0) for sensor in sensors)
 
 
 def _is_left_open(path: Path, report: Verification | Recording) -> bool:
@@ -275,19 +286,20 @@ def write_results(
             left_open = _is_left_open(path, recording)
     if left_open:
         repair(path)
-    with _replaced(path) as copy, h5py.File(copy, "r+", libver=LIBVER) as file:
-        if "results" in file:
-            del file["results"]
+    with _replaced(path) as copy, WholeHdf5(copy, libver=LIBVER) as hdf5:
+        file = hdf5.file
+        if RESULTS in file:
+            del file[RESULTS]
         for method, (arrays, attributes) in results.items():
-            group = file.create_group(f"results/{method}")
+            group = f"{RESULTS}/{method}"
             for name, values in arrays.items():
-                group.create_dataset(name, data=values)
-            group.attrs.update({name: fixed(value) for name, value in attributes.items()})
-            stored = {name: group[name][...] for name in group}
-            group.attrs["crc32"] = result_crc32(stored, dict(group.attrs))
+                hdf5.create(f"{group}/{name}", values)
+            described = file[group].attrs
+            described.update({name: fixed(value) for name, value in attributes.items()})
+            described["crc32"] = result_crc32(arrays, attributes)
         for name, value in (about or {}).items():
             file.require_group(RESULTS).attrs[name] = fixed(value)
-        write_manifest(file, RESULTS_MANIFEST)
+        write_manifest(file, RESULTS_MANIFEST, hdf5.contents)
     remember(path)
 
 
@@ -345,24 +357,18 @@ def _add_last_events(file: h5py.File, report: Verification, now: HostTime) -> No
 @contextlib.contextmanager
 def _replaced(path: Path, *, copied: bool = True) -> Iterator[Path]:
     """Yield a copy, or an empty file; it replaces the original if no error occurs."""
-    copy = path.with_name(f".{path.name}.{uuid.uuid4().hex}.copy")
     try:
-        create_private(copy)
-        if copied:
-            shutil.copyfile(path, copy)
-        yield copy
-        shutil.copymode(path, copy)
-        sync_file(copy)
-        copy.replace(path)
-        sync_directory(path.parent)
+        with replaced(path) as copy:
+            create_private(copy)
+            if copied:
+                shutil.copyfile(path, copy)
+            yield copy
     except RecordingError:
         raise
     except (OSError, RuntimeError, ValueError, KeyError) as error:
         raise RecordingError(
             f"{path}: cannot be rewritten ({error}); it was not changed"
         ) from error
-    finally:
-        copy.unlink(missing_ok=True)
 
 
 def main() -> None:

@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any
 from daq.errors import HuddleError
 from daq.recording.chunks.manifest import root_sha256
 from daq.recording.reader import Recording
-from daq.recording.storage.names import create_private, sync_file
 from daq.recording.storage.opening import open_file
+from daq.whole_file import PRIVATE, write_whole
 
 if TYPE_CHECKING:
     from daq.bench.model import Bench
@@ -96,10 +96,12 @@ def make_key(path: Path) -> Path:
     try:
         if beside.exists():
             raise FileExistsError(f"{beside} exists")
-        create_private(path)
-        path.write_bytes(private)
-        sync_file(path)
-        beside.write_bytes(public)
+        write_whole(path, private, mode=PRIVATE, free=True)
+        try:
+            write_whole(beside, public, free=True)
+        except OSError:
+            path.unlink()
+            raise
     except OSError as error:
         raise SigningError(f"{path}: no key can be written: {error}; nothing is replaced") from None
     return beside
@@ -148,11 +150,8 @@ def sign(path: Path, key: Path, *, now: datetime | None = None) -> Signature:
     made = base64.b64encode(private.sign(unsigned.message)).decode()
     signature = Signature(run_id, root, moment, unsigned.public_key, made)
     target = path.with_suffix(SUFFIX)
-    new = target.with_suffix(".sig.new")
     try:
-        new.write_text(json.dumps(asdict(signature), indent=1) + "\n", encoding="ascii")
-        sync_file(new)
-        new.replace(target)
+        write_whole(target, f"{json.dumps(asdict(signature), indent=1)}\n".encode())
     except OSError as error:
         raise SigningError(f"{target}: cannot be written: {error.strerror}") from error
     return signature

@@ -39,18 +39,11 @@ from daq.recording.creation import make_datasets, write_attributes
 from daq.recording.description import write_checksums
 from daq.recording.storage.journal import Journal
 from daq.recording.storage.locking import WriterLock
-from daq.recording.storage.names import (
-    PRIVATE,
-    create_private,
-    publish,
-    remove_leftovers,
-    sync_directory,
-    sync_file,
-    taken,
-)
+from daq.recording.storage.names import publish, remove_leftovers, taken
 from daq.recording.storage.refusals import text
 from daq.recording.storage.retries import reason_of, repeated
 from daq.recording.storage.trial import remember
+from daq.whole_file import PRIVATE, create_private, sync_directory, sync_file
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from daq.bench.tables.certificate import CertificateTable
 from daq.errors import HuddleError
-from daq.recording.storage.names import sync_directory
+from daq.whole_file import sync_directory
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -28,7 +28,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING
 
 from daq.errors import HuddleError
-from daq.recording.storage.names import PRIVATE
+from daq.whole_file import PRIVATE
 from tui.service.records.places import file_name
 
 if TYPE_CHECKING:

@@ -26,6 +26,7 @@ import numpy as np
 from daq.errors import NotARecordingError
 from daq.recording.file_format import texts
 from daq.recording.storage.refusals import dataset, member
+from daq.recording.storage.whole_hdf5 import contents_sha256, little_endian
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -37,7 +38,6 @@ RESULTS_MANIFEST = "results_manifest"
 ROOT = "/"
 UNREADABLE = "cannot be read"
 """In place of the SHA-256 of a dataset."""
-_BYTES_PER_READ = 1 << 22
 
 
 def make_manifest(file: h5py.File) -> None:
@@ -113,7 +113,7 @@ def computed(
     for path, value in items(file, name):
         if isinstance(value, h5py.Dataset):
             try:
-                inner = known[path] if path in known else _contents_sha256(value, progress)
+                inner = known[path] if path in known else contents_sha256(value, progress)
                 found[path] = _sha256(value.dtype, value.shape, inner)
             except (OSError, RuntimeError):
                 found[path] = UNREADABLE
@@ -159,25 +159,6 @@ def _attributes(found: h5py.Group | h5py.Dataset) -> Iterator[tuple[str, Any]]:
     path = found.name.rstrip("/") or "/"
     for name in found.attrs:
         yield f"{path}@{name}", found.attrs[name]
-
-
-def _contents_sha256(found: h5py.Dataset, progress: Callable[[], object]) -> bytes:
-    digest = hashlib.sha256()
-    if not found.shape:
-        digest.update(little_endian(np.asarray(found[()])))
-        return digest.digest()
-    per_row = max(1, int(np.prod(found.shape[1:])) * found.dtype.itemsize)
-    length = found.chunks[0] if found.chunks else 1
-    n_rows = max(1, _BYTES_PER_READ // (per_row * length)) * length
-    for first in range(0, found.shape[0], n_rows):
-        digest.update(little_endian(found[first : first + n_rows]))
-        progress()
-    return digest.digest()
-
-
-def little_endian(rows: NDArray[Any]) -> bytes:
-    """Return numbers as little-endian bytes in C order."""
-    return rows.astype(rows.dtype.newbyteorder("<"), copy=False).tobytes()
 
 
 def _attribute_sha256(value: Any) -> str:  # noqa: ANN401 - any attribute

@@ -26,16 +26,18 @@ from collections import defaultdict
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-import h5py
 import numpy as np
 
 from daq.recording import file_format
 from daq.recording.storage.retries import repeated
 from daq.recording.storage.superblock import Superblock
+from daq.recording.storage.whole_hdf5 import WholeHdf5
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
+
+    import h5py
 
 _MAGIC = b"huddle-journal 1\n"
 _FRAME = struct.Struct("<II")
@@ -259,10 +261,8 @@ def rebuild(damaged: Path, contents: JournalContents, copy: Path) -> None:
     """
     copy.write_bytes(contents.created)
     counts = contents.counts
-    with (
-        h5py.File(copy, "r+", libver=file_format.LIBVER, locking=False) as file,
-        damaged.open("rb") as source,
-    ):
+    with WholeHdf5(copy, libver=file_format.LIBVER) as hdf5, damaged.open("rb") as source:
+        file = hdf5.file
         names = file_format.texts(file["committed"].attrs["sensors"])
         if counts is None:
             return

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import glob
 import itertools
-import os
 import re
-import sys
 import time
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from daq.errors import RecordingError
 from daq.recording.storage.locking import is_being_written
+from daq.whole_file import take_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -23,25 +21,11 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from daq.protocols.block import HostTime
 
-PRIVATE = 0o600
-"""Permissions of a recording: users who can read it can stop its recorder."""
 CONTINUES = "continues"
 """Attribute of a recording that continues another after a disk error: the run_id of the other."""
 _STALE_SECONDS = 10.0
 """Age in s from which a temporary file without a lock is a leftover. A writer locks its file within
 a millisecond; ten seconds allow for a computer that is suspended or overloaded in between."""
-_NO_HARD_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EINVAL}
-
-
-def create_private(path: Path) -> None:
-    """Create an empty file that only its owner can read.
-
-    Raises
-    ------
-    FileExistsError
-        If the file exists.
-    """
-    os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, PRIVATE))
 
 
 def publish(temporary: Path, path: Path) -> None:
@@ -53,21 +37,9 @@ def publish(temporary: Path, path: Path) -> None:
         If a file with this name exists.
     """
     try:
-        _take_name(temporary, path)
+        take_name(temporary, path)
     except FileExistsError:
         raise taken(path) from None
-
-
-def _take_name(temporary: Path, path: Path) -> None:
-    try:
-        os.link(temporary, path)
-    except OSError as error:
-        if error.errno not in _NO_HARD_LINKS:
-            raise
-        create_private(path)  # takes the name on a file system without hard links
-        temporary.replace(path)
-    else:
-        temporary.unlink()
 
 
 def taken(path: Path) -> RecordingError:
@@ -100,26 +72,6 @@ def remove_leftovers(path: Path) -> None:
             age = time.time() - leftover.stat().st_mtime
             if age > _STALE_SECONDS and not is_being_written(leftover):
                 leftover.unlink()
-
-
-def sync_file(path: Path) -> None:
-    """Make the contents of a closed file durable over a power loss."""
-    handle = os.open(path, os.O_RDWR)  # Windows syncs only files open for writing
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def sync_directory(path: Path) -> None:
-    """Make the names in a directory durable over a power loss (not possible on Windows)."""
-    if sys.platform == "win32":
-        return
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def recording_path(bench: Bench, at: HostTime) -> Path:

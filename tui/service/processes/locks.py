@@ -12,7 +12,7 @@ import signal
 import sys
 from typing import TYPE_CHECKING
 
-from daq.recording.storage.names import PRIVATE
+from daq.whole_file import PRIVATE
 
 if sys.platform != "win32":
     import fcntl

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from daq.bench.end_condition import EndCondition
 from daq.errors import HuddleError
-from daq.recording.storage.names import PRIVATE, sync_file
+from daq.whole_file import PRIVATE, sync_file
 from tui.service.records.run_state import (
     NEXT,
     UNFINISHED,

@@ -1,0 +1,168 @@
+"""Files that are complete, proven and on the disk when they have their names."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import resource
+import stat
+from typing import TYPE_CHECKING
+
+import h5py
+import numpy as np
+import pytest
+
+from daq.archive.spectra_file import Described, Origin, SpectraFile, SpectraWriter
+from daq.bench.channel import Channel
+from daq.recording.storage.whole_hdf5 import WholeHdf5
+from daq.whole_file import RememberingFile, replaced, write_whole, written
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+
+CHANNELS = tuple(("A", Channel(name=name, sensitivity=1.0)) for name in "abcdef")
+
+
+@contextlib.contextmanager
+def files_limited_to(n_bytes: int) -> Iterator[None]:
+    """Let the system refuse to write beyond a size, as a full disk does."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def names_in(folder: Path) -> list[str]:
+    return sorted(each.name for each in folder.iterdir())
+
+
+def test_a_file_replaces_an_earlier_one_and_keeps_its_permissions(tmp_path: Path) -> None:
+    path = tmp_path / "r.json"
+    write_whole(path, b"one")
+    path.chmod(0o640)
+    link = tmp_path / "link"
+    link.symlink_to(path)
+    write_whole(link, b"two")
+    assert link.is_symlink()
+    assert path.read_bytes() == b"two"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+    assert names_in(tmp_path) == ["link", "r.json"]
+
+
+def test_a_file_that_the_disk_refuses_leaves_the_earlier_one(tmp_path: Path) -> None:
+    path = tmp_path / "r.json"
+    write_whole(path, b"one")
+    with files_limited_to(1000), pytest.raises(OSError, match="File too large") as refused:
+        write_whole(path, bytes(100_000))
+    assert refused.value.filename == str(path)
+    assert path.read_bytes() == b"one"
+    assert names_in(tmp_path) == ["r.json"]
+
+
+def test_a_name_that_must_be_free_is_not_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "key"
+    write_whole(path, b"one", mode=0o600, free=True)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    with pytest.raises(FileExistsError):
+        write_whole(path, b"two", free=True)
+    assert path.read_bytes() == b"one"
+
+
+def test_other_bytes_on_the_disk_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+
+    def write_changed() -> None:
+        with written(path) as write:
+            write(bytes(100_000))  # more than is buffered
+            with next(tmp_path.glob(".r.csv.*")).open("r+b") as part:
+                part.write(b"1")
+
+    with pytest.raises(OSError, match="other content than was written"):
+        write_changed()
+    assert names_in(tmp_path) == []
+
+
+def test_leftovers_of_killed_processes_are_removed_after_a_day(tmp_path: Path) -> None:
+    old, new = tmp_path / ".r.csv.1.part", tmp_path / ".r.csv.2.part"
+    for each in (old, new):
+        each.write_bytes(b"")
+    os.utime(old, (1.0, 1.0))
+    write_whole(tmp_path / "r.csv", b"")
+    assert names_in(tmp_path) == [".r.csv.2.part", "r.csv"]
+
+
+def test_a_write_that_fails_once_is_remembered(tmp_path: Path) -> None:
+    with RememberingFile(tmp_path / "f", "x+") as file:
+        with files_limited_to(100):
+            assert file.write(bytes(1000)) == 1000
+        file.write(b"later")
+        with pytest.raises(OSError, match="File too large"):
+            file.check()
+    assert (tmp_path / "f").stat().st_size <= 100
+
+
+@pytest.mark.parametrize("limit", [100, 3000, 20_000, 60_000])
+def test_hdf5_that_the_disk_refuses_raises_one_error(tmp_path: Path, limit: int) -> None:
+    """Also where only closing writes; HDF5's own driver then prints, or crashes."""
+    path = tmp_path / "r.h5"
+    values = np.random.default_rng(1).normal(size=(10, 1000))
+
+    def fill() -> None:
+        with replaced(path) as part, WholeHdf5(part) as hdf5:
+            for name in "abc":
+                hdf5.create(name, values, chunks=(1, 1000), fletcher32=True)
+
+    with files_limited_to(limit), pytest.raises(OSError, match="File too large") as refused:
+        fill()
+    assert (refused.value.errno, refused.value.filename) == (errno.EFBIG, str(path))
+    assert names_in(tmp_path) == []
+    fill()
+    with h5py.File(path) as file:
+        assert np.array_equal(file["c"], values)
+
+
+@pytest.mark.parametrize("limit", [100, 10_000, 100_000, 200_000])
+def test_spectra_that_the_disk_refuses_are_not_kept(tmp_path: Path, limit: int) -> None:
+    path = tmp_path / "r.h5"
+    csm = np.full((51, 6, 6), 1.0 + 0j)
+
+    def fill() -> None:
+        with SpectraWriter(path, n_freqs=51, n_channels=6) as writer:
+            for row in range(16):
+                writer.append(row, 1, csm)
+            writer.commit(
+                Described(Origin("r", "r.h5", 1, 1, 1, closed=True), CHANNELS, 1.0, 1.0), ()
+            )
+
+    with files_limited_to(limit), pytest.raises(OSError, match="File too large") as refused:
+        fill()
+    assert refused.value.filename == str(path)
+    assert names_in(tmp_path) == []
+    fill()
+    with SpectraFile(path) as file:
+        assert len(file.stretches) == 16
+
+
+@pytest.mark.parametrize("lost", ["a chunk", "a row", "all of it"])
+def test_hdf5_with_other_contents_than_in_memory_is_refused(tmp_path: Path, lost: str) -> None:
+    path = tmp_path / "r.h5"
+    values = np.ones((4, 100))
+
+    def fill() -> None:
+        with replaced(path) as part, WholeHdf5(part) as hdf5:
+            made = hdf5.create("a", values, chunks=(1, 100))
+            if lost == "a chunk":
+                made[2] = 0.0
+            elif lost == "a row":
+                made.resize(3, axis=0)
+            else:
+                del hdf5.file["a"]
+
+    with pytest.raises(OSError, match="other content than was written"):
+        fill()
+    assert names_in(tmp_path) == []
