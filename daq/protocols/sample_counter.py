@@ -12,8 +12,9 @@ cannot arrive before they are taken. *Latest* is the largest index that host tim
 - any other step is a restart: the counter was reset, and the number of missing samples is estimated
   from host time.
 
-*Latest* follows from the earliest arrival so far, and tolerates a relative rate error of the
-device's clock of up to ``CLOCK_TOLERANCE``.
+*Latest* follows from the earliest recent arrivals and the rate that they show
+(:mod:`daq.protocols.pace`): a counter may be slow by a per mille, and late arrivals do not count.
+In a time without arrivals, the rate is known to ``CLOCK_TOLERANCE``.
 
 A device may continue to sample while its connection is interrupted.
 :meth:`SampleCounter.expects` tests this by host time, which also gives the number of wraps.
@@ -26,13 +27,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daq.protocols.pace import Pace
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.protocols.block import HostTime
 
 CLOCK_TOLERANCE = 200e-6
-"""Largest tolerated relative rate error of a device's clock."""
+"""Relative error of the rate of a device's clock, as measured or nominal."""
 SLACK = 1.0
 """Largest latency of the earliest arrival, s: a sample may appear early by this much."""
 REPEATED = 1024
@@ -71,8 +74,7 @@ class SampleCounter:
         self._base = 0  # unwrapped counter minus index
         self._next = 0  # expected session index of the next frame
         self._count: int | None = None  # counter of the last frame
-        self._origin = 0.0  # earliest known arrival of sample 0, in s
-        self._seen = 0.0  # host time of the last read, in s
+        self._pace = Pace(sampling_rate)
         self._resumed = False
 
     def place(self, counters: NDArray[np.integer[Any]], at: HostTime) -> tuple[list[Run], int]:
@@ -93,19 +95,17 @@ class SampleCounter:
             Number of repeated frames.
         """
         counters = counters.astype(np.int64)
-        now = at.monotonic_ns * 1e-9
         if self._count is None:
             self._base = int(counters[0])
             self._count = self._base - 1
-            self._origin = now - (counters.size - 1) / self._rate
-        else:
-            self._origin += CLOCK_TOLERANCE * (now - self._seen)
-        latest = (now - self._origin) * self._rate
+            self._pace.take(counters.size - 1, at)
+        latest = self._pace.late(0, at) * self._rate
+        slack = (SLACK + self._doubt(at)) * self._rate
         runs: list[Run] = []
         n_repeated = row = 0
         while row < counters.size:
             step = (int(counters[row]) - self._count) % self.modulus
-            index, restarted = self._index(step, latest - (counters.size - 1 - row))
+            index, restarted = self._index(step, latest - (counters.size - 1 - row), slack)
             if index is None:
                 ahead = (counters[row:] - self._count) % self.modulus
                 forward = np.flatnonzero((ahead >= 1) & (ahead < self.modulus // 2))
@@ -117,14 +117,15 @@ class SampleCounter:
             stop = row + int(jumps.argmax()) + 1 if jumps.any() else counters.size
             if restarted:
                 self._base = int(counters[row]) - index
+                self._pace.restart()
             missing = index - self._next
             runs.append(Run(row, stop, index, index + self._base, missing, restarted))
             self._next = index + stop - row
             self._resumed = False
             self._count = int(counters[stop - 1])
             row = stop
-        self._origin = min(self._origin, now - (self._next - 1) / self._rate)
-        self._seen = now
+        if runs:
+            self._pace.take(self._next - 1, at)
         return runs, n_repeated
 
     def expects(self, counter: int, at: HostTime) -> bool:
@@ -135,10 +136,9 @@ class SampleCounter:
         """
         if self._count is None:
             return False
-        now = at.monotonic_ns * 1e-9
-        slack = (SLACK + CLOCK_TOLERANCE * (now - self._seen)) * self._rate
+        slack = (SLACK + self._doubt(at)) * self._rate
         index = self._next + (counter - self._count - 1) % self.modulus
-        ahead = index - (now - self._origin) * self._rate
+        ahead = -self._pace.late(index, at) * self._rate
         off = (ahead + self.modulus / 2) % self.modulus - self.modulus / 2
         return abs(off) <= slack < self.modulus / 4
 
@@ -146,7 +146,11 @@ class SampleCounter:
         """Allow any number of missing samples before the next frame, also whole wraps."""
         self._resumed = True
 
-    def _index(self, step: int, latest: float) -> tuple[int | None, bool]:
+    def _doubt(self, at: HostTime) -> float:
+        """Return by how much, in s, the count may be off the pace after a time without arrivals."""
+        return CLOCK_TOLERANCE * (at.monotonic_ns * 1e-9 - self._pace.seen)
+
+    def _index(self, step: int, latest: float, slack: float) -> tuple[int | None, bool]:
         """Return the index of a frame ``step`` counts later, and whether it is a restart.
 
         The index is None for a repetition.
@@ -154,7 +158,7 @@ class SampleCounter:
         if step == 1 and not self._resumed:
             return self._next, False
         index = self._next + (step - 1) % self.modulus
-        if index <= latest + SLACK * self._rate:
+        if index <= latest + slack:
             wraps = int((latest - index) / self.modulus + 0.5) if latest > index else 0
             return index + wraps * self.modulus, False
         back = -step % self.modulus

@@ -1,0 +1,76 @@
+"""Counters of devices whose clocks are off, over a host that is busy."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.protocols.block import HostTime
+from daq.protocols.sample_counter import SampleCounter
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+RATE = 100.0
+
+
+def frames(
+    ppm: float, seconds: float, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the numbers of frames as sent, some twice and some lost, and when each was taken."""
+    n = round(seconds * RATE * (1 + ppm * 1e-6))
+    times = rng.permutation(np.arange(500, n - 500, 250))[:40]
+    copies = np.ones(n, np.int64)
+    copies[times[:20]] = 2  # repeated frames
+    copies[times[20:]] = 0  # lost frames
+    sent = np.repeat(np.arange(n), copies)
+    return sent, sent / (RATE * (1 + ppm * 1e-6))
+
+
+def reads(taken: NDArray[np.float64], rng: np.random.Generator) -> list[tuple[int, int, float]]:
+    """Return the frames of each read and its time: a busy host, with stalls that it makes up."""
+    now, found, first = 0.0, [], 0
+    while first < len(taken):
+        stall = rng.uniform(0.2, 5.0) if rng.random() < 0.005 else 0.0
+        now += 0.05 + rng.exponential(0.02) + stall
+        end = int(np.searchsorted(taken, now))
+        if end > first:
+            found.append((first, end, now))
+            first = end
+    return found
+
+
+@pytest.mark.parametrize("ppm", [-10_000, -900, -300, 0, 300, 900])
+@pytest.mark.parametrize("modulus", [256, 65_536])
+def test_every_frame_of_a_counter_off_its_rate_has_its_index(ppm: float, modulus: int) -> None:
+    rng = np.random.default_rng(round(abs(ppm)) + modulus)
+    sent, taken = frames(ppm, 1500, rng)
+    counter = SampleCounter(modulus, RATE)
+    n_repeated, found, restarts = 0, [], 0
+    for first, end, now in reads(taken, rng):
+        at = HostTime(round((now + 1e4) * 1e9), 0)
+        runs, again = counter.place(sent[first:end] % modulus, at)
+        n_repeated += again
+        restarts += sum(run.restarted for run in runs)
+        for run in runs:
+            index = np.arange(run.first_sample, run.first_sample + run.stop - run.start)
+            found.append(np.column_stack([index, sent[first:end][run.start : run.stop]]))
+    placed = np.concatenate(found)
+    assert restarts == 0
+    assert n_repeated == 20
+    assert np.array_equal(placed[:, 0], placed[:, 1])
+    assert len(placed) == len(np.unique(sent))
+
+
+@pytest.mark.parametrize("ppm", [-900, 900])
+def test_a_counter_off_its_rate_restarts_after_the_time_that_passed(ppm: float) -> None:
+    counter, true_rate = SampleCounter(65_536, RATE), RATE * (1 + ppm * 1e-6)
+    for block in range(2000):
+        at = HostTime(round((block * 50 + 49) / true_rate * 1e9), 0)
+        counter.place(np.arange(block * 50, block * 50 + 50) % 65_536, at)
+    at = HostTime(round((100_000 / true_rate + 7.49) * 1e9), 0)
+    (run,), _ = counter.place(np.arange(50), at)
+    assert run.restarted
+    assert run.missing == pytest.approx(7.49 * true_rate - 49, abs=10)
