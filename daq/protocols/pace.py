@@ -27,6 +27,7 @@ _MIN_BASELINE = 20.0  # seconds between two nodes from which on they show the ra
 _MAX_DRIFT = 0.02  # share by which a rate may be off
 _GAIN = 0.2  # of the average that is the scatter
 _SURE = 4.0  # scatters
+_UNKNOWN = 900.0  # seconds of scatter before there are two arrivals
 
 
 class Pace:
@@ -69,7 +70,7 @@ class Pace:
 
     def is_sure(self, seconds: float) -> bool:
         """Return whether one arrival decides about a step of so many seconds."""
-        return self.n_arrivals > 2 and abs(seconds) > _SURE * self.scatter
+        return abs(seconds) > _SURE * (self.scatter if self.n_arrivals > 1 else _UNKNOWN)
 
     def take(self, index: float, at: HostTime) -> None:
         """Take the arrival of a sample; samples that arrive together have that of the last one."""

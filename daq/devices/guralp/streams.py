@@ -55,6 +55,7 @@ class Streams:
         self._searching = not all(ids.values())
         self._name = only(ids)
         self._lost = "block missing"
+        self._incomplete: set[str] = set()  # streams whose next block may follow a lost one
         self._at: HostTime | None = None  # of the last block
 
     @property
@@ -86,8 +87,9 @@ class Streams:
         return self._systems.get(sensor, "")
 
     def lost(self, reason: str) -> None:
-        """Set the reason for gaps from now on."""
+        """Set the reason for gaps from now on: block numbers show that some were lost."""
         self._lost = reason
+        self._incomplete = set(self._owner)
 
     def receive(
         self, block: SampleBlock | StatusBlock, at: HostTime, *, awaiting: bool = False
@@ -102,7 +104,9 @@ class Streams:
         elif block.stream_id in self._owner:
             owner = self._owner[block.stream_id]
             self._systems.setdefault(owner, block.system.text)
-            yield from self._sensors[owner].add(block, at)
+            in_turn = False if awaiting or block.stream_id in self._incomplete else None
+            self._incomplete.discard(block.stream_id)
+            yield from self._sensors[owner].add(block, at, in_turn=in_turn)
         elif block.stream_id in self._unknown or len(self._unknown) < MAX_PENDING:
             self._unknown[block.stream_id] += 1
             if self._searching:
@@ -112,10 +116,11 @@ class Streams:
         for sensor in self._sensors.values():
             yield from sensor.take(at, awaiting=awaiting, reason=self._lost)
 
-    def release(self) -> Iterator[Block]:
+    def release(self) -> Iterator[Block | Event]:
         """Yield the blocks that wait for missing ones: the connection ended, nothing comes."""
         if self._at is not None:
             for sensor in self._sensors.values():
+                yield from sensor.settle(self._at)
                 yield from sensor.take(self._at, awaiting=False, reason=self._lost)
 
     def assign(self, sensor: str, stream_ids: Iterable[str]) -> Iterator[DeviceItem]:

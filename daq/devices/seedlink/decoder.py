@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
-from daq.devices.seedlink.packets import PacketFinder
+from daq.devices.seedlink.packets import WRAP, PacketFinder
 from daq.devices.seedlink.records import decode_record
 from daq.protocols.block import Block, Event, EventKind, HostTime
 from daq.protocols.errors import RemoteProtocolError
@@ -116,8 +116,13 @@ class _Sensor:
         self._refused: set[str] = set()
         self._hole_ns: int | None = None  # host time at which the hole was detected
 
-    def add(self, record: WaveRecord, at: HostTime, *, hold: float) -> Iterator[Block | Event]:
-        """Add a record of this sensor's station; yield the completed blocks and events."""
+    def add(
+        self, record: WaveRecord, at: HostTime, *, hold: float, in_turn: bool | None
+    ) -> Iterator[Block | Event]:
+        """Add a record of this sensor's station; yield the completed blocks and events.
+
+        `in_turn`: see :meth:`daq.protocols.joined_streams.JoinedStreams.add`.
+        """
         if record.counts.dtype.kind != self._dtype.kind:
             yield from self._refuse(record, at)
             return
@@ -134,10 +139,16 @@ class _Sensor:
             for earlier, then in kept:
                 yield from self._joined(self.joined, earlier, then, hold=hold)
         else:
-            yield from self._joined(self.joined, record, at, hold=hold)
+            yield from self._joined(self.joined, record, at, hold=hold, in_turn=in_turn)
 
     def _joined(
-        self, joined: JoinedStreams, record: WaveRecord, at: HostTime, *, hold: float
+        self,
+        joined: JoinedStreams,
+        record: WaveRecord,
+        at: HostTime,
+        *,
+        hold: float,
+        in_turn: bool | None = None,
     ) -> Iterator[Block | Event]:
         if record.stream_id not in self.streams:
             if record.stream_id not in self._refused:
@@ -145,7 +156,7 @@ class _Sensor:
                 text = f"stream {record.stream_id} belongs to no channel of this sensor"
                 yield Event(self.name, EventKind.REFUSED, text, at)
             return
-        yield from joined.add(record, at)
+        yield from joined.add(record, at, in_turn=in_turn)
         yield from joined.take(at, awaiting=self._awaits(joined, at, hold), reason="not received")
 
     def _awaits(self, joined: JoinedStreams, at: HostTime, hold: float) -> bool:
@@ -246,7 +257,11 @@ class SeedLinkDecoder:
             return
         if record is None:
             return
-        self.last[f"{record.network}_{record.station}"] = packet.sequence, record.start_ns
+        station = f"{record.network}_{record.station}"
+        # Some servers number the packets of all stations together: a jump need not be a loss.
+        before = self.last.get(station, (-2, 0))[0]
+        in_turn = True if packet.sequence in {before + 1, (before + 1) % WRAP} else None
+        self.last[station] = packet.sequence, record.start_ns
         for sensor in self._sensors.values():
             if sensor.selection.matches(record):
-                yield from sensor.add(record, at, hold=self._hold)
+                yield from sensor.add(record, at, hold=self._hold, in_turn=in_turn)
