@@ -19,7 +19,7 @@ import stat
 import sys
 import time
 import uuid
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -135,6 +135,8 @@ def written(
 ) -> Iterator[Callable[[bytes], object]]:
     """Yield what adds bytes to a file, which then replaces an earlier one.
 
+    Errors of the disk are raised at the end: some libraries lose those of single writes.
+
     Parameters
     ----------
     path : Path
@@ -152,13 +154,15 @@ def written(
         mode = stat.S_IMODE(path.stat().st_mode)
     with replaced(path, free=free) as part:
         digest = hashlib.sha256()
-        with open(part, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
+        file = RememberingFile(part, "x", mode)
+        with io.BufferedWriter(file) as buffered:
 
             def write(content: bytes) -> None:
-                file.write(content)
                 digest.update(content)
+                buffered.write(content)
 
             yield write
+        file.check()
         with part.open("rb") as disk:
             if hashlib.file_digest(disk, "sha256").digest() != digest.digest():
                 raise wrong_content(path)
@@ -182,11 +186,11 @@ class RememberingFile(io.FileIO):
     a write that failed. So after a failure all writes appear to succeed; `check` raises it.
     """
 
-    def __init__(self, path: Path, mode: str) -> None:
-        super().__init__(path, mode)
+    def __init__(self, path: Path, mode: str, permissions: int = _PUBLIC) -> None:
+        super().__init__(path, mode, opener=lambda name, flags: os.open(name, flags, permissions))
         self._failure: OSError | None = None
 
-    def write(self, content: bytes | memoryview) -> int:  # type: ignore[override]  # any buffer
+    def write(self, content: Any, /) -> int:  # noqa: ANN401 - any buffer
         """Write all of the content."""
         view = memoryview(content).cast("B")
         done = 0

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import tomlkit
 from tomlkit.items import Array, InlineTable, Table
+
+from daq.whole_file import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -35,7 +35,7 @@ def set_sensor_values(path: str | Path, values: Mapping[str, Mapping[str, str]])
     for table in document["sensors"]:
         for key, value in values.get(str(table["name"]), {}).items():
             _set(table, key, value)
-    replace_file(path, tomlkit.dumps(document))
+    write_whole(Path(path), tomlkit.dumps(document).encode())
 
 
 def without_tables(text: str, *names: str) -> str:
@@ -134,28 +134,6 @@ def _lines(tables: list[dict[str, Any]]) -> Array:
         inline.update(one)
         lines.append(inline)
     return lines.multiline(multiline=True)
-
-
-def replace_file(path: str | Path, text: str) -> None:
-    """Write a file whole or not at all; a link stays one, and the mode of the file as it is.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written; it is unchanged then.
-    """
-    path = Path(path).resolve()
-    descriptor, new = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-")
-    try:
-        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(new).chmod(path.stat().st_mode)
-        Path(new).replace(path)
-    except BaseException:
-        Path(new).unlink(missing_ok=True)
-        raise
 
 
 def _set(table: Table | InlineTable, key: str, value: str) -> None:

@@ -9,6 +9,7 @@ by rate and unit.
 
 from __future__ import annotations
 
+import io
 import math
 import re
 import warnings
@@ -25,11 +26,11 @@ from daq.formats.foreign_sensor import NS_PER_S
 from daq.formats.readers.waveforms import load_obspy
 from daq.protocols.block import BlockFlag
 from daq.recording.interface import absences
+from daq.whole_file import write_whole, written
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
-    from typing import BinaryIO
 
     from numpy.typing import NDArray
 
@@ -113,6 +114,8 @@ def _unused(code: str, taken: set[str], length: int) -> str:
 def export_miniseed(recording: Recording, out: Path, station_xml: Path) -> Exported:
     """Write all samples of a recording, and the responses of its channels.
 
+    Both files have their names when they are complete.
+
     Raises
     ------
     ImportFormatError
@@ -124,7 +127,7 @@ def export_miniseed(recording: Recording, out: Path, station_xml: Path) -> Expor
     codes = codes_of(recording.sensors)
     n_samples = n_gaps = 0
     spans: dict[str, tuple[int, int]] = {}
-    with out.open("wb") as file, warnings.catch_warnings():
+    with written(out) as write, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for sensor in recording.sensors:
             runs = list(_runs(recording, sensor))
@@ -135,15 +138,17 @@ def export_miniseed(recording: Recording, out: Path, station_xml: Path) -> Expor
                     start = run.start_ns + round(
                         (first - run.first_row) * NS_PER_S / sensor.sampling_rate
                     )
-                    n_samples += _write_rows(
-                        obspy, file, sensor, codes, rows=(first, end), start_ns=start
-                    )
+                    records = _records(obspy, sensor, codes, rows=(first, end), start_ns=start)
+                    n_samples += end - first
+                    write(records)
             if runs:
                 last = runs[-1]
                 length = round((last.end_row - last.first_row) * NS_PER_S / sensor.sampling_rate)
                 spans[sensor.name] = runs[0].start_ns, last.start_ns + length
         inventory = _inventory(obspy, recording, codes, spans)
-        inventory.write(str(station_xml), format="STATIONXML")
+        content = io.BytesIO()
+        inventory.write(content, format="STATIONXML")
+        write_whole(station_xml, content.getvalue())
     return Exported({".".join(key): each for key, each in codes.items()}, n_samples, n_gaps)
 
 
@@ -246,15 +251,15 @@ def _ends(times: NDArray[np.int64], blocks: NDArray[np.void], rate: float) -> ND
     return ends
 
 
-def _write_rows(
+def _records(
     obspy: Any,  # noqa: ANN401 - ObsPy has no types
-    file: BinaryIO,
     sensor: SensorRecord,
     codes: Mapping[tuple[str, str], Codes],
     *,
     rows: tuple[int, int],
     start_ns: int,
-) -> int:
+) -> bytes:
+    content = io.BytesIO()
     counts, damaged = sensor.intact_counts(*rows)
     if damaged:
         raise RecordingError(
@@ -279,12 +284,12 @@ def _write_rows(
             },
         )
         trace.write(
-            file,
+            content,
             format="MSEED",
             encoding=encoding,
             reclen=_SHORT_RECORD if end - first <= _SHORT_ROWS else _RECORD,
         )
-    return len(counts)
+    return content.getvalue()
 
 
 def _present(sensor: SensorRecord, first_row: int, last_row: int) -> Iterator[tuple[int, int, int]]:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import os
-import resource
 import stat
 from typing import TYPE_CHECKING
 
@@ -17,24 +15,13 @@ from daq.archive.spectra_file import Described, Origin, SpectraFile, SpectraWrit
 from daq.bench.channel import Channel
 from daq.recording.storage.whole_hdf5 import WholeHdf5
 from daq.whole_file import RememberingFile, replaced, write_whole, written
+from tests.full_disk import files_limited_to
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
 
 CHANNELS = tuple(("A", Channel(name=name, sensitivity=1.0)) for name in "abcdef")
-
-
-@contextlib.contextmanager
-def files_limited_to(n_bytes: int) -> Iterator[None]:
-    """Let the system refuse to write beyond a size, as a full disk does."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def names_in(folder: Path) -> list[str]:

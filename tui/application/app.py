@@ -11,6 +11,7 @@ from textual import work
 from textual.binding import Binding, BindingType
 
 from daq.bench.end_condition import NEVER, EndCondition
+from daq.whole_file import write_whole
 from tui.application.dialogs import MarkScreen, QuestionScreen, StopScreen
 from tui.application.following import FollowingApp
 from tui.application.forms.form import Field, Form
@@ -306,7 +307,7 @@ class HuddleApp(FollowingApp):
         if files is None:
             return
         drawn = files[0].with_suffix(".svg")
-        if self._try(partial(drawn.write_text, picture, encoding="utf-8")) is not None:
+        if self._try(partial(write_whole, drawn, picture.encode())) is not None:
             names = ", ".join(file.name for file in (*files, drawn))
             text = f"{names} in {drawn.parent}"
             self.call_from_thread(self.notify, text, title="Written", timeout=10, markup=False)

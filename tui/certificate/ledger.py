@@ -18,7 +18,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import os
 import sqlite3
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -28,7 +27,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from daq.bench.tables.certificate import CertificateTable
 from daq.errors import HuddleError
-from daq.whole_file import sync_directory
+from daq.whole_file import PRIVATE, put_in_place, write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -247,10 +246,7 @@ class Ledger:
         if path.exists():
             raise LedgerError(f"{path}: exists, and is not in the ledger; move it away")
         part = _part(path)
-        with part.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
+        write_whole(part, content, mode=PRIVATE)
         sha256 = hashlib.sha256(content).hexdigest()
         self._add(
             {
@@ -389,14 +385,9 @@ def _part(path: Path) -> Path:
 def _name(part: Path, path: Path) -> None:
     """Give a complete file its name, which must be free."""
     try:
-        os.link(part, path)
+        put_in_place(part, path, free=True)
     except FileExistsError:
         raise LedgerError(f"{path}: exists, and is not in the ledger; move it away") from None
-    except OSError:  # a file system without links
-        part.rename(path)
-    else:
-        part.unlink()
-    sync_directory(path.parent)
 
 
 def _sha256(path: Path) -> str:

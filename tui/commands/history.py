@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import io
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -167,7 +168,11 @@ def history(
     if label is not None:
         write_text(str(label), label_svg(sensor, label_lines(found)))
     if out is not None:
-        history_figure(found).savefig(out, dpi=150)
+        from daq.whole_file import write_whole
+
+        content = io.BytesIO()
+        history_figure(found).savefig(content, format=out.suffix.removeprefix("."), dpi=150)
+        write_whole(out, content.getvalue())
 
 
 def _noise(sources: list[Path], sensor: str, since: datetime | None) -> list[Found]:

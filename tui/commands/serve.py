@@ -305,7 +305,7 @@ def _locked(bench: Bench, folder: Path) -> Lock:
 
 def _snapshot(bench: Bench, path: Path) -> Path:
     """Return a copy of the accepted bench file, which recorders read whatever becomes of it."""
-    from tui.output.console import write_whole
+    from daq.whole_file import write_whole
     from tui.service.records.places import file_name
 
     copy = bench.recording_directory / f".{file_name(bench.name)}.toml"

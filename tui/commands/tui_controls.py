@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from daq.bench.durations import format_duration
-from daq.bench.editing import replace_file, with_values
+from daq.bench.editing import with_values
 from daq.devices.bench_file import parse
 from daq.devices.registry import present_ports
 from daq.errors import BenchFileError, HuddleError, RecordingError
@@ -28,6 +28,7 @@ from daq.recording.reader import Recording
 from daq.recording.storage.names import continuations, continued_name, recording_path
 from daq.results.sources import sources
 from daq.results.store import store_results
+from daq.whole_file import write_whole
 from tui.commands.check import examined_bench
 from tui.commands.runs import RunNotFoundError, runs_named
 from tui.output.check_list import sentence
@@ -284,7 +285,7 @@ class BenchControls(_Controls):
     def save_bench(self, text: str) -> None:
         """Write the bench file, if it has no errors."""
         bench = parse(text, self.path)
-        replace_file(self.path, text)
+        write_whole(self.path, text.encode())
         self.bench = bench
 
     def find_devices(self, port: str) -> Sequence[DiscoveredDevice]:
@@ -351,7 +352,7 @@ class FirstBenchControls:
         """Write the bench file, if it has no errors."""
         parse(text, self.path)
         self.path.touch()
-        replace_file(self.path, text)
+        write_whole(self.path, text.encode())
 
 
 @dataclass(frozen=True)
@@ -510,7 +511,7 @@ def save_result(
         If a file cannot be written.
     """
     csv, json = (folder / f"{path.stem}{suffix}" for suffix in (".csv", ".json"))
-    csv.write_text(curves_csv(snapshot), encoding="utf-8")
+    write_whole(csv, curves_csv(snapshot).encode())
     about = sources([path]) if snapshot.closed else ()
     write_metadata(csv, provenance(snapshot, settings, about))
     result = document(snapshot, settings, sources=about, verdict=verdict)

@@ -8,21 +8,24 @@ the file of metadata that CSV on the Web puts beside it.
 
 from __future__ import annotations
 
+import io
 import json
-import os
 import shutil
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 
 from daq.recording.reader import Recording
+from daq.whole_file import replaced, write_whole, wrong_content
 from tui.notebook.tables import to_frame, to_xarray
 from tui.output.csv_text import csv_text, write_metadata
 from tui.output.extras import load
 
 if TYPE_CHECKING:
+    import os
     from collections.abc import Callable, Iterator
 
     import xarray as xr
@@ -40,10 +43,10 @@ _DOUBLE = 4
 _DIRECTIONS = {"X": 1, "Y": 2, "Z": 3, "E": 1, "N": 2, "1": 1, "2": 2, "3": 3}
 
 
-def _csv(snapshot: Snapshot, path: Path, said: Said) -> None:
+def _csv(snapshot: Snapshot, said: Said) -> bytes:
     del said  # in the metadata beside it
     header = ("method", "sensor", "channel", "unit", "frequency_hz", "data_psd", *_COLUMNS)
-    path.write_text(csv_text(header, _rows(snapshot)), encoding="utf-8")
+    return csv_text(header, _rows(snapshot)).encode()
 
 
 def _rows(snapshot: Snapshot) -> Iterator[tuple[object, ...]]:
@@ -56,7 +59,7 @@ def _rows(snapshot: Snapshot) -> Iterator[tuple[object, ...]]:
                 yield (method, label.sensor, label.channel, label.unit, *numbers[:-1], int(row[-1]))
 
 
-def _parquet(snapshot: Snapshot, path: Path, said: Said) -> None:
+def _parquet(snapshot: Snapshot, said: Said) -> bytes:
     arrow, parquet = load("pyarrow"), load("pyarrow.parquet")
     frame = to_frame(snapshot)
     units = {(label.sensor, label.channel): label.unit for label in snapshot.channels}
@@ -64,57 +67,42 @@ def _parquet(snapshot: Snapshot, path: Path, said: Said) -> None:
     frame.insert(3, "unit", [units[key] for key in keys])
     frame = frame.rename(columns={"frequency": "frequency_hz"})
     table = arrow.Table.from_pandas(frame, preserve_index=False)
-    parquet.write_table(table.replace_schema_metadata({**table.schema.metadata, **said}), path)
+    content = io.BytesIO()
+    parquet.write_table(table.replace_schema_metadata({**table.schema.metadata, **said}), content)
+    return content.getvalue()
 
 
-def _netcdf(snapshot: Snapshot, path: Path, said: Said) -> None:
+def _netcdf(snapshot: Snapshot, said: Said) -> bytes:
+    return _netcdf_bytes(to_xarray(snapshot, said))
+
+
+def _netcdf_bytes(dataset: xr.Dataset) -> bytes:
     load("h5netcdf")
-    to_xarray(snapshot, said).to_netcdf(path, engine="h5netcdf")
-
-
-def _zarr(snapshot: Snapshot, path: Path, said: Said) -> None:
-    _write_zarr(to_xarray(snapshot, said), path)
+    return bytes(dataset.to_netcdf(engine="h5netcdf"))
 
 
 def _write_zarr(dataset: xr.Dataset, path: Path) -> None:
+    """Write a folder; a Zarr folder of this name is replaced, and no other."""
     load("zarr")
+    named = dataset
     for name, coordinate in dataset.coords.items():
         if coordinate.dtype.kind == "U":  # which no version of the format specifies at a length
-            dataset = dataset.assign_coords({name: coordinate.astype(object)})
-    dataset.to_zarr(path, mode="w", consolidated=True, zarr_format=2)
+            named = named.assign_coords({name: coordinate.astype(object)})
+    with replaced(path) as part:
+        named.to_zarr(part, mode="w", consolidated=True, zarr_format=2)
+        if not load("xarray").open_dataset(part, engine="zarr", consolidated=True).equals(dataset):
+            raise wrong_content(path)
+        if (path / ".zgroup").is_file():
+            shutil.rmtree(path)
 
 
 def write_dataset(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """Write a Dataset as netCDF, or as Zarr by the suffix; complete when it has its name."""
     out = Path(path)
-    part = out.with_name(f".{out.name}.part")
-    try:
-        if out.suffix == ".zarr":
-            _write_zarr(dataset, part)
-        else:
-            load("h5netcdf")
-            dataset.to_netcdf(part, engine="h5netcdf")
-        _named(part, out)
-    finally:
-        _removed(part)
-
-
-def _named(part: Path, path: Path) -> None:
-    """Give a file or folder its name; a Zarr folder of this name is replaced, and no other."""
-    if part.is_dir():
-        if (path / ".zgroup").is_file():
-            shutil.rmtree(path)
+    if out.suffix == ".zarr":
+        _write_zarr(dataset, out)
     else:
-        with part.open("rb") as file:
-            os.fsync(file.fileno())
-    part.replace(path)
-
-
-def _removed(part: Path) -> None:
-    if part.is_dir():
-        shutil.rmtree(part)
-    else:
-        part.unlink(missing_ok=True)
+        write_whole(out, _netcdf_bytes(dataset))
 
 
 def _arrays(snapshot: Snapshot) -> dict[str, Any]:
@@ -131,34 +119,44 @@ def _arrays(snapshot: Snapshot) -> dict[str, Any]:
     return found
 
 
-def _mat(snapshot: Snapshot, path: Path, said: Said) -> None:
+def _mat(snapshot: Snapshot, said: Said) -> bytes:
     from scipy.io import savemat  # noqa: PLC0415 - takes long
 
     found = {
         name: np.array(value, dtype=object) if isinstance(value, list) else value
         for name, value in (_arrays(snapshot) | said).items()
     }
+    content = io.BytesIO()
     savemat(
-        str(path),
+        cast("Any", content),  # or a file, which its types lack
         found,
         appendmat=False,
         do_compression=True,
         oned_as="column",
         long_field_names=True,
     )
+    return content.getvalue()
 
 
-def _npz(snapshot: Snapshot, path: Path, said: Said) -> None:
+def _npz(snapshot: Snapshot, said: Said) -> bytes:
     arrays: dict[str, Any] = {
         name: np.asarray(value) for name, value in (_arrays(snapshot) | said).items()
     }
-    with path.open("wb") as file:
-        np.savez(file, **arrays)
+    content = io.BytesIO()
+    np.savez(content, **arrays)
+    return content.getvalue()
 
 
-def _uff(snapshot: Snapshot, path: Path, said: Said) -> None:
+def _uff(snapshot: Snapshot, said: Said) -> bytes:
+    load("pyuff")
+    with TemporaryDirectory(prefix="huddle-") as folder:  # the library takes names of files only
+        path = Path(folder) / "curves.uff"
+        _write_uff(snapshot, path, said)
+        return path.read_bytes()
+
+
+def _write_uff(snapshot: Snapshot, path: Path, said: Said) -> None:
     pyuff = load("pyuff")
-    path.unlink(missing_ok=True)
     file = pyuff.UFF(str(path))
     nodes = {name: number for number, name in enumerate(snapshot.sensor_names, start=1)}
     frequency = snapshot.frequency
@@ -209,16 +207,16 @@ def _ascii(text: str) -> str:
     return text.replace("²", "^2").replace("µ", "u").encode("ascii", "replace").decode()
 
 
-WRITERS: dict[str, tuple[str, Callable[[Snapshot, Path, Said], None]]] = {
+WRITERS: dict[str, tuple[str, Callable[[Snapshot, Said], bytes | xr.Dataset]]] = {
     "csv": (".csv", _csv),
     "parquet": (".parquet", _parquet),
     "netcdf": (".nc", _netcdf),
-    "zarr": (".zarr", _zarr),
+    "zarr": (".zarr", to_xarray),
     "mat": (".mat", _mat),
     "npz": (".npz", _npz),
     "uff58": (".uff", _uff),
 }
-"""Suffix and writer of each format."""
+"""Suffix and content of each format; of a folder, its Dataset."""
 
 
 def write_curves(snapshot: Snapshot, kind: str, path: Path, said: Said) -> None:
@@ -240,14 +238,13 @@ def write_curves(snapshot: Snapshot, kind: str, path: Path, said: Said) -> None:
     OSError
         The file cannot be written.
     """
-    part = path.with_name(f".{path.name}.part")
-    try:
-        WRITERS[kind][1](snapshot, part, said)
-        _named(part, path)
-        if kind == "csv":
-            write_metadata(path, said)
-    finally:
-        _removed(part)
+    content = WRITERS[kind][1](snapshot, said)
+    if not isinstance(content, bytes):
+        _write_zarr(content, path)
+        return
+    write_whole(path, content)
+    if kind == "csv":
+        write_metadata(path, said)
 
 
 def write_samples(file: Path, out: Path) -> tuple[Exported, Path]:
@@ -275,13 +272,5 @@ def write_samples(file: Path, out: Path) -> tuple[Exported, Path]:
     from daq.formats.miniseed_export import export_miniseed  # noqa: PLC0415 - ObsPy is an extra
 
     station = out.with_suffix(".xml")
-    parts = [path.with_name(f".{path.name}.part") for path in (out, station)]
-    try:
-        with Recording.open(file) as recording:
-            written = export_miniseed(recording, *parts)
-        for part, path in zip(parts, (out, station), strict=True):
-            part.replace(path)
-    finally:
-        for part in parts:
-            part.unlink(missing_ok=True)
-    return written, station
+    with Recording.open(file) as recording:
+        return export_miniseed(recording, out, station), station

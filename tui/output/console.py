@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import sys
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -18,6 +17,8 @@ from typing import TYPE_CHECKING, Any, TextIO
 import typer
 from rich.console import Console
 from rich.segment import Segment
+
+from daq.whole_file import written
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -140,39 +141,16 @@ def write_text(file: str, text: str, *, append: bool = False) -> None:
     OSError
         With the name of the file, which the error of a full disk lacks.
     """
-    try:
-        if file == STANDARD_OUTPUT:
-            sys.stdout.write(text)
-            sys.stdout.flush()
-        elif append or (Path(file).exists() and not Path(file).is_file()):
-            with Path(file).open("a", encoding="utf-8") as out:
-                out.write(text)
-        else:
-            write_whole(Path(file), text.encode())
-    except OSError as error:
-        if error.filename is None:
-            error.filename = "standard output" if file == STANDARD_OUTPUT else file
-        raise
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file that is complete when it has its name; an earlier one stays until then."""
-    part = path.with_name(f".{path.name}.part")
-    try:
-        with part.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    with growing(file, append=append) as write:
+        write(text)
 
 
 @contextmanager
-def growing(file: str | None) -> Iterator[Callable[[str], object]]:
+def growing(file: str | None, *, append: bool = False) -> Iterator[Callable[[str], object]]:
     """Return what adds text to a file, or to standard output; to nothing without a file.
 
-    The file is complete when it has its name, and an earlier one stays until then.
+    The file is complete when it has its name, and an earlier one stays until then, unless the text
+    is to `append`.
 
     Raises
     ------
@@ -183,27 +161,20 @@ def growing(file: str | None) -> Iterator[Callable[[str], object]]:
         yield lambda text: None  # noqa: ARG005 - it goes nowhere
         return
     path = Path(file)
-    part = path.with_name(f".{path.name}.part")
     try:
         if file == STANDARD_OUTPUT:
             yield sys.stdout.write
             sys.stdout.flush()
-        elif path.exists() and not path.is_file():
+        elif append or (path.exists() and not path.is_file()):
             with path.open("a", encoding="utf-8") as out:
                 yield out.write
         else:
-            with part.open("w", encoding="utf-8") as out:
-                yield out.write
-                out.flush()
-                os.fsync(out.fileno())
-            part.replace(path)
+            with written(path) as write:
+                yield lambda text: write(text.encode())
     except OSError as error:
         if error.filename is None:
             error.filename = "standard output" if file == STANDARD_OUTPUT else file
         raise
-    finally:
-        if file != STANDARD_OUTPUT:
-            part.unlink(missing_ok=True)
 
 
 _ENCODER = json.JSONEncoder(ensure_ascii=False, allow_nan=False)

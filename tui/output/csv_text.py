@@ -7,6 +7,8 @@ import io
 import json
 from typing import TYPE_CHECKING
 
+from daq.whole_file import write_whole
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
@@ -53,4 +55,4 @@ def write_metadata(path: Path, said: Mapping[str, str]) -> None:
         return
     metadata = {"@context": "http://www.w3.org/ns/csvw", "url": path.name, "notes": [dict(said)]}
     beside = path.with_name(f"{path.name}-metadata.json")
-    beside.write_text(json.dumps(metadata, ensure_ascii=False, indent=1), encoding="utf-8")
+    write_whole(beside, json.dumps(metadata, ensure_ascii=False, indent=1).encode())

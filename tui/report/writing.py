@@ -14,7 +14,7 @@ from markupsafe import Markup, escape
 
 from daq.errors import HuddleError
 from daq.results.sources import sources
-from tui.output.console import write_whole
+from daq.whole_file import write_whole
 from tui.report.contents import report_of
 from tui.report.figures import drawing
 from tui.report.figures.curves import WIDTH

@@ -14,6 +14,7 @@ from urllib.parse import urlsplit
 from daq.bench.loading import dump
 from daq.devices.bench_file import load, parse
 from daq.errors import BenchFileError, FileFault
+from daq.whole_file import write_whole
 from sim_devices.errors import ScenarioError
 from sim_devices.faults import check
 from sim_devices.faults import parse as parse_faults
@@ -225,7 +226,7 @@ def serve_devices(
     with _terminated_as_interrupted(), simulated(bench, speed=speed, log=log) as reachable:
         text = dump(reachable)
         if out is not None:
-            out.write_text(text, encoding="utf-8")
+            write_whole(out, text.encode())
         elif json is None:
             console().print(text, soft_wrap=True)
         write_json(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from typing import TYPE_CHECKING
 
 import matplotlib as mpl
@@ -9,6 +10,8 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
+
+from daq.whole_file import write_whole
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -38,8 +41,10 @@ def save(study: Study, folder: Path) -> tuple[Path, Path]:
     with mpl.rc_context({"svg.hashsalt": "huddle", "font.size": 9.0}):
         figure = _figure(study)
         png, svg = folder / f"{study.name}.png", folder / f"{study.name}.svg"
-        figure.savefig(png, dpi=150, metadata={"Software": None})
-        figure.savefig(svg, metadata={"Date": None})
+        for path, about in ((png, {"Software": None}), (svg, {"Date": None})):
+            content = io.BytesIO()
+            figure.savefig(content, format=path.suffix[1:], dpi=150, metadata=about)
+            write_whole(path, content.getvalue())
     return png, svg
 
 

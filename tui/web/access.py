@@ -15,6 +15,7 @@ token made from the cookie, which pages of other sites cannot read.
 from __future__ import annotations
 
 import base64
+import contextlib
 import hashlib
 import hmac
 import ipaddress
@@ -28,7 +29,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING
 
 from daq.errors import HuddleError
-from daq.whole_file import PRIVATE
+from daq.whole_file import PRIVATE, write_whole
 from tui.service.records.places import file_name
 
 if TYPE_CHECKING:
@@ -131,6 +132,9 @@ def _resolved(secret: str | None, environment: Mapping[str, str]) -> str | None:
     return token_hash(token)
 
 
+_KEY_BYTES = 32
+
+
 def server_key(bench: Bench) -> bytes:
     """Return the key of the server of a bench; make it the first time.
 
@@ -141,18 +145,12 @@ def server_key(bench: Bench) -> bytes:
     """
     path: Path = bench.recording_directory / f".{file_name(bench.name)}.web-key"
     path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        handle = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, PRIVATE)
-    except FileExistsError:
-        key = path.read_bytes()
-        if len(key) >= 32:
-            return key
-        path.unlink()  # its writer was killed
-        return server_key(bench)
-    with os.fdopen(handle, "wb") as file:
-        key = secrets.token_bytes(32)
-        file.write(key)
-    return key
+    if path.is_file() and path.stat().st_size < _KEY_BYTES:
+        path.unlink()  # of an earlier version that was killed while it wrote
+    with contextlib.suppress(FileExistsError):  # another process makes it, too
+        if not path.is_file():
+            write_whole(path, secrets.token_bytes(_KEY_BYTES), mode=PRIVATE, free=True)
+    return path.read_bytes()
 
 
 class _Attempts:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from daq.bench.editing import set_sensor_values, with_sensor, without_sensor
+from tests.full_disk import files_limited_to
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -53,17 +54,10 @@ def test_comments_and_order_are_kept(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_file_that_cannot_be_written_is_unchanged(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_cannot_be_written_is_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "lab.toml"
     path.write_text(BENCH, encoding="utf-8")
-
-    def full(_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("daq.bench.editing.os.fsync", full)
-    with pytest.raises(OSError, match="No space left"):
+    with files_limited_to(10), pytest.raises(OSError, match="File too large"):
         set_sensor_values(path, {"A": {"serial_number": "S1"}})
     assert path.read_text(encoding="utf-8") == BENCH
     assert list(tmp_path.iterdir()) == [path]

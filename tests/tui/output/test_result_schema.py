@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
-import resource
 from dataclasses import dataclass
 from importlib import resources
 from typing import TYPE_CHECKING, Any
@@ -16,6 +15,7 @@ from typer.testing import CliRunner
 
 import huddle
 from daq.bench.estimate_settings import table_keys
+from tests.full_disk import files_limited_to
 from tests.tui.night_recording import HOSTILE, record
 from tests.tui.thinned import thinned
 from tui.commands.main import app
@@ -182,13 +182,9 @@ def test_a_growing_recording_has_no_checksum(tmp_path: Path) -> None:
 def test_a_full_disk_leaves_the_earlier_file(written: Written, option: str, tmp_path: Path) -> None:
     out = tmp_path / "result"
     out.write_text("the earlier one", encoding="utf-8")
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000, before[1]))
-    try:
-        arguments = ["estimate", str(written.recording), "--segment", "1s", option, str(out)]
+    arguments = ["estimate", str(written.recording), "--segment", "1s", option, str(out)]
+    with files_limited_to(1_000):
         result = CliRunner().invoke(app, arguments)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert result.exit_code == 3
     assert out.read_text(encoding="utf-8") == "the earlier one"
     assert list(tmp_path.iterdir()) == [out]

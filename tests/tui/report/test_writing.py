@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import resource
 from typing import TYPE_CHECKING
 
 import pytest
@@ -11,6 +10,7 @@ from typer.testing import CliRunner
 
 from daq.bench.masks.mask_file import masks_named
 from daq.devices.bench_file import load
+from tests.full_disk import files_limited_to
 from tests.tui.night_recording import record
 from tests.tui.report.written_report import ROOT, Reported, Words
 from tui.commands.main import app
@@ -53,16 +53,12 @@ def test_a_test_that_is_still_running_is_preliminary(tmp_path: Path) -> None:
 def test_a_report_is_whole_or_not_there(reported: Reported, tmp_path: Path) -> None:
     out = tmp_path / "old.html"
     out.write_text("the old one", encoding="utf-8")
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))  # as a disk that is full
-    try:
-        with pytest.raises(ReportError, match=r"old.html: the report cannot be written \(File too"):
-            write(
-                reported.snapshot, out, recordings=[reported.recording],
-                settings=reported.settings, taken="replace",
-            )  # fmt: skip
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    message = r"old.html: the report cannot be written \(File too"
+    with files_limited_to(10_000), pytest.raises(ReportError, match=message):
+        write(
+            reported.snapshot, out, recordings=[reported.recording],
+            settings=reported.settings, taken="replace",
+        )  # fmt: skip
     assert out.read_text(encoding="utf-8") == "the old one"
     assert list(tmp_path.iterdir()) == [out]
 

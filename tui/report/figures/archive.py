@@ -19,8 +19,8 @@ from daq.archive.changes import DAYS_PER_YEAR
 from daq.archive.density import HIGHEST_DB, LOWEST_DB
 from daq.archive.spectra_file import DAY_NS
 from daq.bench.units import levels_db
+from daq.whole_file import write_whole
 from tui.output.archive.tables import day_text
-from tui.output.console import write_whole
 from tui.report.figures import drawing
 from tui.wording.formatting import span
 

@@ -16,9 +16,9 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 from daq.bench.units import levels_db
 from daq.results.band_summary import levels
 from daq.results.decision.limits import concerns, mask_psd
+from daq.whole_file import write_whole
 from estimator.errors import InsufficientDataError
 from estimator.levels.bands import log_edges
-from tui.output.console import write_whole
 from tui.report.figures import drawing
 from tui.report.figures.drawing import look, stack, stack_height
 from tui.report.parts import Plot

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from daq.bench.end_condition import EndCondition
 from daq.errors import HuddleError
-from daq.whole_file import PRIVATE, sync_file
+from daq.whole_file import create_private, replaced
 from tui.service.records.run_state import (
     NEXT,
     UNFINISHED,
@@ -391,21 +391,18 @@ class RunStore:
         target = self._copies / f"{day:%Y-%m-%d}.sqlite"
         if target.exists() or not self.path.exists():
             return
-        new = target.with_suffix(".new")
         try:
             self._copies.mkdir(mode=0o700, exist_ok=True)
-            new.unlink(missing_ok=True)
-            os.close(os.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY, PRIVATE))
-            with (
-                contextlib.closing(sqlite3.connect(self.path, timeout=_BUSY)) as source,
-                contextlib.closing(sqlite3.connect(new)) as copied,
-            ):
-                # In steps, so that other connections write meanwhile.
-                source.backup(copied, pages=_STEP, sleep=0.0)
-            if _check(new) == "":
-                sync_file(new)
-                new.replace(target)
-            new.unlink(missing_ok=True)
+            with replaced(target) as new:
+                create_private(new)
+                with (
+                    contextlib.closing(sqlite3.connect(self.path, timeout=_BUSY)) as source,
+                    contextlib.closing(sqlite3.connect(new)) as copied,
+                ):
+                    # In steps, so that other connections write meanwhile.
+                    source.backup(copied, pages=_STEP, sleep=0.0)
+                if problem := _check(new):
+                    raise sqlite3.DatabaseError(problem)
             for old in self.copies()[COPIES:]:
                 old.unlink()
         except (sqlite3.Error, OSError) as error:
@@ -437,11 +434,8 @@ class RunStore:
             for copy in self.copies():
                 with contextlib.suppress(sqlite3.Error):
                     if _check(copy) == "":
-                        new = self.path.with_name(f".{NAME}.new")
-                        new.unlink(missing_ok=True)
-                        shutil.copy(copy, new)
-                        sync_file(new)
-                        new.replace(self.path)
+                        with replaced(self.path) as new:
+                            shutil.copy(copy, new)
                         return moved, copy
         except OSError as error:
             raise StoreError(f"{self.path}: cannot be restored: {error}") from error
@@ -469,7 +463,7 @@ class RunStore:
             if not self.path.exists():
                 self.path.parent.mkdir(parents=True, exist_ok=True)
                 with contextlib.suppress(FileExistsError):
-                    os.close(os.open(self.path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, PRIVATE))
+                    create_private(self.path)
             # Closing undoes what was not committed.
             with contextlib.closing(
                 sqlite3.connect(self.path, timeout=_BUSY, isolation_level=None)
