@@ -65,6 +65,8 @@ class Channel:
     direction : str or None
     response : PolesZeros, Response or None
         Poles and zeros, as the bench file has them, or the whole response of an imported file.
+    tolerance : float or None
+        Of the sensitivity, as a fraction of it, by the data sheet.
     certificate : Certificate or None
         A sensor with one for each channel is the reference of ``huddle calibrate``.
     auxiliary : bool
@@ -81,6 +83,7 @@ class Channel:
     unit: str = "m/s²"
     direction: str | None = None
     response: PolesZeros | Response | None = None
+    tolerance: float | None = None
     certificate: Certificate | None = None
     auxiliary: bool = False
 

@@ -26,6 +26,7 @@ from daq.bench.end_condition import EndCondition
 from daq.bench.estimate_settings import OPTIONS, EstimateSettings, table_keys, to_table
 from daq.bench.masks.mask import NOISE_MODELS, Mask, check_points
 from daq.bench.response import PolesZeros, Response
+from daq.bench.sensitivity import REFERENCE_TEMPERATURE
 from daq.bench.tables.certificate import CertificateTable, Customer, Laboratory
 from daq.bench.tables.fields import Duration, Name, Number, PositiveNumber, Table
 from daq.bench.tables.toml_text import to_toml
@@ -131,6 +132,9 @@ class ChannelTable(Table):
         BeforeValidator(_poles_zeros),
         PlainSerializer(_table_of_response),
     ] = None
+    tolerance: Annotated[PositiveNumber, Field(lt=1.0)] | None = None
+    """Of the sensitivity, as a fraction of it: that of the data sheet, where there is no
+    certificate."""
     certificate: Annotated[
         InstanceOf[Certificate] | None,
         BeforeValidator(_certificate),
@@ -204,11 +208,17 @@ class DataSheet(Table):
     """Names of the channels it holds for; all, if empty."""
     temperature: Annotated[tuple[Number, Number], AfterValidator(_range)] | None = None
     """Lowest and highest of operation, in °C."""
+    temperature_coefficient: PositiveNumber | None = None
+    """Largest change of the sensitivity, as a fraction of it for each °C."""
+    reference_temperature: Number = REFERENCE_TEMPERATURE
+    """In °C, at which the sensitivity holds."""
 
     @model_validator(mode="after")
     def _has_full_scale(self) -> DataSheet:
         if self.dynamic_range and self.full_scale is None:
             raise ValueError("dynamic_range: expected full_scale beside it, the peak in the unit")
+        if self.temperature_coefficient is not None and self.temperature is None:
+            raise ValueError("temperature_coefficient: expected temperature beside it, the range")
         return self
 
 

@@ -2,7 +2,7 @@
 
 The text was checked when it was written. To read it again as a `daq.bench.model.Bench` loads
 pydantic and builds its checks, which takes as long as a short estimate: that is left to who needs
-limits, data sheets or certificates.
+limits or data sheets.
 """
 
 from __future__ import annotations
@@ -12,10 +12,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from daq.bench.estimate_settings import OPTIONS, EstimateSettings, table_keys
+from daq.bench.sensitivity import known_sensitivities
 from daq.bench.tables.toml_text import checked_table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from daq.bench.sensitivity import Sensitivities
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +37,8 @@ class BenchOutline:
         Whether its ports are those of simulated devices, as `Bench.runs_simulated`.
     has_limits : bool
         Whether the whole bench has limits to judge by.
+    sensitivities : Sensitivities
+        By names of sensor and channel.
     """
 
     name: str
@@ -42,6 +47,7 @@ class BenchOutline:
     speed: float
     is_simulated: bool
     has_limits: bool
+    sensitivities: Sensitivities
 
     @classmethod
     def of_text(cls, text: str, estimate: str = "") -> BenchOutline | None:
@@ -73,6 +79,7 @@ class BenchOutline:
                 is_simulated=bool(simulation.get("clock"))
                 or float(simulation.get("speed", 1.0)) != 1.0,
                 has_limits=bool(table.get("limits")),
+                sensitivities=known_sensitivities(table),
             )
         except (ValueError, KeyError, TypeError, AttributeError):
             return None

@@ -10,12 +10,20 @@ import numpy as np
 
 from daq.estimation.settings import DIMENSIONS
 from estimator.checks.advice import Level, ModelMisfit, SharedNoise, TooFewDimensions
-from estimator.levels.contributions import Contribution, Source, contribution, widened
+from estimator.levels.contributions import (
+    Contribution,
+    Source,
+    by_chance,
+    contribution,
+    deviation,
+    widened,
+)
 from estimator.levels.interval import NORMAL_95
 from estimator.likelihood.dimension import most_testable
 from estimator.self_noise.result import Flag, SelfNoise
 
 if TYPE_CHECKING:
+    from daq.bench.sensitivity import Sensitivities
     from daq.estimation.snapshot import Snapshot
     from estimator.types import BoolArray, FloatArray
 
@@ -71,7 +79,35 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
         below = np.zeros(shape)
         below[:, faulty] = math.inf
         found.append(contribution(Source.FAULTY, shape, below=below))
+    if snapshot.sensitivities:
+        found += _sensitivities(snapshot, shape)
     return tuple(found)
+
+
+def _sensitivities(snapshot: Snapshot, shape: tuple[int, int]) -> list[Contribution]:
+    """Return what is known of sensitivities; a PSD has their square."""
+    known = [
+        snapshot.sensitivities.get((label.sensor, label.channel)) for label in snapshot.channels
+    ]
+    own, by_temperature, off = (
+        2 * np.array([0.0 if each is None else getattr(each, part) for each in known])
+        for part in ("own", "by_temperature", "off")
+    )
+    parts = []
+    if own.any() or off.any():
+        parts.append(contribution(Source.SENSITIVITY, shape, share=off, deviation=own))
+    if by_temperature.any():
+        parts.append(contribution(Source.TEMPERATURE, shape, deviation=by_temperature))
+    return parts
+
+
+def with_sensitivities(snapshot: Snapshot, sensitivities: Sensitivities) -> Snapshot:
+    """Return a finished snapshot with other knowledge of the sensitivities, in all intervals."""
+    results = {
+        name: SelfNoise.of(name, each.noise_psd, each.cumulants, each.flags)
+        for name, each in snapshot.results.items()
+    }
+    return _widened(replace(snapshot, results=results, sensitivities=sensitivities))
 
 
 def with_contributions(snapshot: Snapshot) -> Snapshot:
@@ -82,14 +118,24 @@ def with_contributions(snapshot: Snapshot) -> Snapshot:
     found = snapshot.diagnostics.diagnosis
     steady = None if found is None else found.stability
     inflation = max(1.0, 1.0 if steady is None else steady.inflation)
-    scale = np.array([inflation, inflation**2, inflation**3])[:, None, None]
+    if inflation > 1:
+        scale = np.array([inflation, inflation**2, inflation**3])[:, None, None]
+        results = {
+            name: SelfNoise.of(name, each.noise_psd, scale * each.cumulants, each.flags)
+            for name, each in snapshot.results.items()
+        }
+        snapshot = replace(snapshot, results=results)
+    return _widened(snapshot)
+
+
+def _widened(snapshot: Snapshot) -> Snapshot:
+    """Return a snapshot whose intervals of scatter have all contributions."""
     results = {}
     for name, each in snapshot.results.items():
-        result = each
-        if inflation > 1:
-            result = SelfNoise.of(name, each.noise_psd, scale * each.cumulants, each.flags)
-        low, high = widened(result.low, result.high, contributions(snapshot, name))
-        results[name] = replace(result, low=low, high=high)
+        parts = contributions(snapshot, name)
+        low, high = widened(each.low, each.high, parts)
+        low, high = by_chance(each.noise_psd, low, high, NORMAL_95 * deviation(parts))
+        results[name] = replace(each, low=low, high=high)
     return replace(snapshot, results=results)
 
 

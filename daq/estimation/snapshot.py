@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from daq.bench.sensitivity import Sensitivities
     from daq.clocks.clock_model import ClockState
     from daq.protocols.block import Event
     from daq.recording.interface import ReadableSensor
@@ -207,6 +208,8 @@ class Snapshot:
         may be off; empty: not at all.
     rounding : float
         Share of the data's PSD by which the noise may be off, because cross-spectra were rounded.
+    sensitivities : mapping of (str, str) to KnownSensitivity
+        What is known of sensitivities, by names of sensor and channel; not in it: nothing.
     simulated : bool
         Whether a sensor was simulated: the noise is that of no real one.
     channel_segments : tuple of int
@@ -242,6 +245,7 @@ class Snapshot:
     not_estimated: tuple[str, ...] = ()
     across_axes: tuple[float, ...] = ()
     rounding: float = 0.0
+    sensitivities: Sensitivities = field(default_factory=dict)
     simulated: bool = False
     channel_segments: tuple[int, ...] = ()
     shortened: Mapping[str, tuple[float, float]] = field(default_factory=dict)

@@ -48,6 +48,7 @@ from daq.estimation.segments.segment_pass import still_for_a_while
 from daq.estimation.snapshot import Bridged, ChannelLabel, NoSegment, Octave, SensorTotals, Snapshot
 from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics
 from daq.estimation.throttle import Throttle
+from daq.protocols.block import Quantity
 from estimator.checks.advice import Untested
 from estimator.checks.stability import SegmentCourse
 from estimator.errors import InsufficientDataError
@@ -55,10 +56,11 @@ from estimator.likelihood.factor_analysis import Maxima
 from estimator.spectra.segment_rejection import Reason
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
+    from daq.bench.sensitivity import Sensitivities
     from daq.estimation.equalisation import Equalisation
     from daq.estimation.noise_estimates import Channels, ChannelSet
     from daq.estimation.segments.segment_pass import Pass
@@ -320,6 +322,7 @@ class SnapshotBuilder:
             bridged=_bridged(passes, estimates.results),
             not_estimated=left,
             across_axes=self._axes,
+            sensitivities=_sensitivities(recordings),
             simulated=any(recording.simulated for recording in recordings),
             quantisation_psd=(
                 quantisation_psd(frequency, channels, self._unit, _counting_rates(latest))
@@ -524,6 +527,26 @@ def _not_estimated(recording: ReadableRecording, channels: Channels) -> tuple[st
     estimated = {sensor for sensor, _ in channels}
     left = (record for record in recording.sensors if record.name not in estimated)
     return tuple(record.name for record in left if main_columns(record))
+
+
+def sensitivities_at(
+    known: Sensitivities, recordings: Iterable[ReadableRecording]
+) -> Sensitivities:
+    """Return what is known of sensitivities, at the temperatures that sensors stated."""
+    if not any(each.coefficient for each in known.values()):
+        return known
+    read: dict[str, list[float]] = {}
+    for recording in recordings:
+        for reading in recording.readings:
+            if reading.quantity == Quantity.TEMPERATURE:
+                read.setdefault(reading.sensor, []).append(reading.value)
+    ends = {sensor: (min(values), max(values)) for sensor, values in read.items()}
+    return {name: each.at(ends.get(name[0])) for name, each in known.items()}
+
+
+def _sensitivities(recordings: Sequence[ReadableRecording]) -> Sensitivities:
+    outline = recordings[0].outline
+    return {} if outline is None else sensitivities_at(outline.sensitivities, recordings)
 
 
 def _counting_rates(recording: ReadableRecording) -> dict[str, float]:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from daq.bench.channel import Channel
     from daq.formats.foreign_sensor import ForeignSensor, Stretch
-    from daq.protocols.block import Event
+    from daq.protocols.block import Event, Reading
 
 
 class BlocksInMemory:
@@ -120,6 +120,7 @@ class RecordingInMemory:
     closed = True
     outline = None
     events: tuple[Event, ...] = ()
+    readings: tuple[Reading, ...] = ()
 
     def __init__(
         self, sensors: Sequence[SensorInMemory], name: str, *, simulated: bool = False

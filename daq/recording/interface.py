@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from daq.bench.channel import Channel
     from daq.bench.outline import BenchOutline
-    from daq.protocols.block import Event, HostTime
+    from daq.protocols.block import Event, HostTime, Reading
 
 
 class ReadableBlocks(Protocol):
@@ -126,6 +126,10 @@ class ReadableRecording(Protocol):
     @property
     def events(self) -> tuple[Event, ...]:
         """Events of the recording."""
+
+    @property
+    def readings(self) -> tuple[Reading, ...]:
+        """What devices and the host stated of themselves."""
 
     def refresh(self) -> bool:
         """Read newly committed rows; return whether there were any."""

@@ -16,7 +16,7 @@ from daq.estimation.contributions import contributions, shared_parts
 from daq.estimation.noise_estimates import ALL_METHODS
 from estimator.checks.advice import NoSharedMotion
 from estimator.levels.bands import band_edges, band_levels, bin_correlation
-from estimator.levels.contributions import widened
+from estimator.levels.contributions import by_chance, deviation, widened
 from estimator.levels.interval import NORMAL_95, interval, unpredicted
 from estimator.spectra.windows import get_window
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
+    from daq.estimation.snapshot import ChannelLabel, Snapshot
     from estimator.levels.bands import BandLevels
     from estimator.levels.contributions import Contribution, Source
     from estimator.self_noise.result import SelfNoise
@@ -106,7 +106,18 @@ class Levels:
         )
         most = self._most(quantile)
         low = np.where(low > most, -np.inf, low)
-        return low, np.where(np.isnan(high), high, np.fmin(high, most))
+        high = np.where(np.isnan(high), high, np.fmin(high, most))
+        return by_chance(
+            self.mean, low, high, quantile * deviation(self.contributions, without=without)
+        )
+
+    @property
+    def deviation(self) -> FloatArray:
+        """Standard deviation of the logarithm of all levels of a channel, shape (n_channels,).
+
+        By its sensitivity, which is common to all bands.
+        """
+        return np.broadcast_to(deviation(self.contributions), self.mean.shape[1:])
 
     def withdrawn(self, quantile: float = NORMAL_95) -> NDArray[np.bool_]:
         """Whether the whole interval is above the bound: the model has too few dimensions."""
@@ -121,7 +132,7 @@ class Levels:
         return BandMeans(
             *(mean, spread, low[:, column], high[:, column]),
             scatter=(scatter[0][:, column], scatter[1][:, column]),
-            parts={each.source: each.adds(column, mean) for each in self.contributions},
+            parts={each.source: each.adds(column, mean, quantile) for each in self.contributions},
         )
 
     def _most(self, quantile: float) -> FloatArray:
@@ -248,6 +259,16 @@ def averages_at(snapshot: Snapshot, frequency: FloatArray) -> FloatArray:
     edges = np.array([octave.low for octave in snapshot.octaves[1:]])
     averages = np.array([octave.n_effective for octave in snapshot.octaves])
     return np.asarray(averages[np.searchsorted(edges, frequency, side="right")])
+
+
+def without_sensitivity(snapshot: Snapshot) -> list[ChannelLabel]:
+    """Return the channels of whose sensitivity neither certificate nor tolerance is stated."""
+    known = snapshot.sensitivities
+    return [
+        label
+        for label in snapshot.channels
+        if (found := known.get((label.sensor, label.channel))) is None or not found.is_stated
+    ]
 
 
 def highest_known(snapshot: Snapshot) -> float:

@@ -12,7 +12,7 @@ from daq.clocks.clock_model import RelativeTime
 from daq.errors import WrongSettingError
 from daq.results.band_summary import band_of, correlation_of
 from daq.results.clock_effect import relative_time
-from daq.results.uncertainty_budget import Budget, Component, known, noise_budgets
+from daq.results.uncertainty_budget import Budget, Component, calibrated_budgets, known
 from estimator.errors import InsufficientDataError
 from estimator.responses.calibration import calibrate_sensor, response_curve
 from estimator.responses.derived_quantities import Value
@@ -176,21 +176,33 @@ class _Work:
     ) -> None:
         self.snapshot, self._settings, self._bench = snapshot, settings, bench
         self._reference, self._confidence = reference, confidence
+        name = snapshot.sensor_names[reference]
         self._certificates = certificates
         self.band = band_of(settings, snapshot)
         self._correlation = correlation_of(settings)
         self._first = np.cumsum([0, *snapshot.dims])
         scale = np.ones(len(snapshot.channels))
-        self._from_certificate = 0.0
+        own = [label for label in snapshot.channels if label.sensor == name]
+        stated = [snapshot.sensitivities.get((each.sensor, each.channel)) for each in own]
+        # conservative: as if the sensitivities of all its channels erred together
+        self._of_reference = max(
+            (
+                math.hypot(0.0 if certificates else each.own, each.by_temperature)
+                for each in stated
+                if each
+            ),
+            default=0.0,
+        )
+        of_certificates = 0.0
         for number, certificate in enumerate(certificates):
             column = int(self._first[reference]) + number
             label = snapshot.channels[column]
             channel = _channel_of(bench, label.sensor, label.channel)
             if channel is not None:  # motion by the certificate, not by the bench file
                 scale[column] = channel.sensitivity / certificate.value
-            # conservative: as if the certificates of all its channels erred together
             relative = certificate.expanded_uncertainty / certificate.k / abs(certificate.value)
-            self._from_certificate = max(self._from_certificate, relative)
+            of_certificates = max(of_certificates, relative)
+        self._of_reference = math.hypot(self._of_reference, of_certificates)
         self._scale = scale
         self._csm: ComplexArray = snapshot.csm * scale[:, None] * scale[None, :]
         n = snapshot.n_effective
@@ -300,8 +312,9 @@ class _Work:
                 Component("quantisation", "B", "rectangular", self._counting(column, inside)),
             ]
             absolute = bool(self._certificates) and channel is not None
-            if self._certificates:
-                components.append(Component("certificate", "B", "normal", self._from_certificate))
+            if self._of_reference:
+                source = "certificate" if self._certificates else "tolerance"
+                components.append(Component(source, "B", "normal", self._of_reference))
             budgets.append(
                 Budget(
                     sensor=label.sensor,
@@ -338,7 +351,7 @@ class _Work:
             combined[each.sensor, each.channel] = each.combined
         first, labels = int(self._first[self._reference]), self.snapshot.channels
         calibrated = {
-            first + number: (1 / float(self._scale[first + number]), self._from_certificate)
+            first + number: (1 / float(self._scale[first + number]), self._of_reference)
             for number in range(self.snapshot.dims[self._reference])
         }
         for found in sensors:
@@ -346,12 +359,11 @@ class _Work:
                 column = int(self._first[found.sensor]) + number
                 label = labels[column]
                 calibrated[column] = (gain, combined[label.sensor, label.channel])
-        return noise_budgets(
+        return calibrated_budgets(
             self.snapshot,
             self._settings,
             self.band,
             calibrated,
-            averages=self._averages,
             confidence=self._confidence,
             is_absolute=bool(self._certificates),
         )

@@ -1,28 +1,42 @@
-"""Uncertainty budgets by the GUM: their lines, their combination, and the coverage factor.
+"""Uncertainty budgets: their lines, their combination, and the coverage factor.
 
-Those of calibrated channels are in terms of their calibrated sensitivities.
+Every number has one budget, one U and one k, whoever shows it. The standard uncertainties of its
+lines add by squares (JCGM 100:2008, 5.1.2). The interval of noise is that of
+`daq.results.band_summary.Levels`, because noise is not linear in what it is made of (JCGM 101:2008,
+5.10.1): the estimate scatters like a PSD, sensitivities are factors, and the largest error by an
+effect without a distribution is added as it is. U is half the width of the interval, and k is U
+over the combined standard uncertainty.
+
+The budgets of calibrated channels are in terms of their calibrated sensitivities.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.results.band_summary import judged_method, levels
-from estimator.levels.bands import band_edges
+from daq.bench.sensitivity import KnownSensitivity
+from daq.results.band_summary import band_of, judged_method, levels
+from estimator.levels.bands import band_edges, third_octaves
 from estimator.levels.interval import NORMAL_95
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
+
+    from numpy.typing import NDArray
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import ChannelLabel, Snapshot
-    from estimator.levels.contributions import Contribution
+    from daq.results.band_summary import Levels
+    from estimator.types import FloatArray
 
-_MANY = 1e6  # degrees of freedom: those of a stated uncertainty
+STATED = 1e6
+"""Degrees of freedom of an uncertainty that is stated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,23 +46,27 @@ class Component:
     Attributes
     ----------
     source : str
-        "estimate", "variation", "quantisation", "certificate", "sensitivity", or a cause of
+        "estimate", "variation", "quantisation", "certificate", "tolerance", or a cause of
         `estimator.levels.contributions.Source`.
     kind : str
         "A" (from the scatter of these data) or "B" (from elsewhere).
     distribution : str
-        "normal" or "rectangular".
+        "normal", "rectangular" or "chi-squared".
     relative : float
         Standard uncertainty over the value.
     dof : float
         Degrees of freedom.
+    reach : (float, float)
+        How far it alone moves the ends of the interval, of the value; NaN where the expanded
+        uncertainty has no ends of its own.
     """
 
     source: str
     kind: str
     distribution: str
     relative: float
-    dof: float = _MANY
+    dof: float = STATED
+    reach: tuple[float, float] = (math.nan, math.nan)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +86,9 @@ class Budget:
     confidence : float
     is_absolute : bool
         Whether the value rests on a certificate.
+    ends : (float, float) or None
+        The interval, where its ends are not those of Student's distribution: noise is not linear
+        in what it is made of (JCGM 101), and bounds add.
     """
 
     sensor: str
@@ -79,6 +100,7 @@ class Budget:
     components: tuple[Component, ...]
     confidence: float
     is_absolute: bool = False
+    ends: tuple[float, float] | None = None
 
     @property
     def combined(self) -> float:
@@ -89,17 +111,34 @@ class Budget:
     def dof(self) -> float:
         """Effective degrees of freedom (Welch and Satterthwaite)."""
         total = sum(each.relative**4 / each.dof for each in self.components)
-        return self.combined**4 / total if 0 < total < math.inf else _MANY
+        return self.combined**4 / total if 0 < total < math.inf else STATED
 
     @property
     def k(self) -> float:
-        """Coverage factor of the confidence level."""
-        return student_quantile(0.5 + self.confidence / 2, self.dof)
+        """Coverage factor: expanded over combined standard uncertainty."""
+        if self.ends is None:
+            return student_quantile(0.5 + self.confidence / 2, self.dof)
+        return (self.ends[1] - self.ends[0]) / 2 / self.standard if self.standard else math.nan
+
+    @property
+    def standard(self) -> float:
+        """Combined standard uncertainty, in the unit of the value."""
+        return abs(self.value) * self.combined
 
     @property
     def expanded(self) -> float:
-        """Expanded uncertainty, in the unit of the value."""
-        return abs(self.value) * self.k * self.combined
+        """Expanded uncertainty, in the unit of the value: half the width of the interval."""
+        return self.k * self.standard
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Both ends of the interval, in the unit of the value."""
+        return self.ends or (self.value - self.expanded, self.value + self.expanded)
+
+    def over(self, divisor: float) -> Budget:
+        """Return the budget of the value over a number that is known."""
+        low, high = self.interval
+        return replace(self, value=self.value / divisor, ends=(low / divisor, high / divisor))
 
 
 def student_quantile(probability: float, dof: float) -> float:
@@ -109,20 +148,134 @@ def student_quantile(probability: float, dof: float) -> float:
     return float(stdtrit(max(dof, 2.0), probability))
 
 
-_RECTANGULAR = math.sqrt(3.0)
+def level_budget(
+    found: Levels,
+    column: int,
+    label: ChannelLabel,
+    band: tuple[float, float],
+    *,
+    row: int = 0,
+    confidence: float = 0.95,
+) -> Budget:
+    """Return the budget of the noise of one channel in one band.
+
+    The one place in which the parts of an interval become a standard uncertainty and a k.
+
+    Parameters
+    ----------
+    found : Levels
+    column, row : int
+        Channel and band in them.
+    label : ChannelLabel
+    band : (float, float)
+        Hz.
+    confidence : float
+
+    Raises
+    ------
+    ArithmeticError
+        If the total interval does not hold the statistical one: it never may.
+    """
+    quantile = NORMAL_95
+    if confidence != 0.95:
+        quantile = NormalDist().inv_cdf(0.5 + confidence / 2)
+    level = float(found.mean[row, column])
+    low, high = (float(end[row, column]) for end in found.ends(quantile))
+    # the bound, which needs no model of the motion, cuts both intervals
+    inner = [min(float(end[row, column]), high) for end in found.of_scatter.interval(quantile)]
+    if low > inner[0] or high < inner[1]:
+        raise ArithmeticError(f"{label.name}: {low, high} does not hold the statistical {inner}")
+    scale = abs(level) if level else math.nan
+    variance = float(found.of_scatter.cumulants[0, row, column])
+    deviation = math.sqrt(variance) / scale if variance > 0 else 0.0
+    parts = [
+        Component(
+            "estimate", "A", "chi-squared", deviation,
+            2 / deviation**2 if deviation else STATED,
+            ((inner[0] - level) / scale, (inner[1] - level) / scale),
+        )
+    ]  # fmt: skip
+    for each in found.contributions:
+        below, above = (
+            float(side[row]) / scale for side in each.adds(column, found.mean[:, column], quantile)
+        )
+        by_chance = float(np.broadcast_to(each.deviation, found.mean.shape[1:])[column])
+        off = below - abs(math.expm1(-quantile * by_chance))
+        bound = (off + above - math.expm1(quantile * by_chance)) / _RECTANGULAR
+        parts.append(
+            Component(
+                each.source, "B", "normal" if by_chance else "rectangular",
+                math.hypot(by_chance, bound), reach=(-below, above),
+            )
+        )  # fmt: skip
+    return Budget(
+        sensor=label.sensor,
+        channel=label.channel,
+        quantity="noise",
+        low=band[0],
+        high=band[1],
+        value=level,
+        components=tuple(parts),
+        confidence=confidence,
+        ends=(low, high),
+    )
 
 
-def noise_budgets(
+_RECTANGULAR = math.sqrt(12.0)
+"""Width of a rectangular distribution over its standard deviation (JCGM 100:2008, 4.3.8)."""
+
+
+def band_budgets(snapshot: Snapshot, settings: Settings) -> list[Budget]:
+    """Return the budget of every channel over the band of the tables; none without a result."""
+    return [found[0] for found in _budgets(snapshot, settings, band_edges)]
+
+
+def third_octave_budgets(snapshot: Snapshot, settings: Settings) -> list[list[Budget]]:
+    """Return the budgets of every channel in thirds of an octave of the band of the tables.
+
+    Those whose interval has both ends.
+    """
+    return [
+        [each for each in of_channel if all(map(math.isfinite, (each.value, *each.interval)))]
+        for of_channel in _budgets(
+            snapshot, settings, lambda frequency, band: third_octaves(frequency, *band)
+        )
+    ]
+
+
+def _budgets(
+    snapshot: Snapshot,
+    settings: Settings,
+    divided: Callable[[FloatArray, tuple[float, float]], NDArray[np.int64]],
+) -> list[list[Budget]]:
+    """Return the budgets of the bands of every channel, by the method that judges."""
+    noise = snapshot.results.get(judged_method(snapshot, settings))
+    if noise is None:
+        return []
+    edges = divided(snapshot.frequency, band_of(settings, snapshot))
+    found, frequency = levels(noise, snapshot, settings, edges), snapshot.frequency
+    bands = [
+        (float(frequency[first]), float(frequency[last - 1]))
+        for first, last in itertools.pairwise(edges)
+    ]
+    return [
+        [level_budget(found, column, label, band, row=row) for row, band in enumerate(bands)]
+        for column, label in enumerate(snapshot.channels)
+    ]
+
+
+def calibrated_budgets(
     snapshot: Snapshot,
     settings: Settings,
     band: tuple[float, float],
     calibrated: Mapping[int, tuple[float, float]],
     *,
-    averages: float,
     confidence: float,
     is_absolute: bool,
 ) -> tuple[list[Budget], list[ChannelLabel]]:
     """Return a budget for the noise of each calibrated channel over a band.
+
+    It is that of `level_budget`, with the calibrated sensitivities in place of the stated ones.
 
     Parameters
     ----------
@@ -133,8 +286,6 @@ def noise_budgets(
     calibrated : mapping of int to (float, float)
         By number of the channel: its calibrated sensitivity over that of the bench file, and the
         relative standard uncertainty of this. Channels that are not in it have no budget.
-    averages : float
-        Number of independent averages.
     confidence : float
     is_absolute : bool
         Whether the sensitivities rest on a certificate.
@@ -145,65 +296,26 @@ def noise_budgets(
     unknown : list of ChannelLabel
         Calibrated channels whose mean noise is not positive.
     """
-    found = snapshot.results.get(judged_method(snapshot, settings))
-    if found is None:
+    noise = snapshot.results.get(judged_method(snapshot, settings))
+    if noise is None:
         return [], []
-    low, high = band
-    inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
-    whole = levels(found, snapshot, settings, band_edges(snapshot.frequency, band))
-    ends = whole.of_scatter.interval()
+    sensitivities = {
+        (label.sensor, label.channel): KnownSensitivity(own=calibrated[column][1])
+        for column, label in enumerate(snapshot.channels)
+        if column in calibrated
+    }
+    snapshot = replace(snapshot, sensitivities=sensitivities)
+    whole = levels(noise, snapshot, settings, band_edges(snapshot.frequency, band))
     budgets: list[Budget] = []
     unknown: list[ChannelLabel] = []
-    for column, label in enumerate(snapshot.channels):
-        if column not in calibrated:
-            continue
-        ratio, uncertainty = calibrated[column]
-        value = float(whole.mean[0, column])
-        if not value > 0:
+    for column, (ratio, _) in sorted(calibrated.items()):
+        label = snapshot.channels[column]
+        if not whole.mean[0, column] > 0:
             unknown.append(label)
             continue
-        half = known(float(ends[1][0, column] - ends[0][0, column]) / 2 / NORMAL_95)
-        spread = float(whole.of_scatter.spread[0, column])
-        others = tuple(
-            Component(each.source, "B", "rectangular", _half_width(each, column, value))
-            for each in whole.contributions
-        )
-        counting = 0.0
-        if snapshot.quantisation_psd is not None:
-            psd = snapshot.quantisation_psd[inside, column]
-            counting = known(float(np.mean(psd))) / value
-        parts = (
-            Component(
-                "estimate",
-                "A",
-                "normal",
-                max(spread, half) / value,
-                2 * max(averages, 1.0) * max(int(inside.sum()) / 2, 1.0),
-            ),
-            Component("sensitivity", "B", "normal", 2 * uncertainty),
-            *others,
-            Component("quantisation", "B", "rectangular", counting / _RECTANGULAR),
-        )
-        budgets.append(
-            Budget(
-                sensor=label.sensor,
-                channel=label.channel,
-                quantity="noise",
-                low=low,
-                high=high,
-                value=value / ratio**2,
-                components=parts,
-                confidence=confidence,
-                is_absolute=is_absolute,
-            )
-        )
+        found = level_budget(whole, column, label, band, confidence=confidence)
+        budgets.append(replace(found.over(ratio**2), is_absolute=is_absolute))
     return budgets, unknown
-
-
-def _half_width(each: Contribution, column: int, value: float) -> float:
-    """Return the standard uncertainty of a contribution that is within its larger side."""
-    side = max(float(each.below[0, column]), float(each.above[0, column]))
-    return (side / value + float(each.share[0, column])) / _RECTANGULAR
 
 
 def known(value: float) -> float:

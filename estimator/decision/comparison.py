@@ -61,9 +61,11 @@ class Comparison:
     """The noise of one channel beside one mask in all bands of it; arrays of shape (n_bands,).
 
     `outer_low` and `outer_high` are the ends of the interval with all that widens it; `low` and
-    `high` those by the scatter of the estimate alone, `no_clocks` the ends without what the clocks
-    do. NaN in bands without an estimate. `gains` has what the channel reads of the motion of the
-    others, in place of 1; empty where the motion does not contradict its sensitivity.
+    `high` those by what is random alone, the scatter of the estimate and the sensitivity;
+    `no_clocks` the ends without what the clocks do. NaN in bands without an estimate. `gains` has
+    what the channel reads of the motion of the others, in place of 1; empty where the motion does
+    not contradict its sensitivity. `reach` is how far the sensitivity, which no time improves,
+    moves the ends in logarithms of the noise.
     """
 
     centre: FloatArray
@@ -80,6 +82,7 @@ class Comparison:
     is_withdrawn: BoolArray
     is_faulty: bool
     gains: tuple[float, ...] = ()
+    reach: float = 0.0
 
     def judged(self) -> Judged:
         """Return the verdict, and the band where the channel does worst."""
@@ -136,11 +139,18 @@ class Comparison:
                 np.where(np.isfinite(part), np.maximum(part, 0.0), math.inf)
                 for part in (self.low - self.outer_low, self.outer_high - self.high)
             )
+        added, removed = np.log1p(added / self.mask), np.log1p(removed / self.mask)
+        margin = np.where(positive, in_log, in_linear)
+        if self.reach:  # by squares: what it takes off the room that scatter may use
+            bounds = np.where(margin > 0, removed, -added)
+            room = np.where(np.isfinite(bounds), margin - bounds, 0.0)
+            left = np.sqrt(np.maximum(room**2 - self.reach**2, 0.0))
+            margin = np.where(np.isfinite(bounds), bounds + np.sign(room) * left, margin)
         return Margins(
-            margin=np.where(positive, in_log, in_linear),
+            margin=margin,
             cumulants=self.cumulants / np.stack([unit**k for k in (2, 3, 4)]),
-            added=np.log1p(added / self.mask),
-            removed=np.log1p(removed / self.mask),
+            added=added,
+            removed=removed,
             can_fail=np.full(self.mean.shape, not self.is_faulty),
         )
 

@@ -20,6 +20,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimator.levels.interval import NORMAL_95
+
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
@@ -49,6 +51,10 @@ class Source(enum.StrEnum):
     """Cross-spectra were kept in single precision, as fine as their largest part: the motion."""
     FAULTY = "faulty"
     """The channel is clipped, or was dead for a while: its noise is lower than the estimate."""
+    SENSITIVITY = "sensitivity"
+    """The sensitivity is as certain as its certificate, or its tolerance, states."""
+    TEMPERATURE = "temperature"
+    """The sensitivity follows the temperature, within the coefficient of the data sheet."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,20 +68,34 @@ class Contribution:
         By how much the lower end is lower, the upper end higher, in unit**2/Hz.
     share : float64
         Part of the level by which both ends are farther; infinite where nothing is known.
+    deviation : float64, shape (n_channels,), or float
+        Standard deviation of the logarithm of the level, common to all frequencies. Its effect is
+        added to the interval by squares (`by_chance`), where the others are bounds, which add.
     """
 
     source: Source
     below: FloatArray
     above: FloatArray
     share: FloatArray
+    deviation: FloatArray | float = 0.0
 
-    def adds(self, column: int, level: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return what it adds below and above a channel's level, shape (n,), in unit**2/Hz."""
+    def adds(
+        self, column: int, level: FloatArray, quantile: float = NORMAL_95
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return what it alone adds below and above a channel's level, shape (n,), in unit**2/Hz.
+
+        What a deviation adds depends on the quantile, in standard deviations to either end.
+        """
         with np.errstate(invalid="ignore"):
             of_share = np.where(
                 self.share[:, column] > 0, self.share[:, column] * np.abs(level), 0.0
             )
-        return self.below[:, column] + of_share, self.above[:, column] + of_share
+        reach = quantile * np.broadcast_to(self.deviation, self.share.shape[1:])[column]
+        below, above = (np.abs(level * np.expm1(side * reach)) for side in (-1, 1))
+        return (
+            self.below[:, column] + of_share + below,
+            self.above[:, column] + of_share + above,
+        )
 
     def in_bands(
         self, edges: NDArray[np.int64], weight: FloatArray, psd: FloatArray
@@ -105,6 +125,7 @@ class Contribution:
             mean(self.below, weight),
             mean(self.above, weight),
             np.where(unknown, np.inf, share),
+            self.deviation,
         )
 
 
@@ -115,12 +136,13 @@ def contribution(
     below: FloatArray | float = 0.0,
     above: FloatArray | float = 0.0,
     share: FloatArray | float = 0.0,
+    deviation: FloatArray | float = 0.0,
 ) -> Contribution:
     """Return a contribution; what is not given is zero."""
-    arrays = (
+    arrays = [
         np.broadcast_to(np.asarray(part, np.float64), shape) for part in (below, above, share)
-    )
-    return Contribution(source, *arrays)
+    ]
+    return Contribution(source, arrays[0], arrays[1], arrays[2], deviation)
 
 
 def widened(
@@ -147,6 +169,57 @@ def widened(
         upper = np.where(high > 0, high * (1 + share), high)
     unknown = np.isinf(share) & ~np.isnan(low)
     return np.where(unknown, -np.inf, lower), np.where(unknown, np.inf, upper)
+
+
+def deviation(
+    contributions: Iterable[Contribution], *, without: Collection[Source] = ()
+) -> FloatArray:
+    """Return the standard deviation of the logarithm of levels by all contributions but some.
+
+    Shape (n_channels,), or () where there is none.
+    """
+    squares = [np.square(e.deviation) for e in contributions if e.source not in without]
+    total = np.sum(np.broadcast_arrays(*squares), axis=0) if squares else 0.0
+    return np.asarray(np.sqrt(total))
+
+
+def by_chance(
+    level: FloatArray, low: FloatArray, high: FloatArray, reach: FloatArray | float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the ends of an interval of levels that are known but for a factor.
+
+    Parameters
+    ----------
+    level, low, high : float64, shape (..., n_channels)
+        Levels with their intervals as if the factor were 1.
+    reach : float64, shape (n_channels,), or float
+        How far the logarithm of the factor reaches: its standard deviation times the quantile of
+        the interval.
+
+    Returns
+    -------
+    low, high : float64, shape (..., n_channels)
+        The distances from the level to either end, and the reach, are added by squares in
+        logarithms, where the factor is normal whatever its size (JCGM 100, 5.1.2, and within
+        1 % of the distances of JCGM 101). An end without a logarithm, or on the other side of
+        the level, is multiplied by the whole reach.
+    """
+    if not np.any(reach):
+        return low, high
+    with np.errstate(invalid="ignore", divide="ignore"):
+        up, down = np.log(high / level), np.log(level / low)
+        upper = np.where(
+            (level > 0) & (high >= level),
+            level * np.exp(np.hypot(up, reach)),
+            high * np.exp(np.where(high > 0, reach, -np.asarray(reach))),
+        )
+        lower = np.where(
+            (low > 0) & (low <= level),
+            level * np.exp(-np.hypot(down, reach)),
+            low * np.exp(np.where(low > 0, -np.asarray(reach), reach)),
+        )
+    # no shorter by rounding
+    return np.minimum(lower, low), np.maximum(upper, high)
 
 
 _OWN, _OTHERS = 3.5, 1.79

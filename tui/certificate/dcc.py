@@ -18,10 +18,9 @@ from daq.protocols.block import Quantity
 from daq.results.band_summary import band_of, judged_method
 from daq.results.decision.conformity import Statement, conformity, with_rule
 from daq.results.sources import conditions
-from estimator.levels.interval import NORMAL_95
+from daq.results.uncertainty_budget import band_budgets, third_octave_budgets
 from tui.report.certificate import PROCEDURE, QUANTITIES, SCOPE, manufacturers, outside_range
 from tui.report.noise import decision_rule
-from tui.report.uncertainty import thirds, uncertainties
 from tui.wording.formatting import span
 
 if TYPE_CHECKING:
@@ -32,8 +31,8 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from daq.results.decision.conformity import Conformity
     from daq.results.sources import Condition, Source
+    from daq.results.uncertainty_budget import Budget
     from tui.report.certificate import Issue
-    from tui.report.uncertainty import Thirds, Uncertainty
 
 DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"
 SCHEMA_VERSION = "3.1.2"
@@ -212,7 +211,8 @@ def _results(
     found_conditions = conditions(found, about, start=settings.start, end=settings.end)
     _conditions(_add(_add(one, "influenceConditions"), "influenceCondition"), found_conditions)
     results = _add(one, "results")
-    whole, spectra = uncertainties(snapshot, settings), thirds(snapshot, settings)
+    whole = band_budgets(snapshot, settings)
+    spectra = third_octave_budgets(snapshot, settings)
     if not whole:
         result = _add(results, "result")
         _text(result, "name", "Self-noise")
@@ -225,7 +225,7 @@ def _results(
         _text(result, "name", f"Self-noise of {label.sensor}.{label.channel}")
         data = _add(result, "data")
         _mean(data, total, name, factor, unit)
-        if spectrum.centre:
+        if spectrum:
             _spectrum(data, spectrum, factor, unit)
         else:
             _content(_add(data, "text"), "No band of a third of an octave has both ends.")
@@ -255,42 +255,41 @@ def _conditions(condition: ET.Element, stated: Sequence[Condition]) -> None:
         _content(_add(data, "text"), "Temperature: not stated by the devices.")
 
 
-def _mean(data: ET.Element, total: Uncertainty, name: str, factor: float, unit: str) -> None:
+def _mean(data: ET.Element, total: Budget, name: str, factor: float, unit: str) -> None:
     """Add the level over the band, where its interval has both ends."""
-    low, high = total.total
-    if not all(map(math.isfinite, (total.level, low, high))):
+    low, high = total.interval
+    if not all(map(math.isfinite, (total.value, low, high))):
         return
     quantity = _add(data, "quantity")
     _text(quantity, "name", name)
     real = _si(quantity, "real")
-    _si(real, "value", _number(total.level * factor))
+    _si(real, "value", _number(total.value * factor))
     _si(real, "unit", unit)
     interval = _si(real, "coverageInterval")
-    _si(interval, "standardUnc", _number(factor * (high - low) / (2 * NORMAL_95)))
+    _si(interval, "standardUnc", _number(factor * total.standard))
     _si(interval, "intervalMin", _number(factor * low))
     _si(interval, "intervalMax", _number(factor * high))
     _si(interval, "coverageProbability", "0.95")
 
 
-def _spectrum(data: ET.Element, found: Thirds, factor: float, unit: str) -> None:
+def _spectrum(data: ET.Element, found: Sequence[Budget], factor: float, unit: str) -> None:
     """Add levels in thirds of an octave as lists with their intervals."""
     listed = _add(data, "list")
     _text(listed, "name", "PSD in bands of a third of an octave")
     quantity = _add(listed, "quantity")
     _text(quantity, "name", "Frequency, centre of the band")
     frequency = _si(quantity, "realListXMLList")
-    _si(frequency, "valueXMLList", _numbers(found.centre))
+    _si(frequency, "valueXMLList", _numbers(math.sqrt(e.low * e.high) for e in found))
     _si(frequency, "unitXMLList", r"\hertz")
     quantity = _add(listed, "quantity")
     _text(quantity, "name", "Self-noise, one-sided PSD")
     values = _si(quantity, "realListXMLList")
-    _si(values, "valueXMLList", _numbers(found.level, factor))
+    _si(values, "valueXMLList", _numbers((e.value for e in found), factor))
     _si(values, "unitXMLList", unit)
     interval = _si(values, "coverageIntervalXMLList")
-    widths = [high - low for low, high in zip(found.low, found.high, strict=True)]
-    _si(interval, "standardUncXMLList", _numbers(widths, factor / (2 * NORMAL_95)))
-    _si(interval, "intervalMinXMLList", _numbers(found.low, factor))
-    _si(interval, "intervalMaxXMLList", _numbers(found.high, factor))
+    _si(interval, "standardUncXMLList", _numbers((e.standard for e in found), factor))
+    _si(interval, "intervalMinXMLList", _numbers((e.interval[0] for e in found), factor))
+    _si(interval, "intervalMaxXMLList", _numbers((e.interval[1] for e in found), factor))
     _si(interval, "coverageProbabilityXMLList", "0.95")
 
 
@@ -374,5 +373,5 @@ def _number(value: float) -> str:
     return f"{value:.8g}"
 
 
-def _numbers(values: Sequence[float], factor: float = 1.0) -> str:
+def _numbers(values: Iterable[float], factor: float = 1.0) -> str:
     return " ".join(_number(factor * value) for value in values)

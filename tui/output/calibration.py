@@ -33,6 +33,8 @@ _SHORT = {
     "leakage": "leak.",
     "quantisation": "quant.",
     "certificate": "cert.",
+    "tolerance": "tol.",
+    "temperature": "temp.",
     "sensitivity": "sens.",
     "edges": "edges",
     "gaps": "gaps",
@@ -47,7 +49,8 @@ LEGEND = (
     "sources. est.: finite averages. var.: scatter over the frequencies beyond that, by "
     "incoherence or by responses that vary. clocks: error of the alignment of the clocks. leak.: "
     "leakage by the width and the edges of segments. quant.: quantisation. cert.: certificate of "
-    "the reference. sens.: twice the uncertainty of the sensitivity. edges, gaps: leakage at the "
+    "the reference; tol.: its tolerance, without one. sens.: twice the uncertainty of the "
+    "sensitivity. temp.: temperature. edges, gaps: leakage at the "
     "edges of segments and by gaps. misfit: motion that the model does not explain. shared: noise "
     "that channels share. dim.: doubtful number of dimensions of the motion. axes: motion outside "
     "the sensors' axes. u: combined standard uncertainty. U: expanded uncertainty, k u. "
@@ -211,7 +214,7 @@ def noise_rows(found: Calibration, unit: str) -> tuple[tuple[str, ...], Rows]:
     """Return the noise of every channel with its expanded uncertainty."""
     rows = []
     for each in found.whole_band("noise"):
-        low, high = each.value - each.expanded, each.value + each.expanded
+        low, high = each.interval
         down = f"−{decibels(each.value) - decibels(low):.2f}" if low > 0 else "−∞"
         rows.append(
             (

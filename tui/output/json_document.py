@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 from daq.bench.estimate_settings import table_keys
 from daq.protocols.block import Quantity
-from daq.results.band_summary import band_of, channel_means, data_means
+from daq.results.band_summary import band_of, data_means, levels
 from daq.results.clock_effect import relative_time
 from daq.results.facts import Fact, Finding
 from daq.results.sources import conditions
+from daq.results.uncertainty_budget import level_budget
 from estimator.checks.advice import Advice
+from estimator.levels.bands import band_edges
 from estimator.self_noise.result import Flag
 from tui import __version__
 from tui.output.calibration import channels_of
@@ -217,36 +219,38 @@ def _band_means(snapshot: Snapshot, settings: Settings) -> list[dict[str, Any]]:
     """Return the mean noise of every channel in the band of the tables, by every method."""
     if not snapshot.results:
         return []
-    low, high = band_of(settings, snapshot)
-    data = data_means(snapshot, (low, high)).tolist()
-    return [
-        {
-            "sensor": label.sensor,
-            "channel": label.channel,
-            "unit": label.unit,
-            "method": method,
-            "low_hz": low,
-            "high_hz": high,
-            "data_psd": data[column],
-            "noise_psd": float(mean.mean[0]),
-            "noise_psd_low": float(mean.low[0]),
-            "noise_psd_high": float(mean.high[0]),
-            "scatter_low": None if mean.scatter is None else float(mean.scatter[0][0]),
-            "scatter_high": None if mean.scatter is None else float(mean.scatter[1][0]),
-            "contributions": [
-                {"source": source, "below": float(below[0]), "above": float(above[0])}
-                for source, (below, above) in mean.parts.items()
-            ],
-        }
-        for method, noise in snapshot.results.items()
-        for column, (label, mean) in enumerate(
-            zip(
-                snapshot.channels,
-                channel_means(noise, snapshot, settings, (low, high)),
-                strict=True,
+    band = band_of(settings, snapshot)
+    data = data_means(snapshot, band).tolist()
+    edges = band_edges(snapshot.frequency, band)
+    documents = []
+    for method, noise in snapshot.results.items():
+        found = levels(noise, snapshot, settings, edges)
+        for column, label in enumerate(snapshot.channels):
+            mean, total = found.of_channel(column), level_budget(found, column, label, band)
+            documents.append(
+                {
+                    "sensor": label.sensor,
+                    "channel": label.channel,
+                    "unit": label.unit,
+                    "method": method,
+                    "low_hz": band[0],
+                    "high_hz": band[1],
+                    "data_psd": data[column],
+                    "noise_psd": total.value,
+                    "noise_psd_low": total.interval[0],
+                    "noise_psd_high": total.interval[1],
+                    "standard_uncertainty": total.standard,
+                    "k": total.k,
+                    "expanded_uncertainty": total.expanded,
+                    "scatter_low": None if mean.scatter is None else float(mean.scatter[0][0]),
+                    "scatter_high": None if mean.scatter is None else float(mean.scatter[1][0]),
+                    "contributions": [
+                        {"source": source, "below": float(below[0]), "above": float(above[0])}
+                        for source, (below, above) in mean.parts.items()
+                    ],
+                }
             )
-        )
-    ]
+    return documents
 
 
 def verdict_document(found: TestVerdict | None) -> dict[str, Any]:
@@ -302,6 +306,7 @@ def verdict_document(found: TestVerdict | None) -> dict[str, Any]:
                 "noise_psd": each.noise_psd,
                 "noise_psd_low": each.low,
                 "noise_psd_high": each.high,
+                "k": found.k,
                 "limit_psd": each.limit_psd,
                 "margin_db": each.margin_db,
                 "margin_low_db": each.margin_low_db,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.metadata import version
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,6 @@ from tui.output.calibration import (
     angle_table,
     budget_table,
     matrix_table,
-    noise_rows,
     remarks,
     sensitivity_table,
     title,
@@ -68,21 +68,14 @@ def calibration_section(
         found = calibrate(snapshot, settings, bench)
     except InsufficientDataError:
         return None
-    sensitivities, noise = found.whole_band("sensitivity"), found.whole_band("noise")
+    sensitivities = tuple(each for each in found.budgets if each.quantity != "noise")
+    found = replace(found, budgets=sensitivities, without_noise=())  # Uncertainty has the noise
     tables = [
         ("Sensitivity, delay and misalignment", sensitivity_table(found, snapshot)),
         ("Rotation about the axes of the reference", angle_table(found, snapshot)),
         ("Relative response, cross-axis included", matrix_table(found, snapshot)),
-        ("Uncertainty budget of the sensitivities", budget_table(sensitivities)),
+        ("Uncertainty budget of the sensitivities", budget_table(found.whole_band("sensitivity"))),
     ]
-    if noise:
-        tables += [
-            (
-                "Noise by the calibrated sensitivities, with its expanded uncertainty",
-                noise_rows(found, snapshot.unit),
-            ),
-            ("Uncertainty budget of the noise PSD", budget_table(noise)),
-        ]
     parts: list[Part] = [Paragraph(f"{title(found, snapshot)}. {remarks(found, snapshot)[0]}")]
     if found.certificates:
         parts.append(_certificates(found, snapshot))

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.bench.units import in_acceleration
-from daq.results.band_summary import Spectrum, band_of, judged_method
-from estimator.levels.bands import band_edges, third_octaves
-from estimator.levels.interval import NORMAL_95
+from daq.results.band_summary import Spectrum, band_of, judged_method, without_sensitivity
+from daq.results.uncertainty_budget import STATED, band_budgets
+from estimator.levels.contributions import Source
 from tui.report.figures import drawing
 from tui.report.figures.curves import logarithmic
 from tui.report.parts import Paragraph, Plot, Section, Table
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
-    from daq.results.band_summary import Levels
+    from daq.results.uncertainty_budget import Budget
     from estimator.types import FloatArray
     from tui.report.parts import Part
 
@@ -35,142 +35,19 @@ COLUMNS = 9
 """Channels that one table is wide."""
 LEAST_SHARE = 1e-3
 """Of the level, from which a contribution has a row."""
+_NAMES = {"estimate": "finite averages"}
+_DISTRIBUTIONS = {"chi-squared": "chi-squared (skewed)"}
 LEAST_BINS = 3
 """Frequencies from which a half octave has a row."""
 HALF = 2**0.25
 """From the centre of a half octave to its end."""
 
 
-@dataclass(frozen=True, slots=True)
-class Contribution:
-    """One row of the uncertainty budget of a level.
-
-    Attributes
-    ----------
-    name, distribution : str
-    below, above : float
-        Ends less the level, over the level: how far the interval reaches by this alone, at 95 %.
-    degrees : float
-        Of freedom.
-    """
-
-    name: str
-    distribution: str
-    below: float
-    above: float
-    degrees: float
-
-
-@dataclass(frozen=True, slots=True)
-class Uncertainty:
-    """Level of one channel over the band, with its intervals, in unit²/Hz.
-
-    Attributes
-    ----------
-    level : float
-    statistical, total : (float, float)
-        By the scatter alone, and with all contributions.
-    contributions : tuple of Contribution
-    k : float
-        Coverage factor of the total: half its width over the combined standard uncertainty.
-    """
-
-    level: float
-    statistical: tuple[float, float]
-    total: tuple[float, float]
-    contributions: tuple[Contribution, ...]
-    k: float
-
-
-def uncertainties(snapshot: Snapshot, settings: Settings) -> list[Uncertainty]:
-    """Return the uncertainty of every channel over the band of the tables.
-
-    Raises
-    ------
-    ArithmeticError
-        If a total interval does not hold the statistical one: it never may.
-    """
-    noise = snapshot.results.get(judged_method(snapshot, settings))
-    if noise is None:
-        return []
-    edges = band_edges(snapshot.frequency, band_of(settings, snapshot))
-    found = Spectrum(noise, snapshot, settings).levels(edges)
-    return [_uncertainty(found, column) for column in range(len(snapshot.channels))]
-
-
-def _uncertainty(found: Levels, column: int) -> Uncertainty:
-    level = float(found.mean[0, column])
-    outer = tuple(float(end[0, column]) for end in found.ends())
-    scatter = tuple(float(end[0, column]) for end in found.of_scatter.interval(NORMAL_95))
-    inner = tuple(min(end, outer[1]) for end in scatter)  # the bound cuts both
-    if outer[0] > inner[0] or outer[1] < inner[1]:
-        raise ArithmeticError(
-            f"channel {column}: the total interval {outer} does not hold the statistical {inner}"
-        )
-    scale = abs(level) if level else math.nan
-    variance = float(found.of_scatter.cumulants[0, 0, column])
-    deviation = math.sqrt(variance) if variance > 0 else 0.0
-    degrees = 2 * (level / deviation) ** 2 if deviation else math.inf
-    rows = [
-        Contribution(
-            "finite averages", "chi-squared (skewed)",
-            (inner[0] - level) / scale, (inner[1] - level) / scale, degrees,
-        )
-    ]  # fmt: skip
-    combined = deviation**2
-    for part in found.contributions:
-        below, above = (float(each[0]) for each in part.adds(column, found.mean[:, column]))
-        combined += max(below, above) ** 2 / 3
-        if max(below, above) > LEAST_SHARE * scale:
-            name = SOURCE_WORDS[part.source]
-            rows.append(Contribution(name, "rectangular", -below / scale, above / scale, math.inf))
-    width = (outer[1] - outer[0]) / 2
-    k = width / math.sqrt(combined) if combined > 0 and math.isfinite(combined) else math.nan
-    return Uncertainty(level, (inner[0], inner[1]), (outer[0], outer[1]), tuple(rows), k)
-
-
-@dataclass(frozen=True, slots=True)
-class Thirds:
-    """Levels of one channel in thirds of an octave whose intervals have both ends.
-
-    Attributes
-    ----------
-    centre : list of float
-        Hz.
-    level, low, high : list of float
-        In unit²/Hz; the interval is the total one, at 95 %.
-    """
-
-    centre: list[float]
-    level: list[float]
-    low: list[float]
-    high: list[float]
-
-
-def thirds(snapshot: Snapshot, settings: Settings) -> list[Thirds]:
-    """Return the levels of every channel in thirds of an octave of the band of the tables."""
-    noise = snapshot.results.get(judged_method(snapshot, settings))
-    if noise is None:
-        return []
-    edges = third_octaves(snapshot.frequency, *band_of(settings, snapshot))
-    levels = Spectrum(noise, snapshot, settings).levels(edges)
-    centre = np.sqrt(snapshot.frequency[edges[:-1]] * snapshot.frequency[edges[1:] - 1])
-    low, high = levels.ends()
-    own = np.isfinite(levels.mean) & np.isfinite(low) & np.isfinite(high)
-    return [
-        Thirds(
-            centre[own[:, column]].tolist(),
-            *(ends[own[:, column], column].tolist() for ends in (levels.mean, low, high)),
-        )
-        for column in range(len(snapshot.channels))
-    ]
-
-
 def uncertainty_section(
     snapshot: Snapshot, settings: Settings, about: Bench | None
 ) -> Section | None:
     """Return level, contributions, total, and the noise in half octaves; None without a result."""
-    found = uncertainties(snapshot, settings)
+    found = band_budgets(snapshot, settings)
     if not found:
         return None
     names = [f"{label.sensor}.{label.channel}" for label in snapshot.channels]
@@ -181,18 +58,20 @@ def uncertainty_section(
     rows = tuple(
         (
             name,
-            level(each.level),
-            _ends(each.statistical),
-            _ends(each.total),
+            level(each.value),
+            _ends(_statistical(each)),
+            _ends(each.interval),
+            _percent(each.combined, ".2f"),
             plain_number(each.k, ".2f"),
-            _root(each.level),
-            *((_root(each.level, of_g), _root(each.level, 1e6 * of_g)) if of_g else ()),
-            *((level(each.level * in_si**2),) if in_si and unit != "m/s²" else ()),
+            _percent(each.k * each.combined, ".2f"),
+            _root(each.value),
+            *((_root(each.value, of_g), _root(each.value, 1e6 * of_g)) if of_g else ()),
+            *((level(each.value * in_si**2),) if in_si and unit != "m/s²" else ()),
         )
         for name, each in zip(names, found, strict=True)
     )
     header: tuple[str, ...] = (
-        "channel", "noise (dB)", "statistical (dB)", "total (dB)", "k", f"({unit})/√Hz",
+        "channel", "noise (dB)", "statistical (dB)", "total (dB)", "u", "k", "U", f"({unit})/√Hz",
     )  # fmt: skip
     if of_g:
         header += ("g/√Hz", "µg/√Hz")
@@ -200,11 +79,14 @@ def uncertainty_section(
         header += ("dB re 1 (m/s²)²/Hz",)
     budget = tuple(
         (
-            name, row.name, row.distribution, _percent(row.below), _percent(row.above),
-            "∞" if math.isinf(row.degrees) else plain_number(row.degrees, ".0f"),
+            name, _NAMES.get(row.source) or SOURCE_WORDS[Source(row.source)],
+            _DISTRIBUTIONS.get(row.distribution, row.distribution),
+            *(_percent(end) for end in row.reach), _percent(row.relative, ".2f"),
+            "∞" if row.dof >= STATED else plain_number(row.dof, ".0f"),
         )
         for name, each in zip(names, found, strict=True)
-        for row in each.contributions
+        for row in each.components
+        if row.source in _NAMES or row.relative > LEAST_SHARE
     )  # fmt: skip
     parts: list[Part] = [
         Table(
@@ -214,18 +96,22 @@ def uncertainty_section(
         ),
         Paragraph(
             "Intervals at 95 %. The statistical interval is that of the scatter of the averages. "
-            "The total holds it, and adds the bounds below. k: half the width of the total over "
-            "the combined standard uncertainty. The uncertainty of the sensitivities is not part "
-            "of it: see Calibration.",
+            "The total has all of the budget, sensitivities included. u: combined standard "
+            "uncertainty of the PSD. U: half the width of the total interval. k = U / u. Every "
+            "section of this report, its JSON and its DCC state this U." + _not_stated(snapshot),
             "quiet",
         ),
         Table(
-            ("channel", "contribution", "distribution", "−", "+", "degrees of freedom"),
+            (
+                "channel", "contribution", "distribution", "−", "+", "standard uncertainty",
+                "degrees of freedom",
+            ),
             budget,
             left=frozenset({0, 1, 2}),
-            title="Uncertainty budget (GUM): what each contribution moves the ends, of the level",
+            title="Uncertainty budget (JCGM 100 and 101): what each contribution alone moves the "
+            "ends, and its standard uncertainty, of the level",
         ),
-    ]
+    ]  # fmt: skip
     parts += _half_octaves(snapshot, settings, about, names)
     return Section("Uncertainty", tuple(parts))
 
@@ -393,6 +279,22 @@ def _root(psd: float, factor: float = 1.0) -> str:
     return scientific(factor * math.sqrt(psd)) if psd > 0 else NOTHING
 
 
+def _statistical(found: Budget) -> tuple[float, float]:
+    """Return the interval by the scatter of the averages alone."""
+    below, above = found.components[0].reach
+    return found.value + below * abs(found.value), found.value + above * abs(found.value)
+
+
+def _not_stated(snapshot: Snapshot) -> str:
+    """Return whose sensitivities are taken as exact, because nothing is stated of them."""
+    names = ", ".join(each.name for each in without_sensitivity(snapshot))
+    return (
+        f" Without certificate or tolerance, and taken as exact: sensitivities of {names}."
+        if (names)
+        else ""
+    )
+
+
 def _ends(ends: tuple[float, float]) -> str:
     low, high = ends
     if not math.isfinite(high):
@@ -400,5 +302,5 @@ def _ends(ends: tuple[float, float]) -> str:
     return f"{level(low)} … {level(high)}" if low > 0 else f"below {level(high)}"
 
 
-def _percent(value: float) -> str:
-    return f"{plain_number(100 * value, '+.2f')} %" if math.isfinite(value) else NOTHING
+def _percent(value: float, form: str = "+.2f") -> str:
+    return f"{plain_number(100 * value, form)} %" if math.isfinite(value) else NOTHING

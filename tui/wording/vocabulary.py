@@ -113,6 +113,8 @@ SOURCE_WORDS: Mapping[Source, str] = {
     Source.DIMENSIONS: "the number of dimensions",
     Source.ROUNDING: "matrices in single precision",
     Source.FAULTY: "a faulty channel",
+    Source.SENSITIVITY: "sensitivity",
+    Source.TEMPERATURE: "temperature",
 }
 """What widens an interval beyond its scatter."""
 

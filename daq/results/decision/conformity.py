@@ -2,9 +2,14 @@
 
 The rules are those of ILAC-G8:09/2019. The guard band is ``w = r U`` (JCGM 106:2012, 8.3.2), where
 U is the distance in dB from the level to the ends of its 95 % interval, which holds for all
-channels, limits and bands together. The specific risk (JCGM 106:2012, 9.3.2) is the probability
-that the noise is above the limit, by the distribution of the level itself: the quantile whose
-interval ends at the limit.
+channels, limits and bands together; `Conformity.k` is its coverage factor. The specific risk (JCGM
+106:2012, 9.3.2) is that of the item: the probability that its noise is above the limit in any band.
+In a band it follows from the distribution of the level itself, by the quantile whose interval ends
+at the limit. Bands scatter independently; the sensitivity is common to all of them, so that the
+risk is averaged over it.
+
+A statement needs the metrological traceability of the channel (ILAC-P10:07/2020): a certificate of
+its sensitivity in the bench file.
 """
 
 from __future__ import annotations
@@ -34,6 +39,10 @@ QUANTILES = np.arange(0.0, 6.5, 0.25)
 """Standard deviations at which the distribution of a level is tabulated."""
 
 
+NODES = 15
+"""Values of the factor that bands have in common, over which a risk is averaged."""
+
+
 class Statement(enum.StrEnum):
     """What a decision rule states of a channel beside a limit, best first."""
 
@@ -55,10 +64,13 @@ class Conformity:
     statement : Statement
         By the rule.
     risk : float
-        Probability that the noise is above the limit in the band where it is largest; NaN where
-        nothing is known.
+        Probability that the noise is above the limit in any band; NaN where nothing is known.
     frequency : float
-        Centre of that band in Hz.
+        Centre in Hz of the band where that is likeliest.
+    k : float
+        Coverage factor of U: standard deviations of a normal distribution.
+    is_traceable : bool
+        Whether the sensitivity has a certificate; without it, nothing is stated.
     """
 
     limit: str
@@ -67,6 +79,8 @@ class Conformity:
     statement: Statement
     risk: float
     frequency: float
+    k: float
+    is_traceable: bool
 
 
 def conformity(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> list[Conformity]:
@@ -90,12 +104,16 @@ def conformity(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> l
         for column in each.columns:
             compared = each.comparison(bench, snapshot, columns, column)
             judged, label = compared.judged(), snapshot.channels[column]
+            known = snapshot.sensitivities.get((label.sensor, label.channel))
+            traceable = known is not None and known.is_certified
             statement, risk, frequency = Statement.NOT_STATED, math.nan, math.nan
             if columns is not None and judged.band is not None:
-                risks = risk_above(compared.mask, low[..., column], high[..., column])
-                worst = int(np.nan_to_num(risks, nan=-1.0).argmax())
-                risk, frequency = float(risks[worst]), float(compared.centre[worst])
-                if judged.obstacle in {None, Obstacle.SPANS_LIMIT}:
+                deviation = float(columns.levels.deviation[column])
+                risk, worst = risk_of_item(
+                    compared.mask, low[..., column], high[..., column], deviation
+                )
+                frequency = float(compared.centre[worst])
+                if traceable and judged.obstacle in {None, Obstacle.SPANS_LIMIT}:
                     statement = stated(
                         rule,
                         r,
@@ -104,14 +122,13 @@ def conformity(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> l
                         high=compared.outer_high,
                         limit=compared.mask,
                     )
-            found.append(
-                Conformity(each.limit.name, label.sensor, label.channel, statement, risk, frequency)
-            )
+            name = each.limit.name, label.sensor, label.channel
+            found.append(Conformity(*name, statement, risk, frequency, quantile, traceable))
     return found
 
 
 def with_rule(bench: Bench | None, about: Bench | None) -> Bench | None:
-    """Return a bench, whose limits are judged, with the decision rule that another one agrees."""
+    """Return a bench, whose limits are judged, with the decision rule that another one states."""
     if bench is None or about is None:
         return bench
     return bench.model_copy(update={"certificate": about.certificate})
@@ -158,9 +175,43 @@ def stated(
 
 
 def distribution(levels: Levels) -> tuple[FloatArray, FloatArray]:
-    """Return lower and upper ends at `QUANTILES`, shape (n_quantiles, n_bands, n_channels)."""
-    ends = [levels.ends(float(quantile)) for quantile in QUANTILES]
+    """Return lower and upper ends at `QUANTILES`, shape (n_quantiles, n_bands, n_channels).
+
+    Without what is known of the sensitivities, which is common to all bands.
+    """
+    common = {each.source for each in levels.contributions if np.any(each.deviation)}
+    ends = [levels.ends(float(quantile), without=common) for quantile in QUANTILES]
     return np.stack([low for low, _ in ends]), np.stack([high for _, high in ends])
+
+
+def risk_of_item(
+    limit: FloatArray, low: FloatArray, high: FloatArray, deviation: float
+) -> tuple[float, int]:
+    """Return the probability that an item is above its limit in any band, and the likeliest band.
+
+    Parameters
+    ----------
+    limit : float64, shape (n_bands,)
+    low, high : float64, shape (n_quantiles, n_bands)
+        Ends at `QUANTILES`, as `distribution` returns them.
+    deviation : float
+        Standard deviation of the logarithm of a factor that all bands have in common.
+
+    Returns
+    -------
+    risk : float
+        NaN where nothing is known of any band; bands of which nothing is known do not count.
+    worst : int
+    """
+    nodes, weights = np.polynomial.hermite_e.hermegauss(NODES if deviation else 1)
+    of_bands = np.stack(
+        [risk_above(limit * math.exp(-deviation * node), low, high) for node in nodes]
+    )
+    weights = weights / weights.sum()
+    worst = int(np.nan_to_num(weights @ of_bands, nan=-1.0).argmax())
+    if np.isnan(of_bands).all():
+        return math.nan, worst
+    return float(weights @ (1 - np.nanprod(1 - of_bands, axis=1))), worst
 
 
 def risk_above(limit: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:

@@ -33,7 +33,7 @@ from estimator.decision.comparison import (
     whole,
 )
 from estimator.decision.verdict import Obstacle
-from estimator.levels.contributions import Source
+from estimator.levels.contributions import Source, by_chance
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -83,7 +83,7 @@ def judge(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> TestVe
         judged, _general_obstacles(snapshot), is_complete=not snapshot.not_estimated
     )
     sensitivities = _named(snapshot, doubted.values())
-    so_far = TestVerdict(verdict, tuple(limits), obstacles, sensitivities=sensitivities)
+    so_far = TestVerdict(verdict, tuple(limits), obstacles, sensitivities=sensitivities, k=quantile)
     if so_far.is_sure or snapshot.not_estimated:
         return so_far
     left = prediction(found, obstacles, quantile=quantile, elapsed=snapshot.elapsed)
@@ -170,8 +170,9 @@ def _unit_in_file(bench: Bench, label: ChannelLabel) -> str | None:
 class Columns:
     """Levels of all channels in the bands of a limit, as a verdict needs them.
 
-    Each pair has lower and upper ends, shape (n_bands, n_channels): by the scatter alone, with all
-    that widens it, and with all but the clocks.
+    Each pair has lower and upper ends, shape (n_bands, n_channels): by what is random (the scatter
+    and the sensitivities), with all that widens it, and with all but the clocks. `reach` is that of
+    the sensitivities alone, in logarithms of the level, shape (n_channels,).
     """
 
     levels: Levels
@@ -179,16 +180,19 @@ class Columns:
     outer: tuple[FloatArray, FloatArray]
     no_clocks: tuple[FloatArray, FloatArray]
     withdrawn: NDArray[np.bool_]
+    reach: FloatArray
 
     @classmethod
     def of(cls, found: Levels, quantile: float) -> Columns:
         """Return the columns at a quantile."""
+        reach = quantile * found.deviation
         return cls(
             found,
-            found.of_scatter.interval(quantile),
+            by_chance(found.mean, *found.of_scatter.interval(quantile), reach),
             found.ends(quantile),
             found.ends(quantile, without={Source.CLOCKS}),
             found.withdrawn(quantile),
+            reach,
         )
 
 
@@ -235,7 +239,7 @@ class Bands:
             mask = mean_mask(frequency, mask_psd(bench, self.limit, label, frequency), self.edges)
         mean, cumulants = nothing, np.full((3, *centre.shape), np.nan)
         scatter = outer = no_clocks = (nothing, nothing)
-        withdrawn = np.zeros(centre.shape, np.bool_)
+        withdrawn, reach = np.zeros(centre.shape, np.bool_), 0.0
         if columns is not None:
             found = columns.levels
             complete = found.of_scatter.complete[:, column]
@@ -245,7 +249,7 @@ class Bands:
                 (low[:, column], high[:, column])
                 for low, high in (columns.scatter, columns.outer, columns.no_clocks)
             )
-            withdrawn = columns.withdrawn[:, column]
+            withdrawn, reach = columns.withdrawn[:, column], float(columns.reach[column])
         diagnostics = snapshot.diagnostics
         return Comparison(
             centre=centre,
@@ -261,6 +265,7 @@ class Bands:
             is_alone=self.alone[:, column],
             is_withdrawn=withdrawn,
             is_faulty=column in diagnostics.clipped or column in diagnostics.stood_still,
+            reach=reach,
         )
 
     def result(

@@ -104,6 +104,9 @@ class TestVerdict:
         missing, or the verdict is sure.
     sensitivities : tuple of WrongSensitivity
         Sensors, or channels, whose sensitivity the motion contradicts.
+    k : float
+        Coverage factor of the intervals, in standard deviations of a normal distribution: they
+        hold for all channels, limits and bands together with a probability of 95 %.
     """
 
     verdict: Verdict
@@ -111,6 +114,7 @@ class TestVerdict:
     obstacles: tuple[Obstacle, ...] = ()
     prediction: Prediction | None = None
     sensitivities: tuple[WrongSensitivity, ...] = ()
+    k: float = math.nan
 
     __test__ = False  # for pytest
 

@@ -13,14 +13,17 @@ import pytest
 from rich.console import Console
 
 from daq.bench.model import Limit
+from daq.bench.sensitivity import KnownSensitivity
 from daq.bench.units import decibels
+from daq.estimation.contributions import with_sensitivities
 from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics, Synchronisation
 from daq.results.band_summary import levels
 from daq.results.decision.limits import judge
 from daq.results.facts import IntervalsWidened
-from daq.results.uncertainty_budget import noise_budgets
+from daq.results.uncertainty_budget import band_budgets
 from estimator.levels.bands import band_edges
 from estimator.levels.contributions import Source
+from estimator.levels.interval import NORMAL_95
 from tests.tui.example_snapshot import SETTINGS, demo_bench, made_snapshot
 from tui.application.test_view.curves import noise_curve
 from tui.application.test_view.units import units_of
@@ -30,7 +33,6 @@ from tui.output.json_document import _band_means
 from tui.output.results import result_table
 from tui.report.noise import noise_section
 from tui.report.parts import Table
-from tui.report.uncertainty import uncertainties
 from tui.web.chart import _numbers
 from tui.wording.facts import known
 
@@ -41,12 +43,16 @@ BAND = (9.0, 11.0)  # within one third of an octave: a limit there is judged in 
 THIRD = replace(SETTINGS, band=BAND, methods=("three-sensor",))
 
 
-@pytest.fixture(name="snapshot", params=["exact", "wide"])
+@pytest.fixture(name="snapshot", params=["exact", "wide", "sensitivities"])
 def _snapshot(request: pytest.FixtureRequest) -> Snapshot:
     snapshot = made_snapshot()
     snapshot = replace(snapshot, results={"three-sensor": snapshot.results["three-sensor"]})
     if request.param == "exact":
         return snapshot
+    if request.param == "sensitivities":
+        names = [(label.sensor, label.channel) for label in snapshot.channels]
+        stated = KnownSensitivity(own=0.025, coefficient=0.001, temperatures=(10.0, 30.0))
+        return with_sensitivities(snapshot, dict.fromkeys(names, stated))
     share = np.full_like(snapshot.data_psd, 0.03)
     clocks = Synchronisation(noise_bias=share, removed=0.1 * np.abs(snapshot.data_psd) * 1e-3)
     return replace(
@@ -90,7 +96,8 @@ def test_table_report_certificate_json_page_curve_verdict_and_budget_have_the_sa
         assert page["high"][0] == pytest.approx(curve.high_db[0], rel=1e-5)
         assert page["low"][0] == pytest.approx(np.nan_to_num(curve.low_db[0], nan=-200.0), rel=1e-5)
 
-    for column, total in enumerate(uncertainties(snapshot, THIRD)):
+    budgets = band_budgets(snapshot, THIRD)
+    for column, total in enumerate(budgets):
         certified = ET.Element("data")
         _mean(certified, total, "mean", 1.0, "one")
         ends = [
@@ -137,22 +144,41 @@ def test_table_report_certificate_json_page_curve_verdict_and_budget_have_the_sa
         assert judged.low == pytest.approx(low[column], rel=1e-12)
         assert judged.high == pytest.approx(high[column], rel=1e-12)
 
-    calibrated = {column: (1.0, 0.0) for column in range(len(low)) if found.mean[0, column] > 0}
-    budgets, _ = noise_budgets(
-        snapshot, THIRD, BAND, calibrated, averages=100.0, confidence=0.95, is_absolute=True
-    )
-    for column, budget in zip(calibrated, budgets, strict=True):
+
+def test_the_budget_has_the_ends_of_the_levels_and_adds_its_lines_by_squares(
+    snapshot: Snapshot,
+) -> None:
+    (noise,) = snapshot.results.values()
+    found = levels(noise, snapshot, THIRD, band_edges(snapshot.frequency, BAND))
+    low, high = (end[0] for end in found.ends())
+    document = _band_means(snapshot, THIRD)
+    for column, budget in enumerate(band_budgets(snapshot, THIRD)):
+        assert budget.interval == (low[column], high[column])
+        assert document[column]["k"] == budget.k
+        assert document[column]["expanded_uncertainty"] == budget.expanded
+        assert budget.expanded == pytest.approx((high[column] - low[column]) / 2)
         mean = found.of_channel(column)
         for source, (below, above) in mean.parts.items():
             (part,) = [each for each in budget.components if each.source == source]
-            side = max(float(below[0]), float(above[0])) / float(mean.mean[0])
-            assert part.relative == pytest.approx(side / math.sqrt(3))
+            scale = abs(float(mean.mean[0]))
+            if part.distribution == "rectangular":
+                width = float(below[0] + above[0]) / scale
+                assert part.relative == pytest.approx(width / math.sqrt(12))
+            else:
+                assert part.distribution == "normal"
+                assert part.relative == pytest.approx(math.log1p(above[0] / scale) / NORMAL_95)
 
 
 def test_what_widens_an_interval_is_named_with_its_size(snapshot: Snapshot) -> None:
     facts = known(snapshot, THIRD)
     lines = [str(each) for each in facts if isinstance(each.fact, IntervalsWidened)]
-    if snapshot.across_axes:
+    if snapshot.sensitivities:
+        document = _band_means(snapshot, THIRD)[0]
+        assert [each["source"] for each in document["contributions"]][-2:] == [
+            Source.SENSITIVITY,
+            Source.TEMPERATURE,
+        ]
+    elif snapshot.across_axes:
         (line,) = lines
         assert "clocks (up to" in line
         assert "axes that may be off (up to" in line

@@ -60,7 +60,7 @@ def test_values_budgets_and_certificates_are_there() -> None:
         "1 counts per unit, U = 0.01 (k = 2), date not given, L-7",
     )
     tables = {part.title: part for part in section.parts if isinstance(part, Table)}
-    assert len(tables) == 6
+    assert len(tables) == 4  # the noise has its own section
     budget = tables["Uncertainty budget of the sensitivities"]
     assert "cert. (B)" in budget.header
     assert {len(row) for table in tables.values() for row in table.rows} == {

@@ -12,10 +12,11 @@ import pytest
 
 from daq.bench.model import DataSheet
 from daq.recording.reader import Recording
+from daq.results.uncertainty_budget import band_budgets
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
 from tests.tui.report.written_report import tables
 from tui.report.parts import Plot, Table
-from tui.report.uncertainty import half_octaves, uncertainties, uncertainty_section
+from tui.report.uncertainty import half_octaves, uncertainty_section
 
 if TYPE_CHECKING:
     from tests.tui.report.written_report import Reported
@@ -32,24 +33,26 @@ def number(text: str) -> float:
 def test_no_total_is_narrower_than_its_statistical_part(n_effective: float, share: float) -> None:
     snapshot = made_snapshot(n_effective=n_effective, clock_share=share)
     for method in SETTINGS.methods:
-        found = uncertainties(snapshot, replace(SETTINGS, methods=(method,)))
+        found = band_budgets(snapshot, replace(SETTINGS, methods=(method,)))
         assert found
         for each in found:
-            assert each.total[0] <= each.statistical[0]
-            assert each.total[1] >= each.statistical[1]
+            low, high = (end / abs(each.value) for end in each.interval)
+            below, above = (1 + end for end in each.components[0].reach)
+            assert low <= below + 1e-12
+            assert high >= above - 1e-12
             if share and n_effective > 100:
                 assert each.k > 0
-                assert each.total[1] > each.statistical[1] or each.total[0] < each.statistical[0]
+                assert high > above or low < below
 
 
 def test_noise_is_stated_in_the_units_of_the_trade(reported: Reported) -> None:
     """100 counts rms of white noise at 100 Hz, 1e6 counts per m/s²: 2e-10 (m/s²)²/Hz."""
     summary, budget, rms, *_ = tables(reported.report, "Uncertainty")
     row = next(row for row in summary.rows if row[0] == "A.X")
-    assert number(row[5]) == pytest.approx(math.sqrt(2e-10), rel=0.05)
-    assert summary.header[5:] == ("(m/s²)/√Hz", "g/√Hz", "µg/√Hz")
-    assert number(row[6]) == pytest.approx(math.sqrt(2e-10) / 9.80665, rel=0.05)
-    assert number(row[7]) == pytest.approx(math.sqrt(2e-10) / 9.80665e-6, rel=0.05)
+    assert number(row[7]) == pytest.approx(math.sqrt(2e-10), rel=0.05)
+    assert summary.header[7:] == ("(m/s²)/√Hz", "g/√Hz", "µg/√Hz")
+    assert number(row[8]) == pytest.approx(math.sqrt(2e-10) / 9.80665, rel=0.05)
+    assert number(row[9]) == pytest.approx(math.sqrt(2e-10) / 9.80665e-6, rel=0.05)
     assert next(r[1] for r in budget.rows if r[0] == "A.X") == "finite averages"
     column = rms.header.index("A.X")
     for each in rms.rows:

@@ -7,18 +7,29 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from daq.bench.sensitivity import KnownSensitivity
 from daq.bench.tables.certificate import Rule
+from daq.estimation.contributions import with_sensitivities
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
-from daq.results.decision.conformity import QUANTILES, Statement, conformity, risk_above, stated
+from daq.results.decision.conformity import (
+    QUANTILES,
+    Statement,
+    conformity,
+    risk_above,
+    risk_of_item,
+    stated,
+)
 from daq.results.decision.limits import judge
-from estimator.decision.verdict import Verdict
+from estimator.decision.verdict import Obstacle, Verdict
 from estimator.levels.interval import interval
 from tests.tui.night_recording import record
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from daq.estimation.snapshot import Snapshot
 
 LIMIT = np.array([1.0])
 
@@ -95,6 +106,30 @@ def test_nothing_known_has_no_risk() -> None:
     assert np.isnan(risk_above(LIMIT, -unknown, unknown)[0])
 
 
+@pytest.mark.parametrize("deviation", [0.0, 0.02, 0.1])
+def test_the_risk_is_that_of_the_item_over_its_bands(deviation: float) -> None:
+    """Draws of bands that scatter by themselves, and of a sensitivity that all have in common."""
+    n, rng = 200, np.random.default_rng(9)
+    level = np.array([0.80, 0.84, 0.78, 0.5])
+    cumulants = np.stack([level**k / n ** (k - 1) for k in (2, 3, 4)])
+    ends = [interval(level, cumulants, float(q)) for q in QUANTILES]
+    low, high = (np.stack([end[side] for end in ends]) for side in (0, 1))
+    own = level / rng.gamma(n, 1 / n, (200_000, 4))
+    true = own * np.exp(deviation * rng.standard_normal((200_000, 1)))
+    of_bands = (true > 1).mean(axis=0)
+    expected = float((true > 1).any(axis=1).mean())
+    risk, worst = risk_of_item(np.ones(4), low, high, deviation)
+    assert worst == 1
+    assert risk == pytest.approx(expected, rel=0.15)
+    assert risk > 1.05 * of_bands.max()  # more than the worst band alone
+    assert risk < 1.1 * of_bands.sum()
+
+
+def judged_with(snapshot: Snapshot, known: KnownSensitivity | None) -> Snapshot:
+    names = [(label.sensor, label.channel) for label in snapshot.channels]
+    return with_sensitivities(snapshot, {} if known is None else dict.fromkeys(names, known))
+
+
 def test_the_guard_band_of_one_uncertainty_agrees_with_the_verdict(tmp_path: Path) -> None:
     """On a whole recording: pass by both, fail by both; and nothing stated where nothing is."""
     recording = record(tmp_path / "night.h5")
@@ -102,12 +137,38 @@ def test_the_guard_band_of_one_uncertainty_agrees_with_the_verdict(tmp_path: Pat
     snapshot = estimate([recording], settings)
     with Recording.open(recording) as opened:
         bench = opened.bench
-    verdict = judge(bench, snapshot, settings)
+    exact = conformity(bench, snapshot, settings)
+    assert {each.statement for each in exact} == {Statement.NOT_STATED}  # without traceability
+    toleranced = judged_with(snapshot, KnownSensitivity(own=0.002))
+    found = conformity(bench, toleranced, settings)
+    assert {each.statement for each in found} == {Statement.NOT_STATED}
+    certified = judged_with(snapshot, KnownSensitivity(own=0.002, is_certified=True))
+    found = conformity(bench, certified, settings)
+    verdict = judge(bench, certified, settings)
     assert verdict is not None
-    found = conformity(bench, snapshot, settings)
     assert [(e.sensor, e.channel) for e in found] == [(e.sensor, e.channel) for e in verdict.limits]
-    for each, limit in zip(found, verdict.limits, strict=True):
+    for each, before, limit in zip(found, exact, verdict.limits, strict=True):
+        assert each.k == verdict.k > 2.5
+        assert not each.risk < before.risk * 0.99
         if limit.verdict is Verdict.PASS:
             assert each.statement is Statement.PASS
             assert each.risk < 0.025
     assert {e.statement for e in found} >= {Statement.PASS, Statement.NOT_STATED}  # a dead channel
+
+
+def test_an_uncertain_sensitivity_widens_the_interval_and_takes_the_pass(tmp_path: Path) -> None:
+    """A limit 3 dB above the noise: decided by a sensitivity of 1 %, open with one of 25 %."""
+    recording = record(tmp_path / "night.h5", psd=4e-10)
+    settings = Settings(segment=1.0, methods=("three-sensor",), axis_tolerance={"": 0.0})
+    snapshot = estimate([recording], settings)
+    with Recording.open(recording) as opened:
+        bench = opened.bench
+    found = {}
+    for own in (0.01, 0.25):
+        known = judged_with(snapshot, KnownSensitivity(own=own, is_certified=True))
+        verdict = judge(bench, known, settings)
+        assert verdict is not None
+        found[own] = verdict.limits[0]
+    assert found[0.01].verdict is Verdict.PASS
+    assert found[0.25].verdict is Verdict.NOT_DECIDED
+    assert found[0.25].obstacle is Obstacle.SPANS_LIMIT

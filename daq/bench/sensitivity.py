@@ -1,0 +1,105 @@
+"""What is known of a channel's sensitivity: by its certificate, its tolerance and its temperature.
+
+All are relative to the sensitivity itself. A certificate states a standard uncertainty; a tolerance
+and a coefficient of temperature are limits, whose standard uncertainty is that of a rectangular
+distribution (JCGM 100:2008, 4.3.7).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+REFERENCE_TEMPERATURE = 23.0
+"""In °C, at which a sensitivity holds where the data sheet states no other."""
+_RECTANGULAR = math.sqrt(3.0)
+
+
+@dataclass(frozen=True, slots=True)
+class KnownSensitivity:
+    """What is known of one channel's sensitivity.
+
+    Attributes
+    ----------
+    own : float
+        Relative standard uncertainty by the certificate, or else by the tolerance; 0 without.
+    is_certified : bool
+        Whether a certificate states it.
+    off : float
+        Difference of the certificate from the sensitivity that is used, which is not corrected.
+    coefficient : float
+        Largest change of the sensitivity with temperature, in 1/°C; 0 where not stated.
+    reference : float
+        Temperature in °C at which the sensitivity holds.
+    temperatures : (float, float)
+        Lowest and highest temperature of the sensor in °C: those of its readings, or else the
+        range of the data sheet.
+    """
+
+    own: float = 0.0
+    is_certified: bool = False
+    off: float = 0.0
+    coefficient: float = 0.0
+    reference: float = REFERENCE_TEMPERATURE
+    temperatures: tuple[float, float] = (REFERENCE_TEMPERATURE, REFERENCE_TEMPERATURE)
+
+    @property
+    def is_stated(self) -> bool:
+        """Whether certificate or tolerance state an uncertainty."""
+        return self.own > 0
+
+    @property
+    def by_temperature(self) -> float:
+        """Relative standard uncertainty by the temperature."""
+        farthest = max(abs(each - self.reference) for each in self.temperatures)
+        return self.coefficient * farthest / _RECTANGULAR
+
+    @property
+    def combined(self) -> float:
+        """Relative standard uncertainty by all causes."""
+        return math.hypot(self.own, self.by_temperature, self.off / _RECTANGULAR)
+
+    def at(self, readings: tuple[float, float] | None) -> KnownSensitivity:
+        """Return it at the lowest and highest temperature that was read; None: none was."""
+        return self if readings is None else replace(self, temperatures=readings)
+
+
+Sensitivities: TypeAlias = Mapping[tuple[str, str], KnownSensitivity]
+"""By names of sensor and channel."""
+
+
+def known_sensitivities(table: Mapping[str, Any]) -> Sensitivities:
+    """Return what a bench file knows of its sensitivities.
+
+    Parameters
+    ----------
+    table : mapping
+        The bench file, checked before.
+    """
+    return {
+        (sensor["name"], channel["name"]): _known(channel, sensor.get("data_sheet") or {})
+        for sensor in table["sensors"]
+        for channel in sensor["channels"]
+    }
+
+
+def _known(channel: Mapping[str, Any], sheet: Mapping[str, Any]) -> KnownSensitivity:
+    own, off = float(channel.get("tolerance", 0.0)) / _RECTANGULAR, 0.0
+    certificate = channel.get("certificate")
+    if certificate is not None:
+        value = float(certificate["value"])
+        own = float(certificate["expanded_uncertainty"]) / certificate.get("k", 2.0) / abs(value)
+        off = abs(float(channel["sensitivity"]) / value - 1)
+    reference = float(sheet.get("reference_temperature", REFERENCE_TEMPERATURE))
+    is_for = not sheet.get("channels") or channel["name"] in sheet["channels"]
+    low, high = sheet.get("temperature", (reference, reference))
+    return KnownSensitivity(
+        own=own,
+        is_certified=certificate is not None,
+        off=off,
+        coefficient=float(sheet.get("temperature_coefficient", 0.0)) if is_for else 0.0,
+        reference=reference,
+        temperatures=(float(low), float(high)),
+    )
