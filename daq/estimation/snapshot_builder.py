@@ -65,6 +65,7 @@ if TYPE_CHECKING:
     from daq.estimation.noise_estimates import Channels, ChannelSet
     from daq.estimation.segments.segment_pass import Pass
     from daq.estimation.settings import Settings
+    from daq.protocols.block import Reading
     from daq.recording.interface import ReadableRecording
     from estimator.self_noise.result import SelfNoise
     from estimator.spectra.multiresolution import Band
@@ -529,24 +530,24 @@ def _not_estimated(recording: ReadableRecording, channels: Channels) -> tuple[st
     return tuple(record.name for record in left if main_columns(record))
 
 
-def sensitivities_at(
-    known: Sensitivities, recordings: Iterable[ReadableRecording]
-) -> Sensitivities:
+def sensitivities_at(known: Sensitivities, readings: Iterable[Reading]) -> Sensitivities:
     """Return what is known of sensitivities, at the temperatures that sensors stated."""
     if not any(each.coefficient for each in known.values()):
         return known
     read: dict[str, list[float]] = {}
-    for recording in recordings:
-        for reading in recording.readings:
-            if reading.quantity == Quantity.TEMPERATURE:
-                read.setdefault(reading.sensor, []).append(reading.value)
+    for reading in readings:
+        if reading.quantity == Quantity.TEMPERATURE:
+            read.setdefault(reading.sensor, []).append(reading.value)
     ends = {sensor: (min(values), max(values)) for sensor, values in read.items()}
     return {name: each.at(ends.get(name[0])) for name, each in known.items()}
 
 
 def _sensitivities(recordings: Sequence[ReadableRecording]) -> Sensitivities:
     outline = recordings[0].outline
-    return {} if outline is None else sensitivities_at(outline.sensitivities, recordings)
+    if outline is None:
+        return {}
+    readings = (each for recording in recordings for each in recording.readings)
+    return sensitivities_at(outline.sensitivities, readings)
 
 
 def _counting_rates(recording: ReadableRecording) -> dict[str, float]:

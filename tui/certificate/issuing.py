@@ -10,7 +10,10 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from daq.bench.estimate_settings import to_table
+from daq.bench.outline import BenchOutline
 from daq.errors import HuddleError
+from daq.estimation.contributions import with_sensitivities
+from daq.estimation.snapshot_builder import sensitivities_at
 from daq.recording.reader import Recording
 from daq.recording.repair import verify as verify_recording
 from daq.recording.signing import identity
@@ -145,6 +148,7 @@ def issue(
     found = sources(recordings)
     about = found[0].bench if about is None else about
     refuse_unfit(found, about, by=by, complete=complete)
+    snapshot = with_stated(snapshot, found, about)
     prefix = "HT" if about is None else about.certificate.prefix
     runs = [(source.path.name, source.run_id, source.sha256) for source in found]
     roots = dict(identity(source.path) for source in found)
@@ -187,6 +191,15 @@ def issue(
             ledger.void(entry, f"{type(error).__name__}: {error}")
             raise
     return entry, path
+
+
+def with_stated(snapshot: Snapshot, found: Sequence[Source], about: Bench | None) -> Snapshot:
+    """Return a snapshot with the sensitivities that a bench file states of the sensors."""
+    outline = None if about is None else BenchOutline.of_text(about.text)
+    if outline is None:
+        return snapshot
+    readings = (each for source in found for each in source.readings)
+    return with_sensitivities(snapshot, sensitivities_at(outline.sensitivities, readings))
 
 
 def _result(

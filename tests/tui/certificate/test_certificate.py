@@ -60,6 +60,8 @@ deviations = "shortened to one minute"
 responsible = "Grace Hopper"
 decision_rule = "guard-band"
 """
+CALIBRATED = 'certificate = {value = 1e6, expanded_uncertainty = 2e4, k = 2, number = "C-9"}'
+"""Of every channel, in the bench file of the laboratory."""
 NAMESPACES = {"dcc": "https://ptb.de/dcc", "si": "https://ptb.de/si"}
 
 CHECKLIST: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
@@ -106,7 +108,7 @@ CHECKLIST: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "7.8.2.2": (("Given by the customer or user, and not verified",), ()),
     "7.8.4.1 a": (
-        ("Uncertainty budget (GUM)", "finite averages"),
+        ("Uncertainty budget (JCGM 100 and 101)", "finite averages", "sensitivity"),
         ("//si:coverageIntervalXMLList/si:intervalMinXMLList",),
     ),
     "7.8.4.1 b": (
@@ -192,6 +194,7 @@ def laboratory(folder: Path) -> Laboratory:
         + "data_sheet = {temperature = [-40, 26]}\n"
         for number, name in enumerate(("A", "B", "C", HOSTILE))
     )
+    sensors = sensors.replace("sensitivity = 1e6", f"sensitivity = 1e6, {CALIBRATED}")
     bench = folder / "bench.toml"
     bench.write_text(BENCH.format(sensors=sensors, psd=2e-9) + ABOUT, encoding="utf-8")
     return Laboratory(folder, recording, bench)
