@@ -65,9 +65,14 @@ PANELS: dict[str, dict[str, str]] = {
         "simulate": "Simulate a recording without devices.",
         "reproduce": "Reproduce the figures of the paper and compare them with theory.",
     },
+    "Shell": {
+        "completion": "Print what completes commands in a shell, or the manual page.",
+    },
 }
 """By panel of the help: the commands, and the first line of the help of each."""
 
+ASKED_BY_SHELL = "_HUDDLE_COMPLETE"
+"""Environment variable by which a shell asks for completions."""
 COMMANDS = [name for panel in PANELS.values() for name in panel]
 _MODULES = {"import": "import_", "issues": "issue", "pin": "runs"}
 """The module of a command that is not in one of its name."""

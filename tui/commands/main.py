@@ -14,12 +14,13 @@ import io
 import os
 import sys
 from contextlib import suppress
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
 
 from tui import __version__
-from tui.commands.help import LazyGroup
+from tui.commands.help import ASKED_BY_SHELL, LazyGroup
 from tui.output.exit_codes import ExitCode
 
 if TYPE_CHECKING:
@@ -29,12 +30,16 @@ if TYPE_CHECKING:
 class HuddleGroup(LazyGroup):
     """Runs a subcommand; converts its exceptions into messages and exit codes."""
 
-    def main(self, *args: Any, **options: Any) -> Any:  # noqa: ANN401 - the library's own
-        """Run the command. Usage errors are plain lines."""
+    def main(self, args: Sequence[str] | None = None, *rest: Any, **options: Any) -> Any:  # noqa: ANN401 - the library's own
+        """Run the command, and its help without any. Usage errors are plain lines."""
+        args = list(sys.argv[1:] if args is None else args)
+        if args[:1] == ["help"]:  # as of git and others
+            args = [*args[1:2], "--help"]
+        args = args or ["--help"]
         if not options.get("standalone_mode", True):
-            return super().main(*args, **options)
+            return super().main(args, *rest, **options)
         try:
-            code = super().main(*args, **options | {"standalone_mode": False})
+            code = super().main(args, *rest, **options | {"standalone_mode": False})
         except typer.Abort:  # the end of standard input where an answer is expected
             code = ExitCode.TROUBLE
         except typer.TyperException as error:  # a usage error
@@ -56,7 +61,7 @@ class HuddleGroup(LazyGroup):
             raise typer.Exit(ExitCode.INTERRUPTED) from None
         except BrokenPipeError:  # | head
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            raise typer.Exit(ExitCode.DONE) from None
+            raise typer.Exit(ExitCode.CLOSED_PIPE) from None
         except (typer.Exit, typer.Abort, typer.TyperException):
             raise  # of the library, which shows usage errors itself
         except Exception as error:  # noqa: BLE001 -- the one place where errors become exit codes
@@ -109,7 +114,6 @@ def messages(error: BaseException) -> Iterator[str]:
 app = typer.Typer(
     name="huddle",
     cls=HuddleGroup,
-    no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -131,7 +135,12 @@ def _version(requested: bool) -> None:
 @app.callback()
 def _options(
     version: bool = typer.Option(
-        False, "--version", callback=_version, is_eager=True, help="Show the version and exit."
+        False,
+        "--version",
+        "-V",
+        callback=_version,
+        is_eager=True,
+        help="Show the version and exit.",
     ),
 ) -> None:
     del version
@@ -153,13 +162,15 @@ def _spare_the_processor() -> None:
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command and exit with its code."""
     _spare_the_processor()
+    if ASKED_BY_SHELL in os.environ:
+        import_module("typer.completion").completion_init()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # files and pipes hold UTF-8 everywhere
             stream.reconfigure(
                 encoding=stream.encoding if stream.isatty() else "utf-8", errors="replace"
             )
     try:
-        app(arguments)
+        app(arguments, prog_name="huddle")
     except SystemExit as ended:
         writer = sys.modules.get("daq.recording.writer")
         code = ExitCode.DONE if ended.code is None else ended.code

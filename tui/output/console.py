@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -17,8 +18,10 @@ from typing import TYPE_CHECKING, Any, TextIO
 import typer
 from rich.console import Console
 from rich.segment import Segment
+from rich.table import Table
 
 from daq.whole_file import written
+from tui.output.exit_codes import ExitCode
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -30,7 +33,9 @@ STANDARD_OUTPUT = "-"
 _SPEED_PERIOD = 3600.0
 """Seconds over which the time left is predicted: a step may take many minutes."""
 WIDTH_OF_FILES = 110
-"""Columns of tables that go into a file or a pipe."""
+"""Columns of bars and rules that go into a file or a pipe."""
+WIDTH_OF_TABLES = 2000
+"""Columns that a table in a file or a pipe may need."""
 _for_json = False
 SHOWN_CONTROLS = {
     code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) if chr(code) not in "\n\t"
@@ -38,7 +43,29 @@ SHOWN_CONTROLS = {
 
 
 class PlainConsole(Console):
-    """A console on which no text acts: control characters in names or files are shown as such."""
+    """A console on which no text acts: control characters in names or files are shown as such.
+
+    Files and pipes get a row of a table, and a paragraph, on one line each.
+    """
+
+    def print(self, *objects: Any, **options: Any) -> None:  # noqa: ANN401 - the library's own
+        """Print texts and tables; unbroken where no terminal shows them."""
+        if self.is_terminal:
+            super().print(*objects, **options)
+            return
+        usual = self.width
+        if any(isinstance(each, Table) for each in objects):
+            self.width = WIDTH_OF_TABLES
+        else:
+            options.setdefault("soft_wrap", True)
+        super().print(*objects, **options)
+        self.width = usual
+
+    def on_broken_pipe(self) -> None:
+        """End quietly, not as a limit that is not met."""
+        self.quiet = True
+        os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())
+        raise SystemExit(ExitCode.CLOSED_PIPE)
 
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None

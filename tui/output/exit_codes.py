@@ -18,3 +18,5 @@ class ExitCode(IntEnum):
     NOT_DECIDED = 4
     """The limits are not decided: the uncertainty spans one, or data are missing."""
     INTERRUPTED = 130
+    CLOSED_PIPE = 141
+    """Nobody reads the output any more, as in ``| head``: as a shell says of SIGPIPE."""

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.table import Table
 from typer.testing import CliRunner
 
 from daq.devices.interface import DeviceInformation
@@ -23,6 +24,7 @@ from sim_devices.world.paper_scenarios import SCENARIOS
 from tui.commands.check import remarks
 from tui.commands.help import COMMANDS, PANELS, subcommand
 from tui.commands.main import app, main
+from tui.output.console import PlainConsole
 from tui.studies.reproduce import STUDIES
 
 ROOT = Path(__file__).parents[3]
@@ -71,6 +73,63 @@ def test_every_command_has_help_with_examples(name: str) -> None:
     text = huddle(name, "--help")
     assert "Examples" in text
     assert f"huddle {name} " in text or f"huddle {name}\n" in text
+
+
+def test_a_bare_command_and_help_show_help() -> None:
+    assert huddle() == huddle("--help") == huddle("help")
+    assert huddle("help", "estimate") == huddle("estimate", "--help")
+    assert "No such command" in CliRunner().invoke(app, ["help", "nothing"]).output
+    assert huddle("-V") == huddle("--version")
+
+
+def test_shells_complete_commands_and_options() -> None:
+    for shell in ("bash", "zsh", "fish"):
+        assert "_HUDDLE_COMPLETE" in huddle("completion", shell)
+    asked = {"_HUDDLE_COMPLETE": "complete_bash", "COMP_WORDS": "huddle estimate --segm"}
+    done = subprocess.run(
+        python_command("tui"),
+        env=os.environ | asked | {"COMP_CWORD": "2"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout.split() == ["--segment"]
+
+
+def test_the_manual_has_every_command() -> None:
+    page = huddle("completion", "man")
+    assert page.startswith(".TH HUDDLE 1")
+    for name in COMMANDS:
+        assert f"\n.SS huddle {name}\n" in page
+
+
+def test_a_closed_pipe_is_no_failed_limit(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    huddle("simulate", "fig9", "--duration", "2min", "--out", str(path))
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "wb") as pipe:  # noqa: PTH123 - a descriptor
+        done = subprocess.run(
+            [*python_command("tui"), "estimate", str(path)],
+            stdout=pipe,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == 141
+    assert "error" not in done.stderr.lower()
+
+
+def test_files_and_pipes_have_a_row_on_a_line() -> None:
+    out = io.StringIO()
+    screen = PlainConsole(file=out, width=110)
+    table = Table("sensor", "noise")
+    table.add_row("XX.TST5.00 " * 20, "−120 dB")
+    screen.print(table)
+    screen.print("a sentence of many words " * 20)
+    text = out.getvalue()
+    assert "XX.TST5.00 " * 19 in text
+    assert "a sentence of many words " * 19 in text
 
 
 def test_help_names_every_study_and_scenario() -> None:
