@@ -46,7 +46,6 @@ if TYPE_CHECKING:
 _NS = 1_000_000_000
 _RATE_OFF = 5e-4  # share by which the rate may be off that a record states
 _BASELINE_NS = 60 * _NS  # from which on stated times show the rate
-_LOST = 1.0  # seconds for which samples must be late to be missing at a step of the clock
 _NEAR = 10.0  # seconds between the records of several streams behind one gap
 MAX_SEEN = 1 << 17
 """Samples of a stream that are kept to tell repeated ones."""
@@ -130,7 +129,7 @@ class _Stream:
         self.n_steps = 0
         """Steps of the device's clock that this stream has had."""
         self.doubtful: _Doubtful | None = None
-        self._pace = Pace(float(rate))
+        self.pace = Pace(float(rate))
         self._shifted = 0
         self._seen: deque[Record] = deque()
         self._n_seen = 0
@@ -212,20 +211,11 @@ class _Stream:
 
     def arrived(self, at: HostTime) -> None:
         """Take the arrival of the latest sample."""
-        self._pace.take((self.end or 0) - 1 + self._shifted, at)
+        self.pace.take((self.end or 0) - 1 + self._shifted, at)
 
     def late(self, n: int, at: HostTime) -> float:
         """Return by how many s samples that end n after the end are late, if none is missing."""
-        return self._pace.late((self.end or 0) - 1 + n + self._shifted, at)
-
-    def is_sure(self, seconds: float) -> bool:
-        """Return whether arrivals are steady enough to decide about a step of so many seconds."""
-        return self._pace.is_sure(seconds)
-
-    def is_early(self, late: float, seconds: float) -> bool:
-        """Return whether samples so late arrive before they were taken, if so much is missing."""
-        unsure = max(2 * self._pace.scatter, 1.5 / float(self.rate))
-        return self.is_sure(seconds) and late < seconds - min(unsure, seconds / 2)
+        return self.pace.late((self.end or 0) - 1 + n + self._shifted, at)
 
 
 class JoinedStreams:
@@ -349,7 +339,7 @@ class JoinedStreams:
         self, stream: _Stream, doubtful: _Doubtful, record: Record, at: HostTime
     ) -> Iterator[Event]:
         """Place the doubtful record, or drop it, by the next one."""
-        before, end = doubtful.record, stream.end or 0
+        before, end, pace = doubtful.record, stream.end or 0, stream.pace
         missing = self._at_known_step(stream, before)
         if missing is not None:
             self._keep(stream, before, end + missing, doubtful.came, BlockFlag.CLOCK_RESTART)
@@ -361,21 +351,20 @@ class JoinedStreams:
         seconds, late = ahead / float(stream.rate), min(late, after)
         if ahead < 0:
             # Samples that arrive faster than they are taken are old ones, sent again.
-            is_old = after < -len(record.counts) / 2 / float(stream.rate) and stream.is_sure(after)
+            is_old = after < -len(record.counts) / 2 / float(stream.rate) and pace.is_sure(after)
             if not is_last and (is_old or not follows):
                 text = f"dropped {n} samples of {before.stream_id} that came after their gap"
                 yield Event(self._name, EventKind.RESYNCHRONISED, text, at)
                 return
-        elif not stream.is_early(late, seconds) and (
-            stream.is_sure(seconds) or not doubtful.in_turn or ahead >= n
+        elif not pace.is_early(late, seconds) and (
+            pace.is_sure(seconds) or not doubtful.in_turn or ahead >= n
         ):
-            supported = stream.is_sure(seconds) and late < 1.5 * seconds
-            flags = BlockFlag.NONE if supported else BlockFlag.MISSING_ESTIMATED
+            shown = pace.shows(late, seconds)
+            flags = BlockFlag.NONE if shown else BlockFlag.MISSING_ESTIMATED
             self._gap = end, ahead
             self._keep(stream, before, self._by_others(stream, before), doubtful.came, flags)
             return
-        lost = late > _LOST and stream.is_sure(late)
-        missing = round(late * float(stream.rate)) if lost else 0
+        missing = pace.lost(late)
         yield self._stepped(stream, before, missing, at)
         flags = BlockFlag.CLOCK_RESTART
         flags |= BlockFlag.MISSING_ESTIMATED if missing else BlockFlag.NONE

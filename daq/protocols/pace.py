@@ -24,6 +24,8 @@ NODE = 10.0
 """Seconds of arrivals, the earliest of which counts."""
 _KEPT = 3  # nodes: a host is not busy for so long
 _MIN_BASELINE = 20.0  # seconds between two nodes from which on they show the rate
+LOST = 1.0
+"""Seconds for which samples must be late at least, to be missing where a clock was set."""
 _MAX_DRIFT = 0.02  # share by which a rate may be off
 _GAIN = 0.2  # of the average that is the scatter
 _SURE = 4.0  # scatters
@@ -68,9 +70,22 @@ class Pace:
         earliest = min(late + self.drift * (now - then) for then, late in self._nodes)
         return now - index / self._rate - earliest
 
+    def is_early(self, late: float, seconds: float) -> bool:
+        """Return whether samples so late arrive before they were taken, if so much is missing."""
+        unsure = max(2 * self.scatter, 1.5 / self._rate)
+        return self.is_sure(seconds) and late < seconds - min(unsure, seconds / 2)
+
+    def shows(self, late: float, seconds: float) -> bool:
+        """Return whether samples so late show that so much is missing before them, and no more."""
+        return self.is_sure(seconds / 2) and late < 1.5 * seconds
+
     def is_sure(self, seconds: float) -> bool:
         """Return whether one arrival decides about a step of so many seconds."""
         return abs(seconds) > _SURE * (self.scatter if self.n_arrivals > 1 else _UNKNOWN)
+
+    def lost(self, late: float) -> int:
+        """Return how many samples are missing before samples so late, if nothing else says it."""
+        return round(late * self._rate) if late > LOST and self.is_sure(late) else 0
 
     def take(self, index: float, at: HostTime) -> None:
         """Take the arrival of a sample; samples that arrive together have that of the last one."""

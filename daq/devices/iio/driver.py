@@ -22,6 +22,7 @@ from daq.devices.port_rules import only, port_label
 from daq.errors import BenchFileError, FileFault, NoAnswerError, WrongDeviceError
 from daq.protocols.block import Block, BlockFlag, Event, EventKind, Quantity, Reading, ReadingTimes
 from daq.protocols.errors import RemoteProtocolError
+from daq.protocols.pace import Pace
 from daq.transport.address import USUAL_NUMBERS, host_and_port
 from daq.transport.ports import open_port
 
@@ -41,8 +42,6 @@ SCHEME = "iio://"
 REPLY_TIMEOUT = 5.0
 BLOCK_SECONDS = 0.1
 """Seconds of samples in one buffer."""
-MIN_SET_NS = 100_000_000
-"""Shortest step of the board's clock, in ns, that is held against the host's time."""
 
 
 class IioSettings(BaseModel):
@@ -146,7 +145,7 @@ class IioSession:
         self._period_ns = 1e9 / (information.sampling_rate or sensor.sampling_rate)
         self._next = 0
         self._latest_ns: int | None = None
-        self._least_lag_ns = 0  # of arrivals behind the board's clock
+        self._pace = Pace(1e9 / self._period_ns)
         limits = {one.channel: one for one in enabled}
         self._full_scales = np.array(
             [2 ** (limits[name].bits - limits[name].is_signed) - 1 for name in inputs]
@@ -212,11 +211,13 @@ class IioSession:
         columns = [self._layout.decode(scans, name) for name in self._inputs]
         counts = np.stack(columns, axis=1)
         times = self._layout.decode(scans, protocol.TIMESTAMP) if self._has_times else None
-        cuts, missing, flags = self._gaps(times, at)
         found: list[Block | Event] = []
-        if BlockFlag.MISSING_ESTIMATED in flags:
-            text = "the clock of the board was set"
-            found.append(Event(self._sensor.name, EventKind.RESET, text, at))
+        cuts, missing, flags = np.empty(0, np.int64), [0], BlockFlag.NONE
+        if times is not None:
+            cuts, missing, flags, was_set = self._gaps(times, at)
+            if was_set:
+                text = "the clock of the board was set"
+                found.append(Event(self._sensor.name, EventKind.RESET, text, at))
         for rows, n_missing in zip(np.split(np.arange(len(counts)), cuts), missing, strict=True):
             if not len(rows):
                 continue
@@ -232,45 +233,47 @@ class IioSession:
             values = part.astype(np.int32)
             found.append(Block(self._sensor.name, first, values, at, counter, own, reason))
             self._next = first + len(rows)
+        self._pace.take(self._next - 1, at)
         return found
 
     def _gaps(
-        self, times: NDArray[np.int64] | None, at: HostTime
-    ) -> tuple[NDArray[np.int64], list[int], BlockFlag]:
+        self, times: NDArray[np.int64], at: HostTime
+    ) -> tuple[NDArray[np.int64], list[int], BlockFlag, bool]:
         """Return the rows before which scans are missing, and how many: one more number than rows.
+
+        Also the flags of blocks behind missing scans, and whether the clock of the board was set.
 
         Times jitter with the interrupts of the board, so the whole buffer decides how many there
         are, and its long steps where. Lost scans cannot arrive before they were sampled: if the
-        arrival is too early for them, the clock of the board was set forward.
+        arrival is too early for them, the clock of the board was set forward. If arrivals are too
+        unsteady to show that scans are missing, their number is an estimate.
         """
-        nothing = np.empty(0, np.int64), [0], BlockFlag.NONE
-        if times is None:
-            return nothing
+        nothing = np.empty(0, np.int64), [0], BlockFlag.NONE, False
         before, self._latest_ns = self._latest_ns, int(times[-1])
         known = times if before is None else np.concatenate(([before], times))
         steps = np.diff(known) / self._period_ns
-        lag_ns = at.monotonic_ns - int(times[-1])
-        least_ns = lag_ns if before is None else self._least_lag_ns
-        self._least_lag_ns = min(least_ns, lag_ns)
         if not len(steps):
             return nothing
-        early_ns, set_ns = least_ns - lag_ns, (steps.max() - 1) * self._period_ns
-        if steps.min() < -1.0 or (set_ns > MIN_SET_NS and early_ns > set_ns / 2):
-            self._least_lag_ns = lag_ns
-            return np.empty(0, np.int64), [0], BlockFlag.MISSING_ESTIMATED
+        late = self._pace.late(self._next + len(times) - 1, at)  # if none is missing
         total = round(float(steps.sum()) - len(steps))
+        seconds = total * self._period_ns * 1e-9
+        if steps.min() < -0.5 or (total > 0 and self._pace.is_early(late, seconds)):
+            lost = self._pace.lost(late)
+            flags = BlockFlag.MISSING_ESTIMATED if lost else BlockFlag.NONE
+            return np.empty(0, np.int64), [lost], flags, True
         long = np.flatnonzero(steps > 1.5)
         each = np.rint(steps[long]).astype(np.int64) - 1
         if total <= 0 or not len(long):
             return nothing
-        flags = BlockFlag.NONE
+        shown = self._pace.shows(late, seconds)
+        flags = BlockFlag.NONE if shown else BlockFlag.MISSING_ESTIMATED
         if each.sum() != total:
             long, each = long[[np.argmax(steps[long])]], np.array([total])
             flags = BlockFlag.MISSING_ESTIMATED
         rows = long + (1 if before is None else 0)
         if rows[0] == 0:
-            return rows[1:], [int(n) for n in each], flags
-        return rows, [0, *map(int, each)], flags
+            return rows[1:], [int(n) for n in each], flags, False
+        return rows, [0, *map(int, each)], flags, False
 
 
 class IioDriver:

@@ -62,7 +62,7 @@ from daq.protocols.sample_counter import SampleCounter
 from daq.protocols.sample_times import Place, SampleTimes
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -112,8 +112,10 @@ class TextDecoder:
         self._times = SampleTimes(sampling_rate)
         self._packets = Packets(format_.channel_names)
         self._doubtful: Group | None = None
-        self._latest = b""  # the last accepted row
+        self._sampling_rate = sampling_rate
+        self._latest_ns: int | None = None  # time of the last row
         self._n_known = self._n_unreadable = self._n_given_up = 0
+        self._n_explained = 0  # of the unreadable messages: those before the last gap
         self._finest_ns: int | None = None  # resolution of the times
         self._delimiter = format_.delimiter.strip() or None  # None: any white space
         if "\t" in format_.delimiter:
@@ -246,8 +248,7 @@ class TextDecoder:
         if self._format.counter_column is not None:
             yield from self._counted(rows, at)
         elif self._format.time_column is not None:
-            groups = [Group(row.time_ns, row.counts[None], at, row.resolution_ns) for row in rows]
-            yield from self._timed(zip(groups, (row.message for row in rows), strict=True))
+            yield from self._timed([group for row in rows if (group := self._new(row, at))])
         else:
             yield self._block(np.stack([row.counts for row in rows]), None, at)
 
@@ -265,6 +266,16 @@ class TextDecoder:
             self._next = run.first_sample
             device = rows[run.start].time_ns if self._format.device_time else run.counter
             yield self._block(counts[run.start : run.stop], device, at)
+
+    def _new(self, row: _Row, at: HostTime) -> Group | None:
+        """Return a row as a group; None if it is repeated or too late."""
+        width = row.resolution_ns * 1e-9 * self._sampling_rate
+        is_next = width > 1 and row.time_ns == self._latest_ns  # rows of one time may be equal
+        self._latest_ns = row.time_ns
+        if not is_next and self._times.is_known(row.time_ns, hash(row.message)):
+            self._n_known += 1
+            return None
+        return Group(row.time_ns, row.counts[None], at, row.resolution_ns)
 
     def _unreadable(self) -> None:
         """Count an unreadable message as missing, if neither a counter nor a time shows this.
@@ -288,64 +299,65 @@ class TextDecoder:
             raise RemoteProtocolError(f"not a packet of this format: {text!r}") from error
         if name not in self._format.channel_names or not len(values):
             return
-        if self._times.is_known(time_ns, at, resolution_ns=resolution_ns):
+        if self._times.is_known(time_ns, hash((name, time_ns, values.tobytes()))):
             self._n_known += 1
             return
         self._n_known += self._packets.add(name, values, time_ns, at, resolution_ns)
         for group in self._packets.ready(self._times):
-            yield from self._timed([(group, b"")])
+            yield from self._timed([group])
         for text in self._packets.dropped(at):
             yield Event(self._sensor, EventKind.OVERFLOW, _cut(text), at)
 
     # --- positions by time -------------------------------------------------------------------
 
-    def _timed(self, groups: Iterable[tuple[Group, bytes]]) -> Iterator[Block | Event]:
-        """Yield blocks of contiguous groups; each group comes with its message."""
+    def _timed(self, groups: Sequence[Group]) -> Iterator[Block | Event]:
+        """Yield blocks of contiguous groups, which arrived together."""
         together: list[Group] = []
-        for group, message in groups:
-            place = self._place(group, alike=bool(message) and message == self._latest)
-            if place.kind == "next" and not place.missing and self._doubtful is None:
-                self._latest = message
-                together.append(group)
-                continue
-            yield from self._joined(together)
-            together = []
-            if place.kind == "reset":
-                yield from self._restarted(place, group.received)
-                place = self._place(group)
-            elif self._doubtful is not None:  # the next message shows that it was damaged
-                yield self._out_of_time(self._doubtful, group.received)
-            self._doubtful = group if place.kind == "doubtful" else None
+        n_behind = sum(len(group.counts) for group in groups)
+        for group in groups:
+            n_behind -= len(group.counts)
+            while (place := self._place(group, n_behind)).kind in {"before", "damaged"}:
+                yield from self._joined(together)
+                together = []
+                yield from self._decided(place, group.received)
             if place.kind == "next":
-                self._latest = message
-                self._skip(place.missing, "time step", is_exact=place.is_exact)
                 together.append(group)
-            elif place.kind == "known":
-                self._n_known += 1
+            else:
+                self._doubtful = group
         yield from self._joined(together)
+        if groups and self._doubtful is None:
+            self._times.arrived(groups[-1].received)
 
-    def _place(self, group: Group, *, alike: bool = False) -> Place:
+    def _place(self, group: Group, n_behind: int) -> Place:
         return self._times.place(
             group.time_ns,
             len(group.counts),
             group.received,
             resolution_ns=group.resolution_ns,
-            alike=alike,
+            n_behind=n_behind,
+            is_damaged=self._n_unreadable > self._n_explained,
         )
+
+    def _decided(self, place: Place, at: HostTime) -> Iterator[Block | Event]:
+        """Yield the doubtful group, or an event if it was damaged."""
+        group, self._doubtful = self._doubtful, None
+        if group is None:
+            return
+        if place.kind == "damaged":  # the next message shows it
+            yield self._out_of_time(group, at)
+            return
+        if place.is_reset:
+            yield Event(self._sensor, EventKind.RESET, "the device's clock was set", at)
+            self._flags |= BlockFlag.CLOCK_RESTART
+        reason = "clock set" if place.is_reset else "time step"
+        self._skip(place.missing, reason, is_exact=place.is_exact)
+        self._n_explained = self._n_unreadable
+        yield from self._joined([group])
 
     def _joined(self, groups: list[Group]) -> Iterator[Block]:
         if groups:
             counts = np.concatenate([group.counts for group in groups])
             yield self._block(counts, groups[0].time_ns, groups[-1].received)
-
-    def _restarted(self, place: Place, at: HostTime) -> Iterator[Block | Event]:
-        """Yield the doubtful group after the device's clock was found to be set."""
-        yield Event(self._sensor, EventKind.RESET, "the device's clock was set", at)
-        self._flags |= BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
-        self._skip(place.missing, "clock set", is_exact=False)
-        if self._doubtful is not None:
-            yield from self._joined([self._doubtful])
-            self._doubtful = None
 
     def _out_of_time(self, group: Group, at: HostTime) -> Event:
         self._n_unreadable += 1

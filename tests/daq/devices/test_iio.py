@@ -22,6 +22,8 @@ from tests.sim_devices.simulated_bench import device, sensors, spec
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from numpy.typing import NDArray
+
     from daq.protocols.block import DeviceItem
     from sim_devices.server.launch import RunningDevice
 
@@ -83,11 +85,15 @@ async def test_the_temperature_is_read_between_two_buffers() -> None:
 
 
 def decoded(
-    *buffers: Sequence[float], jitter: float = 0.0, arrivals: Sequence[float] | None = None
+    *buffers: Sequence[float] | NDArray[np.int64],
+    jitter: float = 0.0,
+    arrivals: Sequence[float] | None = None,
+    stated: NDArray[np.float64] | None = None,
 ) -> list[DeviceItem]:
     """Return what becomes of scans at these numbers of a sample, their values.
 
-    Each buffer arrives with its last scan, or when the number of ``arrivals`` is sampled.
+    Each buffer arrives with its last scan, or when the number of ``arrivals`` is sampled. The board
+    states these times, or ``stated`` by the number of the scan.
     """
     channels = (Channel(name="x", sensitivity=1.0),)
     one = Sensor(name="A", driver="iio", port="iio://x", sampling_rate=RATE, channels=channels)
@@ -103,7 +109,10 @@ def decoded(
     found: list[DeviceItem] = []
     for numbers, arrival in zip(buffers, arrivals or [n[-1] for n in buffers], strict=True):
         late = rng.uniform(-jitter, jitter, len(numbers)) / RATE
-        times = np.rint((np.array(numbers) / RATE + late + 1.8e9) * 1e9).astype(np.int64)
+        seconds = (
+            np.array(numbers) / RATE + late + 1.8e9 if stated is None else stated[np.array(numbers)]
+        )
+        times = np.rint(seconds * 1e9).astype(np.int64)
         scans = layout.encode({"accel_x": np.array(numbers, np.int64), "timestamp": times})
         found += session._blocks(scans, HostTime(round(arrival / RATE * 1e9), 0))  # noqa: SLF001
     return found
@@ -112,8 +121,9 @@ def decoded(
 @pytest.mark.parametrize("jitter", [0.0, 0.2])
 def test_lost_scans_are_gaps_where_the_times_have_them(jitter: float) -> None:
     """Within a buffer and between two; the value of each scan is its number."""
-    numbers = [*range(13), *range(17, 40), *range(140, 150)], [*range(150, 160)], [*range(190, 200)]
-    blocks = [b for b in decoded(*map(list, numbers), jitter=jitter) if isinstance(b, Block)]
+    first = [*range(3)], [*range(3, 6)], [*range(6, 13), *range(17, 30)]
+    numbers = *first, [*range(30, 40), *range(140, 150)], [*range(150, 160)], [*range(190, 200)]
+    blocks = [b for b in decoded(*numbers, jitter=jitter) if isinstance(b, Block)]
     for block in blocks:
         assert block.counts[:, 0].tolist() == list(range(block.first_sample, block.end_sample))
         assert BlockFlag.MISSING_ESTIMATED not in block.flags
@@ -129,6 +139,36 @@ def test_a_clock_that_is_set_makes_no_gap(step: int) -> None:
     blocks = [item for item in found if isinstance(item, Block)]
     assert [(b.first_sample, b.end_sample) for b in blocks] == [(0, 4), (4, 7), (7, 10), (10, 12)]
     assert [item.kind for item in found if isinstance(item, Event)] == ["reset"]
+
+
+@pytest.mark.parametrize("step", [-3600.0, -0.3, -0.02, 0.02, 0.3, 3600.0])
+def test_scans_of_a_clock_that_is_set_are_all_kept(step: float) -> None:
+    """Buffers of 0.2 s, which arrive 0.5 ms late on average."""
+    rng = np.random.default_rng(7)
+    numbers = np.arange(4000)
+    seconds = numbers / RATE + rng.uniform(0, 1e-4, len(numbers))
+    stated = 1.8e9 + seconds + step * (numbers >= 2007)
+    buffers = np.split(numbers, range(20, 4000, 20))
+    arrivals = [float(n[-1] + RATE * rng.exponential(5e-4)) for n in buffers]
+    found = decoded(*buffers, arrivals=arrivals, stated=stated)
+    blocks = [item for item in found if isinstance(item, Block)]
+    index = np.concatenate([np.arange(b.first_sample, b.end_sample) for b in blocks])
+    rows = np.concatenate([b.counts[:, 0] for b in blocks])
+    assert np.array_equal(index, numbers)
+    assert np.array_equal(rows, numbers)
+    assert [item.kind for item in found if isinstance(item, Event)] == ["reset"]
+
+
+@pytest.mark.parametrize("n_lost", [5, 60, 900])
+def test_scans_lost_in_steady_buffers_are_an_exact_gap(n_lost: int) -> None:
+    rng = np.random.default_rng(8)
+    numbers = np.array([n for n in range(4000) if not 2007 <= n < 2007 + n_lost])
+    buffers = np.split(numbers, range(20, len(numbers), 20))
+    arrivals = [float(n[-1] + RATE * rng.exponential(5e-4)) for n in buffers]
+    blocks = [b for b in decoded(*buffers, arrivals=arrivals) if isinstance(b, Block)]
+    assert [b.first_sample for b in blocks if b.reason] == [2007 + n_lost]
+    assert not any(b.flags & BlockFlag.MISSING_ESTIMATED for b in blocks)
+    assert all(b.counts[:, 0].tolist() == [*range(b.first_sample, b.end_sample)] for b in blocks)
 
 
 def test_scans_lost_while_the_network_was_held_up_are_a_gap() -> None:

@@ -32,8 +32,8 @@ def split(found: list[DeviceItem]) -> tuple[list[int], list[list[float]], list[E
     return index, rows, [e for e in found if isinstance(e, Event)]
 
 
-def datacast(channel: str, packet: int) -> bytes:
+def datacast(channel: str, packet: int, *, ahead: float = 0.0) -> bytes:
     first = packet * 25
-    fields = [f"'{channel}'", f"{1582315130.292 + packet * 0.25:.3f}"]
+    fields = [f"'{channel}'", f"{1582315130.292 + packet * 0.25 + ahead:.3f}"]
     fields += [str(1000 * SHAKE.channel_names.index(channel) + first + i) for i in range(25)]
     return encode_fields(fields, TextFormat(delimiter=", ", prefix="{", terminator="}"))

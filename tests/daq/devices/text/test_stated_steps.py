@@ -1,0 +1,109 @@
+"""Clocks of loggers that are set: every row that arrived is recorded, and no gap is invented.
+
+The logger is `tests.peers.text_logger`, which shares no code with the driver.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from daq.devices.text.decoder import TextDecoder
+from daq.devices.text.format import RASPBERRY_SHAKE, TextFormat
+from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, EventKind, HostTime
+from tests.peers.text_logger import CHANNELS, UNIX, TextLogger
+
+ROWS = TextFormat(columns=(1, 2, 3), time_column=0, whole=True)
+SIZES = [0.02, 0.3, 1.0, 3600.0]
+SIGNED = [sign * size for size in SIZES for sign in (1, -1)]
+
+
+def arrival(seconds: float) -> HostTime:
+    return HostTime(3_000_000_000_000 + round(seconds * 1e9), round((UNIX + seconds) * 1e9))
+
+
+def by_rows(logger: TextLogger) -> list[DeviceItem]:
+    decoder = TextDecoder("A", ROWS, sampling_rate=100.0)
+    return [item for data, at in logger.rows() for item in decoder.receive(data, arrival(at))]
+
+
+def by_packets(logger: TextLogger) -> list[DeviceItem]:
+    shake = replace(RASPBERRY_SHAKE, channel_names=CHANNELS)
+    decoder = TextDecoder("A", shake, sampling_rate=100.0)
+    found: list[DeviceItem] = []
+    for data, at in logger.packets():
+        found += decoder.receive_datagram(data, arrival(at))
+    return found
+
+
+def check(
+    found: list[DeviceItem], logger: TextLogger, *, n_open: int = 0, n_lost: int = 0
+) -> tuple[list[Block], list[Event]]:
+    """See that every row is recorded once, with its index up to estimated gaps."""
+    blocks = [each for each in found if isinstance(each, Block)]
+    index = np.concatenate([np.arange(b.first_sample, b.end_sample) for b in blocks])
+    rows = np.concatenate([b.counts for b in blocks])
+    known = {tuple(row): n for n, row in enumerate(logger.samples.tolist())}
+    true = np.array([known[tuple(row)] for row in rows.tolist()])
+    assert (np.diff(true) > 0).all()
+    assert len(true) >= len(logger.samples) - n_open - n_lost
+    estimated = [b.first_sample for b in blocks if BlockFlag.MISSING_ESTIMATED in b.flags]
+    sure = index < min(estimated, default=index[-1] + 1)
+    assert np.array_equal(index[sure], true[sure])
+    return blocks, [each for each in found if isinstance(each, Event)]
+
+
+@pytest.mark.parametrize("size", SIGNED)
+def test_rows_of_a_clock_that_is_set_are_all_kept(size: float) -> None:
+    logger = TextLogger(steps=((67.77, size),))
+    blocks, events = check(by_rows(logger), logger)
+    decided = size < 0 or size > 0.1
+    if decided:
+        assert [event.kind for event in events] == [EventKind.RESET]
+        restarts = [b.first_sample for b in blocks[1:] if BlockFlag.CLOCK_RESTART in b.flags]
+        assert restarts == [6777]
+        assert not any(BlockFlag.MISSING_ESTIMATED in b.flags for b in blocks)
+
+
+@pytest.mark.parametrize("size", SIGNED)
+def test_packets_of_a_clock_that_is_set_are_all_kept(size: float) -> None:
+    logger = TextLogger(steps=((67.75, size),))
+    blocks, events = check(by_packets(logger), logger)
+    assert [event.kind for event in events] == [EventKind.RESET]
+    restarts = [b.first_sample for b in blocks[1:] if BlockFlag.CLOCK_RESTART in b.flags]
+    assert restarts == [6775]
+    assert not any(BlockFlag.MISSING_ESTIMATED in b.flags for b in blocks)
+
+
+@pytest.mark.parametrize("n", [1, 4, 40])
+def test_lost_packets_are_an_exact_gap(n: int) -> None:
+    logger = TextLogger(lost=frozenset(range(200, 200 + n)), ppm=80.0)
+    blocks, events = check(by_packets(logger), logger, n_lost=25 * n)
+    assert not events
+    assert not any(b.flags & BlockFlag.MISSING_ESTIMATED for b in blocks)
+
+
+@pytest.mark.parametrize("n", [1, 20, 400])
+def test_lost_rows_are_a_gap_of_their_length(n: int) -> None:
+    logger = TextLogger(lost=frozenset(range(6000, 6000 + n)), ppm=-80.0)
+    blocks, events = check(by_rows(logger), logger, n_lost=n)
+    assert not events
+    (gap,) = [b for b in blocks if b.reason]
+    assert (BlockFlag.MISSING_ESTIMATED in gap.flags) == (n == 1)
+    assert gap.first_sample == 6000 + n
+
+
+@pytest.mark.parametrize("packets", [True, False])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_busy_host_makes_no_gap_and_no_epoch(seed: int, *, packets: bool) -> None:
+    rng = np.random.default_rng(seed)
+    begins = np.arange(20.0, 300.0, 20.0)
+    stalls = tuple(
+        (float(t), float(t + d)) for t, d in zip(begins, rng.uniform(1, 15, 14), strict=True)
+    )
+    logger = TextLogger(seconds=320.0, jitter=0.2, stalls=stalls, ppm=300.0, seed=seed)
+    blocks, events = check(by_packets(logger) if packets else by_rows(logger), logger)
+    assert not events
+    assert not any(b.flags & ~BlockFlag.DEVICE_UTC for b in blocks[1:])
