@@ -55,11 +55,12 @@ def record(
     *,
     psd: float = 2e-9,
     more: str = "",
+    stated: str = "",
     before_end: Callable[[], object] = lambda: None,
 ) -> Path:
     """Four biaxial sensors: B misses samples, and Y of the last is dead.
 
-    `more` is added to the bench file.
+    `more` is added to the bench file, `stated` to each of its channels.
     """
     rng = np.random.default_rng(8)
     motion = 4000 * rng.standard_normal((N_SAMPLES, 2))
@@ -71,6 +72,7 @@ def record(
         gaps = ((1000, 1130), (4000, 4001)) if number == 1 else ()
         sensors[name] = Sensor(counts.round().astype(np.int32), rate=RATE, gaps=gaps)
     tables = "".join(SENSOR.format(name=n, number=i) for i, n in enumerate(sensors))
+    tables = tables.replace("sensitivity = 1e6", f"sensitivity = 1e6{stated}")
     bench = parse(BENCH.format(sensors=tables, psd=psd) + more, "bench.toml")
     layouts = [
         SensorLayout(

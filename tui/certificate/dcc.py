@@ -19,7 +19,14 @@ from daq.results.band_summary import band_of, judged_method
 from daq.results.decision.conformity import Statement, conformity, with_rule
 from daq.results.sources import conditions
 from daq.results.uncertainty_budget import band_budgets, third_octave_budgets
-from tui.report.certificate import PROCEDURE, QUANTITIES, SCOPE, manufacturers, outside_range
+from tui.report.certificate import (
+    PROCEDURE,
+    QUANTITIES,
+    SCOPE,
+    SPECIMEN,
+    manufacturers,
+    outside_range,
+)
 from tui.report.noise import decision_rule
 from tui.wording.formatting import span
 
@@ -117,8 +124,11 @@ def _administrative(
         lines.append(laboratory.accreditation)
     if any(source.simulated for source in found):
         lines.insert(0, "SIMULATED SENSORS: no instrument was measured.")
-    if issue is None:
-        lines.insert(0, "DRAFT: not a certificate.")
+    if issue is None or issue.is_specimen:
+        what = "DRAFT" if issue is None else SPECIMEN
+        lines.insert(0, f"{what}: not a certificate.")
+    if issue is not None and issue.despite:
+        lines.append(f"Issued despite facts that invalidate the result: {issue.despite}")
     for line in lines:
         _content(_add(_add(statements, "statement"), "declaration"), line)
 
@@ -141,7 +151,7 @@ def _core(
     identifications = [("other", "SHA-256 of the recording", s.sha256 or "none") for s in found]
     if order:
         identifications.append(("customer", "order", order))
-    if issue is not None:
+    if issue is not None and issue.entry:
         entry = ("calibrationLaboratory", "entry of the ledger", issue.entry)
         identifications.append(entry)
     _identifications(core, identifications)
@@ -205,7 +215,7 @@ def _results(
     if stated:
         method = _add(methods, "usedMethod")
         _text(method, "name", "Decision rule")
-        _content(_add(method, "description"), decision_rule(table))
+        _content(_add(method, "description"), decision_rule(table, stated[0].k))
         _add(method, "norm", "ILAC-G8:09/2019")
         _add(method, "norm", "JCGM 106:2012")
     found_conditions = conditions(found, about, start=settings.start, end=settings.end)
@@ -298,7 +308,7 @@ def _conformity(listed: ET.Element, stated: Iterable[Conformity]) -> None:
     _text(listed, "name", "Conformity")
     for each in stated:
         quantity = _add(listed, "quantity")
-        _text(quantity, "name", f"Probability that the noise is above {each.limit}")
+        _text(quantity, "name", f"Probability that the noise is above {each.limit} in any band")
         if math.isfinite(each.risk):
             real = _si(quantity, "real")
             _si(real, "value", _number(each.risk))

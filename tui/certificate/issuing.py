@@ -1,35 +1,37 @@
-"""Issues certificates and verifies them: what is refused, and what a certificate consists of."""
+"""Issues certificates and specimens: what is refused, and what a certificate consists of."""
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
+from dataclasses import dataclass
 from datetime import UTC, datetime
-from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from daq.bench.estimate_settings import to_table
 from daq.bench.outline import BenchOutline
 from daq.errors import HuddleError
 from daq.estimation.contributions import with_sensitivities
 from daq.estimation.snapshot_builder import sensitivities_at
-from daq.recording.reader import Recording
-from daq.recording.repair import verify as verify_recording
 from daq.recording.signing import identity
 from daq.results.decision.conformity import conformity, with_rule
 from daq.results.decision.limits import judge
 from daq.results.sources import sources
 from tui.certificate.dcc import NAME as DCC_NAME
 from tui.certificate.dcc import dcc
+from tui.certificate.ledger import HeadSigner
+from tui.certificate.verification import JSON_NAME, verified
 from tui.output.console import finite
 from tui.output.json_document import document
-from tui.report.certificate import Issue, changes, missing
+from tui.report.certificate import SPECIMEN, Issue, changes, missing
 from tui.report.contents import report_of
+from tui.report.evidence import invalidating
 from tui.report.paper import write_paper
+from tui.report.writing import write_content
+from tui.wording.facts import known as known_facts
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     from daq.bench.masks.mask import Mask
@@ -40,9 +42,6 @@ if TYPE_CHECKING:
     from tui.certificate.ledger import Entry, Ledger
     from tui.report.parts import Report
 
-JSON_NAME = "result.json"
-"""Name of the result in the certificate."""
-
 
 class NotIssuedError(HuddleError, ValueError):
     """A certificate is refused; the message says why, and what to do."""
@@ -50,44 +49,127 @@ class NotIssuedError(HuddleError, ValueError):
     is_usage_error = True
 
 
-class VerificationError(HuddleError, ValueError):
-    """A certificate is not what the ledger says, or not of the recording that is there."""
+class PdfSigner(HeadSigner, Protocol):
+    """The key of a laboratory, which signs certificates and the head of their ledger."""
+
+    def __call__(self, content: bytes) -> bytes:
+        """Return a PDF with a signature over all of it."""
 
 
-def refuse_unfit(found: Sequence[Source], about: Bench | None, *, by: str, complete: bool) -> None:
-    """Refuse what no certificate may be made of.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Order:
+    """What is asked of a certificate.
+
+    Attributes
+    ----------
+    by : str
+        Who authorises; empty: only a specimen can be made.
+    about : Bench or None
+        Where laboratory, customer, sensors and their sensitivities are described; default: the
+        recorded bench.
+    reason : str
+        Of a revision: needed where these recordings have a certificate already.
+    despite : str
+        Why a result that a fact invalidates is certified nevertheless.
+    complete : bool
+        Whether all that the checklist asks must be given.
+    models : sequence of Mask
+        Noise models to show.
+    signer : PdfSigner, optional
+    """
+
+    by: str = ""
+    about: Bench | None = None
+    reason: str = ""
+    despite: str = ""
+    complete: bool = True
+    models: Sequence[Mask] = ()
+    signer: PdfSigner | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Examined:
+    """Recordings that were examined before a certificate is made of them: by `examine` only.
+
+    Attributes
+    ----------
+    found : tuple of Source
+    order : Order
+    about : Bench or None
+        That of the order, or the recorded one.
+    objections : tuple of str
+        Why no certificate may be made of them; a specimen may.
+    """
+
+    found: tuple[Source, ...]
+    order: Order
+    about: Bench | None
+    objections: tuple[str, ...]
+
+    @property
+    def paths(self) -> list[Path]:
+        """Of the recordings."""
+        return [source.path for source in self.found]
+
+
+def examine(
+    recordings: Sequence[Path],
+    order: Order,
+    *,
+    known: Mapping[Path, tuple[str, str]],
+    folders: Iterable[Path] = (),
+) -> Examined:
+    """Examine recordings, before they are estimated.
 
     Parameters
     ----------
-    found : sequence of Source
-    about : Bench or None
-        Where laboratory, customer and sensors are described.
-    by : str
-        Who authorises.
-    complete : bool
-        Whether all that the checklist asks must be given.
-
-    Raises
-    ------
-    NotIssuedError
-        With everything that is missing.
+    recordings : sequence of Path
+    order : Order
+    known : mapping of Path to (str, str)
+        Run id and root SHA-256 by the databases of services.
+    folders : iterable of Path
+        Of ledgers besides those that recordings name.
     """
+    found = sources(recordings)
+    about = found[0].bench if order.about is None else order.about
+    objections = []
     for source in found:
         if source.simulated:
-            raise NotIssuedError(
+            objections.append(
                 f"{source.path}: sensors were simulated: no certificate is issued of a model;"
-                " huddle report writes a draft"
+                " --specimen makes a specimen"
             )
         if source.state in {"growing", "left open"}:
             wanted = "wait for its end" if source.state == "growing" else "huddle repair closes it"
-            raise NotIssuedError(f"{source.path}: not closed; {wanted}")
-    left = missing(about, found[0], by=by)
-    if left and complete:
+            objections.append(f"{source.path}: not closed; {wanted}")
+    if not any(source.state == "growing" for source in found):
+        objections += [
+            f"{each.path}: {each.state}"
+            for each in verified([s.path for s in found], known=known, folders=folders)
+            if not each.is_intact
+        ]
+    left = missing(about, found[0], by=order.by)
+    if left and order.complete:
         text = "\n".join(f"  {each.what}: {each.key} ({each.clause})" for each in left)
-        raise NotIssuedError(
+        objections.append(
             f"not given in the bench file:\n{text}\n"
             "--bench takes a bench file that gives it; --allow-incomplete issues without"
         )
+    outline = None if about is None else BenchOutline.of_text(about.text)
+    stated = {} if outline is None else outline.sensitivities
+    unknown = [
+        f"{sensor.name}.{channel.name}"
+        for sensor in found[0].sensors
+        for channel in sensor.channels
+        if not channel.auxiliary
+        and ((own := stated.get((sensor.name, channel.name))) is None or not own.is_stated)
+    ]
+    if unknown:
+        objections.append(
+            f"uncertainty of the sensitivity not stated: {', '.join(unknown)}; expected certificate"
+            " or tolerance of each channel in [[sensors.channels]] of the bench file"
+        )
+    return Examined(found, order, about, tuple(objections))
 
 
 def settings_table(settings: Settings, snapshot: Snapshot) -> dict[str, Any]:
@@ -103,52 +185,41 @@ def settings_table(settings: Settings, snapshot: Snapshot) -> dict[str, Any]:
 
 
 def issue(
-    snapshot: Snapshot,
-    settings: Settings,
-    recordings: Sequence[Path],
-    ledger: Ledger,
-    *,
-    by: str,
-    reason: str = "",
-    about: Bench | None = None,
-    models: Sequence[Mask] = (),
-    complete: bool = True,
-    sign: Callable[[bytes], bytes] | None = None,
+    snapshot: Snapshot, settings: Settings, examined: Examined, ledger: Ledger
 ) -> tuple[Entry, Path]:
     """Issue a certificate: number, file, and both in the ledger.
 
     Parameters
     ----------
     snapshot : Snapshot
-        A finished estimate.
+        A finished estimate of the examined recordings.
     settings : Settings
         It was made with.
-    recordings : sequence of Path
+    examined : Examined
     ledger : Ledger
-    by : str
-        Who authorises.
-    reason : str
-        Of a revision: needed where these recordings have a certificate already.
-    about : Bench, optional
-        Where laboratory, customer and sensors are described; default: the recorded bench.
-    models : sequence of Mask
-        Noise models to show.
-    complete : bool
-        Whether all that the checklist asks must be given.
-    sign : callable, optional
-        Signs the PDF.
 
     Raises
     ------
     NotIssuedError
-        If the recordings may not have a certificate.
+        If the recordings may not have a certificate, or a fact invalidates the result.
     LedgerError
         If the ledger was changed by hand or is in use.
     """
-    found = sources(recordings)
-    about = found[0].bench if about is None else about
-    refuse_unfit(found, about, by=by, complete=complete)
-    snapshot = with_stated(snapshot, found, about)
+    found, about, order = examined.found, examined.about, examined.order
+    if examined.objections:
+        raise NotIssuedError("\n".join(examined.objections))
+    if not order.by:
+        raise NotIssuedError("nobody authorises the certificate; expected --by NAME")
+    snapshot = with_stated(snapshot, examined)
+    invalid = invalidating(known_facts(snapshot, settings))
+    if invalid and not order.despite:
+        lines = "\n".join(f"  {each.text}" for each in invalid)
+        raise NotIssuedError(
+            f"the result is invalid:\n{lines}\n--despite REASON issues a certificate that prints"
+            " the reason on page 1"
+        )
+    if [source.sha256 for source in sources(examined.paths)] != [s.sha256 for s in found]:
+        raise NotIssuedError("a recording was changed while it was estimated; try again")
     prefix = "HT" if about is None else about.certificate.prefix
     runs = [(source.path.name, source.run_id, source.sha256) for source in found]
     roots = dict(identity(source.path) for source in found)
@@ -157,60 +228,112 @@ def issue(
         table["guard_band"] = about.certificate.guard_band
     if about is not None:
         table["decision_rule"] = str(about.certificate.decision_rule)
+    signer = order.signer
     with ledger.held():
         before = ledger.last_of(frozenset(run_id for _, run_id, _ in runs))
-        if before is not None and not reason:
+        if before is not None and not order.reason:
             raise NotIssuedError(
                 f"certificate {before.name} is of the same recording; --reason TEXT issues a"
                 " revision of it"
             )
         at = datetime.now(UTC).replace(microsecond=0)
         entry = ledger.allot(
-            prefix, at=at, by=by, recordings=runs, settings=table, reason=reason, roots=roots
+            prefix,
+            at=at,
+            by=order.by,
+            recordings=runs,
+            settings=table,
+            reason=order.reason,
+            roots=roots,
+            signer="" if signer is None else signer.key_id,
         )
         try:
             made = Issue(
                 number=entry.number,
                 revision=entry.revision,
                 at=at,
-                by=by,
+                by=order.by,
                 entry=entry.hash,
                 replaces=None if before is None else before.revision,
                 replaces_sha256="" if before is None else before.sha256,
-                reason=reason,
+                reason=order.reason,
                 changes=() if before is None else tuple(changes(dict(before.settings), table)),
-                incomplete=bool(missing(about, found[0], by=by)),
+                incomplete=bool(missing(about, found[0], by=order.by)),
+                despite=order.despite if invalid else "",
             )
-            report = report_of(snapshot, settings, found, models, issue=made, about=about)
-            xml = dcc(snapshot, settings, found, issue=made, about=about)
-            content = _pdf(report, _result(snapshot, settings, found, made, about), xml, at)
-            if sign is not None:
-                content = sign(content)
-            path = ledger.publish(entry, ".pdf", content)
+            content = _content(snapshot, settings, examined, made, roots)
+            if signer is not None:
+                content = signer(content)
+            path = ledger.publish(entry, ".pdf", content, signer)
         except Exception as error:
             ledger.void(entry, f"{type(error).__name__}: {error}")
             raise
     return entry, path
 
 
-def with_stated(snapshot: Snapshot, found: Sequence[Source], about: Bench | None) -> Snapshot:
-    """Return a snapshot with the sensitivities that a bench file states of the sensors."""
+def specimen(snapshot: Snapshot, settings: Settings, examined: Examined, folder: Path) -> Path:
+    """Make a specimen: what a certificate would be, watermarked, without number and ledger.
+
+    Parameters
+    ----------
+    snapshot, settings, examined
+        As `issue` takes them, of any recordings.
+    folder : Path
+        Where it is written; an earlier specimen of the recording is replaced.
+
+    Returns
+    -------
+    Path
+    """
+    made = Issue(
+        number=SPECIMEN,
+        revision=0,
+        at=datetime.now(UTC).replace(microsecond=0),
+        by=examined.order.by or "nobody",
+        entry="",
+        despite=examined.order.despite,
+        objections=examined.objections,
+    )
+    snapshot = with_stated(snapshot, examined)
+    content = _content(snapshot, settings, examined, made, {})
+    name = f"{examined.found[0].path.stem}-specimen.pdf"
+    return write_content(folder / name, content, "replace")
+
+
+def _content(
+    snapshot: Snapshot,
+    settings: Settings,
+    examined: Examined,
+    made: Issue,
+    roots: Mapping[str, str],
+) -> bytes:
+    """Return the PDF, with its machine-readable forms inside."""
+    found, about, models = examined.found, examined.about, examined.order.models
+    report = report_of(snapshot, settings, found, models, issue=made, about=about)
+    xml = dcc(snapshot, settings, found, issue=made, about=about)
+    return _pdf(report, _result(snapshot, settings, examined, made, roots), xml, made.at)
+
+
+def with_stated(snapshot: Snapshot, examined: Examined) -> Snapshot:
+    """Return a snapshot with what the bench file of the order states of sensitivities."""
+    about = examined.order.about
     outline = None if about is None else BenchOutline.of_text(about.text)
     if outline is None:
         return snapshot
-    readings = (each for source in found for each in source.readings)
+    readings = (each for source in examined.found for each in source.readings)
     return with_sensitivities(snapshot, sensitivities_at(outline.sensitivities, readings))
 
 
 def _result(
     snapshot: Snapshot,
     settings: Settings,
-    found: Sequence[Source],
+    examined: Examined,
     made: Issue,
-    about: Bench | None,
+    roots: Mapping[str, str],
 ) -> bytes:
     """Return the result as JSON, with the certificate it is of."""
-    rule = with_rule(found[0].bench, about)
+    found = examined.found
+    rule = with_rule(found[0].bench, examined.about)
     verdict = judge(rule, snapshot, settings)
     result = document(snapshot, settings, sources=found, verdict=verdict)
     result["certificate"] = {
@@ -219,6 +342,8 @@ def _result(
         "issued": made.at.isoformat(),
         "by": made.by,
         "entry": made.entry,
+        "roots": dict(roots),
+        "despite": made.despite or None,
     }
     stated = conformity(rule, snapshot, settings)
     if rule is not None and stated:
@@ -231,6 +356,8 @@ def _result(
                     "sensor": each.sensor,
                     "channel": each.channel,
                     "statement": each.statement,
+                    "is_traceable": each.is_traceable,
+                    "k": each.k,
                     "risk": each.risk,
                     "frequency_hz": each.frequency,
                 }
@@ -246,83 +373,3 @@ def _pdf(report: Report, result: bytes, xml: bytes, at: datetime) -> bytes:
     attached = [(JSON_NAME, "application/json", result), (DCC_NAME, "application/xml", xml)]
     write_paper(report, paper, attached=attached, at=at)
     return paper.getvalue()
-
-
-def verify(path: Path, recordings: Sequence[Path], ledger: Ledger) -> list[str]:
-    """Return what is right with a certificate, a line each.
-
-    Parameters
-    ----------
-    path : Path
-        The certificate.
-    recordings : sequence of Path
-        Those it should be of; none: those beside the folder of the ledger, by their names.
-    ledger : Ledger
-
-    Raises
-    ------
-    VerificationError
-        With the first thing that is wrong.
-    LedgerError
-        If the ledger was changed by hand.
-    """
-    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-    entries = ledger.entries()
-    entry = next((each for each in entries if each.sha256 == sha256), None)
-    if entry is None:
-        same = next((each for each in entries if each.file == path.name), None)
-        if same is None:
-            raise VerificationError(f"{path}: not in the ledger {ledger.folder}")
-        raise VerificationError(
-            f"{path}: changed: its SHA-256 is not that of certificate {same.name} in the ledger"
-        )
-    lines = [f"certificate {entry.name}, issued {entry.at:%Y-%m-%d} by {entry.by}: {entry.state}"]
-    if entry.state == "replaced":
-        last = ledger.last_of(entry.runs, entries)
-        lines.append(f"replaced by revision {last.revision}" if last else "replaced")
-    lines.append("SHA-256 and ledger: as issued")
-    lines += _signatures(path)
-    return [*lines, *_recordings(path, entry, recordings, ledger)]
-
-
-def _signatures(path: Path) -> list[str]:
-    """Return who signed, a line each."""
-    content = path.read_bytes()
-    if b"/ByteRange" not in content:
-        return ["not signed"]
-    if find_spec("pyhanko") is None:
-        return ["signature not checked: pip install 'huddle-bench[sign]'"]
-    from tui.certificate.signing import signatures  # noqa: PLC0415 - an extra
-
-    lines = []
-    for name, intact in signatures(content):
-        if not intact:
-            raise VerificationError(f"{path}: the signature of {name} is not intact")
-        lines.append(f"signed by {name}: intact; whom the signer is vouched for by, a reader shows")
-    return lines
-
-
-def _recordings(path: Path, entry: Entry, recordings: Sequence[Path], ledger: Ledger) -> list[str]:
-    beside = [ledger.folder.parent / file for file, _, _ in entry.recordings]
-    given = list(recordings) or [each for each in beside if each.is_file()]
-    if not given:
-        names = ", ".join(file for file, _, _ in entry.recordings)
-        return [f"recording not checked: name it ({names})"]
-    expected = {run_id: (file, sha256) for file, run_id, sha256 in entry.recordings}
-    lines = []
-    for each in given:
-        with Recording.open(each) as recording:
-            run_id = recording.run_id
-        if run_id not in expected:
-            raise VerificationError(f"{path}: {each} is another recording than the one certified")
-        with each.open("rb") as file:
-            is_same = hashlib.file_digest(file, "sha256").hexdigest() == expected[run_id][1]
-        state = "unchanged"
-        if not is_same:
-            report = verify_recording(each)
-            root = entry.roots.get(run_id)
-            if not report.intact or root is None or report.root_sha256 != root:
-                raise VerificationError(f"{path}: {each} was changed since the certificate")
-            state = "its contents unchanged, its file not (such as results stored in it since)"
-        lines.append(f"recording {each}: the one certified, {state}")
-    return lines

@@ -7,6 +7,10 @@ SHA-256 of the record before and of itself, so that a changed or removed row bre
 triggers refuse changes through SQL. SQLite counts the rows ever added, so that rows removed from
 the end are missed, too; and every certificate prints the hash of its own row.
 
+All of this shows accidents and careless hands. Who can write the file can also write another chain,
+and another count. Where certificates are signed, the row that is last then, the head, is signed
+with the same key: all rows up to a signed head are those that the owner of the key had.
+
 To issue is: add ``allotted``, make the file under a hidden name, add ``issued`` with the SHA-256 of
 the file, and give the file its name. All of it holds a lock that the system releases when the
 process ends. Whoever takes the lock next finds what a killed process left: a number without a
@@ -15,6 +19,7 @@ certificate becomes ``void``; a certificate that lacks only its name gets it.
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import hashlib
 import json
@@ -23,11 +28,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 
 from daq.bench.tables.certificate import CertificateTable
 from daq.errors import HuddleError
-from daq.whole_file import PRIVATE, put_in_place, write_whole
+from daq.whole_file import PRIVATE, create_private, put_in_place, write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -46,7 +51,24 @@ CREATE TRIGGER IF NOT EXISTS no_change BEFORE UPDATE ON entries
     BEGIN SELECT RAISE(ABORT, 'the ledger is append-only'); END;
 CREATE TRIGGER IF NOT EXISTS no_removal BEFORE DELETE ON entries
     BEGIN SELECT RAISE(ABORT, 'the ledger is append-only'); END;
+CREATE TABLE IF NOT EXISTS heads (
+    row INTEGER PRIMARY KEY, hash TEXT NOT NULL, key TEXT NOT NULL, signature TEXT NOT NULL);
+CREATE TRIGGER IF NOT EXISTS no_change_of_heads BEFORE UPDATE ON heads
+    BEGIN SELECT RAISE(ABORT, 'the ledger is append-only'); END;
+CREATE TRIGGER IF NOT EXISTS no_removal_of_heads BEFORE DELETE ON heads
+    BEGIN SELECT RAISE(ABORT, 'the ledger is append-only'); END;
 """
+
+
+class HeadSigner(Protocol):
+    """The key of a laboratory."""
+
+    key_id: str
+    public_key: str
+    """In PEM."""
+
+    def sign(self, message: bytes) -> bytes:
+        """Return the signature of a message."""
 
 
 class LedgerError(HuddleError, OSError):
@@ -67,6 +89,9 @@ class Entry:
     recordings : tuple of (file, run_id, sha256)
     roots : mapping
         Root SHA-256 of the manifest of each recording, by run id; none in older ledgers.
+    signer : str or None
+        Id of the key that signs the certificate; empty: not signed; None in older ledgers, which
+        do not know.
     settings : mapping
         Those of the estimate that differ from the defaults.
     reason : str
@@ -76,6 +101,8 @@ class Entry:
     state : State
     file, sha256 : str
         Of the certificate; empty for a void number.
+    row : int
+        Of the ledger, in which the certificate was issued.
     """
 
     number: str
@@ -90,6 +117,8 @@ class Entry:
     file: str = ""
     sha256: str = ""
     roots: Mapping[str, str] = field(default_factory=dict)
+    signer: str | None = None
+    row: int = 0
 
     @property
     def name(self) -> str:
@@ -131,6 +160,7 @@ class Ledger:
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         with self._locked(patience):
+            _private(self._path)
             with self._open() as rows:
                 rows.executescript(_TABLE)
             self._clear_up()
@@ -146,7 +176,7 @@ class Ledger:
         """
         found: dict[tuple[str, int], Entry] = {}
         busy = self._is_busy()
-        for record, own in self._records():
+        for row, (record, own) in enumerate(self._records(), start=1):
             key = record["number"], record["revision"]
             if record["kind"] == "allotted":
                 state: State = "being issued" if busy else "void"
@@ -155,7 +185,7 @@ class Ledger:
                 here = (self.folder / record["file"]).exists()
                 state = "issued" if here or busy else "file missing"
                 about = {"file": record["file"], "sha256": record["sha256"]}
-                found[key] = replace(found[key], state=state, **about)
+                found[key] = replace(found[key], state=state, row=row, **about)
             else:
                 found[key] = replace(found[key], state="void")
         last = {e.number: e.revision for e in found.values() if e.state != "void"}
@@ -176,6 +206,7 @@ class Ledger:
         settings: Mapping[str, Any],
         reason: str,
         roots: Mapping[str, str] = MappingProxyType({}),
+        signer: str = "",
     ) -> Entry:
         """Give the next number; a further certificate of the same runs is a revision of theirs."""
         entries = self.entries()
@@ -197,6 +228,7 @@ class Ledger:
             "settings": dict(settings),
             "reason": reason,
             "roots": dict(roots),
+            "signer": signer,
         }
         return _entry(record, self._add(record), "being issued")
 
@@ -234,8 +266,12 @@ class Ledger:
                 return "", f"exchanged: certificate {entry.name} is of another run of this name"
         return last, ""
 
-    def publish(self, entry: Entry, suffix: str, content: bytes) -> Path:
+    def publish(
+        self, entry: Entry, suffix: str, content: bytes, signer: HeadSigner | None = None
+    ) -> Path:
         """Add a certificate to the ledger and to the folder, in which it replaces nothing.
+
+        A signer signs the ledger as far as this certificate.
 
         Raises
         ------
@@ -256,7 +292,8 @@ class Ledger:
                 "at": datetime.now(UTC).isoformat(),
                 "file": path.name,
                 "sha256": sha256,
-            }
+            },
+            signer,
         )
         _name(part, path)
         return path
@@ -272,6 +309,41 @@ class Ledger:
                 "why": why,
             }
         )
+
+    def signed_rows(self, wanted: str = "") -> dict[str, int]:
+        """Return how many rows each key has signed, by its id.
+
+        Parameters
+        ----------
+        wanted : str
+            Id of a key: only its signatures count.
+
+        Raises
+        ------
+        LedgerError
+            If a signature is not that of its row.
+        """
+        from tui.certificate.keys import is_genuine, key_id, loaded  # noqa: PLC0415 - an extra
+
+        hashes = [own for _, own in self._records()]
+        with self._open() as rows:
+            if not rows.execute("SELECT 1 FROM sqlite_master WHERE name = 'heads'").fetchone():
+                return {}
+            heads = rows.execute("SELECT row, hash, key, signature FROM heads").fetchall()
+        found: dict[str, int] = {}
+        for row, own, pem, signature in heads:
+            try:
+                key = loaded(pem)
+                is_own = is_genuine(key, _head(row, own), base64.b64decode(signature))
+            except ValueError:
+                is_own = False
+            if not is_own or row > len(hashes) or hashes[row - 1] != own:
+                raise LedgerError(
+                    f"{self._path}: changed by hand: row {row} is not the one that was signed"
+                )
+            if wanted in {"", key_id(key)}:
+                found[key_id(key)] = max(row, found.get(key_id(key), 0))
+        return found
 
     def _clear_up(self) -> None:
         """Finish what a killed process left; the lock is held."""
@@ -293,7 +365,7 @@ class Ledger:
             for part in self.folder.glob(f".{entry.number}-r{entry.revision}.*.part"):
                 part.unlink()
 
-    def _add(self, record: dict[str, Any]) -> str:
+    def _add(self, record: dict[str, Any], signer: HeadSigner | None = None) -> str:
         with self._open() as rows:
             rows.execute("BEGIN IMMEDIATE")
             last = rows.execute("SELECT hash FROM entries ORDER BY row DESC LIMIT 1").fetchone()
@@ -301,7 +373,15 @@ class Ledger:
                 record | {"previous": last[0] if last else ""}, ensure_ascii=False, sort_keys=True
             )
             own = hashlib.sha256(text.encode()).hexdigest()
-            rows.execute("INSERT INTO entries (record, hash) VALUES (?, ?)", (text, own))
+            added = rows.execute(
+                "INSERT INTO entries (record, hash) VALUES (?, ?) RETURNING row", (text, own)
+            ).fetchone()
+            if signer is not None:
+                signature = base64.b64encode(signer.sign(_head(added[0], own))).decode()
+                rows.execute(
+                    "INSERT INTO heads VALUES (?, ?, ?, ?)",
+                    (added[0], own, signer.public_key, signature),
+                )
             rows.execute("COMMIT")
         return own
 
@@ -344,6 +424,7 @@ class Ledger:
     def _locked(self, patience: float) -> Iterator[None]:
         """Hold the lock: a transaction of a file of its own, which ends with the process."""
         path = self.folder / LOCK
+        _private(path)
         with contextlib.closing(
             sqlite3.connect(path, timeout=patience, isolation_level=None)
         ) as lock:
@@ -373,9 +454,21 @@ def _entry(record: Mapping[str, Any], own: str, state: State) -> Entry:
         settings=record["settings"],
         reason=record["reason"],
         roots=record.get("roots", {}),
+        signer=record.get("signer"),
         hash=own,
         state=state,
     )
+
+
+def _head(row: int, own: str) -> bytes:
+    """Return what is signed of a row."""
+    return f"huddle ledger 1\n{row}\n{own}\n".encode()
+
+
+def _private(path: Path) -> None:
+    """Create a file that only its owner can read, if there is none."""
+    with contextlib.suppress(FileExistsError):
+        create_private(path)
 
 
 def _part(path: Path) -> Path:

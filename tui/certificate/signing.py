@@ -1,14 +1,17 @@
 """Signs certificates by the key of a laboratory, and checks signatures, by pyHanko.
 
 Whether an authority stands behind the signer is for the reader's program to say, which knows whom
-its user trusts: here a signature is intact or not, and names its signer.
+its user trusts: here a signature is intact or not, and names its signer and the key.
 """
 
 from __future__ import annotations
 
 import io
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.serialization import pkcs12
 from pyhanko.pdf_utils.incremental_writer import IncrementalPdfFileWriter
 from pyhanko.pdf_utils.reader import PdfFileReader
 from pyhanko.sign import signers
@@ -16,18 +19,12 @@ from pyhanko.sign.validation import validate_pdf_signature
 from pyhanko.sign.validation.status import SignatureCoverageLevel
 from pyhanko_certvalidator import ValidationContext
 
-from daq.errors import HuddleError
+from tui.certificate.keys import KeyFileError, in_pem, key_id, sign
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 FIELD = "Laboratory"
-
-
-class SigningError(HuddleError, ValueError):
-    """A key cannot be used; the message says which."""
-
-    is_usage_error = True
 
 
 class Signer:
@@ -41,18 +38,24 @@ class Signer:
 
     Raises
     ------
-    SigningError
+    KeyFileError
         If the file is none, or the passphrase is wrong.
     """
 
     def __init__(self, file: Path, passphrase: str) -> None:
         if not file.is_file():
-            raise SigningError(f"{file}: there is no such file; expected a key (.p12)")
+            raise KeyFileError(f"{file}: there is no such file; expected a key (.p12)")
+        secret = passphrase.encode() or None
         load = cast("Any", signers.SimpleSigner).load_pkcs12
-        signer = load(str(file), passphrase=passphrase.encode() or None)
+        signer = load(str(file), passphrase=secret)
         if signer is None:
-            raise SigningError(f"{file}: no key (.p12), or the passphrase is wrong")
+            raise KeyFileError(f"{file}: no key (.p12), or the passphrase is wrong")
         self._signer = signer
+        key, certificate, _ = pkcs12.load_key_and_certificates(file.read_bytes(), secret)
+        if key is None or certificate is None:
+            raise KeyFileError(f"{file}: expected a key with its certificate")
+        self._key, public = cast("Any", key), certificate.public_key()
+        self.key_id, self.public_key = key_id(public), in_pem(public)
 
     def __call__(self, content: bytes) -> bytes:
         """Return a PDF with a signature over all of it."""
@@ -61,14 +64,43 @@ class Signer:
         signed: bytes = signers.sign_pdf(writer, about, self._signer).getvalue()
         return signed
 
+    def sign(self, message: bytes) -> bytes:
+        """Return the signature of a message."""
+        return sign(self._key, message)
 
-def signatures(content: bytes) -> list[tuple[str, bool]]:
-    """Return the signer of each signature of a PDF, and whether it is intact and of all of it."""
+
+@dataclass(frozen=True, slots=True)
+class PdfSignature:
+    """One signature of a PDF.
+
+    Attributes
+    ----------
+    signer : str
+        As its certificate names it: anybody can make a certificate with any name.
+    key_id : str
+        Of the key that signed.
+    is_intact : bool
+        Whether it is genuine, and of the whole file.
+    """
+
+    signer: str
+    key_id: str
+    is_intact: bool
+
+
+def signatures(content: bytes) -> list[PdfSignature]:
+    """Return the signatures of a PDF."""
     found = []
     for each in PdfFileReader(io.BytesIO(content)).embedded_signatures:
         own = ValidationContext(trust_roots=[each.signer_cert], allow_fetching=False)
         status = validate_pdf_signature(each, own)
         whole = status.coverage is SignatureCoverageLevel.ENTIRE_FILE
-        name = each.signer_cert.subject.human_friendly
-        found.append((name, bool(status.intact and status.valid and whole)))
+        key = serialization.load_der_public_key(each.signer_cert.public_key.dump())
+        found.append(
+            PdfSignature(
+                each.signer_cert.subject.human_friendly,
+                key_id(key),
+                bool(status.intact and status.valid and whole),
+            )
+        )
     return found

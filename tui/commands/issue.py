@@ -22,12 +22,14 @@ from tui.commands.options import (
     examples,
     with_estimate_options,
 )
+from tui.commands.verify import known_to_services
 from tui.output.extras import require
 
 
 @examples(
     "huddle issue night.h5 --by 'A. Lovelace'",
     "huddle issue night.h5 --by 'A. Lovelace' --bench lab.toml",
+    "huddle issue night.h5 --specimen",
     "huddle issue night.h5 --by 'A. Lovelace' --segment 20s --reason 'resolution of 0.05 Hz'",
 )
 @with_estimate_options
@@ -35,8 +37,11 @@ def issue(
     files: FilesArgument,
     *,
     by: Annotated[
-        str, typer.Option("--by", metavar="NAME", help="Who authorises the certificate.")
-    ],
+        str,
+        typer.Option(
+            "--by", metavar="NAME", help="Who authorises the certificate; a specimen needs nobody."
+        ),
+    ] = "",
     reason: Annotated[
         str,
         typer.Option(
@@ -67,12 +72,29 @@ def issue(
             "--allow-incomplete", help="Issue without all that ISO/IEC 17025 asks for; say so."
         ),
     ] = False,
+    despite: Annotated[
+        str,
+        typer.Option(
+            "--despite",
+            metavar="REASON",
+            help="Why a result is certified although a fact invalidates it; printed on page 1.",
+        ),
+    ] = "",
+    is_specimen: Annotated[
+        bool,
+        typer.Option(
+            "--specimen",
+            help="Make a specimen of any recording, simulated ones too: watermarked, without "
+            "number, in no ledger (NAME-specimen.pdf beside the recording, or in --folder).",
+        ),
+    ] = False,
     sign: Annotated[
         Path | None,
         typer.Option(
             "--sign",
             metavar="FILE",
-            help="Key of the laboratory (.p12) that signs the PDF. Its passphrase is asked for, "
+            help="Key of the laboratory (.p12) that signs the PDF, and the ledger as far as this "
+            "certificate. Its passphrase is asked for, "
             "or taken from HUDDLE_PASSPHRASE. Extra: sign.",
         ),
     ] = None,
@@ -85,8 +107,10 @@ def issue(
 
     The number, such as HT-2026-0042, comes from an append-only ledger in the
     folder of the certificates. No certificate is overwritten: a further one
-    of the same recording is a revision, and needs a reason. Recordings of
-    simulated sensors are refused.
+    of the same recording is a revision, and needs a reason. Recordings are
+    verified before, as huddle verify does it. Those of simulated sensors are
+    refused, and so are results that a fact invalidates, unless --despite
+    says why. --specimen shows what a certificate would be.
 
     Options not given come from the bench file inside the recording.
     The exit code is 1 if a limit is not met, and 4 if that is not decided.
@@ -94,41 +118,56 @@ def issue(
     from daq.bench.masks.mask_file import masks_named
     from daq.devices.bench_file import load
     from daq.results.decision.limits import judge
-    from daq.results.sources import sources
     from tui.output.console import console, notices
 
     require("matplotlib", "jinja2", "fpdf", *(["pyhanko"] if sign is not None else []))
-    from tui.certificate.issuing import issue, refuse_unfit
+    from tui.certificate.issuing import NotIssuedError, Order, examine, issue, specimen, with_stated
 
+    if is_specimen and sign is not None:
+        raise typer.BadParameter("--sign: a specimen is not signed")
     signer = None
     if sign is not None:
         from tui.certificate.signing import Signer
 
         signer = Signer(sign, _passphrase())
-    masks = masks_named(models)
-    found = sources(files)
-    about = found[0].bench if bench is None else load(bench)
-    refuse_unfit(found, about, by=by, complete=not allow_incomplete)
-    ledger = ledger_of(files[0], about) if folder is None else Ledger(folder)
-    snapshot, settings, recorded = estimated(files, start=start, end=end, **wanted)
-    with notices().status("issuing the certificate"):
-        entry, path = issue(
-            snapshot,
-            settings,
+    order = Order(
+        by=by,
+        about=None if bench is None else load(bench),
+        reason=reason,
+        despite=despite,
+        complete=not allow_incomplete,
+        models=masks_named(models),
+        signer=signer,
+    )
+    with notices().status("verifying the recording"):
+        examined = examine(
             files,
-            ledger,
-            by=by,
-            reason=reason,
-            about=about,
-            models=masks,
-            complete=not allow_incomplete,
-            sign=signer,
+            order,
+            known=known_to_services(files),
+            folders=() if folder is None else (folder.absolute(),),
         )
-    console().print(f"certificate {entry.name}: {path}", soft_wrap=True)
-    if ledger.folder.resolve() not in {each.folder.resolve() for each in ledgers_of(files[0], ())}:
-        text = f"huddle verify --certificates {ledger.folder} compares recordings with it"
-        console().print(text, soft_wrap=True)
-    exit_with(judge(recorded.bench, snapshot, settings))
+    if examined.objections and not is_specimen:
+        raise NotIssuedError("\n".join(examined.objections))
+    if not by and not is_specimen:
+        raise typer.BadParameter("nobody authorises the certificate; expected --by NAME")
+    snapshot, settings, recorded = estimated(files, start=start, end=end, **wanted)
+    with notices().status("making the certificate"):
+        if is_specimen:
+            place = files[0].absolute().parent if folder is None else folder
+            said = f"specimen: {specimen(snapshot, settings, examined, place)}"
+        else:
+            ledger = ledger_of(files[0], examined.about) if folder is None else Ledger(folder)
+            entry, path = issue(snapshot, settings, examined, ledger)
+            said = f"certificate {entry.name}: {path}"
+            if signer is not None:
+                said += f"\nsigned with key {signer.key_id}"
+            known = {each.folder.resolve() for each in ledgers_of(files[0], ())}
+            if ledger.folder.resolve() not in known:
+                said += (
+                    f"\nhuddle verify --certificates {ledger.folder} compares recordings with it"
+                )
+    console().print(said, soft_wrap=True)
+    exit_with(judge(recorded.bench, with_stated(snapshot, examined), settings))
 
 
 @examples("huddle issues certificates", "huddle issues night.h5 --json -")

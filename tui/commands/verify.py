@@ -4,18 +4,18 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from daq.errors import RecordingError
-from daq.recording.storage.trial import trials
-from tui.certificate.ledger import Ledger, ledgers_of
+from tui.certificate.ledger import Ledger
 from tui.commands.options import JsonOption, examples
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
 
 @examples(
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     "huddle verify a.h5 --key lab.key.pub",
     "huddle verify a.h5 b.h5 --json -",
     "huddle verify certificates/HT-2026-0042-r0.pdf night.h5",
+    "huddle verify certificates/HT-2026-0042-r0.pdf --key lab.pem",
 )
 def verify(
     sources: Annotated[
@@ -34,7 +35,10 @@ def verify(
     key: Annotated[
         Path | None,
         typer.Option(
-            "--key", metavar="FILE", help="Public key that must have signed every recording."
+            "--key",
+            metavar="FILE",
+            help="Public key that must have signed every recording; of certificates the public key"
+            " or the X.509 certificate (PEM) that must have signed them and their ledger.",
         ),
     ] = None,
     ledgers: Annotated[
@@ -52,59 +56,42 @@ def verify(
     Recordings that were certified are compared with the ledger of their
     certificates: beside them, or where their bench file says.
 
-    A certificate (.pdf) is compared with the ledger in its folder, and with
-    the recordings named with it, or those beside that folder.
+    A certificate (.pdf) is compared with the ledger in its folder by what is
+    inside the PDF, and with the recordings named with it, or those beside
+    that folder. Only a signature, verified with --key, shows that nobody
+    has written both anew.
 
-    The exit code is 3 if a recording is damaged, lost or exchanged, or a signature does not fit.
+    The exit code is 3 if a recording is damaged, lost or exchanged, or a certificate or
+    signature is not genuine.
     """
-    from daq.recording.signing import problem, signature_of
+    from tui.certificate.verification import verified
     from tui.output.console import for_people, write_json
 
     certificates = [source for source in sources if source.suffix.lower() == ".pdf"]
     if certificates:
-        _verify_certificates(certificates, sources, json=json)
+        _verify_certificates(certificates, sources, key=key, json=json)
         return
     found = []
     paths, known, folders = _recordings(sources)
     folders |= {each.absolute() for each in ledgers or ()}
-    # In children: a file that hangs or crashes HDF5 is damaged, and the others are verified.
-    for path, report in trials(paths, "verify"):
-        damaged = ", ".join(report.get("damaged", ()))
-        state = report.get("error") or (f"damaged: {damaged}" if damaged else "intact")
-        if "fatal" in report:
-            state = f"damaged: {report['fatal']}"
-        own = report.get("run_id", ""), report.get("root_sha256", "")
-        if state == "intact" and known.get(path, own) != own:
-            state = "exchanged: not the recording that the service has made under this name"
-        names: list[str] = []
-        if state == "intact":
-            for ledger in ledgers_of(path, folders):
-                name, wrong = ledger.certified(path, *own)
-                names += [name] if name else []
-                state = wrong or state
-        if state == "intact":
-            state = problem(path, *own, public=key) or state
-        signer = signature_of(path) if state == "intact" else None
-        if signer is not None:
-            state = f"intact, signed with key {signer.key_id}"
-        if names and state.startswith("intact"):
-            state += f", certified by {'; '.join(names)}"
-        found.append((path, state, report.get("root_sha256") or None))
-        for_people(json).print(f"{path}: {state.removeprefix(f'{path}: ')}", soft_wrap=True)
-        if warning := report.get("warning"):
-            for_people(json).print(f"{path}: {warning}", soft_wrap=True, markup=False)
-    bad = [path.name for path, state, _ in found if not state.startswith("intact")]
+    for each in verified(paths, known=known, folders=folders, key=key):
+        found.append(each)
+        said = each.state.removeprefix(f"{each.path}: ")
+        for_people(json).print(f"{each.path}: {said}", soft_wrap=True)
+        if each.warning:
+            for_people(json).print(f"{each.path}: {each.warning}", soft_wrap=True, markup=False)
+    bad = [each.path.name for each in found if not each.is_intact]
     write_json(
         json,
         {
             "recordings": [
                 {
-                    "path": str(path),
-                    "intact": state.startswith("intact"),
-                    "state": state,
-                    "root_sha256": root,
+                    "path": str(each.path),
+                    "intact": each.is_intact,
+                    "state": each.state,
+                    "root_sha256": each.root_sha256 or None,
                 }
-                for path, state, root in found
+                for each in found
             ]
         },
     )
@@ -113,26 +100,46 @@ def verify(
 
 
 def _verify_certificates(
-    certificates: Sequence[Path], sources: Sequence[Path], *, json: str | None
+    certificates: Sequence[Path],
+    sources: Sequence[Path],
+    *,
+    key: Path | None,
+    json: str | None,
 ) -> None:
     """Check certificates against the ledger in their folder, and the recordings named beside them.
 
     Raises
     ------
     VerificationError
-        If one was changed, or is of another recording.
+        If one is not genuine, or is of another recording.
     """
-    from tui.certificate.issuing import verify
+    from tui.certificate.verification import verify
     from tui.output.console import for_people, write_json
 
     recordings = [source for source in sources if source not in certificates]
     found = []
     for path in certificates:
-        lines = verify(path, recordings, Ledger(path.absolute().parent))
+        lines = verify(path, recordings, Ledger(path.absolute().parent), key=key)
         found.append({"path": str(path), "findings": lines})
         for line in lines:
             for_people(json).print(f"{path.name}: {line}", soft_wrap=True)
     write_json(json, {"certificates": found})
+
+
+def known_to_services(paths: Iterable[Path]) -> dict[Path, tuple[str, str]]:
+    """Return run id and root SHA-256 of recordings, by the databases of services beside them."""
+    from tui.service.records.places import NoServiceError, Place
+
+    known: dict[Path, tuple[str, str]] = {}
+    for folder in {path.absolute().parent for path in paths}:
+        with contextlib.suppress(NoServiceError):
+            identities = Place.of(folder).store.identities()
+            known |= {
+                path: identities[path.name]
+                for path in paths
+                if path.absolute().parent == folder and path.name in identities
+            }
+    return known
 
 
 def _recordings(
@@ -163,4 +170,4 @@ def _recordings(
         runs = place.runs(kept=True)
         found += [place.folder / part for run in runs for part in run.parts]
         known |= {place.folder / part: own for part, own in place.store.identities().items()}
-    return list(dict.fromkeys(found)), known, folders
+    return list(dict.fromkeys(found)), known_to_services(found) | known, folders

@@ -31,10 +31,13 @@ _NONE = "not given"
 LEAST_LOST = 0.01
 """Share of a recording without samples of a sensor that page 1 states."""
 PROCEDURE = (
-    "Self-noise by the coherence of sensors side by side (huddle test): Sleeman, van Wettum and"
-    " Trampert (2006), Bull. Seismol. Soc. Am. 96, 258–271, and its extension to sensors in any"
+    "Self-noise by the coherence of sensors side by side (huddle test): Zhu, Au and Wang,"
+    " Instrument noise calibration with arbitrary sensor orientations, which extends Sleeman, van"
+    " Wettum and Trampert (2006), Bull. Seismol. Soc. Am. 96, 258–271, to sensors in any"
     " orientation."
 )
+SPECIMEN = "SPECIMEN"
+"""Number and watermark of what only shows how a certificate looks."""
 SCOPE = (
     "The results relate only to the items listed, as received, and to the time and place of the"
     " test. The certificate may be reproduced only in full, unless the laboratory agrees in"
@@ -67,6 +70,10 @@ class Issue:
         Of the file of the replaced revision.
     incomplete : bool
         Whether it was issued without all that the checklist asks.
+    despite : str
+        Why it was issued although a fact invalidates the result.
+    objections : tuple of str
+        Of a specimen: why a certificate would be refused.
     """
 
     number: str
@@ -79,10 +86,19 @@ class Issue:
     changes: tuple[str, ...] = ()
     replaces_sha256: str = ""
     incomplete: bool = False
+    despite: str = ""
+    objections: tuple[str, ...] = ()
+
+    @property
+    def is_specimen(self) -> bool:
+        """Whether it is no certificate."""
+        return self.number == SPECIMEN
 
     @property
     def name(self) -> str:
         """Number and revision, as on every page."""
+        if self.is_specimen:
+            return f"{SPECIMEN}, not a certificate"
         return f"{self.number}, revision {self.revision}"
 
 
@@ -243,23 +259,38 @@ def notices(
         if left:
             text = "; ".join(f"{each.what} ({each.key})" for each in left)
             lines.append(Paragraph(f"Not given: {text}.", "doubtful"))
+    elif issue.is_specimen:
+        text = "SPECIMEN: not a certificate. It has no number and is in no ledger."
+        lines.append(Paragraph(text, "bad"))
+        lines += [
+            Paragraph("A certificate would be refused: " + " ".join(each.split()), "doubtful")
+            for each in issue.objections
+        ]
     else:
-        text = f"Certificate {issue.name}, issued {issue.at:%Y-%m-%d} by {issue.by}."
-        if issue.replaces is not None:
-            text += (
-                f" Replaces revision {issue.replaces} of {issue.number}. Reason: {issue.reason}."
-                f" Changed settings: {'; '.join(issue.changes) or 'none'}."
-            )
-        lines.append(Paragraph(text))
-        if issue.incomplete:
-            left = missing(bench, found[0], by=issue.by)
-            text = "; ".join(each.what for each in left)
-            lines.append(Paragraph(f"Issued incomplete. Not given: {text}.", "doubtful"))
+        lines += _of_issue(issue, bench, found[0])
+    if issue is not None and issue.despite:
+        text = f"Issued despite facts that invalidate the result. Reason: {issue.despite}."
+        lines.append(Paragraph(text, "bad"))
     lines += [Paragraph(text, "bad") for text in without_samples(found[-1], snapshot)]
     stated = conditions(found, bench, start=settings.start, end=settings.end)
     lines += [Paragraph(text, "bad") for text in outside_range(stated)]
     lines.append(settings_line(settings, bench))
     return tuple(lines)
+
+
+def _of_issue(issue: Issue, bench: Bench | None, source: Source) -> list[Paragraph]:
+    """Return how a certificate was issued."""
+    text = f"Certificate {issue.name}, issued {issue.at:%Y-%m-%d} by {issue.by}."
+    if issue.replaces is not None:
+        text += (
+            f" Replaces revision {issue.replaces} of {issue.number}. Reason: {issue.reason}."
+            f" Changed settings: {'; '.join(issue.changes) or 'none'}."
+        )
+    lines = [Paragraph(text)]
+    if issue.incomplete:
+        left = "; ".join(each.what for each in missing(bench, source, by=issue.by))
+        lines.append(Paragraph(f"Issued incomplete. Not given: {left}.", "doubtful"))
+    return lines
 
 
 def without_samples(source: Source, snapshot: Snapshot) -> list[str]:
@@ -278,6 +309,8 @@ def without_samples(source: Source, snapshot: Snapshot) -> list[str]:
 
 def watermark(found: Sequence[Source], issue: Issue | None) -> str:
     """Return what stands across every page."""
+    if issue is not None and issue.is_specimen:
+        return SPECIMEN
     simulated = any(source.simulated for source in found)
     return "SIMULATED" if simulated else "DRAFT" if issue is None else ""
 
@@ -305,9 +338,9 @@ def parties_section(found: Sequence[Source], bench: Bench | None, issue: Issue |
         ("Traceability", table.traceability or _traceability(bench)),
         ("Operator", first.operator or _NONE),
         ("Authorised by", (issue.by if issue else table.responsible) or _NONE),
-        ("Date of issue", f"{issue.at:%Y-%m-%d}" if issue else "not issued"),
+        ("Date of issue", f"{issue.at:%Y-%m-%d}" if issue and issue.entry else "not issued"),
     ]
-    if issue is not None:
+    if issue is not None and issue.entry:
         rows.append(("Entry of the ledger", issue.entry))
     parts = (
         Facts(tuple(rows)),

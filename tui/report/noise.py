@@ -114,12 +114,30 @@ def limits_section(
     shown = Table(header, tuple(rows), left=frozenset({0, 1, 6, 7}), tones=tones)
     parts: list[Part] = [shown, Paragraph(note, "quiet")]
     if by_rule and table is not None:
-        parts.insert(1, Paragraph(decision_rule(table)))
+        parts[1:1] = [
+            Paragraph(text)
+            for text in (decision_rule(table, statements[0].k), _untraceable(statements))
+            if text
+        ]
     return Section("Verdict against the limits", tuple(parts))
 
 
-def decision_rule(table: CertificateTable) -> str:
-    """Return the decision rule of the statements of conformity, with its source."""
+def _untraceable(statements: Sequence[Conformity]) -> str:
+    """Return of which channels nothing is stated, because their sensitivity has no certificate."""
+    names = dict.fromkeys(f"{e.sensor}.{e.channel}" for e in statements if not e.is_traceable)
+    if not names:
+        return ""
+    return (
+        f"No statement of conformity of {', '.join(names)}: their sensitivity has no certificate in"
+        " the bench file, so the result is not traceable to the SI."
+    )
+
+
+def decision_rule(table: CertificateTable, k: float) -> str:
+    """Return the decision rule of the statements of conformity, with its source.
+
+    `k` is the coverage factor of U.
+    """
     r = table.guard_band
     band = f"the guard band is w = {'' if r == 1 else f'{r:g} '}U below the limit"
     rules = {
@@ -132,9 +150,10 @@ def decision_rule(table: CertificateTable) -> str:
     }
     return (
         f"Decision rule: {rules[table.decision_rule]}. U is the distance in dB from the noise to "
-        "the end of its interval. Risk: probability that the noise is above the limit, by the "
-        "distribution of the level in the band where it is largest (specific risk, JCGM 106:2012, "
-        "9.3.2)."
+        f"the end of its interval, with the coverage factor k = {k:.2f} of a normal distribution: "
+        "95 % for all channels, limits and bands together. Risk: probability that the noise of the "
+        "channel is above the limit in any band, by the distribution of the levels (specific risk, "
+        "JCGM 106:2012, 9.3.2)."
     )
 
 
@@ -156,8 +175,8 @@ def noise_section(
     parts += [
         Paragraph(
             "The 95 % interval is that of the mean over the band, with all that widens it (see "
-            "the facts, from 1 % of the noise on). What is known of the sensitivities comes on "
-            "top. SNR: power of the motion over that of the noise.",
+            "the facts, from 1 % of the noise on), sensitivities included. SNR: power of the "
+            "motion over that of the noise.",
             "quiet",
         )
     ]

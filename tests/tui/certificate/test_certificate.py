@@ -6,20 +6,16 @@ import io
 import json
 import os
 import re
-import shutil
-from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+import sqlite3
+import stat
+import sys
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
 import pytest
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.hazmat.primitives.serialization import pkcs12
-from cryptography.x509.oid import NameOID
 from lxml import etree
 from pypdf import PdfReader
 from typer.testing import CliRunner
@@ -27,41 +23,20 @@ from typer.testing import CliRunner
 from daq.recording.chunks.manifest import write_manifest
 from daq.recording.description import write_checksums
 from daq.recording.repair import write_results
-from tests.tui.night_recording import BENCH, HOSTILE, SENSOR, record
+from daq.recording.signing import identity, make_key, sign
+from tests.tui.certificate.laboratory import CALIBRATED, Laboratory, key, laboratory, text_of
+from tests.tui.night_recording import record
 from tests.tui.report.written_report import ROOT
 from tui.certificate.dcc import NAME
-from tui.certificate.issuing import JSON_NAME
 from tui.certificate.ledger import Ledger
-from tui.certificate.signing import signatures
+from tui.certificate.signing import PdfSignature, signatures
+from tui.certificate.verification import JSON_NAME
 from tui.commands.main import app
+from tui.service.records.store import NAME as RUNS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
-ABOUT = """
-[laboratory]
-name = "Pier Metrology"
-address = "1 Quiet Lane, 12345 Cellarton"
-country = "DE"
-email = "lab@pier.example"
-accreditation = "Accredited by the Example Body, D-K-99999"
-[customer]
-name = "Slow Waves & Sons"
-address = "2 Loud Road"
-email = "buyer@waves.example"
-order = "PO-4711"
-[certificate]
-prefix = "PIER"
-procedure = "QP-17, issue 3"
-received = 2016-07-01
-condition = "unopened, no damage"
-traceability = "sensitivities by certificate 123 of the Example Institute"
-deviations = "shortened to one minute"
-responsible = "Grace Hopper"
-decision_rule = "guard-band"
-"""
-CALIBRATED = 'certificate = {value = 1e6, expanded_uncertainty = 2e4, k = 2, number = "C-9"}'
-"""Of every channel, in the bench file of the laboratory."""
 NAMESPACES = {"dcc": "https://ptb.de/dcc", "si": "https://ptb.de/si"}
 
 CHECKLIST: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
@@ -136,82 +111,6 @@ CHECKLIST: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 """By clause: texts of the PDF, and paths in the DCC."""
 
 
-@dataclass(frozen=True)
-class Laboratory:
-    """A folder with a recording, and the bench file that describes the parties."""
-
-    folder: Path
-    recording: Path
-    bench: Path
-
-    def issue(self, *more: str, by: str = "Grace Hopper") -> str:
-        """Issue a certificate; a channel is dead, so that the limits are not decided."""
-        arguments = ["issue", str(self.recording), "--by", by, "--bench", str(self.bench), *more]
-        found = CliRunner().invoke(app, arguments)
-        assert found.exit_code == 4, found.output
-        return found.output
-
-    def verify(self, *files: Path | str) -> tuple[int, str]:
-        """Verify files; return exit code and all that was said."""
-        found = CliRunner().invoke(app, ["verify", *map(str, files)])
-        return found.exit_code, " ".join((found.output + found.stderr).split())
-
-    @property
-    def certificates(self) -> Path:
-        """Their folder."""
-        return self.folder / "certificates"
-
-    def certificate(self, revision: int = 0) -> Path:
-        """Return the file of a revision of the only certificate."""
-        (path,) = self.certificates.glob(f"PIER-*-0001-r{revision}.pdf")
-        return path
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _empty_figures() -> Iterator[None]:
-    """Leave figures empty: curves take most of a certificate's time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tui.report.figures.drawing.draw", lambda *_, **__: None)
-        yield
-
-
-@pytest.fixture(scope="module")
-def issued(tmp_path_factory: pytest.TempPathFactory) -> Laboratory:
-    """Make a laboratory with one certificate; tests that change it take a copy."""
-    folder = tmp_path_factory.mktemp("laboratory")
-    made = laboratory(folder)
-    made.issue()
-    return made
-
-
-def laboratory(folder: Path) -> Laboratory:
-    folder.mkdir(exist_ok=True)
-    recording = record(folder / "night.h5")
-    sensors = "".join(
-        SENSOR.format(name=name, number=number).replace(
-            "serial_number", 'manufacturer = "Acme Sensors"\nserial_number'
-        )
-        + "data_sheet = {temperature = [-40, 26]}\n"
-        for number, name in enumerate(("A", "B", "C", HOSTILE))
-    )
-    sensors = sensors.replace("sensitivity = 1e6", f"sensitivity = 1e6, {CALIBRATED}")
-    bench = folder / "bench.toml"
-    bench.write_text(BENCH.format(sensors=sensors, psd=2e-9) + ABOUT, encoding="utf-8")
-    return Laboratory(folder, recording, bench)
-
-
-@pytest.fixture
-def copied(issued: Laboratory, tmp_path: Path) -> Laboratory:
-    folder = tmp_path / "laboratory"
-    shutil.copytree(issued.folder, folder)
-    return Laboratory(folder, folder / "night.h5", folder / "bench.toml")
-
-
-def text_of(path: Path) -> str:
-    """Return the text of a PDF without white space, where lines may break."""
-    return "".join("".join(page.extract_text() for page in PdfReader(path).pages).split())
-
-
 def test_the_certificate_has_all_of_the_checklist(issued: Laboratory) -> None:
     """Each line of docs/certificate.md, in the text of the PDF and in the DCC."""
     path = issued.certificate()
@@ -282,7 +181,7 @@ def test_the_files_inside_have_the_numbers_of_the_page(issued: Laboratory) -> No
 
 def test_a_revision_says_what_it_replaces_and_what_changed(copied: Laboratory) -> None:
     again = ["issue", str(copied.recording), "--by", "Ada", "--bench", str(copied.bench)]
-    refused = CliRunner().invoke(app, again)
+    refused = CliRunner().invoke(app, [*again, "--despite", "a test"])
     assert refused.exit_code == 2
     assert "--reason" in refused.stderr
     before = copied.certificate().read_bytes()
@@ -300,26 +199,197 @@ def test_a_revision_says_what_it_replaces_and_what_changed(copied: Laboratory) -
 
 
 def test_what_is_not_given_is_refused_unless_allowed(tmp_path: Path) -> None:
-    recording = record(tmp_path / "night.h5")
-    run = CliRunner()
-    refused = run.invoke(app, ["issue", str(recording), "--by", "Ada"])
+    recording = record(tmp_path / "night.h5", stated=", tolerance = 0.02")
+    run, command = CliRunner(), ["issue", str(recording), "--by", "Ada", "--despite", "a test"]
+    refused = run.invoke(app, command)
     assert refused.exit_code == 2
-    for key in ("[laboratory] name", "[customer] name", "[certificate] procedure"):
-        assert key in " ".join(refused.stderr.split())
+    for asked in ("[laboratory] name", "[customer] name", "[certificate] procedure"):
+        assert asked in " ".join(refused.stderr.split())
     assert not (tmp_path / "certificates").exists()
-    allowed = run.invoke(app, ["issue", str(recording), "--by", "Ada", "--allow-incomplete"])
+    allowed = run.invoke(app, [*command, "--allow-incomplete"])
     assert allowed.exit_code == 4, allowed.output
     (path,) = (tmp_path / "certificates").glob("HT-*.pdf")
     assert "Issuedincomplete.Notgiven:nameandaddressofthelaboratory" in text_of(path)
 
 
-def test_no_certificate_is_issued_of_simulated_sensors(tmp_path: Path) -> None:
-    recording, run = tmp_path / "s.h5", CliRunner()
-    run.invoke(app, ["simulate", "fig4", "--duration", "20s", "--out", str(recording)])
-    found = run.invoke(app, ["issue", str(recording), "--by", "Ada", "--allow-incomplete"])
+def simulated(folder: Path) -> Path:
+    recording = folder / "s.h5"
+    arguments = ["simulate", "fig4", "--duration", "20s", "--out", str(recording)]
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    return recording
+
+
+def test_of_simulated_sensors_there_are_specimens_alone(tmp_path: Path) -> None:
+    recording, run = simulated(tmp_path), CliRunner()
+    arguments = ["issue", str(recording), "--by", "Ada", "--allow-incomplete", "--despite", "x"]
+    found = run.invoke(app, arguments)
     assert found.exit_code == 2
     assert "simulated" in found.stderr
     assert not (tmp_path / "certificates").exists()
+    found = run.invoke(app, ["issue", str(recording), "--specimen"])
+    assert found.exit_code == 0, found.output
+    assert not (tmp_path / "certificates").exists()
+    path = tmp_path / "s-specimen.pdf"
+    pages = ["".join(page.extract_text().split()) for page in PdfReader(path).pages]
+    for page in pages:
+        assert page.count("SPECIMEN") >= 2  # across the page, and at its foot
+    assert "SPECIMEN:notacertificate.Ithasnonumber" in pages[0]
+    assert "SIMULATEDSENSORS" in pages[0]
+    assert "Acertificatewouldberefused:" in pages[0]
+    assert "uncertaintyofthesensitivitynotstated" in pages[0]
+    xml = PdfReader(path).attachments[NAME][0]
+    tree = etree.parse(io.BytesIO(xml))
+    assert tree.xpath("//dcc:statement[contains(., 'SPECIMEN')]", namespaces=NAMESPACES)
+    again = run.invoke(app, ["issue", str(recording), "--specimen"])  # replaces the first
+    assert again.exit_code == 0
+    found = run.invoke(app, ["verify", str(path)])
+    assert found.exit_code == 3
+    assert "a specimen, no certificate" in " ".join((found.output + found.stderr).split())
+
+
+def test_a_result_that_a_fact_invalidates_needs_a_reason(tmp_path: Path) -> None:
+    made = laboratory(tmp_path / "lab")
+    arguments = ["issue", str(made.recording), "--by", "Ada", "--bench", str(made.bench)]
+    refused = CliRunner().invoke(app, [*arguments, "--allow-incomplete"])
+    assert refused.exit_code == 2
+    said = " ".join(refused.stderr.split())
+    assert "the result is invalid" in said
+    assert "no signal; check cable and power" in said
+    assert "--despite REASON" in said
+    assert not made.certificates.exists()
+    made.issue()
+    first = "".join(PdfReader(made.certificate()).pages[0].extract_text().split())
+    assert "Issueddespitefactsthatinvalidatetheresult.Reason:thedeadchannelisnotused." in first
+
+
+def flipped(recording: Path) -> None:
+    with h5py.File(recording, "r") as file:
+        at = file["sensors/A/samples"].id.get_chunk_info(0).byte_offset
+    content = bytearray(recording.read_bytes())
+    content[at + 100] ^= 1
+    recording.write_bytes(content)
+
+
+def rescaled(recording: Path) -> None:
+    """Change a sensitivity, and the checksums with it; the database of the service knows more."""
+    run_id, root = identity(recording)
+    with closing(sqlite3.connect(recording.parent / RUNS)) as rows:
+        rows.executescript("CREATE TABLE identities (part TEXT, run_id TEXT, root_sha256 TEXT);")
+        rows.execute("INSERT INTO identities VALUES (?, ?, ?)", (recording.name, run_id, root))
+        rows.commit()
+    with h5py.File(recording, "r+") as file:
+        file["sensors/A/samples"].attrs["sensitivity"] = [1.5e6, 1.5e6]
+        write_checksums(file)
+        write_manifest(file)
+
+
+def of_another_signature(recording: Path) -> None:
+    private = recording.parent.parent / "lab.key"
+    make_key(private)
+    sign(recording, private)
+    content = json.loads(recording.with_suffix(".sig").read_text("ascii"))
+    content["root_sha256"] = "0" * 64
+    recording.with_suffix(".sig").write_text(json.dumps(content), "ascii")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (flipped, "damaged"),
+        (rescaled, "exchanged: not the recording that the service has made"),
+        (of_another_signature, "the signature is of another recording"),
+    ],
+)
+def test_no_certificate_is_issued_of_what_verify_refuses(
+    tmp_path: Path, spoil: Callable[[Path], None], said: str
+) -> None:
+    made = laboratory(tmp_path / "lab")
+    spoil(made.recording)
+    code, words = made.verify(made.recording)
+    assert code == 3
+    assert said in words
+    arguments = ["issue", str(made.recording), "--by", "Ada", "--bench", str(made.bench)]
+    refused = CliRunner().invoke(app, [*arguments, "--despite", "whatever"])
+    assert refused.exit_code == 2, refused.output
+    assert said in " ".join(refused.stderr.split())
+    assert not made.certificates.exists()
+
+
+def test_no_revision_is_issued_of_a_recording_changed_since_its_certificate(
+    copied: Laboratory,
+) -> None:
+    with h5py.File(copied.recording, "r+") as file:
+        file["sensors/A/samples"].attrs["sensitivity"] = [1.5e6, 1.5e6]
+        write_checksums(file)
+        write_manifest(file)
+    arguments = ["issue", str(copied.recording), "--by", "Ada", "--bench", str(copied.bench)]
+    refused = CliRunner().invoke(app, [*arguments, "--despite", "x", "--reason", "y"])
+    assert refused.exit_code == 2
+    assert "changed since certificate PIER-" in " ".join(refused.stderr.split())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no permissions there")
+def test_only_the_owner_can_read_certificates_and_ledger(issued: Laboratory) -> None:
+    files = {path.name: stat.S_IMODE(path.stat().st_mode) for path in issued.certificates.iterdir()}
+    assert set(files) == {"ledger.sqlite", "ledger.lock", issued.certificate().name}
+    assert set(files.values()) == {0o600}
+
+
+def test_pages_json_and_dcc_have_one_uncertainty(issued: Laboratory) -> None:
+    """U of the PSD by each form of one certificate: sensitivities of 1 % (k = 1) are in it."""
+    reader = PdfReader(issued.certificate())
+    result = json.loads(reader.attachments[JSON_NAME][0])
+    tree = etree.parse(io.BytesIO(reader.attachments[NAME][0]))
+    text = " ".join("".join(page.extract_text() for page in reader.pages).split())
+    for own in result["band_means"][:7]:  # the last channel is dead
+        name = f"{own['sensor']}.{own['channel']}"
+        sources = {each["source"]: each for each in own["contributions"]}
+        of_sensitivity = sources["sensitivity"]["above"] / own["noise_psd"]
+        assert of_sensitivity == pytest.approx(np.exp(1.96 * 0.02) - 1, rel=1e-3)
+        expanded = own["k"] * own["standard_uncertainty"]
+        assert own["expanded_uncertainty"] == pytest.approx(expanded)
+        ends = own["noise_psd_low"], own["noise_psd_high"]
+        assert expanded == pytest.approx((ends[1] - ends[0]) / 2)
+        assert expanded / own["noise_psd"] > 1.96 * 0.02
+        path = f"//dcc:result[dcc:name/dcc:content='Self-noise of {name}']"
+        (real,) = tree.xpath(f"{path}//si:real[si:unit!='\\one']", namespaces=NAMESPACES)
+
+        def of_dcc(key: str, real: etree._Element = real) -> float:
+            return float(real.findtext(f".//si:{key}", namespaces=NAMESPACES) or "nan")
+
+        assert of_dcc("standardUnc") == pytest.approx(own["standard_uncertainty"], rel=1e-6)
+        assert of_dcc("intervalMin") == pytest.approx(ends[0], rel=1e-6)
+        assert of_dcc("intervalMax") == pytest.approx(ends[1], rel=1e-6)
+        low, high = (f"{10 * np.log10(end):.2f}".replace("-", "−") for end in ends)
+        assert text.replace("-", "−").count(f"{low} … {high}") >= 2, name  # two sections
+        # in the table of the uncertainty: u, k and U beside the same ends
+        u, k, whole = (
+            f"{100 * own['standard_uncertainty'] / own['noise_psd']:.2f} %",
+            f"{own['k']:.2f}",
+            f"{100 * expanded / own['noise_psd']:.2f} %",
+        )
+        assert f"{u}{k}{whole}".replace(" ", "") in text.replace(" ", ""), name
+    for each in result["certificate"]["conformity"]:
+        assert f"k = {each['k']:.2f} of a normal distribution" in text
+        limit = next(
+            e for e in result["limits"]
+            if (e["sensor"], e["channel"]) == (each["sensor"], each["channel"])
+        )  # fmt: skip
+        assert limit["k"] == each["k"]
+        assert each["is_traceable"]
+
+
+def test_without_traceability_there_is_no_statement(tmp_path: Path) -> None:
+    made = laboratory(tmp_path / "lab")
+    text = made.bench.read_text(encoding="utf-8")
+    made.bench.write_text(text.replace(CALIBRATED, "tolerance = 0.02"), encoding="utf-8")
+    made.issue()
+    reader = PdfReader(made.certificate())
+    result = json.loads(reader.attachments[JSON_NAME][0])
+    statements = {each["statement"] for each in result["certificate"]["conformity"]}
+    assert statements == {"not-stated"}
+    assert all(each["risk"] is not None for each in result["certificate"]["conformity"][:7])
+    assert "NostatementofconformityofA.X,A.Y" in text_of(made.certificate())
 
 
 def test_recordings_are_compared_with_their_certificates(copied: Laboratory) -> None:
@@ -372,33 +442,6 @@ def test_the_ledger_of_a_recording_is_found_wherever_it_is(tmp_path: Path) -> No
     assert said.count("PIER-") == 2
 
 
-def key(file: Path, passphrase: bytes) -> Path:
-    """Write a key with a certificate of its own."""
-    private = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "Pier Metrology")])
-    now = datetime(2026, 1, 1, tzinfo=UTC)
-    usage = dict.fromkeys(
-        ("key_encipherment", "data_encipherment", "key_agreement", "key_cert_sign", "crl_sign"),
-        False,
-    )
-    certificate = (
-        x509.CertificateBuilder(name, name, private.public_key(), 1, now, now + timedelta(36500))
-        .add_extension(
-            x509.KeyUsage(
-                digital_signature=True, content_commitment=True, encipher_only=False,
-                decipher_only=False, **usage,
-            ),
-            critical=True,
-        )
-        .sign(private, hashes.SHA256())
-    )  # fmt: skip
-    locked = serialization.BestAvailableEncryption(passphrase)
-    file.write_bytes(
-        pkcs12.serialize_key_and_certificates(b"p", private, certificate, None, locked)
-    )
-    return file
-
-
 def test_a_signed_certificate_is_verified(
     copied: Laboratory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -414,10 +457,12 @@ def test_a_signed_certificate_is_verified(
     path = copied.certificate(1)
     code, said = copied.verify(path)
     assert code == 0, said
-    assert "signed by Common Name: Pier Metrology: intact" in said
-    assert signatures(path.read_bytes()) == [("Common Name: Pier Metrology", True)]
+    (found,) = signatures(path.read_bytes())
+    assert f"signed by Common Name: Pier Metrology with key {found.key_id}: intact" in said
+    assert f"ledger signed with key {found.key_id}" in said
+    assert found == PdfSignature("Common Name: Pier Metrology", found.key_id, is_intact=True)
     changed = path.read_bytes().replace(b"/Title", b"/Tible", 1)
-    assert signatures(changed) == [("Common Name: Pier Metrology", False)]
+    assert not signatures(changed)[0].is_intact
     assert "not signed" in copied.verify(copied.certificate())[1]
     assert len(Ledger(copied.certificates).entries()) == 2  # the refused one took no number
 
@@ -442,7 +487,7 @@ def changed_recording(made: Laboratory) -> list[Path]:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (changed_certificate, "changed: its SHA-256 is not that of certificate"),
+        (changed_certificate, "changed since it was issued: its SHA-256"),
         (other_recording, "is another recording than the one certified"),
         (changed_recording, "was changed since the certificate"),
     ],

@@ -25,6 +25,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from typer.testing import CliRunner
 
+from daq.recording.reader import Recording
 from tests.tui.night_recording import HOSTILE
 from tests.tui.web.pages import READER, SECRETS, STEERER, Server, Visit, bench_file, serving
 from tests.waiting import limit, wait_until
@@ -119,8 +120,12 @@ def test_certificates_of_a_test_are_read(
     monkeypatch.setattr("tui.report.figures.drawing.draw", lambda *_, **__: None)
     recording = folder / "recordings" / "night.h5"
     assert "Certificate" not in server.visit().get("/tests/night.h5").text
-    issue = ("issue", str(recording), "--by", "Ada", "--allow-incomplete")
-    CliRunner().invoke(app, issue)
+    with Recording.open(recording) as opened:
+        text = opened.bench_text.replace("sensitivity = 1e6", "sensitivity = 1e6, tolerance = 0.02")
+    bench = folder / "stated.toml"
+    bench.write_text(text, encoding="utf-8")
+    issue = ("issue", str(recording), "--by", "Ada", "--allow-incomplete", "--bench", str(bench))
+    CliRunner().invoke(app, [*issue, "--despite", "a test"])
     (issued,) = (folder / "recordings" / "certificates").glob("*.pdf")
     visit = server.visit()
     assert re.search(

@@ -1,0 +1,127 @@
+"""A laboratory with a recording, the bench file of its certificates, and keys."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import TYPE_CHECKING
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import pkcs12
+from cryptography.x509.oid import NameOID
+from pypdf import PdfReader
+from typer.testing import CliRunner
+
+from tests.tui.night_recording import BENCH, HOSTILE, SENSOR, record
+from tui.commands.main import app
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+ABOUT = """
+[laboratory]
+name = "Pier Metrology"
+address = "1 Quiet Lane, 12345 Cellarton"
+country = "DE"
+email = "lab@pier.example"
+accreditation = "Accredited by the Example Body, D-K-99999"
+[customer]
+name = "Slow Waves & Sons"
+address = "2 Loud Road"
+email = "buyer@waves.example"
+order = "PO-4711"
+[certificate]
+prefix = "PIER"
+procedure = "QP-17, issue 3"
+received = 2016-07-01
+condition = "unopened, no damage"
+traceability = "sensitivities by certificate 123 of the Example Institute"
+deviations = "shortened to one minute"
+responsible = "Grace Hopper"
+decision_rule = "guard-band"
+"""
+CALIBRATED = 'certificate = {value = 1e6, expanded_uncertainty = 2e4, k = 2, number = "C-9"}'
+"""Of every channel, in the bench file of the laboratory."""
+DESPITE = "the dead channel is not used"
+
+
+@dataclass(frozen=True)
+class Laboratory:
+    """A folder with a recording, and the bench file that describes the parties."""
+
+    folder: Path
+    recording: Path
+    bench: Path
+
+    def issue(self, *more: str, by: str = "Grace Hopper") -> str:
+        """Issue a certificate; a channel is dead: not decided, and invalid without a reason."""
+        arguments = ["issue", str(self.recording), "--by", by, "--bench", str(self.bench)]
+        arguments += ["--despite", DESPITE, *more]
+        found = CliRunner().invoke(app, arguments)
+        assert found.exit_code == 4, found.output
+        return found.output
+
+    def verify(self, *files: Path | str) -> tuple[int, str]:
+        """Verify files; return exit code and all that was said."""
+        found = CliRunner().invoke(app, ["verify", *map(str, files)])
+        return found.exit_code, " ".join((found.output + found.stderr).split())
+
+    @property
+    def certificates(self) -> Path:
+        """Their folder."""
+        return self.folder / "certificates"
+
+    def certificate(self, revision: int = 0) -> Path:
+        """Return the file of a revision of the only certificate."""
+        (path,) = self.certificates.glob(f"PIER-*-0001-r{revision}.pdf")
+        return path
+
+
+def laboratory(folder: Path) -> Laboratory:
+    folder.mkdir(exist_ok=True)
+    recording = record(folder / "night.h5")
+    sensors = "".join(
+        SENSOR.format(name=name, number=number).replace(
+            "serial_number", 'manufacturer = "Acme Sensors"\nserial_number'
+        )
+        + "data_sheet = {temperature = [-40, 26]}\n"
+        for number, name in enumerate(("A", "B", "C", HOSTILE))
+    )
+    sensors = sensors.replace("sensitivity = 1e6", f"sensitivity = 1e6, {CALIBRATED}")
+    bench = folder / "bench.toml"
+    bench.write_text(BENCH.format(sensors=sensors, psd=2e-9) + ABOUT, encoding="utf-8")
+    return Laboratory(folder, recording, bench)
+
+
+def text_of(path: Path) -> str:
+    """Return the text of a PDF without white space, where lines may break."""
+    return "".join("".join(page.extract_text() for page in PdfReader(path).pages).split())
+
+
+def key(file: Path, passphrase: bytes) -> Path:
+    """Write a key with a certificate of its own."""
+    private = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "Pier Metrology")])
+    now = datetime(2026, 1, 1, tzinfo=UTC)
+    usage = dict.fromkeys(
+        ("key_encipherment", "data_encipherment", "key_agreement", "key_cert_sign", "crl_sign"),
+        False,
+    )
+    certificate = (
+        x509.CertificateBuilder(name, name, private.public_key(), 1, now, now + timedelta(36500))
+        .add_extension(
+            x509.KeyUsage(
+                digital_signature=True, content_commitment=True, encipher_only=False,
+                decipher_only=False, **usage,
+            ),
+            critical=True,
+        )
+        .sign(private, hashes.SHA256())
+    )  # fmt: skip
+    locked = serialization.BestAvailableEncryption(passphrase)
+    file.write_bytes(
+        pkcs12.serialize_key_and_certificates(b"p", private, certificate, None, locked)
+    )
+    return file

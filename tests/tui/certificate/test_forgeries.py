@@ -1,0 +1,350 @@
+"""Forgeries of certificates, ledgers and recordings, each found and named."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import shutil
+import sqlite3
+from contextlib import closing
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import h5py
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.serialization import pkcs12
+from pypdf import PdfReader, PdfWriter
+from pypdf.generic import ContentStream, NameObject
+
+from daq.recording.chunks.manifest import write_manifest
+from daq.recording.description import write_checksums
+from tests.tui.certificate.laboratory import Laboratory, key, laboratory
+from tui.certificate import issuing
+from tui.certificate.ledger import NAME, Ledger
+from tui.certificate.signing import Signer
+from tui.certificate.verification import JSON_NAME
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+SECRET = "secret"  # noqa: S105 - of keys that the tests make
+DROP = "".join(
+    f"DROP TRIGGER IF EXISTS {each};"
+    for each in ("no_change", "no_removal", "no_change_of_heads", "no_removal_of_heads")
+)
+
+
+@dataclass(frozen=True)
+class Signed:
+    """A laboratory that signs, and the public key that it gives to its customers."""
+
+    lab: Laboratory
+    public: Path
+    other: Path
+    """Private key of somebody who uses the same name."""
+
+    def check(self, *files: Path, trusted: bool = True) -> tuple[int, str]:
+        """Verify; `trusted`: with the public key of the laboratory."""
+        return self.lab.verify(*files, *(("--key", self.public) if trusted else ()))
+
+    @property
+    def certificate(self) -> Path:
+        """The second certificate, a revision of the first."""
+        return self.lab.certificate(1)
+
+
+@pytest.fixture(scope="module")
+def signing(tmp_path_factory: pytest.TempPathFactory) -> Signed:
+    """Make a laboratory with two signed revisions."""
+    folder = tmp_path_factory.mktemp("signing")
+    private, other = (key(folder / name, SECRET.encode()) for name in ("lab.p12", "other.p12"))
+    made = laboratory(folder / "lab")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HUDDLE_PASSPHRASE", SECRET)
+        made.issue("--sign", str(private))
+        made.issue("--sign", str(private), "--reason", "again")
+    return Signed(made, exported(private), other)
+
+
+@pytest.fixture
+def forged(signing: Signed, tmp_path: Path) -> Signed:
+    """Return a copy that a test may forge."""
+    folder = tmp_path / "lab"
+    shutil.copytree(signing.lab.folder, folder)
+    lab = Laboratory(folder, folder / "night.h5", folder / "bench.toml")
+    return Signed(lab, signing.public, signing.other)
+
+
+def exported(private: Path) -> Path:
+    """Write the X.509 certificate of a key, as openssl pkcs12 -nokeys does."""
+    _, certificate, _ = pkcs12.load_key_and_certificates(private.read_bytes(), SECRET.encode())
+    assert isinstance(certificate, x509.Certificate)
+    public = private.with_suffix(".pem")
+    public.write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
+    return public
+
+
+def rewrite(
+    folder: Path, change: Callable[[list[dict[str, Any]]], list[dict[str, Any]]]
+) -> list[str]:
+    """Write a ledger again: its records changed, chain and count made to fit, heads dropped."""
+    with closing(sqlite3.connect(folder / NAME)) as rows:
+        records = [
+            json.loads(r) for (r,) in rows.execute("SELECT record FROM entries ORDER BY row")
+        ]
+        rows.executescript(DROP)
+        rows.executescript("DELETE FROM entries; DELETE FROM heads;")
+        previous, hashes = "", []
+        for row, record in enumerate(change(records), start=1):
+            text = json.dumps(record | {"previous": previous}, ensure_ascii=False, sort_keys=True)
+            previous = hashlib.sha256(text.encode()).hexdigest()
+            hashes.append(previous)
+            rows.execute("INSERT INTO entries VALUES (?, ?, ?)", (row, text, previous))
+        rows.execute("UPDATE sqlite_sequence SET seq = ?", (len(hashes),))
+        rows.commit()
+    return hashes
+
+
+def with_hash_of(path: Path) -> Callable[[list[dict[str, Any]]], list[dict[str, Any]]]:
+    """Return what gives the row of a changed certificate its new SHA-256."""
+
+    def change(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        for record in records:
+            if record.get("file") == path.name:
+                record["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
+        return records
+
+    return change
+
+
+def stripped(path: Path) -> None:
+    """Take the signature off: the file as it was before it was signed."""
+    content = path.read_bytes()
+    path.write_bytes(content[: content.index(b"%%EOF") + 6])
+
+
+def edited(path: Path, change: Callable[[PdfWriter], None]) -> None:
+    """Write a certificate again with a change."""
+    writer = PdfWriter(clone_from=path)
+    change(writer)
+    content = io.BytesIO()
+    writer.write(content)
+    path.write_bytes(content.getvalue())
+
+
+def another_authoriser(made: Signed) -> None:
+    def change(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        return [r | ({"by": "Mallory"} if r["kind"] == "allotted" else {}) for r in records]
+
+    rewrite(made.lab.certificates, change)
+
+
+def rows_under_the_heads(made: Signed) -> None:
+    """Do the same, and leave the signed heads where they are."""
+    with closing(sqlite3.connect(made.lab.certificates / NAME)) as rows:
+        heads = rows.execute("SELECT * FROM heads").fetchall()
+    another_authoriser(made)
+    with closing(sqlite3.connect(made.lab.certificates / NAME)) as rows:
+        rows.executemany("INSERT INTO heads VALUES (?, ?, ?, ?)", heads)
+        rows.commit()
+
+
+def unsigned(made: Signed) -> None:
+    stripped(made.certificate)
+    rewrite(made.lab.certificates, with_hash_of(made.certificate))
+
+
+def of_the_same_name(made: Signed) -> None:
+    stripped(made.certificate)
+    signer = Signer(made.other, SECRET)
+    made.certificate.write_bytes(signer(made.certificate.read_bytes()))
+    rewrite(made.lab.certificates, with_hash_of(made.certificate))
+
+
+def swapped(made: Signed) -> None:
+    first, second = made.lab.certificate(0), made.certificate
+    content = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    second.write_bytes(content)
+
+
+def another_text(made: Signed) -> None:
+    def change(writer: PdfWriter) -> None:
+        page = writer.pages[0]
+        stream = ContentStream(None, writer)
+        old = page.get_contents()
+        assert old is not None
+        stream.set_data(old.get_data() + b"\n1 1 1 rg 0 700 600 60 re f\n")
+        page[NameObject("/Contents")] = writer._add_object(stream)  # noqa: SLF001 - pypdf has no other
+
+    edited(made.certificate, change)
+    rewrite(made.lab.certificates, with_hash_of(made.certificate))
+
+
+def another_revision(made: Signed) -> None:
+    """Give the first revision out as the second, in the ledger, too."""
+    first, second = made.lab.certificate(0), made.certificate
+    shutil.copy(first, second)
+    rewrite(made.lab.certificates, with_hash_of(second))
+
+
+def truncated(made: Signed) -> None:
+    rewrite(made.lab.certificates, lambda records: records[:2])
+
+
+def checksums_rewritten(made: Signed) -> None:
+    with h5py.File(made.lab.recording, "r+") as file:
+        file["sensors/A/samples"].attrs["sensitivity"] = [1.5e6, 1.5e6]
+        write_checksums(file)
+        write_manifest(file)
+
+
+def flipped_bit(made: Signed) -> None:
+    content = bytearray(made.certificate.read_bytes())
+    at = content.index(b"/Title") + 9
+    content[at] ^= 1
+    made.certificate.write_bytes(content)
+
+
+def another_attachment(made: Signed) -> None:
+    def change(writer: PdfWriter) -> None:
+        result = json.loads(PdfReader(made.certificate).attachments[JSON_NAME][0])
+        result["certificate"]["by"] = "Mallory"
+        for each in writer.attachment_list:
+            if each.name == JSON_NAME:
+                each.content = json.dumps(result).encode()
+
+    edited(made.certificate, change)
+    rewrite(made.lab.certificates, with_hash_of(made.certificate))
+
+
+def appended(made: Signed) -> None:
+    """Add something behind the signature: what it covers is genuine."""
+    with made.certificate.open("ab") as file:
+        file.write(b"\n% approved\n")
+    rewrite(made.lab.certificates, with_hash_of(made.certificate))
+
+
+FORGERIES: dict[Callable[[Signed], None], str] = {
+    another_authoriser: "the ledger has another row for it than the one it names",
+    rows_under_the_heads: "is not the one that was signed",
+    unsigned: "was removed",
+    of_the_same_name: "in the ledger with",
+    swapped: "under the name of",
+    another_text: "is not intact",
+    another_revision: "it is PIER",
+    truncated: "is not in the ledger",
+    checksums_rewritten: "was changed since the certificate",
+    flipped_bit: "its SHA-256 is not that of the ledger",
+    another_attachment: "authorised by Mallory",
+    appended: "not of the whole file",
+}
+
+
+def test_the_genuine_one_is(signing: Signed) -> None:
+    for trusted in (False, True):
+        code, said = signing.check(signing.certificate, signing.lab.recording, trusted=trusted)
+        assert code == 0, said
+        assert "ledger signed with key" in said
+        assert "the one certified, unchanged" in said
+
+
+@pytest.mark.parametrize("trusted", [False, True], ids=["", "with the key"])
+@pytest.mark.parametrize(
+    ("forge", "words"), FORGERIES.items(), ids=[each.__name__ for each in FORGERIES]
+)
+def test_a_forgery_is_named(
+    forged: Signed, forge: Callable[[Signed], None], words: str, *, trusted: bool
+) -> None:
+    forge(forged)
+    code, said = forged.check(forged.certificate, forged.lab.recording, trusted=trusted)
+    assert code == 3, said
+    assert words in said
+    assert "signed by" not in said
+
+
+def test_a_ledger_that_was_cut_short_hides_no_revision(forged: Signed) -> None:
+    """The file of the later revision is still there, or its signature is."""
+    truncated(forged)
+    code, said = forged.check(forged.lab.certificate(0), trusted=False)
+    assert code == 3
+    assert "a later revision is in the folder, and not in the ledger" in said
+    forged.certificate.unlink()
+    code, said = forged.check(forged.lab.certificate(0))
+    assert code == 3
+    assert "the ledger is not signed with key" in said
+
+
+def test_another_laboratory_of_the_same_name_does_not_have_the_key(
+    forged: Signed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All of it anew, with a key whose certificate has the same name: only --key shows it."""
+    monkeypatch.setenv("HUDDLE_PASSPHRASE", SECRET)
+    shutil.rmtree(forged.lab.certificates)
+    forged.lab.issue("--sign", str(forged.other))
+    path = forged.lab.certificate(0)
+    code, said = forged.check(path, trusted=False)
+    assert code == 0
+    assert "whose key this is, --key or a reader shows" in said
+    code, said = forged.check(path)
+    assert code == 3
+    assert "not genuine" in said
+    assert "expected" in said
+    missing = tmp_path / "nonexistent"
+    code, said = forged.lab.verify(path, "--key", missing)
+    assert code == 2
+    assert str(missing) in "".join(said.split())
+    code, said = forged.lab.verify(path, "--key", forged.lab.bench)
+    assert code == 2
+    assert "no public key" in said
+
+
+def test_an_unsigned_certificate_is_not_what_a_key_asks_for(
+    issued: Laboratory, signing: Signed
+) -> None:
+    code, said = issued.verify(issued.certificate())
+    assert code == 0
+    assert "not signed: who can write the folder can write certificate and ledger anew" in said
+    code, said = issued.verify(issued.certificate(), "--key", signing.public)
+    assert code == 3
+    assert "it is not signed" in said
+
+
+def test_a_ledger_of_an_earlier_version_is_read_and_says_what_it_cannot_prove(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows had no signer, certificates no roots, and there were no signed heads."""
+    made, add = laboratory(tmp_path / "lab"), Ledger._add  # noqa: SLF001 - to write as before
+
+    def as_before(self: Ledger, record: dict[str, Any], signer: None = None) -> str:
+        return add(self, {k: v for k, v in record.items() if k != "signer"}, signer)
+
+    def without_roots(*arguments: Any) -> bytes:  # noqa: ANN401 - as it takes them
+        document = json.loads(result(*arguments))
+        del document["certificate"]["roots"]
+        return json.dumps(document).encode()
+
+    result = issuing._result  # noqa: SLF001 - as above
+    with monkeypatch.context() as patch:
+        patch.setattr(Ledger, "_add", as_before)
+        patch.setattr(issuing, "_result", without_roots)
+        made.issue()
+    with closing(sqlite3.connect(made.certificates / NAME)) as rows:
+        rows.executescript("DROP TABLE heads;")
+    path = made.certificate()
+    code, said = made.verify(path, made.recording)
+    assert code == 0, said
+    assert "issued by an earlier version: it does not say of which contents it is" in said
+    assert "of an earlier version, does not say whether it was signed" in said
+    private = key(tmp_path / "lab.p12", SECRET.encode())
+    monkeypatch.setenv("HUDDLE_PASSPHRASE", SECRET)
+    made.issue("--reason", "now signed", "--sign", str(private))
+    public = exported(private)
+    assert made.verify(made.certificate(1), "--key", public)[0] == 0
+    code, said = made.verify(path, "--key", public)
+    assert code == 3
+    assert "it is not signed" in said
