@@ -123,7 +123,7 @@ def replaced(path: Path, *, free: bool = False) -> Iterator[Path]:
         put_in_place(part, path, free=free)
     except OSError as error:
         if error.errno is not None and str(error.filename or part) == str(part):
-            error.filename, error.filename2 = str(path), None
+            raise OSError(error.errno, error.strerror, str(path)) from error
         raise
     finally:
         remove(part)

@@ -147,10 +147,16 @@ def run(text: str) -> str:
     except (HuddleError, EstimatorError, OSError) as error:
         outcome = Outcome(
             task.source,
-            failure=str(error) or type(error).__name__,
+            failure=_reason(error),
             is_usage_error=isinstance(error, HuddleError) and error.is_usage_error,
         )
     return json.dumps(asdict(outcome))
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    return str(error) or type(error).__name__
 
 
 def origin_of(recording: Recording) -> Origin:

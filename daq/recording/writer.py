@@ -34,7 +34,7 @@ import numpy as np
 from daq.errors import DiskError, RecordingError
 from daq.recording import file_format
 from daq.recording.chunks.chunk_writer import SensorRows, TableBuffer
-from daq.recording.chunks.manifest import write_manifest
+from daq.recording.chunks.manifest import differences, write_manifest
 from daq.recording.creation import make_datasets, write_attributes
 from daq.recording.description import write_checksums
 from daq.recording.storage.journal import Journal
@@ -43,7 +43,13 @@ from daq.recording.storage.names import publish, remove_leftovers, taken
 from daq.recording.storage.refusals import text
 from daq.recording.storage.retries import reason_of, repeated
 from daq.recording.storage.trial import remember
-from daq.whole_file import PRIVATE, create_private, sync_directory, sync_file
+from daq.whole_file import (
+    PRIVATE,
+    RememberingFile,
+    create_private,
+    sync_directory,
+    sync_file,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -85,15 +91,16 @@ class RecordingWriter:
         sensors: Sequence[SensorLayout],
         lock: WriterLock,
         *,
-        packs: bool = False,
+        disk: RememberingFile | None = None,
     ) -> None:
         self.path = path
+        self._disk = disk
         self._hidden: Path | None = None
         self._journal: Journal | None = None
         self._file = file
         self._lock = lock
         self._sensors = {
-            s.name: SensorRows(file["sensors"][s.name], s, packs=packs) for s in sensors
+            s.name: SensorRows(file["sensors"][s.name], s, packs=disk is not None) for s in sensors
         }
         self._events = TableBuffer(file["events"])
         self._readings = TableBuffer(file["readings"])
@@ -134,7 +141,8 @@ class RecordingWriter:
             Length of a chunk. Longer chunks are read faster, but samples are buffered longer.
         hidden : bool
             Keep the temporary name until `close`, to hide an incomplete recording; `abandon` then
-            removes the file. Chunks are packed as in `daq.recording.chunks.packing`.
+            removes the file. Chunks are packed as in `daq.recording.chunks.packing`. No write that
+            fails is repeated.
 
         Raises
         ------
@@ -151,10 +159,11 @@ class RecordingWriter:
             temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.new") if renames else path
             create_private(temporary)
             lock, file, writer = WriterLock(temporary), None, None
+            disk = RememberingFile(temporary, "r+") if hidden else None
             try:
                 # A small cache suffices: chunks are written completely and not read again.
                 file = h5py.File(
-                    temporary,
+                    disk or temporary,
                     "w",
                     libver=file_format.LIBVER,
                     rdcc_nbytes=64 * 1024,
@@ -162,8 +171,9 @@ class RecordingWriter:
                 )
                 write_attributes(file, bench, created, control, attributes or {}, sensors=sensors)
                 make_datasets(file, sensors, chunk_seconds)
-                file.swmr_mode = True
-                writer = cls(path, file, sensors, lock, packs=hidden)
+                if not hidden:
+                    file.swmr_mode = True
+                writer = cls(path, file, sensors, lock, disk=disk)
                 writer._sync()
                 if hidden:
                     writer._hidden = temporary
@@ -176,6 +186,8 @@ class RecordingWriter:
                 with contextlib.suppress(OSError, RuntimeError):
                     if file is not None:
                         file.close()
+                    if disk is not None:
+                        disk.close()
                 lock.release()
                 temporary.unlink(missing_ok=True)
                 raise
@@ -253,6 +265,7 @@ class RecordingWriter:
                 self._close_hdf5()
                 sync_file(self._hidden or self.path)
                 if self._hidden is not None:
+                    self._prove(self._hidden)
                     publish(self._hidden, self.path)
                 self._hidden = None
                 if self._journal is not None:
@@ -285,6 +298,18 @@ class RecordingWriter:
         sys.unraisablehook = lambda _: None
         self._file.close()
         sys.unraisablehook = before  # not after an error: objects are then freed later
+        if self._disk is not None:
+            self._disk.close()
+            self._disk.check()
+
+    def _prove(self, hidden: Path) -> None:
+        """Compare the closed file with the digests of what was in memory."""
+        with h5py.File(hidden, "r", locking=False) as file:
+            if changed := differences(file):
+                raise RecordingError(
+                    f"{self.path}: the disk returns other content than was written:"
+                    f" {', '.join(changed)}"
+                )
 
     def _close_file(self) -> None:
         try:
@@ -348,7 +373,7 @@ class RecordingWriter:
     def _check_place(self) -> None:
         """Check that the file still has its name, so that users can find it."""
         place = self._hidden or self.path
-        written = os.fstat(self._file.id.get_vfd_handle())
+        written = os.fstat(self._handle)
         try:
             found = place.stat()
         except FileNotFoundError:
@@ -361,9 +386,15 @@ class RecordingWriter:
         for sensor in self._sensors.values():
             sensor.write_again()
 
+    @property
+    def _handle(self) -> int:
+        return int(self._file.id.get_vfd_handle() if self._disk is None else self._disk.fileno())
+
     def _sync(self) -> None:
         repeated(self._file.flush, before=self._write_again)
-        os.fsync(self._file.id.get_vfd_handle())
+        if self._disk is not None:
+            self._disk.check()
+        os.fsync(self._handle)
 
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[None]:

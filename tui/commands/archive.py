@@ -331,11 +331,12 @@ def _show_one(asked: _Asked, archive: Store, failures: Sequence[str]) -> None:
     settings = asked.checked(archive.plan)
     _thin(archive, asked.thin[0], single=asked.thin[1])
     entries, bad = archive.entries()
+    wrong = [*failures, *bad]
     found = _answered(archive, entries, settings, zone=asked.zone, false_alarm=asked.false_alarm)
     screen = for_people(asked.json, asked.csv)
     _show(screen, found, settings, str(asked.zone))
     if asked.json is not None:
-        write_text(asked.json, archive_json(found, archive, len(entries)) + "\n")
+        write_text(asked.json, archive_json(found, archive, len(entries), wrong) + "\n")
     if asked.csv is not None:
         write_text(asked.csv, days_csv(found))
     if asked.out is not None:
@@ -344,7 +345,6 @@ def _show_one(asked: _Asked, archive: Store, failures: Sequence[str]) -> None:
         with _counting("drawing", "figures") as drawn:
             written = write_figures(found, asked.out, asked.masks, drawn)
         screen.print(", ".join(map(str, written)) + " written", soft_wrap=True)
-    wrong = [*failures, *bad]
     for line in wrong:
         notices().print(line, style="red", soft_wrap=True)
     if wrong or found.problems:

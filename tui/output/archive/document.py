@@ -46,8 +46,11 @@ _PSD = f"%.{DIGITS}g"
 _DAY = ("date", "sensor", "channel", "band from (Hz)", "band to (Hz)", "segments")
 
 
-def archive_json(answer: Answer, store: Store, n_recordings: int) -> str:
-    """Return the answer as one line of JSON; arrays in the order that their names say."""
+def archive_json(answer: Answer, store: Store, n_recordings: int, wrong: Sequence[str] = ()) -> str:
+    """Return the answer as one line of JSON; arrays in the order that their names say.
+
+    `wrong` are sentences on recordings that are not in the answer.
+    """
     pooled = answer.pooled
     n_channels = len(pooled.channels)
     rows = [
@@ -59,7 +62,7 @@ def archive_json(answer: Answer, store: Store, n_recordings: int) -> str:
         "archive": {
             "stretch_s": store.plan.stretch_s,
             "recordings": n_recordings,
-            "problems": list(answer.problems),
+            "problems": [*wrong, *answer.problems],
             "doubted": [
                 {"source": each.origin.path, "clocks": list(each.not_understood)}
                 for each in answer.doubted

@@ -1,0 +1,59 @@
+"""A part of the torture by faults at every call of a command that changes a file."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.torture.fault_commands import commands, device_commands, devices
+from tests.torture.faulty_disk import FAULTS, FaultyDisk, library, torture
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.torture.faulty_disk import Command
+
+SAMPLE = {"import": 3, "results in a recording": 2, "archive": 1}
+"""Commands, and how many of their calls fail."""
+
+
+def wrong(
+    folder: Path, made: dict[str, Command], places: dict[str, int], *faults: str
+) -> list[str]:
+    """Return what was wrong after faults, and see that something failed at all."""
+    built = library(folder)
+    if built is None:
+        pytest.skip("no gcc, or not Linux: nothing can fail")
+    found, refused = [], 0
+    with FaultyDisk(built, folder) as disk:
+        for name, n_places in places.items():
+            for outcome in torture(disk, made[name], n_places=n_places, seed=5, faults=faults):
+                found += [f"{name}, {outcome.fault}: {each}" for each in outcome.wrong]
+                refused += outcome.counts["refused"]
+    assert refused or found
+    return found
+
+
+@pytest.fixture
+def inputs(tmp_path: Path) -> Path:
+    folder = tmp_path / "inputs"
+    folder.mkdir()
+    return folder
+
+
+def test_a_call_that_fails_once_gives_no_wrong_number(tmp_path: Path, inputs: Path) -> None:
+    assert wrong(tmp_path, commands(inputs), SAMPLE, "EIO once") == []
+
+
+@pytest.mark.long
+def test_no_fault_of_the_disk_gives_a_wrong_number(tmp_path: Path, inputs: Path) -> None:
+    made = commands(inputs)
+    assert wrong(tmp_path, made, dict.fromkeys(made, 3), *FAULTS) == []
+
+
+@pytest.mark.long
+def test_no_fault_of_the_disk_loses_what_devices_sent(tmp_path: Path, inputs: Path) -> None:
+    with devices(inputs) as bench:
+        made = device_commands(bench)
+        assert wrong(tmp_path, made, dict.fromkeys(made, 2), *FAULTS) == []
