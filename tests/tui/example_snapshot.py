@@ -13,6 +13,7 @@ import numpy as np
 from daq.clocks.clock_model import ClockSource, ClockState
 from daq.devices.bench_file import parse
 from daq.devices.interface import DeviceInformation
+from daq.errors import HuddleError
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import ChannelLabel, SensorTotals, Snapshot
 from daq.estimation.snapshot_diagnostics import (
@@ -367,6 +368,17 @@ class ProgressCallback:
         assert snapshot.closed
         self.told.append(f"report {path.name} {settings.segment:g}")
         return path.with_suffix(".html")
+
+    def certify(
+        self, path: Path, snapshot: Snapshot, settings: Settings, wanted: Mapping[str, str]
+    ) -> Path:
+        """Note it."""
+        assert snapshot.closed
+        del settings
+        if wanted["by"] == "Nobody":
+            raise HuddleError(f"{path}: sensors were simulated\nnot given: a name")
+        self.told.append(f"certify {path.name} {dict(wanted)}")
+        return path.with_suffix(".pdf")
 
     def find_running(self) -> Path | None:
         """Return what was prepared."""

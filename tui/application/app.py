@@ -11,18 +11,20 @@ from textual import work
 from textual.binding import Binding, BindingType
 
 from daq.bench.end_condition import NEVER, EndCondition
+from daq.errors import HuddleError
 from daq.whole_file import write_whole
 from tui.application.dialogs import MarkScreen, QuestionScreen, StopScreen
 from tui.application.following import FollowingApp
 from tui.application.forms.form import Field, Form
-from tui.application.messages import RecordingOpened
+from tui.application.forms.issue import IssueForm
+from tui.application.messages import ErrorReported, RecordingOpened
 from tui.application.plan import TestPlan
 from tui.application.reference import can_open
 from tui.application.state import TITLES, VIEWS
 from tui.wording.formatting import clock_time
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from textual.driver import Driver
@@ -160,7 +162,7 @@ class HuddleApp(FollowingApp):
             return self.recording and self.now is not None
         if action == "save":
             return self.snapshot is not None and self.path is not None
-        if action in {"report", "open_report"}:
+        if action in {"report", "open_report", "issue"}:
             return self.state.has_result
         return True
 
@@ -288,6 +290,47 @@ class HuddleApp(FollowingApp):
             self.call_from_thread(self.open_url, report.resolve().as_uri())
         else:
             notify(title="Report written")
+
+    def action_issue(self) -> None:
+        """Ask who authorises a certificate, and issue it; without anybody, make a specimen."""
+        path, snapshot, settings = self.path, self.snapshot, self.state.settings
+        if path is None or snapshot is None or settings is None or not snapshot.closed:
+            return
+
+        def issue(wanted: Mapping[str, str] | None) -> None:
+            if wanted is not None:
+                self.notify("verifying the recording, making the certificate …", timeout=5)
+                self._issue(path, snapshot, settings, wanted)
+
+        self.push_screen(IssueForm(path.name), issue)
+
+    @work(thread=True, group="control")
+    def _issue(
+        self, path: Path, snapshot: Snapshot, settings: Settings, wanted: Mapping[str, str]
+    ) -> None:
+        try:
+            with self._reading:
+                made = self._controls.certify(path, snapshot, settings, wanted)
+        except (HuddleError, OSError) as error:
+            self.call_from_thread(self._refused, wanted, f"{error}")
+            return
+        what = "Certificate issued" if wanted["by"] else "Specimen made"
+        self.call_from_thread(self.notify, f"{made}", title=what, timeout=15, markup=False)
+
+    def _refused(self, wanted: Mapping[str, str], why: str) -> None:
+        """Say why there is no certificate, and offer a specimen."""
+        if not wanted["by"]:
+            self.post_message(ErrorReported(why))
+            return
+
+        def make(really: bool | None) -> None:
+            path, snapshot, settings = self.path, self.snapshot, self.state.settings
+            if really and path and snapshot and settings:
+                self._issue(path, snapshot, settings, {**wanted, "by": ""})
+
+        text = f"{why}\n\nMake a specimen instead?"
+        question = QuestionScreen("no certificate", text, does="makes a specimen")
+        self.push_screen(question, make)
 
     def action_save(self) -> None:
         """Write the estimate as CSV and JSON, and the screen as a picture (SVG)."""

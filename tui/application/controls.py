@@ -157,6 +157,25 @@ class Controls(Protocol):
         """Write the report of a recording; returns its file. Blocks."""
         ...
 
+    def certify(
+        self, path: Path, snapshot: Snapshot, settings: Settings, wanted: Mapping[str, str]
+    ) -> Path:
+        """Issue a certificate, or make a specimen; returns its file. Blocks.
+
+        Parameters
+        ----------
+        path, snapshot, settings
+            The recording and its estimate.
+        wanted : mapping of str to str
+            ``by`` (empty: a specimen), ``reason`` and ``despite``.
+
+        Raises
+        ------
+        HuddleError
+            If a certificate is refused.
+        """
+        ...
+
     def save(
         self, path: Path, snapshot: Snapshot, settings: Settings, verdict: TestVerdict | None
     ) -> tuple[Path, ...]:

@@ -29,8 +29,10 @@ from daq.recording.storage.names import continuations, continued_name, recording
 from daq.results.sources import sources
 from daq.results.store import store_results
 from daq.whole_file import write_whole
+from tui.certificate.ledger import ledger_of
 from tui.commands.check import examined_bench
 from tui.commands.runs import RunNotFoundError, runs_named
+from tui.commands.verify import known_to_services
 from tui.output.check_list import sentence
 from tui.output.console import write_json
 from tui.output.csv_text import write_metadata
@@ -150,6 +152,35 @@ class _Controls:
     ) -> list[str]:
         """Write a test into the ledger of sensors; return how they have changed."""
         return noted(path, snapshot, settings, verdict)
+
+    def described(self, path: Path) -> Bench | None:
+        """Return the bench that describes the parties of a certificate; None: the recorded one."""
+        del path
+        return None
+
+    def certify(
+        self, path: Path, snapshot: Snapshot, settings: Settings, wanted: Mapping[str, str]
+    ) -> Path:
+        """Issue a certificate beside a recording, or make a specimen.
+
+        Raises
+        ------
+        HuddleError
+            If a certificate is refused.
+        """
+        require("matplotlib", "jinja2", "fpdf", "pypdf")
+        from tui.certificate import issuing  # noqa: PLC0415 - loads matplotlib
+
+        order = issuing.Order(
+            by=wanted["by"],
+            reason=wanted["reason"],
+            despite=wanted["despite"],
+            about=self.described(path),
+        )
+        examined = issuing.examine([path], order, known=known_to_services([path]))
+        if not order.by:
+            return issuing.specimen(snapshot, settings, examined, path.parent)
+        return issuing.issue(snapshot, settings, examined, ledger_of(path, examined.about))[1]
 
     def about(self, path: Path, changes: Mapping[str, Any]) -> tuple[Settings, Bench | None]:
         """Return the settings for a recording, with changes and methods for comparison; its bench.
@@ -299,6 +330,10 @@ class BenchControls(_Controls):
             if recording.results():
                 return
         store_results(path, snapshot, verdict)
+
+    def described(self, path: Path) -> Bench | None:
+        """Return the bench as it is now, if the recording is of its sensors."""
+        return self.bench if is_of(path, self.bench) else None
 
     def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
         """Write the report."""

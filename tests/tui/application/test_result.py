@@ -163,3 +163,36 @@ async def test_a_comparison_says_where_a_name_is_another_sensor_now(
     assert text.count("was another sensor in") == 1
     assert "B was another sensor in" in text
     assert "S7, now SB" in text
+
+
+async def test_i_asks_who_authorises_and_issues_or_makes_a_specimen(
+    told: ProgressCallback,
+) -> None:
+    app = HuddleApp(told, path=told.path)  # which is not there: nothing else comes
+    async with app.run_test(size=NARROW) as pilot:
+        await app.workers.wait_for_complete()
+        await at_result(pilot, app)
+        assert "i Issue" in screen_text(app)
+        await pilot.press("i")
+        await shown(pilot, app)
+        assert "certificate of run.h5" in screen_text(app)
+        assert "Empty: a specimen, watermarked" in screen_text(app)
+        await pilot.press("enter")
+        await app.workers.wait_for_complete()
+        for keys in (
+            ("i", *"Ada", "tab", *"finer", "tab", *"no", "enter"),
+            ("i", "escape"),
+            ("i", *"Nobody", "enter"),
+        ):
+            await pilot.press(*keys)
+            await app.workers.wait_for_complete()
+            await shown(pilot, app)
+        assert "sensors were simulated" in screen_text(app)
+        assert "Make a specimen instead?" in screen_text(app)
+        await pilot.press("y")
+        await app.workers.wait_for_complete()
+    assert [each for each in told.told if each.startswith("certify")] == [
+        "certify run.h5 {'by': '', 'reason': '', 'despite': ''}",
+        "certify run.h5 {'by': 'Ada', 'reason': 'finer', 'despite': 'no'}",
+        "certify run.h5 {'by': '', 'reason': '', 'despite': ''}",
+    ]

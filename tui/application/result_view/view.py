@@ -30,6 +30,7 @@ class ResultView(View):
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("w", "app.report", "Report"),
         Binding("o", "app.open_report", "Open"),
+        Binding("i", "app.issue", "Issue"),
         Binding("e", "estimate", "Estimate"),
         Binding("c", "compare", "Compare"),
         Binding("v", "app.save", "Save", show=False),
@@ -38,12 +39,14 @@ class ResultView(View):
     TASKS = (
         ("Write the report", "app.report"),
         ("Open the report in a browser", "app.open_report"),
+        ("Issue a certificate, or make a specimen", "app.issue"),
         ("Estimate again with other settings", "estimate"),
         ("Compare with an earlier test", "compare"),
     )
     KEYS = (
         ("w", "write the report beside the recording"),
         ("o", "open the report in a browser; written first, if it is not there"),
+        ("i", "issue a certificate, or make a watermarked specimen of one"),
         ("e", "estimate the recording again with other settings"),
         ("c", "compare: choose an earlier recording, c there; c again ends it"),
         ("v", "save the estimate as CSV and JSON, and this screen as a picture (SVG)"),
