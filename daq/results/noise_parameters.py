@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.bench.units import canonical, conversion
-from daq.results.band_summary import band_of, correlation_of, judged_method
+from daq.results.band_summary import Spectrum, band_of, correlation_of, judged_method
 from estimator.errors import InsufficientDataError
-from estimator.levels.bands import band_edges, band_levels
+from estimator.levels.bands import band_edges
+from estimator.levels.contributions import by_chance
+from estimator.levels.interval import NORMAL_95
 
 if TYPE_CHECKING:
     from daq.bench.model import Bench, DataSheet
@@ -124,6 +126,8 @@ def noise_parameters(
         return ()
     frequency, correlation = snapshot.frequency, correlation_of(settings)
     band = band_of(replace(settings, band=None), snapshot)
+    spectrum = Spectrum(noise, snapshot, settings)
+    factors = spectrum.levels(band_edges(frequency, band)).deviation
     shares = quantisation_shares(snapshot, settings)
     found = []
     for column, label in enumerate(snapshot.channels):
@@ -133,6 +137,7 @@ def noise_parameters(
         try:
             parameters = fit(frequency, psd, cov, correlation, band=band)
             allan = allan_deviation(frequency, psd, cov, correlation, parameters)
+            parameters, allan = _with_factor(parameters, allan, float(factors[column]))
         except InsufficientDataError as error:
             refused = str(error)
         sheet = _data_sheet(bench, label)
@@ -146,9 +151,7 @@ def noise_parameters(
                 ()
                 if sheet is None
                 else tuple(
-                    _compared(
-                        sheet, label, frequency, (psd, noise.cumulants[:, :, column]), correlation
-                    )
+                    _compared(sheet, label, frequency, psd, spectrum=spectrum, column=column)
                 ),
             )
         )
@@ -188,30 +191,51 @@ def _data_sheet(bench: Bench | None, label: ChannelLabel) -> DataSheet | None:
     return sheet.model_copy(update={"unit": unit})
 
 
+def _with_factor(
+    parameters: NoiseParameters, allan: AllanDeviation, deviation: float
+) -> tuple[NoiseParameters, AllanDeviation]:
+    """Return terms and Allan deviation of a PSD that is known but for a factor.
+
+    All terms have it in common, and the Allan deviation has its root.
+    """
+    values = parameters.values
+    low, high = by_chance(allan.deviation, allan.low, allan.high, NORMAL_95 * deviation / 2)
+    covariance = parameters.covariance + np.outer(values, values) * deviation**2
+    errors = np.sqrt(np.diag(covariance))
+    return (
+        replace(parameters, errors=errors, covariance=covariance),
+        replace(allan, low=low, high=high),
+    )
+
+
 def _compared(
     sheet: DataSheet,
     label: ChannelLabel,
     frequency: FloatArray,
-    estimate: tuple[FloatArray, FloatArray],
-    correlation: FloatArray,
+    own: FloatArray,
+    *,
+    spectrum: Spectrum,
+    column: int,
 ) -> list[Comparison]:
     unit = canonical(sheet.unit or label.unit)
     with np.errstate(divide="ignore", invalid="ignore"):
         factor = np.abs(conversion(label.unit, unit, frequency)) ** 2
-        psd = estimate[0] * factor
-        scatter = (estimate[1] * np.stack([factor**k for k in (2, 3, 4)]))[:, :, None]
+    width = np.gradient(frequency)
 
     def mean(low: float, high: float) -> tuple[float, float, float]:
         edges = np.searchsorted(frequency, (low, high), side="left")
         edges = np.array([edges[0], max(edges[1], edges[0] + 1)])
+        inside = slice(*edges)
         if low < frequency[1] / 2 or high > frequency[-1] or edges[1] >= len(frequency):
             return math.nan, math.nan, math.nan
-        if not np.isfinite(psd[edges[0] : edges[1]]).all():
+        if not np.isfinite(own[inside] * factor[inside]).all():
             return math.nan, math.nan, math.nan
-        width = np.gradient(frequency)
-        found = band_levels(psd[:, None], scatter, edges, correlation, weights=width)
-        ends = found.interval()
-        return float(found.mean[0, 0]), float(ends[0][0, 0]), float(ends[1][0, 0])
+        found = spectrum.levels(edges)
+        ends = (found.mean, *found.ends())
+        weight = width[inside] * np.maximum(np.abs(own[inside]), np.finfo(float).tiny)
+        ratio = float(np.average(factor[inside], weights=weight))
+        middle, lower, upper = (float(end[0, column]) * ratio for end in ends)
+        return middle, lower, upper
 
     rows = []
     for at, stated in sheet.noise_density:
@@ -225,7 +249,7 @@ def _compared(
         rms = [_root(value * (high - low)) for value in mean(low, high)]
         sine = (sheet.full_scale or math.nan) / math.sqrt(2)
         middle, worst, best = (
-            20 * math.log10(sine / v) if v > 0 else math.inf if v == 0 else math.nan
+            20 * math.log10(sine / v) if 0 < v < math.inf else math.inf if v == 0 else -v
             for v in (rms[0], rms[2], rms[1])
         )
         rows.append(
@@ -235,7 +259,7 @@ def _compared(
 
 
 def _root(power: float) -> float:
-    return math.sqrt(max(power, 0.0)) if math.isfinite(power) else math.nan
+    return power if math.isnan(power) else math.sqrt(max(power, 0.0))
 
 
 def _compare(

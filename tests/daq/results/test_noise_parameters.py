@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from daq.bench.sensitivity import KnownSensitivity
 from daq.devices.bench_file import parse
 from daq.errors import BenchFileError
+from daq.estimation.contributions import with_sensitivities
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.protocols.block import HostTime
@@ -167,3 +169,28 @@ def test_noise_of_counting_is_known_and_said_where_it_prevails(
     said = quantisation_notes(snapshot.channels, shares)
     assert len(said) == mostly
     assert not mostly or "A.X (8" in said[0]
+
+
+def test_an_uncertain_sensitivity_is_in_terms_allan_deviation_and_data_sheet() -> None:
+    """A factor that all have in common: twice its uncertainty in a PSD, once in a root."""
+    snapshot = made_snapshot()
+    names = [(label.sensor, label.channel) for label in snapshot.channels]
+    own = 0.05
+    stated = with_sensitivities(snapshot, dict.fromkeys(names, KnownSensitivity(own=own)))
+    high = noise_parameters(snapshot, SETTINGS, bench())[0].comparisons[0].high
+    sheet = bench(density=1.003 * high)
+    before, after = (noise_parameters(each, SETTINGS, sheet)[0] for each in (snapshot, stated))
+    assert before.parameters is not None
+    assert after.parameters is not None
+    white = after.parameters.value(Term.WHITE)
+    added = math.sqrt(
+        after.parameters.error(Term.WHITE) ** 2 - before.parameters.error(Term.WHITE) ** 2
+    )
+    assert added == pytest.approx(2 * own * white, rel=1e-6)
+    assert before.allan is not None
+    assert after.allan is not None
+    reach = np.log(after.allan.high / after.allan.deviation)
+    scatter = np.log(before.allan.high / before.allan.deviation)
+    np.testing.assert_allclose(reach, np.hypot(scatter, 1.96 * own), rtol=1e-3)
+    assert before.comparisons[0].outcome is Outcome.MEETS
+    assert after.comparisons[0].outcome is Outcome.NOT_DECIDED
