@@ -88,6 +88,25 @@ class Order:
 
 
 @dataclass(frozen=True, slots=True)
+class Objection:
+    """Why no certificate may be made of recordings.
+
+    Attributes
+    ----------
+    line : str
+        In a line.
+    details : str
+        What follows on the command line: what is missing where, and which option helps.
+    """
+
+    line: str
+    details: str = ""
+
+    def __str__(self) -> str:
+        return self.line + self.details
+
+
+@dataclass(frozen=True, slots=True)
 class Examined:
     """Recordings that were examined before a certificate is made of them: by `examine` only.
 
@@ -97,14 +116,14 @@ class Examined:
     order : Order
     about : Bench or None
         That of the order, or the recorded one.
-    objections : tuple of str
+    objections : tuple of Objection
         Why no certificate may be made of them; a specimen may.
     """
 
     found: tuple[Source, ...]
     order: Order
     about: Bench | None
-    objections: tuple[str, ...]
+    objections: tuple[Objection, ...]
 
     @property
     def paths(self) -> list[Path]:
@@ -136,24 +155,29 @@ def examine(
     for source in found:
         if source.simulated:
             objections.append(
-                f"{source.path}: sensors were simulated: no certificate is issued of a model;"
-                " --specimen makes a specimen"
+                Objection(
+                    f"{source.path}: sensors were simulated: no certificate is issued of a model",
+                    "; --specimen makes a specimen",
+                )
             )
         if source.state in {"growing", "left open"}:
             wanted = "wait for its end" if source.state == "growing" else "huddle repair closes it"
-            objections.append(f"{source.path}: not closed; {wanted}")
+            objections.append(Objection(f"{source.path}: not closed; {wanted}"))
     if not any(source.state == "growing" for source in found):
         objections += [
-            f"{each.path}: {each.state}"
+            Objection(f"{each.path}: {each.state.removeprefix(f'{each.path}: ')}")
             for each in verified([s.path for s in found], known=known, folders=folders)
             if not each.is_intact
         ]
     left = missing(about, found[0], by=order.by)
     if left and order.complete:
-        text = "\n".join(f"  {each.what}: {each.key} ({each.clause})" for each in left)
+        where = "".join(f"\n  {each.what}: {each.key} ({each.clause})" for each in left)
         objections.append(
-            f"not given in the bench file:\n{text}\n"
-            "--bench takes a bench file that gives it; --allow-incomplete issues without"
+            Objection(
+                f"not given in the bench file: {', '.join(each.what for each in left)}",
+                f"{where}\n--bench takes a bench file that gives it;"
+                " --allow-incomplete issues without",
+            )
         )
     outline = None if about is None else BenchOutline.of_text(about.text)
     stated = {} if outline is None else outline.sensitivities
@@ -166,8 +190,11 @@ def examine(
     ]
     if unknown:
         objections.append(
-            f"uncertainty of the sensitivity not stated: {', '.join(unknown)}; expected certificate"
-            " or tolerance of each channel in [[sensors.channels]] of the bench file"
+            Objection(
+                f"uncertainty of the sensitivity not stated: {', '.join(unknown)}",
+                "; expected certificate or tolerance of each channel in [[sensors.channels]] of the"
+                " bench file",
+            )
         )
     return Examined(found, order, about, tuple(objections))
 
@@ -207,7 +234,7 @@ def issue(
     """
     found, about, order = examined.found, examined.about, examined.order
     if examined.objections:
-        raise NotIssuedError("\n".join(examined.objections))
+        raise NotIssuedError("\n".join(map(str, examined.objections)))
     if not order.by:
         raise NotIssuedError("nobody authorises the certificate; expected --by NAME")
     snapshot = with_stated(snapshot, examined)
@@ -292,7 +319,7 @@ def specimen(snapshot: Snapshot, settings: Settings, examined: Examined, folder:
         by=examined.order.by or "nobody",
         entry="",
         despite=examined.order.despite,
-        objections=examined.objections,
+        objections=tuple(each.line for each in examined.objections),
     )
     snapshot = with_stated(snapshot, examined)
     content = _content(snapshot, settings, examined, made, {})

@@ -147,7 +147,7 @@ def issue(
             folders=() if folder is None else (folder.absolute(),),
         )
     if examined.objections and not is_specimen:
-        raise NotIssuedError("\n".join(examined.objections))
+        raise NotIssuedError("\n".join(map(str, examined.objections)))
     if not by and not is_specimen:
         raise typer.BadParameter("nobody authorises the certificate; expected --by NAME")
     snapshot, settings, recorded = estimated(files, start=start, end=end, **wanted)

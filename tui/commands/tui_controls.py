@@ -178,6 +178,8 @@ class _Controls:
             about=self.described(path),
         )
         examined = issuing.examine([path], order, known=known_to_services([path]))
+        if order.by and examined.objections:
+            raise HuddleError("\n".join(each.line for each in examined.objections))
         if not order.by:
             return issuing.specimen(snapshot, settings, examined, path.parent)
         return issuing.issue(snapshot, settings, examined, ledger_of(path, examined.about))[1]

@@ -263,7 +263,7 @@ def notices(
         text = "SPECIMEN: not a certificate. It has no number and is in no ledger."
         lines.append(Paragraph(text, "bad"))
         lines += [
-            Paragraph(f"A certificate would be refused: {_in_a_line(each)}.", "doubtful")
+            Paragraph(f"A certificate would be refused: {each}.", "doubtful")
             for each in issue.objections
         ]
     else:
@@ -276,13 +276,6 @@ def notices(
     lines += [Paragraph(text, "bad") for text in outside_range(stated)]
     lines.append(settings_line(settings, bench))
     return tuple(lines)
-
-
-def _in_a_line(objection: str) -> str:
-    """Return an objection without what the command line could do about it."""
-    first, *others = objection.partition("; --")[0].splitlines()
-    listed = "; ".join(each.strip() for each in others if not each.startswith("--"))
-    return f"{first} {listed}".strip()
 
 
 def _of_issue(issue: Issue, bench: Bench | None, source: Source) -> list[Paragraph]:
