@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 
 from daq.protocols.block import Block, Event, EventKind, Quantity, Reading, ReadingTimes
 from daq.recorder.connection import SensorLate, SensorLost
+from daq.recorder.late_blocks import REASON as LATE_FOR_GOOD
+from daq.recorder.late_blocks import LateBlocks
 from daq.recorder.sample_index import Gap, SampleIndexer
 from daq.recording.sensor_state import SensorState
 from daq.recording.writer import SensorCounts
@@ -53,8 +55,12 @@ class SensorProgress:
 
 
 class _Sensor:
-    def __init__(self, sampling_rate: float, thermometer: tuple[int, float] | None) -> None:
+    def __init__(
+        self, sampling_rate: float, thermometer: tuple[int, float] | None, speed: float
+    ) -> None:
         self.rate = sampling_rate
+        self.speed = speed
+        self.late = LateBlocks(sampling_rate, speed=speed)
         self.thermometer = thermometer
         self.indexer = SampleIndexer(sampling_rate)
         self.state = SensorState.WAITING
@@ -146,6 +152,8 @@ class BlockWriter:
         In Hz, by sensor.
     thermometers : mapping
         Column and sensitivity of the channel that measures the temperature, by sensor.
+    speed : float
+        Of the host's clock against real time.
     """
 
     def __init__(
@@ -153,10 +161,13 @@ class BlockWriter:
         writer: RecordingWriter,
         sampling_rates: Mapping[str, float],
         thermometers: Mapping[str, tuple[int, float]] = MappingProxyType({}),
+        *,
+        speed: float = 1.0,
     ) -> None:
         self._writer = writer
         self._sensors = {
-            name: _Sensor(rate, thermometers.get(name)) for name, rate in sampling_rates.items()
+            name: _Sensor(rate, thermometers.get(name), speed)
+            for name, rate in sampling_rates.items()
         }
         self._limits: defaultdict[tuple[str, str], _RateLimit] = defaultdict(_RateLimit)
         self._items: deque[Item] = deque()
@@ -242,6 +253,7 @@ class BlockWriter:
 
     def _end(self, now: HostTime, reason: str) -> None:
         for name, sensor in self._sensors.items():
+            self._write_held(sensor)
             if sensor.state.is_lost or sensor.state is SensorState.WAITING:
                 gap = sensor.indexer.lost_until(now)
                 if gap is not None:
@@ -306,6 +318,7 @@ class BlockWriter:
     def _begin_session(self, item: Connected) -> None:
         for name in item.sensors if item.reason else ():
             sensor = self._sensors[name]
+            self._write_held(sensor)
             sensor.state = SensorState.WAITING
             if item.resumed:
                 sensor.indexer.resume(item.reason)
@@ -314,14 +327,31 @@ class BlockWriter:
 
     def _write_block(self, block: Block) -> None:
         sensor = self._sensors[block.sensor]
+        sensor.state, sensor.late_event = SensorState.LIVE, None
+        for passed in sensor.late.passed(block):
+            self._write_passed(sensor, passed)
+
+    def _write_held(self, sensor: _Sensor) -> None:
+        """Write the blocks that are held back: the session ended."""
+        for block in sensor.late.rest():
+            self._write_passed(sensor, block)
+        sensor.late = LateBlocks(sensor.rate, speed=sensor.speed)
+
+    def _write_passed(self, sensor: _Sensor, block: Block) -> None:
         placed = sensor.indexer.place(block)
         if placed.repeated:
             sensor.n_repeated += placed.repeated
             self._report_repeated(sensor, block)
         if placed.gap is not None:
             self._write_gap(block.sensor, sensor, placed.gap)
+            if placed.gap.reason == LATE_FOR_GOOD:
+                missing = placed.gap.missing
+                text = (
+                    f"blocks arrive {missing / sensor.rate:.3g} s late for good: about {missing}"
+                    " samples were lost, and not counted, while they were not read"
+                )
+                self._record(Event(block.sensor, EventKind.OVERFLOW, text, block.received))
         if placed.block is not None:
-            sensor.state, sensor.late_event = SensorState.LIVE, None
             self._append(block.sensor, placed.block)
             self._write_thermometer(sensor, placed.block)
 

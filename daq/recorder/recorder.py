@@ -304,7 +304,7 @@ class _Recorder:
         writer.event(Event("", EventKind.STARTED, f"{len(ordered)} sensors", self._started))
         _LOGGER.info("recording to %s", self._path, extra={"recording": str(self._path)})
         rates = {layout.name: layout.sampling_rate for layout in ordered}
-        rows = BlockWriter(writer, rates, thermometers)
+        rows = BlockWriter(writer, rates, thermometers, speed=self._clock.speed)
         rows.write(
             Reading(layout.name, Quantity.TEMPERATURE, layout.temperature, self._started)
             for layout in ordered

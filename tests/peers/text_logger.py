@@ -77,6 +77,32 @@ class TextLogger:
                 begin = end
         return found
 
+    def stopped(self, begin: float, end: float, buffer: int) -> list[tuple[bytes, float]]:
+        """Return what a host reads that stops reading in between, and keeps so many bytes."""
+        found: list[tuple[bytes, float]] = []
+        kept = b""
+        for data, now in self.rows():
+            if begin <= now < end:
+                kept += data[: max(0, buffer - len(kept))]
+                continue
+            if now >= end and kept:
+                found.append((kept, now))
+                kept = b""
+            found.append((data, now))
+        return found
+
+    def drained(self, begin: float, end: float, speed: float) -> list[tuple[bytes, float]]:
+        """Return what a host reads from a server that is held up, and catches up at this speed."""
+        found, latest = [], end
+        for data, now in self.rows():
+            if now < begin:
+                found.append((data, now))
+                continue
+            seconds = data.count(b"\n") / self.rate
+            latest = max(now, latest + seconds / speed)
+            found.append((data, latest))
+        return found
+
     def packets(self, length: int = 25) -> list[tuple[bytes, float]]:
         """Return datagrams of one channel each."""
         found, latest = [], 0.0
