@@ -24,11 +24,13 @@ class KnownSensitivity:
     Attributes
     ----------
     own : float
-        Relative standard uncertainty by the certificate, or else by the tolerance; 0 without.
+        Relative standard uncertainty by the certificate, or else by the tolerance; 0 without. A
+        difference of the certificate, which is not corrected, adds by squares in full, so that
+        95 % intervals hold whatever its size.
     is_certified : bool
         Whether a certificate states it.
     off : float
-        Difference of the certificate from the sensitivity that is used, which is not corrected.
+        Difference of the certificate from the sensitivity that is used.
     coefficient : float
         Largest change of the sensitivity with temperature, in 1/°C; 0 where not stated.
     reference : float
@@ -59,7 +61,7 @@ class KnownSensitivity:
     @property
     def combined(self) -> float:
         """Relative standard uncertainty by all causes."""
-        return math.hypot(self.own, self.by_temperature, self.off / _RECTANGULAR)
+        return math.hypot(self.own, self.by_temperature)
 
     def at(self, readings: tuple[float, float] | None) -> KnownSensitivity:
         """Return it at the lowest and highest temperature that was read; None: none was."""
@@ -90,8 +92,9 @@ def _known(channel: Mapping[str, Any], sheet: Mapping[str, Any]) -> KnownSensiti
     certificate = channel.get("certificate")
     if certificate is not None:
         value = float(certificate["value"])
-        own = float(certificate["expanded_uncertainty"]) / certificate.get("k", 2.0) / abs(value)
         off = abs(float(channel["sensitivity"]) / value - 1)
+        relative = float(certificate["expanded_uncertainty"]) / abs(value)
+        own = math.hypot(relative / certificate.get("k", 2.0), off)
     reference = float(sheet.get("reference_temperature", REFERENCE_TEMPERATURE))
     is_for = not sheet.get("channels") or channel["name"] in sheet["channels"]
     low, high = sheet.get("temperature", (reference, reference))

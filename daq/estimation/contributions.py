@@ -80,22 +80,31 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
         below[:, faulty] = math.inf
         found.append(contribution(Source.FAULTY, shape, below=below))
     if snapshot.sensitivities:
-        found += _sensitivities(snapshot, shape)
+        found += _sensitivities(snapshot, method, shape)
     return tuple(found)
 
 
-def _sensitivities(snapshot: Snapshot, shape: tuple[int, int]) -> list[Contribution]:
-    """Return what is known of sensitivities; a PSD has their square."""
+def _sensitivities(snapshot: Snapshot, method: str, shape: tuple[int, int]) -> list[Contribution]:
+    """Return what is known of sensitivities; a PSD has their square.
+
+    Two channels are subtracted as they are: what their sensitivities differ by leaves so much of
+    the motion in the noise. All other methods find the ratios from the motion.
+    """
     known = [
         snapshot.sensitivities.get((label.sensor, label.channel)) for label in snapshot.channels
     ]
-    own, by_temperature, off = (
+    own, by_temperature = (
         2 * np.array([0.0 if each is None else getattr(each, part) for each in known])
-        for part in ("own", "by_temperature", "off")
+        for part in ("own", "by_temperature")
     )
-    parts = []
-    if own.any() or off.any():
-        parts.append(contribution(Source.SENSITIVITY, shape, share=off, deviation=own))
+    parts, most = [], np.zeros(shape)
+    if method == "two-channel":
+        psd = np.nan_to_num(np.abs(snapshot.results[method].noise_psd))
+        motion = np.maximum(np.nan_to_num(snapshot.data_psd) - psd, 0.0)
+        each = np.array([0.0 if one is None else one.combined for one in known])
+        most = NORMAL_95 * np.hypot(each, each.max()) * motion
+    if own.any() or most.any():
+        parts.append(contribution(Source.SENSITIVITY, shape, below=most, above=most, deviation=own))
     if by_temperature.any():
         parts.append(contribution(Source.TEMPERATURE, shape, deviation=by_temperature))
     return parts

@@ -84,7 +84,11 @@ class Levels:
         return self.of_scatter.mean
 
     def ends(
-        self, quantile: float = NORMAL_95, *, without: Collection[Source] = ()
+        self,
+        quantile: float = NORMAL_95,
+        *,
+        without: Collection[Source] = (),
+        factor: bool = True,
     ) -> tuple[FloatArray, FloatArray]:
         """Return the ends of the interval.
 
@@ -94,6 +98,8 @@ class Levels:
             Standard deviations to either end.
         without : collection of Source
             Contributions that do not count.
+        factor : bool
+            Whether the factor counts that all levels of a channel have in common (`deviation`).
 
         Returns
         -------
@@ -107,9 +113,10 @@ class Levels:
         most = self._most(quantile)
         low = np.where(low > most, -np.inf, low)
         high = np.where(np.isnan(high), high, np.fmin(high, most))
-        return by_chance(
-            self.mean, low, high, quantile * deviation(self.contributions, without=without)
-        )
+        if not factor:
+            return low, high
+        reach = quantile * deviation(self.contributions, without=without)
+        return by_chance(self.mean, low, high, reach)
 
     @property
     def deviation(self) -> FloatArray:

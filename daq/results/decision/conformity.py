@@ -179,8 +179,7 @@ def distribution(levels: Levels) -> tuple[FloatArray, FloatArray]:
 
     Without what is known of the sensitivities, which is common to all bands.
     """
-    common = {each.source for each in levels.contributions if np.any(each.deviation)}
-    ends = [levels.ends(float(quantile), without=common) for quantile in QUANTILES]
+    ends = [levels.ends(float(quantile), factor=False) for quantile in QUANTILES]
     return np.stack([low for low, _ in ends]), np.stack([high for _, high in ends])
 
 

@@ -36,7 +36,7 @@ from estimator.decision.verdict import Obstacle
 from estimator.levels.contributions import Source, by_chance
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable
 
     from numpy.typing import NDArray
 
@@ -63,7 +63,7 @@ def judge(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> TestVe
     known: dict[bytes, Columns] = {}  # limits often share their bands
     found: list[Comparison] = []
     judged: list[Judged] = []
-    doubted = _doubted(bench, snapshot)
+    doubted = _doubted(snapshot)
     limits: list[LimitResult] = []
     for each in bands:
         columns = known.get(each.edges.tobytes())
@@ -90,7 +90,7 @@ def judge(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> TestVe
     return replace(so_far, prediction=left)
 
 
-def _doubted(bench: Bench, snapshot: Snapshot) -> dict[int, WrongGain]:
+def _doubted(snapshot: Snapshot) -> dict[int, WrongGain]:
     """Return the channels whose sensitivity the motion contradicts, by column.
 
     A channel with a certificate that agrees with its sensitivity is not doubted.
@@ -98,23 +98,16 @@ def _doubted(bench: Bench, snapshot: Snapshot) -> dict[int, WrongGain]:
     diagnosis = snapshot.diagnostics.diagnosis
     if diagnosis is None:
         return {}
-    faulty = {*snapshot.diagnostics.clipped, *snapshot.diagnostics.stood_still}
-    found = wrong_gains(
-        diagnosis.responses, snapshot.dims, certified=_certified(bench, snapshot.channels)
-    )
-    return {each.channel: each for each in found if each.channel not in faulty}
-
-
-def _certified(bench: Bench, labels: Sequence[ChannelLabel]) -> set[int]:
-    """Return the columns of channels with a certificate that agrees with the bench file."""
     certified = {
-        (sensor.name, channel.name)
-        for sensor in bench.sensors
-        for channel in sensor.channels
-        if channel.certificate is not None
-        and abs(channel.sensitivity / channel.certificate.value - 1) <= TOLERANCE
+        column
+        for column, label in enumerate(snapshot.channels)
+        if (known := snapshot.sensitivities.get((label.sensor, label.channel))) is not None
+        and known.is_certified
+        and known.off <= TOLERANCE
     }
-    return {n for n, label in enumerate(labels) if (label.sensor, label.channel) in certified}
+    faulty = {*snapshot.diagnostics.clipped, *snapshot.diagnostics.stood_still}
+    found = wrong_gains(diagnosis.responses, snapshot.dims, certified=certified)
+    return {each.channel: each for each in found if each.channel not in faulty}
 
 
 def _named(snapshot: Snapshot, found: Iterable[WrongGain]) -> tuple[WrongSensitivity, ...]:

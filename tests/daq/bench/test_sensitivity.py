@@ -37,7 +37,7 @@ def test_certificate_tolerance_and_temperature() -> None:
     assert outline is not None
     parse(BENCH)
     x, y, z = (outline.sensitivities["A.1", channel] for channel in "XYZ")
-    assert x.own == pytest.approx(0.01)
+    assert x.own == pytest.approx(math.hypot(0.01, 0.01))  # U / k, and the difference
     assert x.off == pytest.approx(0.01)
     assert x.is_certified
     assert y.own == pytest.approx(0.05 / math.sqrt(3))

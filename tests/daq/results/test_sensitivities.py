@@ -1,0 +1,68 @@
+"""Sensitivities that are off within what is stated: intervals hold the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from daq.bench.sensitivity import KnownSensitivity
+from daq.estimation.contributions import with_sensitivities
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.formats.arrays import recording_of_arrays
+from daq.results.band_summary import channel_means
+
+RATE, OWN, SNR = 100.0, 0.03, 300.0
+BAND = (2.0, 40.0)
+
+
+def held(method: str, seed: int) -> tuple[list[bool], list[bool]]:
+    """Return which intervals hold the truth, without and with what is known."""
+    rng = np.random.default_rng(seed)
+    motion = np.sqrt(SNR) * rng.standard_normal(12_000)
+    gains = 1 + OWN * rng.standard_normal(3)
+    samples = {
+        name: (gain * (motion + rng.standard_normal(12_000)))[:, None]
+        for name, gain in zip("ABC", gains, strict=True)
+    }
+    settings = Settings(segment=1.0, methods=(method,), axis_tolerance={"": 0.0})
+    exact = estimate([recording_of_arrays(samples, RATE)], settings)
+    names = [(label.sensor, label.channel) for label in exact.channels]
+    stated = with_sensitivities(exact, dict.fromkeys(names, KnownSensitivity(own=OWN)))
+    found: list[list[bool]] = []
+    for snapshot in (exact, stated):
+        means = channel_means(snapshot.results[method], snapshot, settings, BAND)
+        found.append([bool(m.low[0] <= 2 / RATE <= m.high[0]) for m in means])
+    return found[0], found[1]
+
+
+@pytest.mark.parametrize("method", ["two-channel", "three-channel", "three-sensor"])
+def test_intervals_hold_the_truth_with_sensitivities_off_as_stated(method: str) -> None:
+    """Of 60 intervals 57 should; 50 leaves room for chance (p = 0.001)."""
+    draws = [held(method, seed) for seed in range(20)]
+    exact, stated = (np.array([draw[n] for draw in draws]) for n in (0, 1))
+    assert stated.sum() >= 51, stated.mean()
+    assert exact.sum() < 45, exact.mean()  # scatter alone is too narrow
+
+
+def test_temperatures_and_certificates_are_in_the_interval() -> None:
+    """By squares, in logarithms."""
+    rng = np.random.default_rng(3)
+    samples = {name: rng.standard_normal((6000, 1)) for name in "ABC"}
+    settings = Settings(segment=1.0, methods=("three-sensor",), axis_tolerance={"": 0.0})
+    snapshot = estimate([recording_of_arrays(samples, RATE)], settings)
+    widths = {}
+    for name, known in {
+        "exact": KnownSensitivity(),
+        "stated": KnownSensitivity(own=0.03),
+        "warm": KnownSensitivity(own=0.03, coefficient=0.004, temperatures=(13.0, 33.0)),
+    }.items():
+        channels = [(label.sensor, label.channel) for label in snapshot.channels]
+        found = with_sensitivities(snapshot, dict.fromkeys(channels, known))
+        mean = channel_means(found.results["three-sensor"], found, settings, BAND)[0]
+        widths[name] = float(np.log(mean.high[0] / abs(mean.mean[0])))
+        bins = found.results["three-sensor"]
+        assert (bins.high >= snapshot.results["three-sensor"].high)[np.isfinite(bins.high)].all()
+    by_temperature = 1.96 * 2 * 0.04 / np.sqrt(3)
+    assert widths["stated"] == pytest.approx(np.hypot(widths["exact"], 1.96 * 0.06), rel=1e-3)
+    assert widths["warm"] == pytest.approx(np.hypot(widths["stated"], by_temperature), rel=1e-3)
