@@ -46,15 +46,15 @@ class Signer:
         if not file.is_file():
             raise KeyFileError(f"{file}: there is no such file; expected a key (.p12)")
         secret = passphrase.encode() or None
-        load = cast("Any", signers.SimpleSigner).load_pkcs12
-        signer = load(str(file), passphrase=secret)
-        if signer is None:
-            raise KeyFileError(f"{file}: no key (.p12), or the passphrase is wrong")
-        self._signer = signer
-        key, certificate, _ = pkcs12.load_key_and_certificates(file.read_bytes(), secret)
+        try:
+            key, certificate, _ = pkcs12.load_key_and_certificates(file.read_bytes(), secret)
+        except ValueError:
+            raise KeyFileError(f"{file}: no key (.p12), or the passphrase is wrong") from None
         if key is None or certificate is None:
             raise KeyFileError(f"{file}: expected a key with its certificate")
         self._key, public = cast("Any", key), certificate.public_key()
+        load = cast("Any", signers.SimpleSigner).load_pkcs12
+        self._signer = load(str(file), passphrase=secret)
         self.key_id, self.public_key = key_id(public), in_pem(public)
 
     def __call__(self, content: bytes) -> bytes:

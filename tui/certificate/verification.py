@@ -17,6 +17,7 @@ import io
 import json
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
@@ -27,15 +28,13 @@ from daq.recording.signing import problem, signature_of
 from daq.recording.storage.trial import trials
 from tui.certificate.dcc import DCC
 from tui.certificate.dcc import NAME as DCC_NAME
-from tui.certificate.ledger import Ledger, ledgers_of
+from tui.certificate.ledger import Entry, Ledger, ledgers_of
 from tui.output.extras import require
 from tui.report.certificate import SPECIMEN
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
-
-    from tui.certificate.ledger import Entry
 
 JSON_NAME = "result.json"
 """Name of the result in the certificate."""
@@ -217,6 +216,8 @@ def verify(
         wanted = key_id(public_key(key))
     content = path.read_bytes()
     claims = Claims.of(path, content)
+    if wanted and not ledger.exists:
+        return _without_ledger(path, content, claims, recordings, wanted)
     entries = ledger.entries()
     entry = next(
         (e for e in entries if (e.number, e.revision) == (claims.number, claims.revision)), None
@@ -242,6 +243,34 @@ def verify(
     if not claims.roots:
         lines.append("issued by an earlier version: it does not say of which contents it is")
     return [*lines, *signed, *_recordings(path, entry, recordings, ledger)]
+
+
+def _without_ledger(
+    path: Path, content: bytes, claims: Claims, recordings: Sequence[Path], wanted: str
+) -> list[str]:
+    """Return what a signature alone shows, to who has the certificate and not its ledger."""
+    entry = Entry(
+        number=claims.number,
+        revision=claims.revision,
+        at=datetime.now(UTC),
+        by=claims.by,
+        recordings=tuple((run_id, run_id, "") for run_id in claims.roots),
+        settings={},
+        reason="",
+        hash=claims.entry,
+        state="issued",
+        roots=claims.roots,
+        signer=wanted,
+    )
+    signed, wrong = _signatures(content, entry, wanted)
+    if wrong:
+        raise VerificationError(f"{path}: not genuine: {'; '.join(wrong)}")
+    return [
+        f"certificate {entry.name}, by {entry.by}",
+        "no ledger here: a later revision would not be known",
+        *signed,
+        *(_recordings(path, entry, recordings, None) if claims.roots else ()),
+    ]
 
 
 def _against_ledger(
@@ -309,6 +338,8 @@ def _head(ledger: Ledger, entry: Entry, wanted: str) -> tuple[list[str], list[st
     """Return whether the ledger is signed as far as a certificate, and what is wrong with that."""
     if not entry.signer and not wanted:
         return [], []
+    if entry.signer is None:
+        return ["ledger not signed as far as this certificate: of an earlier version"], []
     if find_spec("cryptography") is None:
         return ["signature of the ledger not checked: pip install 'huddle-bench[sign]'"], []
     rows = ledger.signed_rows()
@@ -318,12 +349,14 @@ def _head(ledger: Ledger, entry: Entry, wanted: str) -> tuple[list[str], list[st
     return [f"ledger signed with key {key_id} as far as this certificate"], []
 
 
-def _recordings(path: Path, entry: Entry, recordings: Sequence[Path], ledger: Ledger) -> list[str]:
-    beside = [ledger.folder.parent / file for file, _, _ in entry.recordings]
+def _recordings(
+    path: Path, entry: Entry, recordings: Sequence[Path], ledger: Ledger | None
+) -> list[str]:
+    files = [file for file, _, _ in entry.recordings]
+    beside = [] if ledger is None else [ledger.folder.parent / file for file in files]
     given = list(recordings) or [each for each in beside if each.is_file()]
     if not given:
-        names = ", ".join(file for file, _, _ in entry.recordings)
-        return [f"recording not checked: name it ({names})"]
+        return [f"recording not checked: name it ({', '.join(files)})"]
     expected = {run_id: (file, sha256) for file, run_id, sha256 in entry.recordings}
     lines = []
     for each in given:

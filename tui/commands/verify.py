@@ -46,7 +46,8 @@ def verify(
         typer.Option(
             "--certificates",
             metavar="FOLDER",
-            help="Folder of certificates that no bench file names; may be repeated.",
+            help="Folder of certificates that no bench file names, or ledger of a certificate"
+            " that is elsewhere; may be repeated.",
         ),
     ] = None,
     json: JsonOption = None,
@@ -69,7 +70,8 @@ def verify(
 
     certificates = [source for source in sources if source.suffix.lower() == ".pdf"]
     if certificates:
-        _verify_certificates(certificates, sources, key=key, json=json)
+        folder = ledgers[0] if ledgers else None
+        _verify_certificates(certificates, sources, folder=folder, key=key, json=json)
         return
     found = []
     paths, known, folders = _recordings(sources)
@@ -103,6 +105,7 @@ def _verify_certificates(
     certificates: Sequence[Path],
     sources: Sequence[Path],
     *,
+    folder: Path | None,
     key: Path | None,
     json: str | None,
 ) -> None:
@@ -119,7 +122,8 @@ def _verify_certificates(
     recordings = [source for source in sources if source not in certificates]
     found = []
     for path in certificates:
-        lines = verify(path, recordings, Ledger(path.absolute().parent), key=key)
+        ledger = Ledger(path.absolute().parent if folder is None else folder)
+        lines = verify(path, recordings, ledger, key=key)
         found.append({"path": str(path), "findings": lines})
         for line in lines:
             for_people(json).print(f"{path.name}: {line}", soft_wrap=True)

@@ -9,6 +9,7 @@ import shutil
 import sqlite3
 from contextlib import closing
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import h5py
@@ -29,7 +30,6 @@ from tui.certificate.verification import JSON_NAME
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
 SECRET = "secret"  # noqa: S105 - of keys that the tests make
 DROP = "".join(
@@ -348,3 +348,29 @@ def test_a_ledger_of_an_earlier_version_is_read_and_says_what_it_cannot_prove(
     code, said = made.verify(path, "--key", public)
     assert code == 3
     assert "it is not signed" in said
+
+
+def test_who_has_the_key_and_no_ledger_verifies_the_signature(
+    signing: Signed, tmp_path: Path
+) -> None:
+    path = Path(shutil.copy(signing.certificate, tmp_path / "received.pdf"))
+    code, said = signing.check(path, trusted=False)
+    assert code == 3
+    assert "there is no ledger" in said
+    code, said = signing.check(path, signing.lab.recording)
+    assert code == 0, said
+    assert "no ledger here: a later revision would not be known" in said
+    assert "the one certified" in said
+    folder = signing.lab.certificates
+    code, said = signing.lab.verify(path, "--certificates", folder)
+    assert code == 0
+    assert "ledger signed with key" in said
+    recording = Path(shutil.copy(signing.lab.recording, tmp_path / "night.h5"))
+    checksums_rewritten(Signed(Laboratory(tmp_path, recording, path), path, path))
+    code, said = signing.check(path, recording)
+    assert code == 3
+    assert "was changed since the certificate" in said
+    stripped(path)
+    code, said = signing.check(path)
+    assert code == 3
+    assert "was removed" in said
