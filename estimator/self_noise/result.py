@@ -42,6 +42,8 @@ class Flag(enum.IntFlag):
     """Not a cross-spectral matrix: not Hermitian, a negative PSD or coherence above 1."""
     POOLED = 1024
     """The bin alone does not resolve the motion: its directions are those of neighbouring bins."""
+    UNIDENTIFIED = 2048
+    """The motion does not tell noise from motion: the value is what others do not predict."""
 
 
 @dataclass(frozen=True, slots=True)

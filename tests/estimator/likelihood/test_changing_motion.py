@@ -9,7 +9,7 @@ import pytest
 
 from estimator.errors import InsufficientDataError
 from estimator.levels.interval import interval
-from estimator.likelihood.multi_part import STEADINESS, MultiPart, Refusal, multi_part
+from estimator.likelihood.changing_motion import STEADINESS, BandNoise, Refusal, band_noise
 from tests.estimator.csm_models import rotation, wishart
 
 if TYPE_CHECKING:
@@ -65,9 +65,9 @@ class Bench:
         *,
         shared: tuple[tuple[int, int], ...] = (),
         steadiness: float = STEADINESS,
-    ) -> MultiPart:
+    ) -> BandNoise:
         """Return what the parts say of the noise."""
-        return multi_part(
+        return band_noise(
             *(csm, np.full(N_PARTS, float(AVERAGES))),
             dims=self.dims,
             n_dims=self.dims[0],
@@ -96,7 +96,7 @@ def changing(bench: Bench, size: float = CHANGING) -> FloatArray:
     return size * bench.rng.standard_normal(N_PARTS)
 
 
-def holds(found: MultiPart, bench: Bench) -> np.ndarray:
+def holds(found: BandNoise, bench: Bench) -> np.ndarray:
     """Return whether each interval holds the noise, the lever included."""
     low, high = interval(found.level, found.cumulants)
     truth = np.diag(bench.noise)
@@ -212,7 +212,7 @@ def test_levels_scale_with_the_units_of_channels() -> None:
 def test_parts_with_too_few_averages_are_an_error() -> None:
     csm = np.broadcast_to(np.eye(6, dtype=np.complex128), (3, 4, 6, 6))
     with pytest.raises(InsufficientDataError, match="more than 6 averages"):
-        multi_part(csm, np.full(4, 6.0), dims=(3, 3), n_dims=3)
+        band_noise(csm, np.full(4, 6.0), dims=(3, 3), n_dims=3)
 
 
 def test_the_change_of_the_motion_is_stated() -> None:
