@@ -9,7 +9,12 @@ import difflib
 import math
 from collections.abc import Mapping, Sequence
 
-METHODS = ("auto", "two-channel", "three-channel", "three-sensor", "maximum-likelihood", "all")
+METHODS = (
+    *("auto", "two-channel", "three-channel", "three-sensor", "maximum-likelihood"),
+    *("multi-part", "all"),
+)
+LEAST_SENSORS = {"auto": 1, "two-channel": 2, "multi-part": 2}
+"""By method; the others need three."""
 CLOCKS = ("refined", "arrivals", "nominal")
 EQUALISATIONS = ("auto", "known", "estimated", "off")
 TRENDS = ("none", "constant", "linear")

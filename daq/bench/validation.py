@@ -19,6 +19,7 @@ from daq.bench.model import (
     valid_rate,
 )
 from daq.bench.option_fit import misfits, shortest_duration
+from daq.bench.option_values import LEAST_SENSORS
 from daq.errors import BenchFileError, FileFault, WrongSettingError
 
 if TYPE_CHECKING:
@@ -147,7 +148,7 @@ def _device_faults(
 def _set_faults(
     sensors: Sequence[Sensor], n_named: int, estimate: EstimateSettings
 ) -> Iterator[FileFault]:
-    needed = 2 if estimate.methods == ("two-channel",) else 3
+    needed = max(LEAST_SENSORS.get(method, 3) for method in estimate.methods)
     if n_named < needed:
         yield FileFault(
             "sensors",

@@ -352,7 +352,8 @@ class Estimation:
             self._equalisation.reset()
             self._take_all(count, repeat)
         snapshot = self._snapshots.build(self._recordings, self._passes, final=True)
-        if not any(np.isfinite(each.noise_psd).any() for each in snapshot.results.values()):
+        nothing = not any(np.isfinite(each.noise_psd).any() for each in snapshot.results.values())
+        if nothing and (snapshot.results or snapshot.refused or not snapshot.n_segments):
             why = why_nothing(
                 self._recordings, self._passes, snapshot, segment=self.settings.segment
             )

@@ -59,10 +59,13 @@ class Settings(EstimateSettings):
     def for_sensors(self, dims: tuple[int, ...]) -> Settings:
         """Return settings with a method in place of ``auto``, by the channels of each sensor.
 
-        Maximum likelihood needs room for more dimensions than a sensor has channels.
+        Maximum likelihood needs room for more dimensions than a sensor has channels. Two sensors
+        take motion that changes; no method gives the noise of one.
         """
         if "auto" not in self.methods:
             return self
+        if len(dims) < 3:
+            return replace(self, methods=("multi-part",) if len(dims) > 1 else ())
         roomy = has_room(dims)
         chosen = "maximum-likelihood" if roomy else "three-sensor"
         methods = (chosen if name == "auto" else name for name in self.methods)

@@ -250,6 +250,19 @@ def data_means(snapshot: Snapshot, band: tuple[float, float]) -> FloatArray:
     return np.asarray(np.average(snapshot.data_psd[inside], axis=0, weights=width))
 
 
+def data_interval(
+    snapshot: Snapshot, settings: Settings, band: tuple[float, float]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the 95 % interval of `data_means`, two arrays of shape (n_channels,)."""
+    psd = snapshot.data_psd
+    averages = averages_at(snapshot, snapshot.frequency)[:, None]
+    cumulants = np.stack([psd**k / averages ** (k - 1) for k in (2, 3, 4)])
+    edges, width = band_edges(snapshot.frequency, band), np.gradient(snapshot.frequency)
+    found = band_levels(psd, cumulants, edges, correlation_of(settings), weights=width)
+    low, high = found.interval()
+    return low[0], high[0]
+
+
 def judged_method(snapshot: Snapshot, settings: Settings) -> str:
     """Return the method by which limits, c.o.v. and clocks are judged.
 

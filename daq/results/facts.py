@@ -95,6 +95,19 @@ class SensorsSimulated(Fact):
 
 
 @record
+class FewSensors(Fact):
+    """One sensor alone, or none: no method tells its noise from motion.
+
+    Attributes
+    ----------
+    n_sensors : int
+    """
+
+    name: ClassVar[str] = "few-sensors"
+    n_sensors: int
+
+
+@record
 class MethodRefused(Fact):
     """A method gives no result.
 

@@ -26,6 +26,7 @@ from daq.results.facts import (
     DimensionsUnexplained,
     DirectionsPooled,
     Fact,
+    FewSensors,
     Finding,
     GapsBridged,
     IntervalsWidened,
@@ -340,7 +341,9 @@ def _model(snapshot: Snapshot) -> Iterator[Fact]:
     more = any(each.n_factors > each.usual for each in choices)
     if diagnostics.untested is not None:
         named = found is not None and any(isinstance(each, TooFewSensors) for each in found.advice)
-        if not named and snapshot.no_segment is None:
+        if len(snapshot.dims) == 1:
+            yield FewSensors(rank=Rank.DELAYS, n_sensors=1)
+        elif not named and snapshot.no_segment is None:
             yield _untested(snapshot, diagnostics.untested)
     elif (
         found is not None

@@ -197,7 +197,7 @@ def diagnose(
     frequency : float64, shape (n_freqs,)
         Hz, ascending.
     dims : tuple of int
-        Number of channels of each of three or more sensors.
+        Number of channels of each of two or more sensors.
     n_effective : float
         Number of independent averages. Results of the likelihood (SNR and model test) are NaN if
         it does not exceed the number of channels, or with fewer than three sensors with signal.
@@ -223,9 +223,9 @@ def diagnose(
     InvalidMatrixError
         As `estimator.self_noise.coherency.coherency`, or if `frequency` does not fit.
     InsufficientDataError
-        With fewer than three sensors, or if `n_effective` is not a finite number above zero.
+        With fewer than two sensors, or if `n_effective` is not a finite number above zero.
     """
-    check_dims(dims)
+    check_dims(dims, 2)
     check_averages(n_effective)
     csm = np.asarray(csm, np.complex128)
     given = coherency(csm, dims)

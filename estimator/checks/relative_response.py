@@ -3,12 +3,16 @@
 For common motion, ``S_jk S_ik^-1 = H_j H_i^-1`` for any third sensor k, independent of the noise of
 all three sensors. Averaged over a band and without its delay this matrix is real; its rows express
 the channels of sensor j by those of sensor i.
+
+Without a third sensor, k is i, so that the noise of i makes the response too small, or j, so that
+the noise of j makes it too large. The response is the mean of both, and the errors include half of
+the difference.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -30,6 +34,8 @@ from estimator.self_noise.coherency import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from estimator.self_noise.coherency import Coherency
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
@@ -185,8 +191,8 @@ def relative_response(
     ----------
     csm : complex128, shape (n_freqs, n_channels, n_channels)
         One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
-        channels grouped by sensor; at least three sensors, both with d channels, and the others
-        with at least d channels in total.
+        channels grouped by sensor; at least two sensors, both with d channels, and the others, if
+        any, with at least d channels in total.
     frequency : float64, shape (n_freqs,)
         Hz, ascending.
     dims : tuple of int
@@ -212,7 +218,7 @@ def relative_response(
     Raises
     ------
     InsufficientDataError
-        If the two have different numbers of channels, no third sensor exists, or they are coherent
+        If the two have different numbers of channels, the others have fewer, or they are coherent
         at no frequency of the band.
     InvalidMatrixError
         As `estimator.self_noise.coherency.coherency`, or if `frequency` does not fit.
@@ -228,7 +234,7 @@ def relative_response(
     ``Re sum_f w T(f) exp(2 pi i f tau)`` on a grid of up to half a segment in both directions. Then
     least squares fit a line through the origin to the remaining phase, with the same weights.
     """
-    check_dims(dims)
+    check_dims(dims, 2)
     csm = np.asarray(csm, dtype=np.complex128)
     given = coherency(csm, dims) if checked is None else checked
     frequency = check_frequency(frequency, len(csm))
@@ -248,14 +254,16 @@ def relative_response(
     coherence = coherence or CanonicalCoherence(given.matrix)
     own = [np.array(own_channels(dims, sensor)) for sensor in (first, second)]
     rest = other_channels(dims, first, second)
-    if len(rest) < d:
+    is_pair = len(dims) == 2
+    if len(rest) < d and not is_pair:
         raise InsufficientDataError(
             f"sensors {first} and {second}: the others have {len(rest)} channels; expected {d}"
         )
     g = coherence.between(*own)[:, -1]
     weight = g / np.maximum(1 - g, 1e-9)
     weight[~(usable & is_coherent(g, usable))] = 0.0
-    weight[~seen_by_others(coherence, dims, (first, second), weight > 0)] = 0.0
+    if not is_pair:
+        weight[~seen_by_others(coherence, dims, (first, second), weight > 0)] = 0.0
     if not weight.any():
         raise InsufficientDataError(
             f"sensors {first} and {second}: at no frequency from {low:g} to {high:g} Hz are they "
@@ -263,20 +271,71 @@ def relative_response(
             f"more than {MIN_COHERENCE}"
         )
     inside = np.flatnonzero(weight)
-    f, weight = frequency[inside], weight[inside]
-    power = _power(csm, dims, first)[inside]
-    if products is None or len(rest) == d:
-        S_ik, S_jk = (_part(csm, inside, channels, rest) / power[:, None, None] for channels in own)
-        transfer = _over(S_jk, S_ik)
-    else:
-        transfer = _quotient(*(each[inside] for each in products.of(first, second)))
-    delay, delay_error, is_ambiguous = _delay(f, weight, transfer)
     horizontal = _horizontal_channels(d, vertical)
+    at = _At(csm, frequency[inside], weight[inside], inside, _power(csm, dims, first)[inside])
+
+    def by(rest: IntArray) -> RelativeResponse:
+        if products is None or len(rest) == d:
+            S_ik, S_jk = (_part(csm, inside, each, rest) / at.power[:, None, None] for each in own)
+            transfer = _over(S_jk, S_ik)
+        else:
+            transfer = _quotient(*(each[inside] for each in products.of(first, second)))
+        return _response(at, transfer, own, rest, horizontal, sensors=(first, second))
+
+    found = _between(*(by(each) for each in own)) if is_pair else by(rest)
+    return replace(found, coherence=float(g[inside].mean()))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _At:
+    """Averages, the frequencies that count with their weights, and the PSD of the first sensor."""
+
+    csm: ComplexArray
+    frequency: FloatArray
+    weight: FloatArray
+    inside: IntArray
+    power: FloatArray
+
+
+def _between(low: RelativeResponse, high: RelativeResponse) -> RelativeResponse:
+    """Return the mean of two responses that the noise of either sensor makes too small, too large.
+
+    The truth is between them, so that half of the difference is two standard errors.
+    """
+    apart = np.abs(high.gains - low.gains) / 4
+    turned = np.rad2deg(np.linalg.norm(high.rotation - low.rotation)) / math.sqrt(2) / 4
+    return replace(
+        low,
+        matrix=(low.matrix + high.matrix) / 2,
+        gains=(low.gains + high.gains) / 2,
+        gain_errors=np.hypot(np.fmax(low.gain_errors, high.gain_errors), apart),
+        angle_error_deg=math.hypot(max(low.angle_error_deg, high.angle_error_deg), turned),
+        rotation_error_deg=math.hypot(max(low.rotation_error_deg, high.rotation_error_deg), turned),
+        delay=(low.delay + high.delay) / 2,
+        delay_error=math.hypot(
+            max(low.delay_error, high.delay_error), (high.delay - low.delay) / 4
+        ),
+        is_ambiguous=low.is_ambiguous or high.is_ambiguous,
+    )
+
+
+def _response(
+    at: _At,
+    transfer: ComplexArray,
+    own: Sequence[IntArray],
+    rest: IntArray,
+    horizontal: tuple[int, int] | None,
+    *,
+    sensors: tuple[int, int],
+) -> RelativeResponse:
+    """Return the response by the channels `rest`, without its coherence."""
+    f, weight, csm, inside = at.frequency, at.weight, at.csm, at.inside
+    delay, delay_error, is_ambiguous = _delay(f, weight, transfer)
     starts = _parts(weight)
     late = np.exp(2j * np.pi * f * delay)
     right, left = (
         _weighted_sums(csm, inside, channels, by, starts)[:, :, rest]
-        for channels, by in zip(own, (weight / power, weight / power * late), strict=True)
+        for channels, by in zip(own, (weight / at.power, weight / at.power * late), strict=True)
     )
     matrix = _over(left.sum(axis=0), right.sum(axis=0)).real
     # one after the other without a part of the band, for the scatter
@@ -289,8 +348,8 @@ def relative_response(
     skew_errors = _jackknife(between_without, between)
     turned = _jackknife(np.rad2deg(_rotations(without)[0] - rotation), rotation)
     return RelativeResponse(
-        first=first,
-        second=second,
+        first=sensors[0],
+        second=sensors[1],
         low=float(f[0]),
         high=float(f[-1]),
         matrix=matrix,
@@ -307,7 +366,7 @@ def relative_response(
         delay=delay,
         delay_error=delay_error,
         is_ambiguous=is_ambiguous,
-        coherence=float(g[inside].mean()),
+        coherence=math.nan,
     )
 
 

@@ -314,7 +314,7 @@ def _absent(given: Coherency, dims: tuple[int, ...]) -> Iterator[Advice]:
         )
     there = presence(given, dims)
     missing = tuple(s for s in range(len(dims)) if s not in there.whole)
-    if len(there.sensors) < 3:
+    if len(there.sensors) < min(3, len(dims)):  # a bench of two lacks none
         yield TooFewSensors(level=Level.PROBLEM, sensors=there.sensors)
     elif missing and len(there.whole) < 3:
         yield MissingChannels(level=Level.WARNING, sensors=missing, whole_sensors=there.whole)

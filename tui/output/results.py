@@ -9,7 +9,13 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from daq.results.band_summary import band_of, channel_means, data_means, without_partners
+from daq.results.band_summary import (
+    band_of,
+    channel_means,
+    data_interval,
+    data_means,
+    without_partners,
+)
 from estimator.self_noise.result import Flag
 from tui.wording.formatting import (
     clock_time,
@@ -33,8 +39,9 @@ def result_title(snapshot: Snapshot, settings: Settings) -> Text:
     low, high = band_of(settings, snapshot)
     wanted = high if settings.band is None else settings.band[1]
     asked = f" ({wanted:.3g} requested)" if wanted > high else ""
+    what = "Self-noise" if snapshot.results else "PSD of the recorded signals"
     return Text.assemble(
-        (f"Self-noise, mean over {low:.3g} to {high:.3g} Hz", "bold"),
+        (f"{what}, mean over {low:.3g} to {high:.3g} Hz", "bold"),
         f"{asked}, dB re 1 ({snapshot.unit})²/Hz, with its 95 % interval",
     )
 
@@ -51,10 +58,14 @@ def result_table(snapshot: Snapshot, settings: Settings) -> Table:
         table.add_column(method, justify="right")
         columns.append(channel_means(noise, snapshot, settings, band))
     data, alone = data_means(snapshot, band), without_partners(snapshot, band)
+    ends = None if columns else data_interval(snapshot, settings, band)
     for number, label in enumerate(snapshot.channels):
         power = float(data[number])
         no_signal = FLAG_WORDS[Flag.DEAD_CHANNEL].short
-        row = [label.sensor, label.channel, no_signal if power == 0 else level(power)]
+        text = level(power)
+        if ends is not None:
+            text = level_with_error(power, float(ends[1][number]), float(ends[0][number]))
+        row = [label.sensor, label.channel, no_signal if power == 0 else text]
         for means in columns:
             mean = means[number]
             if number in alone:

@@ -29,6 +29,7 @@ from daq.results.facts import (
     DimensionsUnexplained,
     DirectionsPooled,
     Fact,
+    FewSensors,
     Finding,
     GapsBridged,
     IntervalsWidened,
@@ -223,6 +224,16 @@ def _finding(fact: Finding, names: Names) -> Wording:
 def _simulated(fact: SensorsSimulated, names: Names) -> Wording:
     del fact, names
     return Wording(SIMULATED.rstrip("."), SIMULATED)
+
+
+@word.register(FewSensors)
+def _few_sensors(fact: FewSensors, names: Names) -> Wording:
+    del fact, names
+    return Wording(
+        "Noise needs more sensors: the table shows the PSD of what the sensor recorded",
+        "One sensor alone cannot tell its noise from motion: its noise is below its PSD.",
+        "Place two more sensors beside it; one more suffices where the motion changes.",
+    )
 
 
 @word.register(MethodRefused)

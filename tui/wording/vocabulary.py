@@ -91,6 +91,9 @@ FLAG_WORDS: Mapping[Flag, FlagWords] = {
     Flag.POOLED: FlagWords(
         "pooled", "the directions of the motion are those of neighbouring frequencies"
     ),
+    Flag.UNIDENTIFIED: FlagWords(
+        "not identified", "the motion does not change enough, and the value is an upper bound"
+    ),
     Flag.UNRESOLVED: FlagWords(
         "unresolved", "too few averages for the weak motion, which the noise may include"
     ),
@@ -112,6 +115,8 @@ SOURCE_WORDS: Mapping[Source, str] = {
     Source.AXES: "axes that may be off",
     Source.DIMENSIONS: "the number of dimensions",
     Source.ROUNDING: "matrices in single precision",
+    Source.GAINS: "gains that may follow the loudness",
+    Source.STEADY_MOTION: "motion that does not tell noise from motion",
     Source.FAULTY: "a faulty channel",
     Source.SENSITIVITY: "sensitivity",
     Source.TEMPERATURE: "temperature",

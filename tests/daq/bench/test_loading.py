@@ -274,10 +274,16 @@ def test_each_fault_names_file_key_value_and_what_was_expected(text: str, expect
 
 
 def test_too_few_sensors_are_refused() -> None:
-    found = faults(HEAD + sensor_text("a") + sensor_text("b"))
-    assert found == ['bench.toml: sensors = "2 sensors": expected at least 3 for method auto']
-    method = '[estimate]\nmethod = "two-channel"\n'
-    assert len(read(HEAD + sensor_text("a") + sensor_text("b") + method).sensors) == 2
+    two, method = HEAD + sensor_text("a") + sensor_text("b"), '[estimate]\nmethod = "{}"\n'
+    found = faults(two + method.format("three-sensor"))
+    assert found == [
+        'bench.toml: sensors = "2 sensors": expected at least 3 for method three-sensor'
+    ]
+    found = faults(HEAD + sensor_text("a") + method.format("multi-part"))
+    assert found == ['bench.toml: sensors = "1 sensor": expected at least 2 for method multi-part']
+    assert len(read(two + method.format("two-channel")).sensors) == 2
+    assert len(read(two).sensors) == 2
+    assert len(read(HEAD + sensor_text("a")).sensors) == 1
 
 
 def test_all_errors_are_reported_together() -> None:

@@ -343,8 +343,8 @@ def test_invalid_arguments_are_refused() -> None:
     csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)))
     with pytest.raises(InvalidMatrixError, match="frequency"):
         diagnose(csm, FREQUENCY[:5], dims=THREE, n_effective=100)
-    with pytest.raises(InsufficientDataError, match="2 sensors"):
-        diagnose(csm[:, :6, :6], FREQUENCY, dims=(3, 3), n_effective=100)
+    with pytest.raises(InsufficientDataError, match="1 sensors"):
+        diagnose(csm[:, :3, :3], FREQUENCY, dims=(3,), n_effective=100)
     with pytest.raises(InvalidMatrixError, match="ascending"):
         diagnose(csm, FREQUENCY[::-1], dims=THREE, n_effective=100)
     for n in (np.nan, np.inf, -1):

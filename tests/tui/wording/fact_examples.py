@@ -24,6 +24,7 @@ A, NOON = ("A",), 1_700_000_000_000_000_000
 EXAMPLES: tuple[Fact, ...] = (
     facts.Finding(rank=Rank.INVALIDATES, findings=(MISFIT,)),
     facts.SensorsSimulated(rank=Rank.TO_KNOW),
+    facts.FewSensors(rank=Rank.DELAYS, n_sensors=1),
     facts.MethodRefused(rank=Rank.DELAYS, method="two-channel", reason="channels differ"),
     facts.WithoutEstimate(
         rank=Rank.DELAYS,
