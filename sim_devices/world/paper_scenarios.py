@@ -13,7 +13,7 @@ import numpy as np
 from sim_devices.errors import ScenarioError
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.spectrum import Mixed, Resonance, Sum, Tabulated, White
-from sim_devices.world.tables import CommonMotion, PlaneWaves, SensorModel
+from sim_devices.world.tables import ChangingLevel, CommonMotion, PlaneWaves, SensorModel
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -210,6 +210,32 @@ def waves(*, snr: float = 1e3, speed: float = 150.0, seed: int = 0) -> Scenario:
     )
 
 
+def two(*, snr: float = 30.0, deviation: float = 6.0, seed: int = 0) -> Scenario:
+    """Return two triaxial sensors of arbitrary directions in motion whose level changes.
+
+    With `deviation` in dB. The noise of both follows from the changes, without a third sensor.
+    """
+    angles = np.random.default_rng(27).uniform(-180.0, 180.0, (2, 3))
+    return Scenario(
+        seed=seed,
+        motion=CommonMotion(
+            spectra=tuple(White(level=each * snr * NOISE) for each in (1.0, 1.5, 0.8)),
+            level=ChangingLevel(deviation=deviation),
+        ),
+        sensors={
+            name: SensorModel(
+                sampling_rate=SAMPLING_RATE,
+                rotation=(float(yaw), float(pitch), float(roll)),
+                gain=gain,
+                noise=White(level=noise * NOISE),
+            )
+            for name, gain, noise, (yaw, pitch, roll) in zip(
+                "AB", (1.0, 1.1), (1.0, 0.5), angles, strict=True
+            )
+        },
+    )
+
+
 SCENARIOS: Mapping[str, Callable[[], Scenario]] = {
     "fig4": fig4,
     "fig5": fig5,
@@ -219,6 +245,7 @@ SCENARIOS: Mapping[str, Callable[[], Scenario]] = {
     "setup1": setup1,
     "setup2": setup2,
     "waves": waves,
+    "two": two,
 }
 
 

@@ -121,17 +121,26 @@ class SensorModel(Table):
     temperature: DeviceTemperature = DeviceTemperature()
 
 
+class ChangingLevel(Table):
+    """Level of the motion in dB: normal with this `deviation` every `period` in s, and linear."""
+
+    deviation: NonNegativeFloat
+    period: PositiveFloat = 60.0
+
+
 class CommonMotion(Table):
     """One motion for all sensors: independent components with these PSDs, then mixed.
 
     With `mixing` (one row per direction of the world, one column per spectrum) the directions are
-    correlated: their cross-PSD matrix is mixing · diag(spectra) · mixingᵀ.
+    correlated: their cross-PSD matrix is mixing · diag(spectra) · mixingᵀ. The spectra are those at
+    a level of 0 dB, where the level changes.
     """
 
     kind: Literal["common"] = "common"
     spectra: tuple[Spectrum, ...] = Field(min_length=1)
     mixing: tuple[tuple[float, ...], ...] | None = None
     bandwidth: PositiveFloat | None = None
+    level: ChangingLevel | None = None
 
     @property
     def n_dims(self) -> int:

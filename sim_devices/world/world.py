@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from sim_devices.arrays import ComplexArray, FloatArray
     from sim_devices.world.scenario import Scenario
-    from sim_devices.world.tables import Response, SensorClock
+    from sim_devices.world.tables import ChangingLevel, Response, SensorClock
 
 _Kept = TypeVar("_Kept")
 
@@ -214,6 +214,34 @@ class SampleClock:
         self._time = np.concatenate([self._time, time])
 
 
+class MotionLevel:
+    """Level of a motion that changes, equal for all sensors and in every process."""
+
+    def __init__(self, level: ChangingLevel, *, key: tuple[int, int]) -> None:
+        self._level = level
+        self._key = np.array(key, dtype=np.uint64)
+
+    def amplitude(self, times: FloatArray) -> FloatArray:
+        """Return the factor of the motion at world `times` in s, shape (n,)."""
+        place = times / self._level.period
+        first = int(np.floor(place.min(initial=0.0)))
+        knots = self._knots(first, int(np.floor(place.max(initial=0.0))) + 2)
+        decibel = np.interp(place, first + np.arange(len(knots)), knots)
+        return np.asarray(10 ** (decibel / 20))
+
+    def _knots(self, first: int, end: int) -> FloatArray:
+        """Return the level in dB at knots `first` to `end`, excluded."""
+        blocks = range(first // KNOTS_PER_BLOCK, (end - 1) // KNOTS_PER_BLOCK + 1)
+        each = []
+        for block in blocks:
+            counter = np.array([0, 0, block % 2**64, 0], dtype=np.uint64)
+            random = np.random.Generator(np.random.Philox(key=self._key, counter=counter))
+            each.append(random.standard_normal(KNOTS_PER_BLOCK))
+        begin = first - blocks[0] * KNOTS_PER_BLOCK
+        whole = np.concatenate(each)[begin : begin + end - first]
+        return np.asarray(self._level.deviation * whole)
+
+
 GRID_OVERSAMPLING = 4  # rate of the master grid over the highest frequency of the motion
 N_TAPS = 22
 KAISER_BETA = 13.4
@@ -262,13 +290,18 @@ class World:
         )
         key = scenario.seed, floor << 32
         self._sources = WhiteSources(key, n_sources, scenario.longest_block)
+        level = None if isinstance(motion, PlaneWaves) else motion.level
+        self._level = None if level is None else MotionLevel(level, key=(key[0], key[1] + 1))
         self._motions: dict[str, Motion] = {}
         self._noises: dict[str, GaussianSeries] = {}
         self._clocks: dict[str, SampleClock] = {}
 
     def samples(self, sensor: str, first_sample: int, n: int) -> FloatArray:
         """Return the sensor's readings, including noise, in m/s², shape (n, n_channels)."""
-        felt = self.motion(sensor).at(self.sample_times(sensor, first_sample, n))
+        times = self.sample_times(sensor, first_sample, n)
+        felt = self.motion(sensor).at(times)
+        if self._level is not None:
+            felt *= self._level.amplitude(times)[:, None]
         felt += self.noise(sensor, first_sample, n)
         return felt
 

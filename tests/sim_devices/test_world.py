@@ -208,3 +208,18 @@ def test_the_samples_have_the_true_cross_spectral_matrix() -> None:
     away = np.abs(matrix[band] - true) / power * np.sqrt(n)
     assert np.sqrt(np.mean(away**2)) == pytest.approx(1.0, abs=0.05)
     assert np.abs(((matrix[band] - true) / power).mean()) < 5 / np.sqrt(n * band.size)
+
+
+def test_the_level_of_the_motion_changes_for_all_sensors_alike() -> None:
+    level = {"deviation": 6.0, "period": 2.0}
+    steady = World(scenario({"A": {}, "B": {}}))
+    changing = World(scenario({"A": {}, "B": {}}, spectra=[white(1.0)] * 3, level=level))
+    n = 60_000
+    course = changing.samples("A", -100, n)[:, 0] / steady.samples("A", -100, n)[:, 0]
+    assert np.array_equal(changing.samples("B", 30_000, 50), changing.samples("A", 30_000, 50))
+    decibel = 20 * np.log10(np.abs(course))
+    knots = decibel[100::400]  # a knot every two seconds, from time 0 on
+    assert abs(knots.mean()) < 4 * 6 / np.sqrt(len(knots))
+    assert abs(knots.std() / 6 - 1) < 4 / np.sqrt(2 * len(knots))
+    between = decibel[300::400][: len(knots) - 1]
+    assert np.allclose(between, (knots[:-1] + knots[1:])[: len(between)] / 2, atol=1e-6)

@@ -20,7 +20,7 @@ def simulate(
         typer.Argument(
             metavar="SCENARIO",
             help="Bench file with a [simulation] table, or a scenario of the paper: fig4, fig5, "
-            "fig9, fig12, fig13, setup1, setup2, waves.",
+            "fig9, fig12, fig13, setup1, setup2, waves, two.",
         ),
     ],
     *,
