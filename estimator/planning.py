@@ -13,9 +13,11 @@ from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import ndtri
 
 from estimator.checks.shared_motion import CanonicalCoherence
 from estimator.errors import EstimatorError, InsufficientDataError
+from estimator.likelihood.changing_motion import bound_of_parts
 from estimator.likelihood.fisher import covariance, cramer_rao_cov, efficiency
 from estimator.methods import METHODS, self_noise
 from estimator.self_noise.coherency import check_dims, own_channels
@@ -30,6 +32,9 @@ REFERENCE = 1e6  # number of averages at which the scatter of a method is evalua
 MIN_COHERENT_AVERAGES = 30.0
 """Averages times the coherence of two sensors in the direction of its minimum, from which the
 c.o.v. is as predicted: in simulations it is 5 % higher at 30, and 20 to 200 % higher at 8."""
+CHANGES = (3.0, 6.0)
+"""Standard deviations in dB of the level of the motion, for which two sensors are planned."""
+PLANNED_PARTS = 12
 ROUNDING = 1e-24  # coherence that is zero within rounding
 
 
@@ -40,7 +45,8 @@ class Plan:
     Attributes
     ----------
     method : str
-        A name in `estimator.methods.METHODS`, or "cramer-rao-bound": the lower limit of any method.
+        A name in `estimator.methods.METHODS`, or "cramer-rao-bound": the lower limit of any method;
+        of two sensors "multi-part" and the change of the motion.
     n_effective : float64, shape (n_freqs, n_channels)
         Number of independent averages required for the target c.o.v. and to resolve the motion; NaN
         if the method gives no estimate.
@@ -137,7 +143,8 @@ def plan(
     noise_psd : float64, shape (n_freqs, n_channels)
         True noise, included in `csm`.
     dims : tuple of int
-        Number of channels of each sensor; at least three sensors.
+        Number of channels of each sensor; at least two sensors. Two need motion that changes:
+        plans for a standard deviation of its level of each of `CHANGES` in dB.
     settings : WelchSettings
     cov : float
         Target coefficient of variation of the noise PSD of every channel.
@@ -150,15 +157,20 @@ def plan(
     Raises
     ------
     InsufficientDataError
-        With fewer than three sensors.
+        With fewer than two sensors.
     InvalidMatrixError
         If `csm` or `noise_psd` has a wrong shape or is not finite, or a noise PSD is not positive.
     EstimatorError
         If `cov` is not a finite number above zero.
     """
-    check_dims(dims)
+    check_dims(dims, 2)
     if not (np.isfinite(cov) and cov > 0):
         raise EstimatorError(f"c.o.v. {cov}: expected a number above zero")
+    if len(dims) == 2:
+        return [
+            _plan_of_two(csm, noise_psd, dims, settings, cov=cov, change=change)
+            for change in CHANGES
+        ]
     bound = cramer_rao_cov(csm, noise_psd, n_effective=REFERENCE)
     unknown = np.full_like(bound, np.nan)
     plans = []
@@ -189,6 +201,31 @@ def plan(
         settings=settings,
     )
     return [*plans, least]
+
+
+def _plan_of_two(
+    csm: ComplexArray,
+    noise_psd: FloatArray,
+    dims: tuple[int, ...],
+    settings: WelchSettings,
+    *,
+    cov: float,
+    change: float,
+) -> Plan:
+    """Return what two sensors need where the level of the motion has a deviation of so many dB."""
+    noise = np.diag(noise_psd[0]).astype(np.complex128)
+    level = ndtri((np.arange(PLANNED_PARTS) + 0.5) / PLANNED_PARTS)
+    power = 10 ** (change / 10 * level)[:, None, None]
+    parts = power * (csm - noise) + noise
+    scatter = bound_of_parts(parts[None], noise, dims=dims, n_dims=max(dims)) / noise_psd
+    return _plan(
+        f"multi-part, {change:g} dB",
+        (scatter / cov) ** 2,
+        least=float(PLANNED_PARTS * 2 * sum(dims)),
+        bias=np.zeros_like(noise_psd),
+        share=np.ones_like(noise_psd),
+        settings=settings,
+    )
 
 
 def crossed_csm(

@@ -480,6 +480,38 @@ def band_noise(
     )
 
 
+def bound_of_parts(
+    csm: ComplexArray, noise: ComplexArray, *, dims: Sequence[int], n_dims: int
+) -> FloatArray:
+    """Return the least standard deviation of the noise of every channel, by Cramér and Rao.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_parts, n_channels, n_channels)
+        True cross-spectral matrices of parts of equal length.
+    noise : complex128, shape (n_channels, n_channels)
+        True noise, included in `csm`.
+    dims : sequence of int
+    n_dims : int
+        Dimensions of the motion.
+
+    Returns
+    -------
+    float64, shape (n_channels,)
+        Times the root of the averages of all parts; infinite where the noise is not identified.
+    """
+    model = _Model.of(dims, n_dims, ())
+    n_parts = csm.shape[1]
+    parts = _Parts(csm, np.full(n_parts, 1 / n_parts), 1.0)
+    white = _power(noise, -0.5)
+    axes = _power(noise, 0.5) @ np.linalg.eigh(white @ parts.mean @ white)[1][..., -n_dims:]
+    point = _Point(parts, model, noise, axes)
+    point.derive()
+    information = point.mixed_part(point.information) + _trusted(point)[0]
+    known = _determined(information, model.diagonal)
+    return np.where(known, _sandwich(information, information, model.diagonal), np.inf)
+
+
 def _units(csm: ComplexArray, n: FloatArray, model: _Model) -> FloatArray:
     """Return the root of what the others do not predict of every channel, in the mean bin."""
     mean = np.tensordot(n / n.sum(), csm, axes=(0, 1))

@@ -132,13 +132,24 @@ def test_the_mean_snr_is_the_requested_one() -> None:
     assert snr.mean() == pytest.approx(50)
 
 
+def test_two_sensors_need_motion_that_changes_and_longer() -> None:
+    csm, noise_psd = planned_csm(np.vstack([np.eye(3)] * 2), snr=30)
+    plans = plan(csm, noise_psd, dims=(3, 3), settings=PAPER, cov=0.05)
+    assert [each.method for each in plans] == ["multi-part, 3 dB", "multi-part, 6 dB"]
+    little, much = (each.duration.max() for each in plans)
+    assert little > 2 * much
+    three, three_noise = planned_csm(np.vstack([np.eye(3)] * 3), snr=30)
+    least = plan(three, three_noise, dims=(3, 3, 3), settings=PAPER, cov=0.05)[-1]
+    assert much > least.duration.max()
+
+
 def test_invalid_plans_are_refused() -> None:
     directions = planar_sensors(10)
     csm, noise_psd = planned_csm(directions, snr=10)
     with pytest.raises(EstimatorError, match=r"c\.o\.v\."):
         plan(csm, noise_psd, dims=DIMS, settings=PAPER, cov=0)
     with pytest.raises(InsufficientDataError, match="sensors"):
-        plan(csm[:, :4, :4], noise_psd[:, :4], dims=(2, 2), settings=PAPER, cov=0.1)
+        plan(csm[:, :2, :2], noise_psd[:, :2], dims=(2,), settings=PAPER, cov=0.1)
     for arguments in (
         {"snr": 0.0},
         {"snr": np.inf},

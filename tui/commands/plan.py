@@ -5,17 +5,36 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from tui.commands.options import BenchArgument, JsonOption, examples
+from tui.commands.options import JsonOption, examples
 
 
-@examples("huddle plan lab.toml --snr 1000 --cov 0.05")
+@examples(
+    "huddle plan lab.toml --snr 1000 --cov 0.05",
+    "huddle plan --sensors 2 --rate 200 --snr 30 --cov 0.05",
+)
 def plan(
-    path: BenchArgument,
+    path: Annotated[
+        Path | None, typer.Argument(metavar="BENCH", help="Bench file; or give --rate.")
+    ] = None,
     *,
+    sensors: Annotated[
+        int, typer.Option("--sensors", metavar="N", min=2, help="Sensors, without a bench file.")
+    ] = 3,
+    channels: Annotated[
+        int, typer.Option("--channels", metavar="N", min=1, max=3, help="Channels of each sensor.")
+    ] = 3,
+    rate: Annotated[
+        float | None,
+        typer.Option("--rate", metavar="HZ", min=1e-3, help="Sampling rate, without a bench file."),
+    ] = None,
+    segment: Annotated[
+        str | None, typer.Option("--segment", metavar="TIME", help="Length of segments.")
+    ] = None,
     snr: Annotated[
         float,
         typer.Option(
@@ -40,13 +59,18 @@ def plan(
 ) -> None:
     """Compute the duration of recording for a target precision, by method.
 
+    Two sensors need motion that changes: the table says for how much change.
     Orientations come from the simulation table of the bench file; without
     it all sensors point the same way.
     """
-    from tui.notebook.planning import plan_bench
+    from tui.notebook.planning import plan as plan_of
     from tui.output.console import for_people, write_json
 
-    planned = plan_bench(path, snr=snr, cov=cov)
+    if path is None and rate is None:
+        raise typer.BadParameter("name a bench file, or give --rate and --sensors")
+    planned = plan_of(
+        path, snr=snr, cov=cov, fs=rate, sensors=sensors, channels=channels, segment=segment
+    )
     screen = for_people(json)
     screen.print(planned.title)
     screen.print(planned.table())

@@ -190,6 +190,14 @@ class RecordingPlan(Mapping[str, MethodPlan]):
         """Remarks below the table."""
         plans = list(self.values())
         lines = []
+        if plans[0].method.startswith("multi-part"):
+            lines.append(
+                "Two sensors tell noise from motion only where the motion changes: by so many dB"
+                " (standard deviation of its level), in several steps, for example over the"
+                " morning traffic. Their gains must be steady to 0.1 % a decade of loudness."
+                " A third sensor needs no change."
+            )
+            return lines
         if any(entry.is_motion_weak for entry in plans):
             lines.append(
                 "The motion is weak: finding it takes longer than the precision requires, and "
@@ -321,7 +329,7 @@ def plan(
     HuddleError
         If the bench file or an option is wrong.
     EstimatorError
-        If nothing can be planned: fewer than three sensors, `snr` or `cov` not above 0.
+        If nothing can be planned: one sensor, `snr` or `cov` not above 0.
 
     Examples
     --------

@@ -102,7 +102,7 @@ def waves_across(
         Metres.
     snr : float
     """
-    if set(dims) != {3} or directions.shape[1] != 3:
+    if set(dims) != {3} or len(dims) < 3 or directions.shape[1] != 3:
         return None
     n_sensors = len(dims)
     where = _ring(n_sensors, ASSUMED_RADIUS) if positions is None else positions[:, :2]

@@ -9,7 +9,13 @@ import pytest
 
 from estimator.errors import InsufficientDataError
 from estimator.levels.interval import interval
-from estimator.likelihood.changing_motion import STEADINESS, BandNoise, Refusal, band_noise
+from estimator.likelihood.changing_motion import (
+    STEADINESS,
+    BandNoise,
+    Refusal,
+    band_noise,
+    bound_of_parts,
+)
 from tests.estimator.csm_models import rotation, wishart
 
 if TYPE_CHECKING:
@@ -207,6 +213,31 @@ def test_levels_scale_with_the_units_of_channels() -> None:
     plain, scaled = bench.estimate(csm), bench.estimate(csm * unit[:, None] * unit)
     np.testing.assert_allclose(scaled.level, plain.level * unit**2, rtol=1e-4)
     np.testing.assert_allclose(scaled.cumulants[2], plain.cumulants[2] * unit**8, rtol=1e-3)
+
+
+def test_scatter_is_near_the_bound() -> None:
+    """The half-width stays within 1.3 times what Cramér and Rao allow at ratios up to 30."""
+    for d, snr in ((1, 3.0), (3, 30.0)):
+        over = []
+        for bench in benches(25, draws=10, d=d, snr=snr):
+            level = changing(bench)
+            found = bench.estimate(bench.parts(level))
+            power = (10 ** (level / 10))[None, :, None, None]
+            felt = bench.response[:, None] @ (power * bench.motion)
+            true = felt @ _adjoint(bench.response)[:, None] + bench.noise
+            least = bound_of_parts(true, bench.noise.astype(complex), dims=bench.dims, n_dims=d)
+            least /= np.sqrt(AVERAGES * N_PARTS)
+            over.append(np.sqrt(found.cumulants[0]) / least)
+        assert np.median(over) < 1.3
+        assert np.median(over) > 0.85
+
+
+def test_steady_motion_has_no_bound() -> None:
+    (bench,) = benches(27, draws=1)
+    felt = bench.response @ bench.motion @ _adjoint(bench.response)
+    true = np.repeat((felt + bench.noise)[:, None], 4, axis=1)
+    least = bound_of_parts(true, bench.noise.astype(complex), dims=bench.dims, n_dims=1)
+    assert np.isinf(least).all()
 
 
 def test_parts_with_too_few_averages_are_an_error() -> None:
