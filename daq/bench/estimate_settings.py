@@ -67,11 +67,12 @@ class EstimateSettings:
     methods: Annotated[
         tuple[str, ...],
         Option(
-            "Method: auto; two-channel, three-channel, three-sensor, maximum-likelihood; all: every"
-            " method that applies; several: separated by commas. auto is maximum likelihood with as"
+            "Method: auto; two-channel, three-channel, three-sensor, maximum-likelihood, multi-part"
+            " (two sensors, from motion that changes); all: every method that applies; several:"
+            " separated by commas. auto is maximum likelihood with as"
             " many dimensions of the motion as the data show, where the sensors leave room for"
             " them (four with two or three channels, six with one; up to 96 channels), else"
-            " three-sensor.",
+            " three-sensor; of two sensors multi-part.",
             check=values.methods,
             flags=("--method", "-m"),
             metavar="METHOD",
@@ -221,6 +222,18 @@ class EstimateSettings:
             repeated=True,
         ),
     ] = field(default_factory=dict)
+    gain_steadiness: Annotated[
+        float,
+        Option(
+            "Change of a gain in percent, for motion of ten times the power, that method multi-part"
+            " allows for (default 0.1).",
+            check=values.not_negative,
+            flags=("--gain-steadiness",),
+            metavar="PERCENT",
+            read=values.to_number,
+            text=repr,
+        ),
+    ] = 0.1
     lean: Annotated[
         Mapping[str, tuple[float, float]],
         Option(

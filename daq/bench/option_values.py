@@ -81,6 +81,14 @@ def cov(value: object) -> float:
     raise ValueError("expected a number between 0 and 1, such as 0.05")
 
 
+def not_negative(value: object) -> float:
+    """Return a number from 0."""
+    found = number(value)
+    if found >= 0:
+        return found
+    raise ValueError("expected a number from 0")
+
+
 def yes_or_no(value: object) -> bool:
     """Return true or false."""
     if isinstance(value, bool):

@@ -187,6 +187,9 @@ def estimate(
     axis_tolerance : float or mapping of str to float
         Angle in degrees, rms, by which axes of sensors with one or two channels may be off
         (default 1), of all or by sensor. Motion across an axis widens the intervals.
+    gain_steadiness : float
+        Change of a gain in percent, for motion of ten times the power, that the method multi-part
+        allows for (default 0.1).
     lean : mapping of str to (float, float)
         Known lean of a sensor with one or two channels, in degrees: of its axis or plane, towards
         two directions that all sensors have in common (``{"B": (0.3, -0.1)}``).

@@ -39,6 +39,7 @@ class EstimateOptions(TypedDict, total=False):
     dimension: int | str
     gains: Mapping[str, float]
     axis_tolerance: float | Mapping[str, float]
+    gain_steadiness: float
     lean: Mapping[str, tuple[float, float]]
     unit: str
     band: tuple[float, float]

@@ -38,7 +38,16 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
 
 TEMPLATE = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
-KEYS = ("reject", "octaves", "dimension", "gains", "axis_tolerance", "lean", "target_cov_bin")
+KEYS = (
+    "reject",
+    "octaves",
+    "dimension",
+    "gains",
+    "axis_tolerance",
+    "gain_steadiness",
+    "lean",
+    "target_cov_bin",
+)
 VALUES: dict[str, Any] = {
     "methods": ("maximum-likelihood", "two-channel"),
     "segment": 90.5,
@@ -54,6 +63,7 @@ VALUES: dict[str, Any] = {
     "dimension": 2,
     "gains": {"B": 1.02, "C.Z": 0.1 + 0.2},
     "axis_tolerance": {"": 0.5, "B": 0.25},
+    "gain_steadiness": 0.02,
     "lean": {"B": (0.3, -0.1)},
     "unit": "µg",
     "band": (1 / 3, 20.0),
@@ -65,7 +75,7 @@ ARGUMENTS = [
     "--window=kaiser,8", "--detrend=linear", "--no-correction", "--clocks=arrivals",
     "--equalise=known", "--reject", "--bridge=0.25", "--octaves", "--dimension=2", "--gain=B=1.02",
     f"--gain=C.Z={0.1 + 0.2}", "--axis-tolerance=0.5", "--axis-tolerance=B=0.25",
-    "--lean=B=0.3,-0.1",
+    "--gain-steadiness=0.02", "--lean=B=0.3,-0.1",
     "--unit=µg", f"--band={1 / 3}:20", "--target-cov=0.07",
     "--target-cov-bin=0.3",
 ]  # fmt: skip
