@@ -74,6 +74,12 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
         above = taken if source is Source.SHARED_NOISE else 0.0
         if share.any() or np.any(above):
             found.append(contribution(source, shape, above=above, share=share[:, None]))
+    changing = diagnostics.multi_part
+    if changing is not None and method == "multi-part":
+        lever = np.nan_to_num(changing.lever)
+        found.append(contribution(Source.GAINS, shape, below=lever, above=lever))
+        unknown = (noise.flags & Flag.UNIDENTIFIED) != 0  # anywhere below the bound
+        found.append(contribution(Source.STEADY_MOTION, shape, below=np.where(unknown, psd, 0.0)))
     faulty = [*diagnostics.clipped, *diagnostics.stood_still]
     if faulty:
         below = np.zeros(shape)

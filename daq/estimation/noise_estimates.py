@@ -17,6 +17,7 @@ from estimator.likelihood.goodness_of_fit import neighbour_correlation
 from estimator.methods import METHODS, self_noise
 from estimator.self_noise.result import Flag, SelfNoise, combined
 from estimator.spectra.multiresolution import Band, MultiResolution
+from estimator.spectra.parts import Parts
 from estimator.spectra.welch import CrossSpectra, scale
 from estimator.spectra.windows import effective_averages, get_window
 
@@ -31,16 +32,19 @@ if TYPE_CHECKING:
     from daq.recording.interface import ReadableRecording
     from estimator.likelihood.factor_analysis import Maxima
     from estimator.likelihood.gradients import Gradients
+    from estimator.likelihood.multi_part import MultiPart
 
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
     ComplexArray = NDArray[np.complex128]
     Channels = Sequence[tuple[str, Channel]]
 
-ALL_METHODS = tuple(sorted(METHODS, key=lambda name: name != "three-sensor"))
+ALL_METHODS = (*sorted(METHODS, key=lambda name: name != "three-sensor"), "multi-part")
 """The first is what limits, c.o.v. and clocks are judged by: one that needs no alignment."""
 MIN_AVERAGES = 20
 """Of an octave with its own segments: with fewer it goes with the octave above."""
+USABLE = 0.9
+"""Of half the sampling rate: the anti-alias filters of sensors differ beyond."""
 BY_MOTION = frozenset({"three-sensor", "maximum-likelihood"})
 """Methods that use segments which only some channels have: they pair no channels by number."""
 _WHOLE = 3  # sensors with all channels
@@ -58,11 +62,15 @@ class Dimensions:
 
 @dataclass(frozen=True, slots=True)
 class Estimates:
-    """Results by method, reasons of refused methods, and the dimension of the motion."""
+    """Results by method, reasons of refused methods, and the dimension of the motion.
+
+    `multi_part` is what motion that changes says of two sensors, or None.
+    """
 
     results: dict[str, SelfNoise]
     refused: dict[str, str]
     dimensions: Dimensions | None
+    multi_part: MultiPart | None = None
 
 
 def averages(passes: Sequence[Pass]) -> tuple[Band, ...]:
@@ -96,8 +104,31 @@ def averages(passes: Sequence[Pass]) -> tuple[Band, ...]:
         for each in passes
         if (count := each.n_segments)
     )
-    band = Band(first.welch, first.welch.frequencies, spectra.csm(), n_segments, n_effective)
+    band = Band(
+        first.welch,
+        first.welch.frequencies,
+        spectra.csm(),
+        n_segments,
+        n_effective,
+        parts=_parts(passes),
+    )
     return (up_to(band, usable),)
+
+
+def _parts(passes: Sequence[Pass]) -> Parts | None:
+    """Return the averages of all recordings in parts of time; None unless all have them."""
+    found = [each.parts for each in passes]
+    known = [each for each in found if each is not None]
+    if len(known) < len(found):
+        return None
+    origin = passes[0].aligned.start_utc_ns
+    parts = []
+    for each, of_pass in zip(passes, known, strict=True):
+        later = (each.aligned.start_utc_ns - origin) * 1e-9
+        parts += [
+            replace(part, begin=part.begin + later, end=part.end + later) for part in of_pass.each
+        ]
+    return Parts(known[0].bins, tuple(parts))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -256,7 +287,9 @@ def with_sets(
     blocks = blocks_of(frequency)
     results = {name: combined(found, blocks) for name, found in parts.items()}
     refused = {name: why for name, why in refused.items() if name not in results}
-    return Estimates(results, refused, dimensions), tuple(counted)
+    return replace(estimates, results=results, refused=refused, dimensions=dimensions), tuple(
+        counted
+    )
 
 
 def _spread(
@@ -294,7 +327,12 @@ def in_units(
     response = responses(band.frequencies, channels, unit)
     if filters is not None:
         response = response * filters
-    return band if np.all(response == 1) else replace(band, csm=scale(band.csm, response))
+    if np.all(response == 1):
+        return band
+    parts = band.parts
+    if parts is not None:
+        parts = replace(parts, response=response[parts.bins])
+    return replace(band, csm=scale(band.csm, response), parts=parts)
 
 
 def responses(frequency: FloatArray, channels: Channels, unit: str) -> ComplexArray:
@@ -408,10 +446,15 @@ def noise_estimates(
     settings = settings.for_sensors(dims)
     results: dict[str, SelfNoise] = {}
     refused: dict[str, str] = {}
+    changing: MultiPart | None = None
     wanted = list(ALL_METHODS if "all" in settings.methods else settings.methods)
     with np.errstate(invalid="ignore", divide="ignore"):  # responses vanish at 0 Hz
         for method in wanted:
             try:
+                if method == "multi-part":
+                    changing = _by_changes(bands, settings, dims)
+                    results[method] = changing.noise
+                    continue
                 options: list[dict[str, Any]] = [{} for _ in bands]
                 if method == "two-channel":
                     options = [{"response": gains.astype(np.complex128)} for _ in bands]
@@ -444,7 +487,39 @@ def noise_estimates(
                     wanted.append("three-sensor")  # it needs fewer averages; it is not judged by
             else:
                 results[method] = _joined(parts)
-    return Estimates(results, refused, dimensions)
+    return Estimates(results, refused, dimensions, changing)
+
+
+def _by_changes(bands: Sequence[Band], settings: Settings, dims: tuple[int, ...]) -> MultiPart:
+    """Return the noise of sensors from motion that changes.
+
+    Raises
+    ------
+    InsufficientDataError
+        If sensors have different numbers of channels, or averages are not kept in parts.
+    """
+    from estimator.likelihood.multi_part import multi_part  # noqa: PLC0415 - of two sensors
+
+    parts = bands[0].parts
+    if len(set(dims)) > 1:
+        raise InsufficientDataError("the sensors have different numbers of channels")
+    if parts is None or len(bands) > 1:
+        raise InsufficientDataError(
+            "not with octaves, --reject or bridged gaps: averages are not kept in parts of time"
+        )
+    frequency = bands[0].frequencies[parts.bins]
+    known = np.isfinite(bands[0].csm[parts.bins]).all(axis=(1, 2))
+    known &= ~bands[0].settings.real(frequency) & (frequency <= USABLE * bands[0].frequencies[-1])
+    found = multi_part(
+        parts.csm(),
+        parts.averages,
+        frequency,
+        dims=dims,
+        correlation=_power_correlation(bands[0]),
+        steadiness=settings.gain_steadiness / 100,
+        usable=known,
+    )
+    return found.at(bands[0].frequencies)
 
 
 def _by_gradients(

@@ -280,6 +280,7 @@ class SnapshotBuilder:
                 results=estimates.results,
             ),
             dimensions=() if estimates.dimensions is None else estimates.dimensions.chosen,
+            multi_part=estimates.multi_part,
         )
         left = _not_estimated(latest, channels)
         if final and csm.nbytes > FREED_FROM:

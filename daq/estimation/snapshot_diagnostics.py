@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from estimator.checks.relative_response import RelativeResponse
     from estimator.checks.stability import Stability
     from estimator.likelihood.dimension import BandDimension
+    from estimator.likelihood.multi_part import MultiPart
     from estimator.self_noise.result import SelfNoise
 
     FloatArray = NDArray[np.float64]
@@ -186,6 +187,8 @@ class SnapshotDiagnostics:
         Why the model of one common motion was tested in no band; None where it was.
     edge_leakage : EdgeLeakage or None
         None where it is not known.
+    multi_part : MultiPart or None
+        What motion that changes says of two sensors; None of an estimate without it.
     """
 
     synchronisation: Synchronisation = field(default_factory=Synchronisation)
@@ -195,6 +198,7 @@ class SnapshotDiagnostics:
     diagnosis: Diagnosis | None = None
     untested: Untested | None = Untested.UNFINISHED
     edge_leakage: EdgeLeakage | None = None
+    multi_part: MultiPart | None = None
 
     @property
     def advice(self) -> tuple[Advice, ...]:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from estimator.decision.verdict import Obstacle
     from estimator.levels.contributions import Source
     from estimator.likelihood.dimension import BandDimension
-    from estimator.self_noise.result import Flag
+    from estimator.self_noise.result import Flag, Refusal
     from estimator.spectra.segment_rejection import Reason
 
 
@@ -105,6 +105,39 @@ class FewSensors(Fact):
 
     name: ClassVar[str] = "few-sensors"
     n_sensors: int
+
+
+@record
+class SteadyGainsAssumed(Fact):
+    """Two sensors tell noise from motion that changes, if their gains do not follow its loudness.
+
+    Attributes
+    ----------
+    steadiness : float
+        Change of a gain in percent, for motion of ten times the power, that intervals allow for.
+    """
+
+    name: ClassVar[str] = "steady-gains-assumed"
+    steadiness: float
+
+
+@record
+class NoiseNotIdentified(Fact):
+    """Motion that changes does not give the noise of `channels` in `band`: it is below a bound.
+
+    Attributes
+    ----------
+    refusal : Refusal
+    change : float
+        Standard deviation in dB of the level of the motion over the parts of the recording.
+    axis : str
+        Channel along which the motion changes least; empty where it is not that.
+    """
+
+    name: ClassVar[str] = "noise-not-identified"
+    refusal: Refusal
+    change: float
+    axis: str
 
 
 @record

@@ -37,6 +37,7 @@ from daq.results.facts import (
     ModelPasses,
     ModelUntested,
     NoEstimateAbove,
+    NoiseNotIdentified,
     NoSegmentUsable,
     NotInLiveEstimate,
     OctaveSegments,
@@ -54,6 +55,7 @@ from daq.results.facts import (
     StatedTimesDrift,
     StatedTimesUnchecked,
     SteadinessNotTested,
+    SteadyGainsAssumed,
     TargetMissed,
     ValuesBelowZero,
     WithoutEstimate,
@@ -73,7 +75,7 @@ from estimator.checks.advice import (
 from estimator.checks.shared_noise import MAX_CHANNELS
 from estimator.decision.verdict import Obstacle, Verdict
 from estimator.errors import BandError
-from estimator.self_noise.result import Flag
+from estimator.self_noise.result import Flag, Refusal
 from estimator.spectra.segment_rejection import Reason
 
 if TYPE_CHECKING:
@@ -343,7 +345,7 @@ def _model(snapshot: Snapshot) -> Iterator[Fact]:
         named = found is not None and any(isinstance(each, TooFewSensors) for each in found.advice)
         if len(snapshot.dims) == 1:
             yield FewSensors(rank=Rank.DELAYS, n_sensors=1)
-        elif not named and snapshot.no_segment is None:
+        elif len(snapshot.dims) > 2 and not named and snapshot.no_segment is None:
             yield _untested(snapshot, diagnostics.untested)
     elif (
         found is not None
@@ -386,6 +388,33 @@ def _untested(snapshot: Snapshot, why: Untested) -> ModelUntested:
     )
 
 
+def _by_changes(snapshot: Snapshot) -> Iterator[Fact]:
+    """Yield what the noise of two sensors rests on, and where motion does not give it."""
+    found = snapshot.diagnostics.multi_part
+    if found is None:
+        return
+    if any(None in block.refusal for block in found.blocks):
+        steadiness = 100 * found.steadiness
+        yield SteadyGainsAssumed(rank=Rank.TO_KNOW, method="multi-part", steadiness=steadiness)
+    names = [label.name for label in snapshot.channels]
+    causes = dict.fromkeys(why for block in found.blocks for why in block.refusal if why)
+    for cause in causes:
+        blocks = [block for block in found.blocks if cause in block.refusal]
+        concerned = {k for block in blocks for k, why in enumerate(block.refusal) if why is cause}
+        changes = [float(block.found.change.max(initial=0.0)) for block in blocks]
+        is_axis = cause is Refusal.STEADY and max(snapshot.dims) > 1
+        least = min(blocks, key=lambda block: float(block.found.change.max(initial=0.0)))
+        yield NoiseNotIdentified(
+            rank=Rank.DELAYS,
+            method="multi-part",
+            channels=tuple(names[k] for k in sorted(concerned)),
+            band=(blocks[0].low, blocks[-1].high),
+            refusal=cause,
+            change=float(np.median(changes)),
+            axis=names[least.found.still] if is_axis else "",
+        )
+
+
 def _methods(snapshot: Snapshot) -> Iterator[Fact]:
     """Yield what the methods assume, and where they give nothing."""
     advice, found = snapshot.diagnostics.advice, snapshot.diagnostics.diagnosis
@@ -402,6 +431,7 @@ def _methods(snapshot: Snapshot) -> Iterator[Fact]:
     if found is not None and found.stability is None and any(holds for _, holds in causes):
         names = tuple(name for name, holds in causes if holds)
         yield SteadinessNotTested(rank=Rank.TO_KNOW, causes=names)
+    yield from _by_changes(snapshot)
     if "two-channel" in snapshot.results:
         yield LikeChannelsAssumed(rank=Rank.TO_KNOW, method="two-channel")
     named = any(isinstance(each, NoSignal | Copies) for each in advice)  # once for all methods

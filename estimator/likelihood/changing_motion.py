@@ -35,7 +35,6 @@ Method item 27a of the design; K = 1 is the ordinary likelihood with a block of 
 
 from __future__ import annotations
 
-import enum
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -44,6 +43,7 @@ from scipy.special import chdtrc, chdtri, ndtr, polygamma, psi
 
 from estimator.errors import InsufficientDataError
 from estimator.levels.interval import NORMAL_95
+from estimator.self_noise.result import Refusal
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -67,23 +67,6 @@ _ROUNDS = 60
 _HALVINGS = 14
 _SETTLED = 1e-3  # of the log-likelihood
 _ZERO = 1e-9  # eigenvalue of scaled information that is none
-
-
-class Refusal(enum.StrEnum):
-    """Why the noise of a channel is not identified."""
-
-    STEADY = "steady"
-    """The motion, or one direction of it, hardly changes."""
-    WIDE = "wide"
-    """The interval is wider than what the other sensors leave of the channel."""
-    UNSETTLED = "unsettled"
-    """The likelihood has no clear maximum."""
-    MISFIT = "misfit"
-    """Noise or responses that are steady do not explain the parts."""
-    GAIN_FOLLOWS = "gain-follows"
-    """The gain of a sensor follows the loudness of the motion."""
-    NOISE_FOLLOWS = "noise-follows"
-    """The noise of a sensor follows the loudness of the motion."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,6 +97,8 @@ class BandNoise:
     change : float64, shape (n_dims,)
         Standard deviation in dB of the power of the motion over the parts, in its strongest
         direction first.
+    still : int
+        Channel that feels most of the direction of motion that changes least.
     follows : float64, shape (2, n_sensors)
         Whether gains (first row) and noise of sensors follow the loudness of the motion, each
         alone, in standard deviations.
@@ -130,6 +115,7 @@ class BandNoise:
     of_noise: float
     of_responses: float
     change: FloatArray
+    still: int
     follows: FloatArray
 
     @property
@@ -606,6 +592,7 @@ def _estimate(
         of_noise=of_noise,
         of_responses=of_responses,
         change=_change(point, parts, q),
+        still=_still(point, q),
         follows=_follows(slopes, parts),
     )
 
@@ -632,8 +619,8 @@ def _slopes(
     over parts are inner products of images, with the part of A taken out.
     """
     q, n = model.n_dims, parts.n
-    loudness = np.log10(_trace(point.motion))
-    loudness = loudness - (n * loudness).sum(axis=1, keepdims=True) / parts.total
+    loudness = np.log10(_trace(point.motion)).mean(axis=0, keepdims=True)  # of all bins: amplitude
+    loudness = loudness - (n * loudness).sum() / parts.total
     root = np.sqrt(n)[:, None, None] * _power(point.inverse, 0.5)
     of_axes = root @ (point.motion - np.eye(q))  # (n_freqs, n_parts, q, q)
     back = np.linalg.inv(_adjoint(point.frame))
@@ -643,7 +630,7 @@ def _slopes(
         own = model.sensor == number
         turn = _adjoint((_adjoint(point.frame) * own @ back)[:, q:, :q])
         uv.append(loudness[..., None, None] * (of_axes @ turn[:, None]))
-        vv.append(np.zeros((*loudness.shape, *point.vv.shape[-2:]), np.complex128))
+        vv.append(np.zeros((*point.contrasts.shape[:2], *point.vv.shape[-2:]), np.complex128))
     for number in range(model.sensor[-1] + 1):
         own = model.sensor == number
         noise = _adjoint(point.frame) @ (point.noise * (own[:, None] & own)) @ point.frame
@@ -684,6 +671,14 @@ def _scale(information: FloatArray) -> FloatArray:
     """Return the root of the diagonal, positive also where there is no information."""
     own = np.diag(information)
     return np.asarray(np.sqrt(np.maximum(own, max(1e-30 * own.max(), 1e-300))))
+
+
+def _still(point: _Point, q: int) -> int:
+    """Return the channel with most of the direction of motion that changes least."""
+    back = _adjoint(np.linalg.inv(point.frame))[..., :q]
+    least = back @ np.linalg.eigh(point.of_axes)[1][..., :1]
+    share = np.abs(least[..., 0]) ** 2
+    return int(np.argmax((share / share.sum(axis=1, keepdims=True)).mean(axis=0)))
 
 
 def _follows(slopes: _Slopes, parts: _Parts) -> FloatArray:

@@ -10,15 +10,15 @@ anywhere below.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.levels.interval import unpredicted, worth
 from estimator.levels.pooled import blocks_of
-from estimator.likelihood.changing_motion import STEADINESS, BandNoise, Refusal, band_noise
-from estimator.self_noise.result import Flag, SelfNoise
+from estimator.likelihood.changing_motion import STEADINESS, BandNoise, band_noise
+from estimator.self_noise.result import Flag, Refusal, SelfNoise
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -63,11 +63,37 @@ class MultiPart:
         By how much gains that follow the loudness, within the stated steadiness, may shift the
         noise either way, in unit**2/Hz; zero where the value is a bound.
     blocks : tuple of PartBlock
+    frequency : float64, shape (n_freqs,)
+        Hz.
+    steadiness : float
+        Relative change of a gain a decade of the motion's power that is allowed for.
     """
 
     noise: SelfNoise
     lever: FloatArray
     blocks: tuple[PartBlock, ...]
+    frequency: FloatArray
+    steadiness: float
+
+    def at(self, frequency: FloatArray) -> MultiPart:
+        """Return the same at more frequencies: each has the noise of the nearest one below.
+
+        These err together, so that a mean of them is known no better than one of fewer.
+        """
+        if len(frequency) == len(self.frequency):
+            return self
+        place = np.searchsorted(self.frequency, frequency, side="right") - 1
+        near = np.maximum(place, 0)
+        outside = (place < 0)[:, None]
+        alike = np.bincount(near, minlength=len(self.frequency))[near][:, None]
+        cumulants = self.noise.cumulants[:, near] * np.stack([alike, alike**2, alike**3])
+        noise = SelfNoise.of(
+            self.noise.method,
+            np.where(outside, np.nan, self.noise.noise_psd[near]),
+            np.where(outside, np.nan, cumulants),
+            self.noise.flags[near],
+        )
+        return replace(self, noise=noise, lever=self.lever[near], frequency=frequency)
 
 
 def multi_part(
@@ -143,7 +169,13 @@ def multi_part(
         for m in range(3):  # the mean of the block then has the cumulants of its level
             own = each.cumulants[m] * (course[:, None] ** (m + 2)) * apart ** (m + 1)
             cumulants[m, bins] = np.where(has, own, scatter[m, bins])
-    return MultiPart(SelfNoise.of("multi-part", noise, cumulants, flags), lever, tuple(found))
+    return MultiPart(
+        SelfNoise.of("multi-part", noise, cumulants, flags),
+        lever,
+        tuple(found),
+        frequency,
+        steadiness,
+    )
 
 
 def _course(bound: FloatArray, total: float) -> FloatArray:

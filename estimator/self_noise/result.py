@@ -46,6 +46,23 @@ class Flag(enum.IntFlag):
     """The motion does not tell noise from motion: the value is what others do not predict."""
 
 
+class Refusal(enum.StrEnum):
+    """Why motion that changes does not give the noise of a channel."""
+
+    STEADY = "steady"
+    """The motion, or one direction of it, hardly changes."""
+    WIDE = "wide"
+    """The interval is wider than what the other sensors leave of the channel."""
+    UNSETTLED = "unsettled"
+    """The likelihood has no clear maximum."""
+    MISFIT = "misfit"
+    """Noise or responses that are steady do not explain the parts."""
+    GAIN_FOLLOWS = "gain-follows"
+    """The gain of a sensor follows the loudness of the motion."""
+    NOISE_FOLLOWS = "noise-follows"
+    """The noise of a sensor follows the loudness of the motion."""
+
+
 @dataclass(frozen=True, slots=True)
 class SelfNoise:
     """Self-noise PSD of every channel with its uncertainty.

@@ -28,6 +28,7 @@ from estimator.spectra.segment_rejection import Reason, RejectionSettings, Selec
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 
 if TYPE_CHECKING:
+    from estimator.spectra.parts import Parts
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
     Columns = tuple[int, ...]
@@ -53,6 +54,8 @@ class Band:
     n_effective : float
     left_out : Counter of Reason
         Segments of this stage that do not count for all channels: incomplete (GAP) or disturbed.
+    parts : Parts or None
+        The same averages in parts of time; None where they are not kept.
     """
 
     settings: WelchSettings
@@ -61,6 +64,7 @@ class Band:
     n_segments: int
     n_effective: float
     left_out: Counter[Reason] = field(default_factory=Counter)
+    parts: Parts | None = None
 
 
 class MultiResolution:

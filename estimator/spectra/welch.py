@@ -20,11 +20,13 @@ from typing import TYPE_CHECKING, Literal, Self
 import numpy as np
 
 from estimator.errors import EstimatorError, InsufficientDataError
+from estimator.spectra.parts import Part
 from estimator.spectra.windows import effective_averages, get_window
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from estimator.spectra.parts import PartEnds
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 SEGMENTS_PER_BLOCK = 32
@@ -102,6 +104,8 @@ class CrossSpectra:
         Maximum number of threads of `add`; use 1 if the caller already uses all processors.
     segments : SegmentSpectra, optional
         Receives the spectra of the single segments.
+    ends : PartEnds, optional
+        Receives the sums at the ends of parts of time, which `end_part` tells.
     """
 
     def __init__(
@@ -111,6 +115,7 @@ class CrossSpectra:
         *,
         threads: int = THREADS,
         segments: SegmentSpectra | None = None,
+        ends: PartEnds | None = None,
     ) -> None:
         if n_channels < 1:
             raise EstimatorError(f"{n_channels} channels; expected at least one")
@@ -118,6 +123,7 @@ class CrossSpectra:
         self.n_channels = n_channels
         self._threads = threads
         self._single = segments
+        self.ends = ends
         self.n_segments = 0
         length = settings.segment_length
         self._window = get_window(settings.window, length)
@@ -251,6 +257,41 @@ class CrossSpectra:
         """Number of independent averages equivalent to these segments, if contiguous."""
         return effective_averages(self._window, self.settings.hop, self.n_segments)
 
+    def end_part(self, place: int) -> None:
+        """End a part of time before this place of the segments."""
+        if self.ends is not None:
+            self.ends.end(place, self.n_segments, self._products.packed())
+
+    def parts(self, place: int) -> tuple[Part, ...]:
+        """Return the averages in parts of time, up to this place; none where none are kept.
+
+        Times are those of places in the recording, of which each begins a hop after the one before.
+        """
+        if self.ends is None or not self.n_segments:
+            return ()
+        hop, rate = self.settings.hop, self.settings.sampling_rate
+        found = []
+        place_before, count_before, before = 0, 0, None
+        for end, count, after in self.ends.ends(place, self.n_segments, self._products.packed()):
+            if own := count - count_before:
+                averages = effective_averages(self._window, hop, own)
+                last = end * hop + self.settings.segment_length - hop
+                scale = self._density(own)[self.ends.bins]
+                found.append(
+                    Part(before, after, scale, averages, place_before * hop / rate, last / rate)
+                )
+            place_before, count_before, before = end, count, after
+        return tuple(found)
+
+    def _density(self, n_segments: int) -> FloatArray:
+        """Return the factor from a sum to a one-sided density, shape (n_freqs,)."""
+        energy = self.settings.sampling_rate * float(self._window @ self._window)
+        density = np.full(self._shape[0], 2 / (energy * n_segments))
+        density[0] /= 2
+        if self.settings.segment_length % 2 == 0:
+            density[-1] /= 2
+        return density
+
     def csm(self) -> ComplexArray:
         """Return the cross-spectral matrix.
 
@@ -266,11 +307,7 @@ class CrossSpectra:
         """
         if self.n_segments == 0:
             raise InsufficientDataError("no segment yet; expected at least one")
-        energy = self.settings.sampling_rate * float(self._window @ self._window)
-        density = np.full(self._shape[0], 2 / (energy * self.n_segments))
-        density[0] /= 2
-        if self.settings.segment_length % 2 == 0:
-            density[-1] /= 2
+        density = self._density(self.n_segments)
         self._work = _Work()  # whoever asks for the sum is rarely about to add more
         csm = self._products.total()
         csm *= density[:, None, None]
@@ -411,6 +448,11 @@ class _Products:
                 _add_gram(self._total[some], self._gram[some])
             self._gram = None
         self._add_waiting()
+
+    def packed(self) -> FloatArray:
+        """Return the sum as it is kept; later segments change it."""
+        self._settle()
+        return self._total
 
     def total(self) -> ComplexArray:
         """Return the sum in an array of its own, (n_freqs, n_channels, n_channels)."""

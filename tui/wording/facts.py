@@ -41,6 +41,7 @@ from daq.results.facts import (
     ModelUntested,
     NightsNotCompared,
     NoEstimateAbove,
+    NoiseNotIdentified,
     NoSegmentUsable,
     NotInLiveEstimate,
     OctaveSegments,
@@ -60,6 +61,7 @@ from daq.results.facts import (
     StatedTimesDrift,
     StatedTimesUnchecked,
     SteadinessNotTested,
+    SteadyGainsAssumed,
     StretchesLeftOut,
     TargetMissed,
     ValuesBelowZero,
@@ -69,6 +71,7 @@ from daq.results.facts import (
 from daq.results.known_facts import facts_of, facts_of_sensors, facts_of_verdict
 from estimator.checks.advice import Untested
 from estimator.decision.verdict import MIN_AVERAGES, Obstacle
+from estimator.self_noise.result import Refusal
 from estimator.spectra.segment_rejection import Reason
 from tui.wording.findings import Names, alert, explain, model, together
 from tui.wording.formatting import clock_time, listed, percent, roughly, several, signed, span
@@ -233,6 +236,44 @@ def _few_sensors(fact: FewSensors, names: Names) -> Wording:
         "Noise needs more sensors: the table shows the PSD of what the sensor recorded",
         "One sensor alone cannot tell its noise from motion: its noise is below its PSD.",
         "Place two more sensors beside it; one more suffices where the motion changes.",
+    )
+
+
+@word.register(SteadyGainsAssumed)
+def _steady_gains(fact: SteadyGainsAssumed, names: Names) -> Wording:
+    del names
+    return Wording(
+        f"Two sensors: gains are assumed steady to {fact.steadiness:g} % for ten times the motion",
+        "Two sensors tell noise from motion by parts of the recording in which the motion differs."
+        f" The intervals allow for gains that change by {fact.steadiness:g} % for motion of ten"
+        " times the power; a larger change shifts the noise, and tests may not show it.",
+    )
+
+
+_NOT_IDENTIFIED = {
+    Refusal.STEADY: "the motion changes by {change:.1f} dB{axis}, too little to tell noise from it",
+    Refusal.WIDE: "the interval is wider than what the other sensor does not predict",
+    Refusal.UNSETTLED: "the likelihood has no clear maximum",
+    Refusal.MISFIT: "noise or responses are not steady from part to part",
+    Refusal.GAIN_FOLLOWS: "the gain of a sensor follows the loudness of the motion",
+    Refusal.NOISE_FOLLOWS: "the noise of a sensor follows the loudness of the motion",
+}
+_RECORD_CHANGES = (
+    "Record while the motion changes by 3 dB or more in several steps, or add a sensor."
+)
+
+
+@word.register(NoiseNotIdentified)
+def _not_identified(fact: NoiseNotIdentified, names: Names) -> Wording:
+    del names
+    axis = f", least along {fact.axis}" if fact.axis else ""
+    why = _NOT_IDENTIFIED[fact.refusal].format(change=fact.change, axis=axis)
+    where = "" if fact.band is None else f" at {span(*fact.band)}"
+    few = fact.refusal in {Refusal.STEADY, Refusal.WIDE}
+    return Wording(
+        f"Only upper limits{where}: {why}",
+        f"{listed(fact.channels)}{where}: {why}. The noise is anywhere below the upper limit.",
+        _RECORD_CHANGES if few else "Add a third sensor, which needs no motion that changes.",
     )
 
 

@@ -21,6 +21,7 @@ from daq.estimation.segments.own_spectra import OwnSpectra, need_samples_of_grid
 from daq.estimation.segments.stated_times import agree, compare
 from estimator.spectra.channel_sets import ChannelSets
 from estimator.spectra.multiresolution import MultiResolution
+from estimator.spectra.parts import MOST, PartEnds, Parts, part_bins
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
 from estimator.spectra.welch import CrossSpectra, SegmentSpectra, WelchSettings, kept_bins
 from estimator.spectra.windows import Leakage, gap_window, get_window, without_trend
@@ -226,7 +227,16 @@ class Pass:
         single = SegmentSpectra(kept_bins(len(self.welch.frequencies)), self.n_channels)
         self.single = None if wanted.octaves or wanted.reject else single
         self._kept_at = GrowingRows(np.int64)
-        self._all = CrossSpectra(self.welch, self.n_channels, threads=1, segments=self.single)
+        self._ends: PartEnds | None = None
+        if not (wanted.octaves or wanted.reject):
+            bins = part_bins(len(self.welch.frequencies), self.n_channels)
+            every = max(1, -(-self.n_complete // MOST))
+            self._ends = PartEnds(
+                bins, every if every < self._at_once else self._at_once * -(-every // self._at_once)
+            )
+        self._all = CrossSpectra(
+            self.welch, self.n_channels, threads=1, segments=self.single, ends=self._ends
+        )
         self._selected: CrossSpectra | None = None
         self._bridge: GapBridge | None = None
         if wanted.bridge > 0 and self._undisturbed is None and self.octaves is None:
@@ -255,6 +265,18 @@ class Pass:
         if self._selected is None:
             self._selected = self._undisturbed.spectra()
         return self._selected
+
+    @property
+    def parts(self) -> Parts | None:
+        """Averages in parts of time; None where they are not kept, or do not hold all segments."""
+        if self._ends is None or self.n_bridged:
+            return None
+        return Parts(self._ends.bins, self._all.parts(self.n_seen))
+
+    @property
+    def _at_once(self) -> int:
+        """Segments that are read together."""
+        return max(1, _VALUES_AT_ONCE // (self.welch.hop * self.n_channels))
 
     def drain(self, *, last: bool) -> CrossSpectra:
         """Return the spectra since the last call; none with octaves.
@@ -329,11 +351,14 @@ class Pass:
 
         `live` segments come one by one: their delays are measured later, a few at a time.
         """
-        hop = self.welch.hop
-        at_once = max(1, _VALUES_AT_ONCE // (hop * self.n_channels))
+        hop, at_once = self.welch.hop, self._at_once
         total = self.n_complete if most is None else min(most, self.n_complete)
         begin = self.n_seen
-        bounds = [begin, *range(begin + max(at_once, self._delays.fewest), total, at_once), total]
+        first = min(begin + max(at_once, self._delays.fewest), total)
+        bounds = [begin, *range(first, total, at_once), total]
+        if self._ends is not None:
+            ends = range(self._ends.next_end(first), total, self._ends.every)
+            bounds = sorted({*bounds, *ends})
         pieces = [(a, b - a) for a, b in itertools.pairwise(bounds) if a < b]
 
         source = self._newest if live and len(pieces) == 1 else self.aligned
@@ -354,6 +379,7 @@ class Pass:
             else:
                 self._take_samples(part, first, count, together=live)
             self.n_seen += count
+            self._all.end_part(self.n_seen)
             if progress is not None:
                 progress(count)
 

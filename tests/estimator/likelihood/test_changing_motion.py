@@ -12,10 +12,10 @@ from estimator.levels.interval import interval
 from estimator.likelihood.changing_motion import (
     STEADINESS,
     BandNoise,
-    Refusal,
     band_noise,
     bound_of_parts,
 )
+from estimator.self_noise.result import Refusal
 from tests.estimator.csm_models import rotation, wishart
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from estimator.checks.advice import Untested
 from estimator.checks.sensitivities import Cause
 from estimator.decision.verdict import Obstacle
 from estimator.levels.contributions import Source
-from estimator.self_noise.result import Flag
+from estimator.self_noise.result import Flag, Refusal
 from estimator.spectra.segment_rejection import Reason
 from tests.tui.wording.advice_examples import MISFIT
 
@@ -25,6 +25,16 @@ EXAMPLES: tuple[Fact, ...] = (
     facts.Finding(rank=Rank.INVALIDATES, findings=(MISFIT,)),
     facts.SensorsSimulated(rank=Rank.TO_KNOW),
     facts.FewSensors(rank=Rank.DELAYS, n_sensors=1),
+    facts.SteadyGainsAssumed(rank=Rank.TO_KNOW, method="multi-part", steadiness=0.1),
+    facts.NoiseNotIdentified(
+        rank=Rank.DELAYS,
+        method="multi-part",
+        channels=("A.X",),
+        band=(0.1, 1.0),
+        refusal=Refusal.STEADY,
+        change=0.4,
+        axis="A.Z",
+    ),
     facts.MethodRefused(rank=Rank.DELAYS, method="two-channel", reason="channels differ"),
     facts.WithoutEstimate(
         rank=Rank.DELAYS,

@@ -1,0 +1,166 @@
+"""Averages in parts of time: whether noise, responses and motion are steady.
+
+A part is a run of segments, counted by their places in time, whether they count or were left out.
+All parts but the last are of equal length. There are `MOST` at most: when these are full,
+neighbours are merged, and a part is twice as long from then on. So a recording of any length has
+12 to 24 parts, and they hold every segment.
+
+What is kept is the sum of all segments so far at the end of each part: parts are differences, which
+costs a pass no product. In float64 the difference is as exact as the sum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from estimator.types import ComplexArray, FloatArray, IntArray
+
+MOST = 24
+"""Parts at most; half as many after neighbours are merged."""
+VALUES = 2_500_000
+"""Values of all parts at most: 20 MB. Of more frequencies or channels, some are left out."""
+LEAST_BINS = 48
+
+
+def part_bins(n_freqs: int, n_channels: int) -> IntArray:
+    """Return the frequencies that are kept in parts: all of them where they fit.
+
+    Parameters
+    ----------
+    n_freqs, n_channels : int
+
+    Returns
+    -------
+    int64, shape (n_kept,)
+        Ascending; of many frequencies with a constant ratio where they are distinct.
+    """
+    room = max(LEAST_BINS, VALUES // (MOST * n_channels**2))
+    if room >= n_freqs:
+        return np.arange(n_freqs)
+    wanted, most = room, n_freqs - 1
+    kept = np.arange(0)
+    while len(kept) < room and wanted < 64 * room:  # low frequencies coincide
+        kept = np.array(
+            sorted(set(np.round(np.geomspace(1, most, wanted)).astype(np.int64).tolist()))
+        )
+        wanted = wanted * 5 // 4
+    return kept[np.linspace(0, len(kept) - 1, min(room, len(kept))).astype(np.int64)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """The segments between two ends of parts.
+
+    Attributes
+    ----------
+    before : float64, shape (n_kept, n_channels, n_channels), or None
+        Sum of all segments before it: real parts in the lower triangles, imaginary parts in the
+        upper ones. None before the first.
+    after : float64, shape (n_kept, n_channels, n_channels)
+        The same with its own.
+    scale : float64, shape (n_kept,)
+        From a sum to a one-sided density.
+    averages : float
+        Independent averages.
+    begin, end : float
+        Seconds since the start of the first recording.
+    """
+
+    before: FloatArray | None
+    after: FloatArray
+    scale: FloatArray
+    averages: float
+    begin: float
+    end: float
+
+    def csm(self, some: slice | IntArray) -> ComplexArray:
+        """Return the averages at some of the kept frequencies."""
+        packed = self.after[some] if self.before is None else self.after[some] - self.before[some]
+        packed = packed * self.scale[some, None, None]
+        lower, upper = np.tril(packed), np.triu(packed, 1)
+        real = lower + np.tril(lower, -1).swapaxes(1, 2)
+        return np.asarray(real + 1j * (upper - upper.swapaxes(1, 2)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Parts:
+    """Averages of each part of one or several recordings, at some frequencies.
+
+    Attributes
+    ----------
+    bins : int64, shape (n_kept,)
+        Indices of the frequencies.
+    each : tuple of Part
+        In order of time.
+    response : complex128, shape (n_kept, n_channels), optional
+        By which the spectra are to be divided, for physical units.
+    """
+
+    bins: IntArray
+    each: tuple[Part, ...]
+    response: ComplexArray | None = None
+
+    @property
+    def averages(self) -> FloatArray:
+        """Independent averages of each part, shape (n_parts,)."""
+        return np.array([part.averages for part in self.each])
+
+    def csm(self, some: slice | IntArray = slice(None)) -> ComplexArray:
+        """Return the matrices of all parts at some of the kept frequencies.
+
+        Returns
+        -------
+        complex128, shape (n_parts, n_some, n_channels, n_channels)
+            In unit**2/Hz; NaN where a response is zero.
+        """
+        found = np.stack([part.csm(some) for part in self.each])
+        if self.response is None:
+            return found
+        response = self.response[some]
+        known = np.isfinite(response) & (response != 0)
+        inverse = np.where(known, 1 / np.where(known, response, 1), np.nan)
+        return np.asarray(found * inverse[:, :, None] * inverse[:, None, :].conj())
+
+
+class PartEnds:
+    """Sums at the ends of parts, while segments are taken.
+
+    Parameters
+    ----------
+    bins : int64, shape (n_kept,)
+    every : int
+        Places of a part; doubles when all parts are full.
+    """
+
+    def __init__(self, bins: IntArray, every: int = 1) -> None:
+        self.bins, self.every = bins, every
+        self._ends: list[tuple[int, int, FloatArray]] = []
+
+    def next_end(self, place: int) -> int:
+        """Return the place at which the part that holds `place` ends."""
+        return (place // self.every + 1) * self.every
+
+    def end(self, place: int, count: int, total: FloatArray) -> None:
+        """End a part before `place`, with `count` segments and their packed sum so far."""
+        if len(self._ends) == MOST:
+            del self._ends[::2]
+            self.every *= 2
+        if place % self.every == 0:
+            self._ends.append((place, count, total[self.bins]))
+
+    def ends(self, place: int, count: int, total: FloatArray) -> list[tuple[int, int, FloatArray]]:
+        """Return place, number of segments and packed sum at the end of every part.
+
+        The last one ends before `place`. It holds the one before, too, if it is shorter than half
+        of a part.
+        """
+        found = list(self._ends)
+        if not found or place > found[-1][0]:
+            found.append((place, count, total[self.bins]))
+        if len(found) > 1 and found[-1][0] - found[-2][0] < self.every / 2:
+            del found[-2]
+        return found
