@@ -113,12 +113,12 @@ class SteadyGainsAssumed(Fact):
 
     Attributes
     ----------
-    steadiness : float
-        Change of a gain in percent, for motion of ten times the power, that intervals allow for.
+    share : float
+        Relative change of a gain, for motion of ten times the power, that intervals allow for.
     """
 
     name: ClassVar[str] = "steady-gains-assumed"
-    steadiness: float
+    share: float
 
 
 @record

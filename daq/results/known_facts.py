@@ -394,8 +394,7 @@ def _by_changes(snapshot: Snapshot) -> Iterator[Fact]:
     if found is None:
         return
     if any(None in block.refusal for block in found.blocks):
-        steadiness = 100 * found.steadiness
-        yield SteadyGainsAssumed(rank=Rank.TO_KNOW, method="multi-part", steadiness=steadiness)
+        yield SteadyGainsAssumed(rank=Rank.TO_KNOW, method="multi-part", share=found.steadiness)
     names = [label.name for label in snapshot.channels]
     causes = dict.fromkeys(why for block in found.blocks for why in block.refusal if why)
     for cause in causes:

@@ -139,7 +139,8 @@ def multi_part(
     good = np.isfinite(mean).all(axis=(1, 2)) if usable is None else usable.copy()
     good[[0, -1]] &= usable is not None
     noise, lever = np.full(shape, np.nan), np.zeros(shape)
-    cumulants, flags = np.full((3, *shape), np.nan), np.zeros(shape, np.int64)
+    cumulants, flags = np.full((3, *shape), np.nan), np.full(shape, int(Flag.SINGULAR))
+    flags[np.einsum("fii->fi", mean).real == 0] = int(Flag.DEAD_CHANNEL)
     bound, scatter = unpredicted(mean, dims=dims, n_effective=np.full(shape[0], total))
     known = good & np.isfinite(bound).all(axis=1)
     block = blocks_of(frequency)

@@ -350,7 +350,12 @@ UNITS: Mapping[str, str] = (
     {name: f"{name}_s" for name in _IN_SECONDS}
     | {name: f"{name}_hz" for name in _IN_HERTZ}
     | {name: f"{name}_share" for name in _SHARES}
-    | {"seconds": "constant_s", "amounts": "coherencies", "errors": "standard_errors"}
+    | {
+        "change": "change_db",
+        "seconds": "constant_s",
+        "amounts": "coherencies",
+        "errors": "standard_errors",
+    }
 )
 """Names of the numbers of facts and findings in JSON, where those in the code have no unit."""
 

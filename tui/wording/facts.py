@@ -243,9 +243,9 @@ def _few_sensors(fact: FewSensors, names: Names) -> Wording:
 def _steady_gains(fact: SteadyGainsAssumed, names: Names) -> Wording:
     del names
     return Wording(
-        f"Two sensors: gains are assumed steady to {fact.steadiness:g} % for ten times the motion",
+        f"Two sensors: gains are assumed steady to {100 * fact.share:g} % for ten times the motion",
         "Two sensors tell noise from motion by parts of the recording in which the motion differs."
-        f" The intervals allow for gains that change by {fact.steadiness:g} % for motion of ten"
+        f" The intervals allow for gains that change by {100 * fact.share:g} % for motion of ten"
         " times the power; a larger change shifts the noise, and tests may not show it.",
     )
 

@@ -354,10 +354,10 @@ class Pass:
         hop, at_once = self.welch.hop, self._at_once
         total = self.n_complete if most is None else min(most, self.n_complete)
         begin = self.n_seen
-        first = min(begin + max(at_once, self._delays.fewest), total)
-        bounds = [begin, *range(first, total, at_once), total]
+        fewest = self._delays.fewest  # of the first piece
+        bounds = [begin, *range(begin + max(at_once, fewest), total, at_once), total]
         if self._ends is not None:
-            ends = range(self._ends.next_end(first), total, self._ends.every)
+            ends = range(self._ends.next_end(begin + max(0, fewest - 1)), total, self._ends.every)
             bounds = sorted({*bounds, *ends})
         pieces = [(a, b - a) for a, b in itertools.pairwise(bounds) if a < b]
 

@@ -99,7 +99,9 @@ def test_numbers_of_facts_have_their_units_in_their_names() -> None:
             if each.name in {*common, "transients_by_octave"} or "float" not in str(each.type):
                 continue
             name = UNITS.get(each.name, each.name)
-            assert name in DIMENSIONLESS or name.endswith(("_s", "_hz", "_share", "_deg")), kind
+            assert name in DIMENSIONLESS or name.endswith(("_s", "_hz", "_share", "_deg", "_db")), (
+                kind
+            )
 
 
 def test_a_verdict_has_its_facts_in_the_document() -> None:

@@ -25,7 +25,7 @@ EXAMPLES: tuple[Fact, ...] = (
     facts.Finding(rank=Rank.INVALIDATES, findings=(MISFIT,)),
     facts.SensorsSimulated(rank=Rank.TO_KNOW),
     facts.FewSensors(rank=Rank.DELAYS, n_sensors=1),
-    facts.SteadyGainsAssumed(rank=Rank.TO_KNOW, method="multi-part", steadiness=0.1),
+    facts.SteadyGainsAssumed(rank=Rank.TO_KNOW, method="multi-part", share=0.001),
     facts.NoiseNotIdentified(
         rank=Rank.DELAYS,
         method="multi-part",
