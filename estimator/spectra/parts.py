@@ -140,9 +140,11 @@ class PartEnds:
         self.bins, self.every = bins, every
         self._ends: list[tuple[int, int, FloatArray]] = []
 
-    def next_end(self, place: int) -> int:
-        """Return the place at which the part that holds `place` ends."""
-        return (place // self.every + 1) * self.every
+    @property
+    def upcoming(self) -> int:
+        """Place at which the next part ends."""
+        last = self._ends[-1][0] if self._ends else 0
+        return (last // self.every + 1) * self.every
 
     def end(self, place: int, count: int, total: FloatArray) -> None:
         """End a part before `place`, with `count` segments and their packed sum so far."""

@@ -230,10 +230,7 @@ class Pass:
         self._ends: PartEnds | None = None
         if not (wanted.octaves or wanted.reject):
             bins = part_bins(len(self.welch.frequencies), self.n_channels)
-            every = max(1, -(-self.n_complete // MOST))
-            self._ends = PartEnds(
-                bins, every if every < self._at_once else self._at_once * -(-every // self._at_once)
-            )
+            self._ends = PartEnds(bins)
         self._all = CrossSpectra(
             self.welch, self.n_channels, threads=1, segments=self.single, ends=self._ends
         )
@@ -354,11 +351,9 @@ class Pass:
         hop, at_once = self.welch.hop, self._at_once
         total = self.n_complete if most is None else min(most, self.n_complete)
         begin = self.n_seen
-        fewest = self._delays.fewest  # of the first piece
-        bounds = [begin, *range(begin + max(at_once, fewest), total, at_once), total]
-        if self._ends is not None:
-            ends = range(self._ends.next_end(begin + max(0, fewest - 1)), total, self._ends.every)
-            bounds = sorted({*bounds, *ends})
+        bounds = [begin, *range(begin + max(at_once, self._delays.fewest), total, at_once), total]
+        if self._ends is not None and not begin:  # as many as the recording has now
+            self._ends.every = max(1, -(-total // MOST))
         pieces = [(a, b - a) for a, b in itertools.pairwise(bounds) if a < b]
 
         source = self._newest if live and len(pieces) == 1 else self.aligned
@@ -379,7 +374,6 @@ class Pass:
             else:
                 self._take_samples(part, first, count, together=live)
             self.n_seen += count
-            self._all.end_part(self.n_seen)
             if progress is not None:
                 progress(count)
 
@@ -529,16 +523,33 @@ class Pass:
         `first` is the grid sample of row 0.
         """
         if self._undisturbed is None:
-            self._all.add(samples, starts)
-            self._kept_at.add(first + starts)
+            begins = first + starts
+            for some in self._by_part(begins - self.reach):
+                self._all.add(samples, starts[some])
+            self._kept_at.add(begins)
         else:
             self._undisturbed.add(samples, starts)
             self._selected = None
 
     def _take_whole(self, spectra: ComplexArray, begins: NDArray[np.int64]) -> None:
         """Add segments by their spectra; they begin at grid samples `begins`."""
-        self._all.add_spectra(spectra)
+        for some in self._by_part(begins):
+            self._all.add_spectra(spectra[some])
         self._kept_at.add(begins)
+
+    def _by_part(self, begins: NDArray[np.int64]) -> Iterator[slice]:
+        """Yield the segments of each part of time; the sum so far ends a part before the next."""
+        ends = self._ends
+        if ends is None:
+            yield slice(None)
+            return
+        places, done = begins // self.welch.hop, 0
+        while done < len(places):
+            while ends.upcoming <= places[done]:
+                self._all.end_part(ends.upcoming)
+            stop = int(np.searchsorted(places, ends.upcoming))
+            yield slice(done, stop)
+            done = stop
 
     def _take_samples(self, part: _Samples, first: int, count: int, *, together: bool) -> None:
         """Add segments from samples on the grid; `first` is the number of the first of them."""

@@ -157,7 +157,7 @@ def test_octaves_of_few_complete_segments_are_those_of_the_sets() -> None:
 
 @pytest.mark.parametrize(
     ("methods", "only"),
-    [(("three-sensor",), ()), (("all",), ("two-channel", "three-channel"))],
+    [(("three-sensor",), ()), (("all",), ("two-channel", "three-channel", "multi-part"))],
 )
 def test_methods_that_pair_channels_by_number_are_named(
     methods: tuple[str, ...], only: tuple[str, ...]

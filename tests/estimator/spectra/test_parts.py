@@ -22,7 +22,7 @@ def taken(
     n = (len(samples) - SETTINGS.segment_length) // SETTINGS.hop + 1
     place = 0
     while place < n:
-        end = min(place + at_once, n, ends.next_end(place))
+        end = min(place + at_once, n, ends.upcoming)
         places = [each for each in range(place, end) if each not in left_out]
         spectra.add(samples, np.array(places, dtype=np.int64) * SETTINGS.hop)
         spectra.end_part(end)
