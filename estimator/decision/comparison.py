@@ -145,7 +145,8 @@ class Comparison:
             bounds = np.where(margin > 0, removed, -added)
             room = np.where(np.isfinite(bounds), margin - bounds, 0.0)
             left = np.sqrt(np.maximum(room**2 - self.reach**2, 0.0))
-            margin = np.where(np.isfinite(bounds), bounds + np.sign(room) * left, margin)
+            margin = np.where(left > 0, bounds + np.sign(room) * left, margin)
+            added, removed = (np.where(left > 0, part, math.inf) for part in (added, removed))
         return Margins(
             margin=margin,
             cumulants=self.cumulants / np.stack([unit**k for k in (2, 3, 4)]),

@@ -93,6 +93,31 @@ def test_nothing_is_known_of_the_margins_of_ends_that_are_infinite() -> None:
     assert np.isinf(margins.removed).all()
 
 
+@pytest.mark.parametrize("level", [0.8, 1.25])
+def test_an_uncertain_sensitivity_takes_time_by_squares_and_no_time_decides_beside_it(
+    level: float,
+) -> None:
+    """The margin is a logarithm: what scatter may use of it is the root of the rest."""
+    noise: dict[str, Any] = {"mean": np.full(3, level)}
+    noise["cumulants"] = np.stack([noise["mean"] ** k * 0.01 ** (k - 1) for k in (2, 3, 4)])
+    whole = abs(math.log(level))
+    times = []
+    for part in (0.0, 0.6, 0.9):
+        found = comparison(0.5, 1.2, reach=part * whole, **noise)
+        left = np.abs(found.margins().margin)
+        np.testing.assert_allclose(left, whole * math.sqrt(1 - part**2))
+        ahead = prediction([found], [Obstacle.SPANS_LIMIT], quantile=QUANTILE, elapsed=100.0)
+        assert ahead is not None
+        assert ahead.seconds is not None
+        times.append(ahead.seconds)
+    assert times == sorted(times)
+    assert times[2] > 2 * times[0]
+    never = comparison(0.5, 1.2, reach=2 * whole, **noise)
+    ahead = prediction([never], [Obstacle.SPANS_LIMIT], quantile=QUANTILE, elapsed=100.0)
+    assert ahead is not None
+    assert ahead.seconds is None
+
+
 def test_more_bands_take_wider_intervals() -> None:
     assert joint_quantile(1) == pytest.approx(1.96, abs=0.001)
     assert joint_quantile(81) > 3.4
