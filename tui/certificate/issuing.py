@@ -31,7 +31,7 @@ from tui.report.writing import write_content
 from tui.wording.facts import known as known_facts
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
     from daq.bench.masks.mask import Mask
@@ -135,7 +135,7 @@ def examine(
     recordings: Sequence[Path],
     order: Order,
     *,
-    known: Mapping[Path, tuple[str, str]],
+    known: Callable[[Sequence[Path]], Mapping[Path, tuple[str, str]]],
     folders: Iterable[Path] = (),
 ) -> Examined:
     """Examine recordings, before they are estimated.
@@ -144,8 +144,8 @@ def examine(
     ----------
     recordings : sequence of Path
     order : Order
-    known : mapping of Path to (str, str)
-        Run id and root SHA-256 by the databases of services.
+    known : callable
+        Returns run id and root SHA-256 of recordings by the databases of services.
     folders : iterable of Path
         Of ledgers besides those that recordings name.
     """
@@ -164,9 +164,10 @@ def examine(
             wanted = "wait for its end" if source.state == "growing" else "huddle repair closes it"
             objections.append(Objection(f"{source.path}: not closed; {wanted}"))
     if not any(source.state == "growing" for source in found):
+        paths = [source.path for source in found]  # with those that continue the ones given
         objections += [
             Objection(f"{each.path}: {each.state.removeprefix(f'{each.path}: ')}")
-            for each in verified([s.path for s in found], known=known, folders=folders)
+            for each in verified(paths, known=known(paths), folders=folders)
             if not each.is_intact
         ]
     left = missing(about, found[0], by=order.by)

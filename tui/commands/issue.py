@@ -143,7 +143,7 @@ def issue(
         examined = examine(
             files,
             order,
-            known=known_to_services(files),
+            known=known_to_services,
             folders=() if folder is None else (folder.absolute(),),
         )
     if examined.objections and not is_specimen:

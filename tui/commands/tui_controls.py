@@ -177,7 +177,7 @@ class _Controls:
             despite=wanted["despite"],
             about=self.described(path),
         )
-        examined = issuing.examine([path], order, known=known_to_services([path]))
+        examined = issuing.examine([path], order, known=known_to_services)
         if order.by and examined.objections:
             raise HuddleError("\n".join(each.line for each in examined.objections))
         if not order.by:
