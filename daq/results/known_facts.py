@@ -400,9 +400,9 @@ def _by_changes(snapshot: Snapshot) -> Iterator[Fact]:
     for cause in causes:
         blocks = [block for block in found.blocks if cause in block.refusal]
         concerned = {k for block in blocks for k, why in enumerate(block.refusal) if why is cause}
-        changes = [float(block.found.change.max(initial=0.0)) for block in blocks]
+        changes = [block.change for block in blocks]
         is_axis = cause is Refusal.STEADY and max(snapshot.dims) > 1
-        least = min(blocks, key=lambda block: float(block.found.change.max(initial=0.0)))
+        least = min(blocks, key=lambda block: block.change).found
         yield NoiseNotIdentified(
             rank=Rank.DELAYS,
             method="multi-part",
@@ -410,7 +410,7 @@ def _by_changes(snapshot: Snapshot) -> Iterator[Fact]:
             band=(blocks[0].low, blocks[-1].high),
             refusal=cause,
             change=float(np.median(changes)),
-            axis=names[least.found.still] if is_axis else "",
+            axis=names[least.still] if is_axis and least is not None else "",
         )
 
 

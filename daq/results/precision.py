@@ -11,6 +11,7 @@ import numpy as np
 from daq.results.band_summary import band_of, correlation_of, judged_method
 from estimator.levels.bands import band_levels, third_octaves
 from estimator.median import median_of_columns
+from estimator.self_noise.result import Flag
 
 if TYPE_CHECKING:
     from daq.estimation.settings import Settings
@@ -70,7 +71,7 @@ def channel_covs(snapshot: Snapshot, settings: Settings, method: str | None = No
     """Return the c.o.v. of every channel in the third of an octave of the band where it is largest.
 
     With `Settings.target_cov_bin` it is that of single frequencies, median in the band. By the
-    method that judges, if none is given; NaN where there is no estimate.
+    method that judges, if none is given; NaN where there is none, or a bound.
     """
     noise = snapshot.results.get(method or judged_method(snapshot, settings))
     low, high = band_of(settings, snapshot)
@@ -85,5 +86,6 @@ def channel_covs(snapshot: Snapshot, settings: Settings, method: str | None = No
     found = band_levels(noise.noise_psd, noise.cumulants, edges, correlation, weights=width)
     with np.errstate(invalid="ignore", divide="ignore"):
         cov = np.where(np.isfinite(found.mean), found.spread / np.abs(found.mean), -np.inf)
-    worst = cov.max(axis=0)
+    bounds = (noise.flags[edges[0] : edges[-1]] & Flag.UNIDENTIFIED) != 0
+    worst = np.where(bounds.any(axis=0), -np.inf, cov.max(axis=0))  # no precision of a bound
     return [math.nan if each < 0 else each for each in worst.tolist()]

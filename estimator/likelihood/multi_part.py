@@ -29,6 +29,10 @@ REJECTED = 1e-3
 """p-value of the model's fit in a block, from which the block has no levels."""
 FOLLOWS = 3.5
 """Standard deviations from which a gain, or noise, follows the loudness of the motion."""
+LEAST = 2.5
+"""Averages of a part for each channel, at least."""
+FEWEST = 4
+"""Parts at least."""
 SMOOTH = 400.0
 """Averages on which the course of the noise within a block rests."""
 
@@ -42,13 +46,19 @@ class PartBlock:
     low, high : float
         First and last frequency in Hz.
     refusal : tuple of Refusal or None, length n_channels
-    found : BandNoise
+    found : BandNoise or None
+        None where the recording is too short for parts.
     """
 
     low: float
     high: float
     refusal: tuple[Refusal | None, ...]
-    found: BandNoise
+    found: BandNoise | None
+
+    @property
+    def change(self) -> float:
+        """Standard deviation of the motion over the parts in dB; 0 where it is not known."""
+        return 0.0 if self.found is None else float(self.found.change.max(initial=0.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,6 +103,7 @@ class MultiPart:
             np.where(outside, np.nan, cumulants),
             self.noise.flags[near],
         )
+        noise = replace(noise, cov=np.where(outside, np.nan, self.noise.cov[near]))
         return replace(self, noise=noise, lever=self.lever[near], frequency=frequency)
 
 
@@ -128,18 +139,19 @@ def multi_part(
     usable : bool, shape (n_freqs,), optional
         Frequencies that count; default: where the averages are finite, without zero and Nyquist.
 
-    Raises
-    ------
-    InsufficientDataError
-        If fewer than two parts have more averages than there are channels.
+    Notes
+    -----
+    Neighbouring parts are taken together until each has `LEAST` averages for each channel.
     """
+    csm, averages = _merged(csm, averages, LEAST * csm.shape[-1])
     total = float(averages.sum())
     mean = np.tensordot(averages / total, csm, axes=1)
     shape = mean.shape[:2]
     good = np.isfinite(mean).all(axis=(1, 2)) if usable is None else usable.copy()
     good[[0, -1]] &= usable is not None
     noise, lever = np.full(shape, np.nan), np.zeros(shape)
-    cumulants, flags = np.full((3, *shape), np.nan), np.full(shape, int(Flag.SINGULAR))
+    cumulants, flags = np.full((3, *shape), np.nan), np.zeros(shape, np.int64)
+    flags[good] = int(Flag.SINGULAR)
     flags[np.einsum("fii->fi", mean).real == 0] = int(Flag.DEAD_CHANNEL)
     bound, scatter = unpredicted(mean, dims=dims, n_effective=np.full(shape[0], total))
     known = good & np.isfinite(bound).all(axis=1)
@@ -148,6 +160,12 @@ def multi_part(
     found = []
     for number in np.unique(block[known]):
         bins = np.flatnonzero(known & (block == number))
+        edges = float(frequency[bins[0]]), float(frequency[bins[-1]])
+        if len(averages) < FEWEST:
+            noise[bins], cumulants[:, bins] = bound[bins], scatter[:, bins]
+            flags[bins] = int(Flag.UNIDENTIFIED)
+            found.append(PartBlock(*edges, (Refusal.SHORT,) * shape[1], None))
+            continue
         apart = float(worth(len(bins), lags)[-1])
         course = _course(bound[bins], total)
         each = band_noise(
@@ -160,9 +178,7 @@ def multi_part(
             steadiness=steadiness,
         )
         refusal = _refusals(each)
-        found.append(
-            PartBlock(float(frequency[bins[0]]), float(frequency[bins[-1]]), refusal, each)
-        )
+        found.append(PartBlock(*edges, refusal, each))
         has = np.array([why is None for why in refusal])
         noise[bins] = np.where(has, each.level * course[:, None], bound[bins])
         lever[bins] = np.where(has, each.lever * course[:, None], 0.0)
@@ -170,13 +186,25 @@ def multi_part(
         for m in range(3):  # the mean of the block then has the cumulants of its level
             own = each.cumulants[m] * (course[:, None] ** (m + 2)) * apart ** (m + 1)
             cumulants[m, bins] = np.where(has, own, scatter[m, bins])
-    return MultiPart(
-        SelfNoise.of("multi-part", noise, cumulants, flags),
-        lever,
-        tuple(found),
-        frequency,
-        steadiness,
-    )
+    result = SelfNoise.of("multi-part", noise, cumulants, flags)
+    precise = np.where(flags & Flag.UNIDENTIFIED, np.nan, result.cov)  # a bound is no level
+    return MultiPart(replace(result, cov=precise), lever, tuple(found), frequency, steadiness)
+
+
+def _merged(
+    csm: ComplexArray, averages: FloatArray, least: float
+) -> tuple[ComplexArray, FloatArray]:
+    """Return parts of so many averages at least: neighbours together."""
+    together = int(np.ceil(least / averages.mean()))
+    number = np.arange(len(averages)) // together
+    number = np.minimum(number, max(len(averages) // together - 1, 0))
+    starts = np.flatnonzero(np.diff(number, prepend=-1))
+    if len(starts) == len(averages):
+        return csm, averages
+    weighted = averages[:, None, None, None] * csm
+    total = np.add.reduceat(averages, starts)
+    means = np.add.reduceat(weighted, starts) / total[:, None, None, None]
+    return np.asarray(means, np.complex128), np.asarray(total, np.float64)
 
 
 def _course(bound: FloatArray, total: float) -> FloatArray:

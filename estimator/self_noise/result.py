@@ -49,6 +49,8 @@ class Flag(enum.IntFlag):
 class Refusal(enum.StrEnum):
     """Why motion that changes does not give the noise of a channel."""
 
+    SHORT = "short"
+    """Too few averages for parts of the recording."""
     STEADY = "steady"
     """The motion, or one direction of it, hardly changes."""
     WIDE = "wide"

@@ -14,6 +14,7 @@ from daq.errors import HuddleError
 from daq.estimation.contributions import with_sensitivities
 from daq.estimation.snapshot_builder import sensitivities_at
 from daq.recording.signing import identity
+from daq.results.band_summary import judged_method
 from daq.results.decision.conformity import conformity, with_rule
 from daq.results.decision.limits import judge
 from daq.results.sources import sources
@@ -238,6 +239,11 @@ def issue(
         raise NotIssuedError("\n".join(map(str, examined.objections)))
     if not order.by:
         raise NotIssuedError("nobody authorises the certificate; expected --by NAME")
+    if judged_method(snapshot, settings) == "multi-part":
+        raise NotIssuedError(
+            "the noise of two sensors assumes steady gains: no certificate is issued of it;"
+            " --specimen makes a specimen"
+        )
     snapshot = with_stated(snapshot, examined)
     invalid = invalidating(known_facts(snapshot, settings))
     if invalid and not order.despite:

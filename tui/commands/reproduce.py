@@ -24,7 +24,7 @@ def reproduce(
         list[str] | None,
         typer.Argument(
             metavar="STUDY",
-            help="fig4, fig5, fig9, fig12, fig13, setup1, setup2, fig14, waves (default: all);"
+            help="fig4, fig5, fig9, fig12, fig13, setup1, setup2, fig14, waves, two (default: all);"
             " or public, with the FOLDER of each public huddle test after it.",
         ),
     ] = None,

@@ -14,8 +14,10 @@ import numpy as np
 
 from estimator.levels.bands import bin_correlation
 from estimator.likelihood.dimension import choose_dimension
+from estimator.likelihood.multi_part import multi_part
 from estimator.methods import self_noise
 from estimator.self_noise.bias import three_channel_bias, three_sensor_bias
+from estimator.spectra.parts import PartEnds, Parts, part_bins
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window
 from sim_devices.world import paper_scenarios
@@ -50,7 +52,12 @@ REACH = 3
 PSD_LABEL, FREQUENCY_LABEL = "PSD ((m/s²)²/Hz)", "frequency (Hz)"
 BIAS_LABEL = "fractional bias (1)"
 BIAS = {"three-channel": three_channel_bias, "three-sensor": three_sensor_bias}
-STYLES = {"three-channel": "k-", "three-sensor": "C0-", "maximum-likelihood": "C2-"}
+STYLES = {
+    "three-channel": "k-",
+    "three-sensor": "C0-",
+    "maximum-likelihood": "C2-",
+    "multi-part": "C3-",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +73,7 @@ class MeasuredSpectra:
     motion: ComplexArray
     noise: FloatArray
     n_effective: float
+    parts: Parts
 
     def of(self, sensors: tuple[str, ...]) -> MeasuredSpectra:
         """Return the part that belongs to some sensors, in their order."""
@@ -91,7 +99,7 @@ class Laboratory:
             self._measured[name] = measure(
                 paper_scenarios.named(name),
                 duration=self._duration,
-                progress=lambda share: self._progress(f"{name}: five triaxial sensors", share),
+                progress=lambda share: self._progress(f"{name}: triaxial sensors", share),
             )
         return self._measured[name]
 
@@ -101,7 +109,8 @@ def measure(
 ) -> MeasuredSpectra:
     """Simulate triaxial sensors for a duration in seconds, and transform what they read."""
     world = World(scenario)
-    spectra = CrossSpectra(HANN, 3 * len(scenario.names))
+    bins = part_bins(len(HANN.frequencies), 3 * len(scenario.names))
+    spectra = CrossSpectra(HANN, 3 * len(scenario.names), ends=PartEnds(bins))
     length, hop = HANN.segment_length, HANN.hop
     n_samples = round(duration * HANN.sampling_rate)
     kept: list[FloatArray] = []
@@ -114,6 +123,7 @@ def measure(
             together = np.concatenate(kept)
             starts = np.arange(0, len(together) - length + 1, hop)
             spectra.add(together, starts)
+            spectra.end_part(spectra.n_segments)
             kept = [together[len(starts) * hop :]]
             progress((first + n) / n_samples)
     return MeasuredSpectra(
@@ -122,6 +132,7 @@ def measure(
         motion=smoothed(lambda f: world.motion_csm(scenario.names, f), HANN)[SHOWN],
         noise=smoothed(lambda f: true_noise(scenario, scenario.names, f), HANN)[SHOWN].real,
         n_effective=spectra.n_effective,
+        parts=Parts(bins, spectra.parts(spectra.n_segments)),
     )
 
 
@@ -348,6 +359,30 @@ def waves(laboratory: Laboratory) -> Study:
     )
 
 
+def two(laboratory: Laboratory) -> Study:
+    """Two sensors in motion whose level changes: beyond the paper."""
+    measured = laboratory.measured("two")
+    correlation = bin_correlation(get_window(HANN.window, HANN.segment_length), HANN.hop)
+    frequency = HANN.frequencies[measured.parts.bins]
+    found = multi_part(
+        *(measured.parts.csm(), measured.parts.averages, frequency),
+        dims=(3, 3),
+        correlation=correlation,
+        usable=(frequency > 0) & (frequency <= HANN.frequencies[SHOWN][-1]),
+    ).noise
+    truth = true_noise(measured.scenario, measured.scenario.names, HANN.frequencies[SHOWN])
+    deviation = np.sqrt(found.cumulants[0][SHOWN])
+    noise = Noise("multi-part", found.noise_psd[SHOWN], truth, deviation, truth)
+    return Study(
+        "two",
+        "Two triaxial sensors, motion that changes by 6 dB, SNR 30",
+        (
+            _spectra("A and B", _record(measured, "A"), (noise,)),
+            _biases("bias", band_series(noise, label="A and B")),
+        ),
+    )
+
+
 def _goal(high: float) -> float:
     """Bias that is left to the five sensors: 5 % to 20 Hz, 20 % above."""
     return 0.05 if high <= 20 else 0.2
@@ -358,4 +393,5 @@ LABORATORY: Mapping[str, Callable[[Laboratory], Study]] = {
     "setup2": setup2,
     "fig14": fig14,
     "waves": waves,
+    "two": two,
 }

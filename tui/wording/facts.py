@@ -251,6 +251,7 @@ def _steady_gains(fact: SteadyGainsAssumed, names: Names) -> Wording:
 
 
 _NOT_IDENTIFIED = {
+    Refusal.SHORT: "the recording is too short to compare parts of it",
     Refusal.STEADY: "the motion changes by {change:.1f} dB{axis}, too little to tell noise from it",
     Refusal.WIDE: "the interval is wider than what the other sensor does not predict",
     Refusal.UNSETTLED: "the likelihood has no clear maximum",
@@ -269,7 +270,7 @@ def _not_identified(fact: NoiseNotIdentified, names: Names) -> Wording:
     axis = f", least along {fact.axis}" if fact.axis else ""
     why = _NOT_IDENTIFIED[fact.refusal].format(change=fact.change, axis=axis)
     where = "" if fact.band is None else f" at {span(*fact.band)}"
-    few = fact.refusal in {Refusal.STEADY, Refusal.WIDE}
+    few = fact.refusal in {Refusal.SHORT, Refusal.STEADY, Refusal.WIDE}
     return Wording(
         f"Only upper limits{where}: {why}",
         f"{listed(fact.channels)}{where}: {why}. The noise is anywhere below the upper limit.",

@@ -40,6 +40,11 @@ _NEXT_DAYS = 12 * 3600.0
 
 def headline(found: TestVerdict) -> str:
     """Return the verdict in a sentence or two."""
+    two = any(each.method == "multi-part" for each in found.limits)
+    return _headline(found) + (" Two sensors: steady gains are assumed." if two else "")
+
+
+def _headline(found: TestVerdict) -> str:
     word = WORDS[found.verdict]
     n_channels = len({each.name for each in found.limits})
     names = listed(list(dict.fromkeys(each.limit for each in found.limits)) or ["the limits"])

@@ -15,7 +15,8 @@ from estimator.likelihood.changing_motion import (
     band_noise,
     bound_of_parts,
 )
-from estimator.self_noise.result import Refusal
+from estimator.likelihood.multi_part import multi_part
+from estimator.self_noise.result import Flag, Refusal
 from tests.estimator.csm_models import rotation, wishart
 
 if TYPE_CHECKING:
@@ -244,6 +245,24 @@ def test_parts_with_too_few_averages_are_an_error() -> None:
     csm = np.broadcast_to(np.eye(6, dtype=np.complex128), (3, 4, 6, 6))
     with pytest.raises(InsufficientDataError, match="more than 6 averages"):
         band_noise(csm, np.full(4, 6.0), dims=(3, 3), n_dims=3)
+
+
+def test_short_parts_are_taken_together_and_few_give_a_bound() -> None:
+    (bench,) = benches(29, draws=1)
+    csm = np.swapaxes(bench.parts(changing(bench)), 0, 1)
+    frequency = np.arange(1.0, N_BINS + 1)
+    usable = np.ones(N_BINS, dtype=bool)
+    for averages, n_kept in ((60.0, N_PARTS), (3.0, 6), (1.0, 0)):
+        found = multi_part(
+            *(csm, np.full(N_PARTS, averages), frequency), dims=bench.dims, usable=usable
+        )
+        (block,) = found.blocks
+        if n_kept:
+            assert block.found is not None
+            assert len(block.found.kept) == n_kept
+        else:
+            assert set(block.refusal) == {Refusal.SHORT}
+            assert np.all(found.noise.flags == Flag.UNIDENTIFIED)
 
 
 def test_the_change_of_the_motion_is_stated() -> None:
