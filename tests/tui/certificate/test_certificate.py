@@ -240,25 +240,24 @@ def test_of_simulated_sensors_there_are_specimens_alone(tmp_path: Path) -> None:
     xml = PdfReader(path).attachments[NAME][0]
     tree = etree.parse(io.BytesIO(xml))
     assert tree.xpath("//dcc:statement[contains(., 'SPECIMEN')]", namespaces=NAMESPACES)
-    again = run.invoke(app, ["issue", str(recording), "--specimen"])  # replaces the first
-    assert again.exit_code == 0
     found = run.invoke(app, ["verify", str(path)])
     assert found.exit_code == 3
     assert "a specimen, no certificate" in " ".join((found.output + found.stderr).split())
 
 
-def test_a_result_that_a_fact_invalidates_needs_a_reason(tmp_path: Path) -> None:
-    made = laboratory(tmp_path / "lab")
-    arguments = ["issue", str(made.recording), "--by", "Ada", "--bench", str(made.bench)]
-    refused = CliRunner().invoke(app, [*arguments, "--allow-incomplete"])
+def test_a_result_that_a_fact_invalidates_needs_a_reason(
+    issued: Laboratory, tmp_path: Path
+) -> None:
+    arguments = ["issue", str(issued.recording), "--by", "Ada", "--bench", str(issued.bench)]
+    elsewhere = ["--folder", str(tmp_path / "papers")]
+    refused = CliRunner().invoke(app, [*arguments, *elsewhere, "--allow-incomplete"])
     assert refused.exit_code == 2
     said = " ".join(refused.stderr.split())
     assert "the result is invalid" in said
     assert "no signal; check cable and power" in said
     assert "--despite REASON" in said
-    assert not made.certificates.exists()
-    made.issue()
-    first = "".join(PdfReader(made.certificate()).pages[0].extract_text().split())
+    assert not (tmp_path / "papers").exists()
+    first = "".join(PdfReader(issued.certificate()).pages[0].extract_text().split())
     assert "Issueddespitefactsthatinvalidatetheresult.Reason:thedeadchannelisnotused." in first
 
 
