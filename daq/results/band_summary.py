@@ -16,7 +16,7 @@ from daq.estimation.contributions import contributions, shared_parts
 from daq.estimation.noise_estimates import ALL_METHODS
 from estimator.checks.advice import NoSharedMotion
 from estimator.levels.bands import band_edges, band_levels, bin_correlation
-from estimator.levels.contributions import by_chance, deviation, widened
+from estimator.levels.contributions import Source, by_chance, deviation, widened
 from estimator.levels.interval import NORMAL_95, interval, unpredicted
 from estimator.spectra.windows import get_window
 
@@ -28,10 +28,12 @@ if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import ChannelLabel, Snapshot
     from estimator.levels.bands import BandLevels
-    from estimator.levels.contributions import Contribution, Source
+    from estimator.levels.contributions import Contribution
     from estimator.self_noise.result import SelfNoise
     from estimator.types import FloatArray
 
+CONSTANT = frozenset({Source.SENSITIVITY})
+"""What is the same in all tests of a sensor, and no part of the difference of two."""
 _SHAPE_LENGTH = 512  # only the window's shape and overlap matter to the correlation of bins
 
 
@@ -131,9 +133,11 @@ class Levels:
         low, _ = widened(*self.of_scatter.interval(quantile), self.contributions)
         return np.asarray(low > self._most(quantile))
 
-    def of_channel(self, column: int, quantile: float = NORMAL_95) -> BandMeans:
+    def of_channel(
+        self, column: int, quantile: float = NORMAL_95, *, without: Collection[Source] = ()
+    ) -> BandMeans:
         """Return the means of one channel."""
-        low, high = self.ends(quantile)
+        low, high = self.ends(quantile, without=without)
         mean, spread = self.mean[:, column], self.of_scatter.spread[:, column]
         scatter = self.of_scatter.interval(quantile)
         return BandMeans(
@@ -237,10 +241,12 @@ def channel_means(
     band: tuple[float, float],
     *,
     quantile: float = NORMAL_95,
+    without: Collection[Source] = (),
 ) -> tuple[BandMeans, ...]:
     """Return the mean noise of every channel in a band, each with its interval: `levels` of one."""
     found = levels(noise, snapshot, settings, band_edges(snapshot.frequency, band))
-    return tuple(found.of_channel(column, quantile) for column in range(len(snapshot.channels)))
+    columns = range(len(snapshot.channels))
+    return tuple(found.of_channel(column, quantile, without=without) for column in columns)
 
 
 def data_means(snapshot: Snapshot, band: tuple[float, float]) -> FloatArray:

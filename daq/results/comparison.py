@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from daq.bench.units import decibels
-from daq.results.band_summary import band_of, channel_means
+from daq.results.band_summary import CONSTANT, band_of, channel_means
 
 if TYPE_CHECKING:
     from daq.estimation.settings import Settings
@@ -45,6 +45,8 @@ def compare(
 ) -> dict[tuple[str, str], Difference]:
     """Return the differences of the channels that both tests have, by sensor and channel.
 
+    What is known of their sensitivities is the same in both, and no part of it.
+
     Both are judged by the first method that both have, in the band that both have. Nothing can be
     compared, and the result is empty, where units differ, or bands or methods have nothing in
     common.
@@ -55,12 +57,14 @@ def compare(
     if not methods or snapshot.unit != earlier.unit or band[0] >= band[1]:
         return {}
     method = methods[0]
-    now = channel_means(snapshot.results[method], snapshot, settings, band)
+    now = channel_means(snapshot.results[method], snapshot, settings, band, without=CONSTANT)
     before = {
         (label.sensor, label.channel): mean
         for label, mean in zip(
             earlier.channels,
-            channel_means(earlier.results[method], earlier, earlier_settings, band),
+            channel_means(
+                earlier.results[method], earlier, earlier_settings, band, without=CONSTANT
+            ),
             strict=True,
         )
     }

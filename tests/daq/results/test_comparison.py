@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from daq.bench.sensitivity import KnownSensitivity
+from daq.estimation.contributions import with_sensitivities
 from daq.results.band_summary import BandMeans
 from daq.results.comparison import compare, difference
 from estimator.self_noise.result import SelfNoise
@@ -49,6 +51,21 @@ def test_like_channels_are_compared_in_the_common_band() -> None:
         assert each.db == pytest.approx(10 * math.log10(2), abs=1e-6)
         assert each.low_db < each.db < each.high_db
         assert each.is_certain
+
+
+def test_an_uncertain_sensitivity_is_no_part_of_a_difference() -> None:
+    """It is the same in both tests; the temperature may not be."""
+    snapshot = made_snapshot(n_effective=2000.0)
+    names = [(label.sensor, label.channel) for label in snapshot.channels]
+    exact = compare(snapshot, SETTINGS, snapshot, SETTINGS)
+    for known, same in (
+        (KnownSensitivity(own=0.1), True),
+        (KnownSensitivity(own=0.1, coefficient=0.01), False),
+    ):
+        stated = with_sensitivities(snapshot, dict.fromkeys(names, known.at((0.0, 40.0))))
+        found = compare(stated, SETTINGS, stated, SETTINGS)
+        assert (found == exact) == same
+        assert found[names[0]].high_db >= exact[names[0]].high_db
 
 
 def test_what_has_nothing_in_common_is_not_compared() -> None:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from daq.bench.units import decibels
 from daq.errors import HuddleError
 from daq.recording.reader import Recording
-from daq.results.band_summary import band_of, channel_means, judged_method
+from daq.results.band_summary import CONSTANT, band_of, channel_means, judged_method
 from estimator.errors import BandError
 from tui.service.records.run_state import BandNoise, utc_text
 from tui.wording.findings import drift_line
@@ -155,6 +155,8 @@ def band_noise(
 ) -> tuple[BandNoise, ...]:
     """Return the noise of every channel in the band of a test, and in others.
 
+    To be compared with other tests of the sensors: without what is known of their sensitivities.
+
     Parameters
     ----------
     about : mapping
@@ -168,7 +170,9 @@ def band_noise(
     found = []
     for band in dict.fromkeys([band_of(settings, snapshot), *bands]):
         try:
-            means = channel_means(snapshot.results[method], snapshot, settings, band)
+            means = channel_means(
+                snapshot.results[method], snapshot, settings, band, without=CONSTANT
+            )
         except BandError as error:
             notes.append(f"no noise for the history: {error}")
             continue
