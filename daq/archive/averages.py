@@ -25,6 +25,7 @@ from daq.estimation.snapshot_diagnostics import (
     SnapshotDiagnostics,
     Synchronisation,
 )
+from estimator.checks.count_limits import CountLimits
 from estimator.errors import InsufficientDataError
 from estimator.spectra.multiresolution import Band
 from estimator.spectra.segment_rejection import Reason
@@ -150,7 +151,7 @@ class Estimator:
                 edges,
                 bands=(band,),
                 dims=self.dims,
-                clipped=average.clipped,
+                counts=CountLimits(average.clipped),
                 stood_still=average.stood_still,
             ).added_to(diagnostics)
         snapshot = Snapshot(

@@ -34,7 +34,7 @@ from daq.errors import ArchiveError, HuddleError
 from daq.estimation.blas_threads import one_blas_thread
 from daq.estimation.diagnosis import synchronisation
 from daq.estimation.noise_estimates import responses
-from daq.estimation.segments.clipping import clipped_columns
+from daq.estimation.segments.clipping import limits_by_column
 from daq.estimation.segments.segment_pass import Pass, still_for_a_while
 from daq.estimation.settings import check_fit
 from daq.recording.reader import Recording
@@ -217,7 +217,7 @@ def _written(
             not_understood=tuple(
                 clock.sensor for clock in each.aligned.clocks if not clock.is_understood
             ),
-            clipped=clipped_columns([recording], channels),
+            clipped=limits_by_column([recording], channels).clipped,
             stood_still=still_for_a_while([each], settings),
             simulated=recording.simulated,
             lacking=each.sets.lacking(each.n_channels),

@@ -80,7 +80,7 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
         found.append(contribution(Source.GAINS, shape, below=lever, above=lever))
         unknown = (noise.flags & Flag.UNIDENTIFIED) != 0  # anywhere below the bound
         found.append(contribution(Source.STEADY_MOTION, shape, below=np.where(unknown, psd, 0.0)))
-    faulty = [*diagnostics.clipped, *diagnostics.stood_still]
+    faulty = sorted(diagnostics.faulty)
     if faulty:
         below = np.zeros(shape)
         below[:, faulty] = math.inf

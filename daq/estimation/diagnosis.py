@@ -20,6 +20,7 @@ from daq.estimation.snapshot_diagnostics import (
     Synchronisation,
 )
 from estimator.checks.advice import Advice, Delay, Gain, Level, ModelMisfit, SharedNoise, Untested
+from estimator.checks.count_limits import CountLimits
 from estimator.checks.diagnose import Diagnostics, diagnose
 from estimator.errors import InsufficientDataError
 from estimator.responses.equalisation import leakage_advice
@@ -53,7 +54,7 @@ _UP = {"z", "up", "down", "vertical", "+z", "-z"}
 class Findings:
     """Fields of `SnapshotDiagnostics` that a diagnosis fills in; empty before the first."""
 
-    clipped: Mapping[int, float] = field(default_factory=dict)
+    counts: CountLimits = field(default_factory=CountLimits)
     stood_still: Mapping[int, float] = field(default_factory=dict)
     diagnosis: Diagnosis | None = None
     untested: Untested | None = Untested.UNFINISHED
@@ -67,7 +68,7 @@ class Findings:
         *,
         bands: Sequence[Band],
         dims: tuple[int, ...],
-        clipped: Mapping[int, float],
+        counts: CountLimits,
         stood_still: Mapping[int, float],
     ) -> Findings:
         """Return findings with advice on leakage at the edges of segments, worst first."""
@@ -89,7 +90,7 @@ class Findings:
             order = list(Level)
             advice = sorted([*rest, *leaks], key=lambda each: order.index(each.level))
             whole = replace(whole, advice=tuple(advice))
-        return cls(clipped, stood_still, whole, untested, edges)
+        return cls(counts, stood_still, whole, untested, edges)
 
     def fits(self, frequency: FloatArray) -> bool:
         """Whether it is about these frequencies: with octaves, there are more as time goes by."""
@@ -102,7 +103,7 @@ class Findings:
         """Return diagnostics with these findings."""
         return replace(
             diagnostics,
-            clipped=self.clipped,
+            counts=self.counts,
             stood_still=self.stood_still,
             diagnosis=self.diagnosis,
             untested=self.untested,

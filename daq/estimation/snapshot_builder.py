@@ -43,7 +43,7 @@ from daq.estimation.noise_estimates import (
     with_sets,
 )
 from daq.estimation.recording_set import is_complete
-from daq.estimation.segments.clipping import clipped_columns
+from daq.estimation.segments.clipping import limits_by_column
 from daq.estimation.segments.segment_pass import still_for_a_while
 from daq.estimation.snapshot import Bridged, ChannelLabel, NoSegment, Octave, SensorTotals, Snapshot
 from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics
@@ -365,14 +365,14 @@ class SnapshotBuilder:
     ) -> Findings:
         """Diagnose the test: too costly for every snapshot."""
         dims, channels = passes[0].aligned.dims, passes[0].aligned.channels
-        clipped = clipped_columns(recordings, channels)
+        counts = limits_by_column(recordings, channels)
         stood_still = still_for_a_while(passes, self._settings)
         found = diagnosis(
             bands,
             dims,
             channels,
             dimensions=estimates.dimensions,
-            faulty={*clipped, *stood_still},
+            faulty={*counts.faulty, *stood_still},
             axes=self._axes,
             aligned=aligned_pairs(clock_states(passes)),
             course=segment_course(passes, channels, self._unit, self._equalisation),
@@ -380,7 +380,7 @@ class SnapshotBuilder:
         )
         edges = self._equalisation.leakage(raw, channels, self._unit)
         return Findings.of(
-            found, edges, bands=bands, dims=dims, clipped=clipped, stood_still=stood_still
+            found, edges, bands=bands, dims=dims, counts=counts, stood_still=stood_still
         )
 
     def _estimates(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.checks.advice import Untested
+from estimator.checks.count_limits import CountLimits
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -175,11 +176,11 @@ class SnapshotDiagnostics:
     synchronisation : Synchronisation
     dimensions : tuple of BandDimension
         Where the dimension of the motion was chosen by band; rising.
-    clipped : mapping of int to float
-        Share of samples at the end of the range, by column of the channel; without channels that
-        have none.
+    counts : CountLimits
+        Channels whose counts are clipped, wrap, repeat or lack codes.
     stood_still : mapping of int to float
-        Seconds for which a channel had a constant count though it has a signal otherwise; likewise.
+        Seconds for which a channel had a constant count though it has a signal otherwise, by
+        column; without channels that had none.
     diagnosis : Diagnosis or None
         None where there is too little to diagnose. While a recording grows it may be that of some
         segments before: it takes too long to be made for every snapshot.
@@ -193,12 +194,17 @@ class SnapshotDiagnostics:
 
     synchronisation: Synchronisation = field(default_factory=Synchronisation)
     dimensions: tuple[BandDimension, ...] = ()
-    clipped: Mapping[int, float] = field(default_factory=dict)
+    counts: CountLimits = field(default_factory=CountLimits)
     stood_still: Mapping[int, float] = field(default_factory=dict)
     diagnosis: Diagnosis | None = None
     untested: Untested | None = Untested.UNFINISHED
     edge_leakage: EdgeLeakage | None = None
     multi_part: MultiPart | None = None
+
+    @property
+    def faulty(self) -> set[int]:
+        """Columns of channels whose samples are wrong."""
+        return {*self.counts.faulty, *self.stood_still}
 
     @property
     def advice(self) -> tuple[Advice, ...]:

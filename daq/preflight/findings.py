@@ -51,6 +51,12 @@ class Problem(enum.StrEnum):
     """Samples are missing."""
     CLIPPING = "clipping"
     """Samples are at the end of the range."""
+    WRAPPING = "wrapping"
+    """The counts wrap: a value beyond one end of the range continues at the other end."""
+    REPEATS = "repeats"
+    """The device repeats its readings: it is polled faster than it refreshes them."""
+    STUCK_BIT = "stuck-bit"
+    """A bit of the counts never changes, or codes between others never occur."""
     NEAR_FULL_SCALE = "near-full-scale"
     """Samples are near the full scale of the data sheet."""
     DEAD = "dead"
@@ -111,7 +117,7 @@ class Finding:
     value : float
         Rate in Hz, missing samples, frequency of hum, error of the clock in ppm, scatter of
         arrivals in s, acceleration at rest in m/s², correlation, gain, share of the full scale, or
-        bytes that are free; NaN where there is none.
+        bytes that are free, bits, or rate of new readings in Hz; NaN where there is none.
     wanted : float
         Rate of the bench file in Hz, or bytes that the recording takes; NaN where there is none.
     text : str

@@ -45,7 +45,13 @@ MISSING_SHARE = 0.01
 """Share of missing samples from which on a port is bad."""
 NEAR = 0.9
 """Share of the full scale from which on a channel may clip in a test."""
-OF_CHANNELS = {Problem.DEAD, Problem.HUM, Problem.NEAR_FULL_SCALE, Problem.SENSITIVITY}
+OF_CHANNELS = {
+    Problem.DEAD,
+    Problem.WRAPPING,
+    Problem.HUM,
+    Problem.NEAR_FULL_SCALE,
+    Problem.SENSITIVITY,
+}
 """Problems that all channels of a sensor have for one cause."""
 ALIKE = 1.05
 """Largest over smallest value of the channels of a sensor up to which they have one cause."""
@@ -86,7 +92,10 @@ def check_list(
         Check.PORTS: [one for each in sensors for one in _port(each)],
         Check.IDENTITY: [one for each in sensors for one in _identity(each)],
         Check.RATES: [one for each in sensors for one in _rate(each)],
-        Check.CHANNELS: [*(one for each in able for one in _dead(each)), *waiting],
+        Check.CHANNELS: [
+            *(one for each in able for one in (*_dead(each), *_repeats(each))),
+            *waiting,
+        ],
         Check.LEVELS: [*(one for each in able for one in _levels(each)), *waiting],
         Check.HUM: [*_hum(able), *waiting],
         Check.MOTION: [*alone(fast), *waiting, *slow],
@@ -216,7 +225,19 @@ def _dead(each: SensorPreview) -> Iterator[Finding]:
             yield Finding(Problem.DEAD, each.sensor.name, channel.name)
 
 
+def _repeats(each: SensorPreview) -> Iterator[Finding]:
+    rate = each.sensor.sampling_rate
+    for share in set(each.limits.repeated.values()):
+        yield replace(_of(Problem.REPEATS, each, (1 - share) * rate), wanted=rate)
+
+
 def _levels(each: SensorPreview) -> Iterator[Finding]:
+    names = [channel.name for channel in each.sensor.channels]
+    for column, wrap in each.limits.wrapped.items():
+        yield Finding(Problem.WRAPPING, each.sensor.name, names[column], value=wrap.bits)
+    for column, codes in each.limits.codes.items():
+        if codes.stuck_bits or codes.n_missing:
+            yield Finding(Problem.STUCK_BIT, each.sensor.name, names[column], value=codes.bits)
     if each.is_clipping:
         yield _of(Problem.CLIPPING, each)
         return

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -20,6 +20,7 @@ from daq.preflight.arrivals import arrivals
 from daq.protocols.block import Block, BlockFlag
 from daq.protocols.errors import RemoteProtocolError
 from daq.recorder.device_identity import check_identity, with_owner
+from estimator.checks.count_limits import CountLimits
 
 if TYPE_CHECKING:
     import threading
@@ -60,8 +61,10 @@ class SensorPreview:
         Its standard error, as a fraction of the rate.
     arrival_scatter : float
         Standard deviation of the arrival times about even ones, in s.
+    limits : CountLimits
+        What the counts show of their limits.
     is_clipping : bool
-        Whether a sample reached the end of the range.
+        Whether a sample reached the end of the range, by the device or by the counts.
     n_missing : int
         Samples missing between the kept ones.
     trouble : str
@@ -75,6 +78,7 @@ class SensorPreview:
     measured_rate: float | None = None
     rate_error: float = 0.0
     arrival_scatter: float = 0.0
+    limits: CountLimits = field(default_factory=CountLimits)
     is_clipping: bool = False
     n_missing: int = 0
     trouble: str = ""
@@ -92,8 +96,11 @@ class SensorPreview:
         if not blocks:
             none = np.empty((0, len(sensor.channels)))
             return cls(sensor, information, none, trouble=trouble)
-        counts = np.concatenate([block.counts for block in blocks]).astype(np.float64)
+        raw = np.concatenate([block.counts for block in blocks])
+        counts = raw.astype(np.float64)
         arrived = arrivals(blocks)
+        main = [n for n, channel in enumerate(sensor.channels) if not channel.auxiliary]
+        limits = CountLimits.of(raw, {n: np.ones(len(raw), bool) for n in main})
         return cls(
             sensor,
             information,
@@ -102,7 +109,9 @@ class SensorPreview:
             measured_rate=arrived.rate,
             rate_error=arrived.error,
             arrival_scatter=arrived.scatter,
-            is_clipping=any(BlockFlag.CLIPPED in block.flags for block in blocks),
+            limits=limits,
+            is_clipping=bool(limits.clipped)
+            or any(BlockFlag.CLIPPED in block.flags for block in blocks),
             n_missing=blocks[-1].end_sample - blocks[0].first_sample - len(counts),
             trouble=trouble,
         )

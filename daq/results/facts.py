@@ -344,6 +344,59 @@ class ChannelsClipped(Fact):
 
 
 @record
+class ChannelsWrap(Fact):
+    """Counts wrap: the noise of these channels is too high.
+
+    Attributes
+    ----------
+    bits : tuple of int
+        The counts of each channel wrap at 2**bits.
+    """
+
+    name: ClassVar[str] = "channels-wrap"
+    bits: tuple[int, ...]
+
+
+@record
+class CodesMissing(Fact):
+    """Codes of channels never occur: their resolution is less than their counts suggest.
+
+    Attributes
+    ----------
+    steps, n_missing : tuple of int
+        Step of the counts of each channel, and codes that never occur between those that do.
+    stuck_bits : tuple of tuple of int
+        Bits of each channel that never change within the range of its signal.
+    bits : tuple of float
+        Effective number of bits of the range of each channel's signal.
+    """
+
+    name: ClassVar[str] = "codes-missing"
+    steps: tuple[int, ...]
+    n_missing: tuple[int, ...]
+    stuck_bits: tuple[tuple[int, ...], ...]
+    bits: tuple[float, ...]
+
+
+@record
+class ReadingsRepeat(Fact):
+    """A device repeats its readings: the noise of its channels is too high.
+
+    Attributes
+    ----------
+    share : float
+        Share of the rows that repeat the row before.
+    refresh, polled : float
+        Hz: of new readings, and of the rows.
+    """
+
+    name: ClassVar[str] = "readings-repeat"
+    share: float
+    refresh: float
+    polled: float
+
+
+@record
 class ChannelsStoodStill(Fact):
     """Channels had a constant count for a while.
 

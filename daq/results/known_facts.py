@@ -18,9 +18,11 @@ from daq.results.facts import (
     ChannelsClipped,
     ChannelsStoodStill,
     ChannelsStuck,
+    ChannelsWrap,
     ClockNotUnderstood,
     ClocksFitted,
     ClocksMayExplain,
+    CodesMissing,
     DimensionsChosen,
     DimensionsUndetermined,
     DimensionsUnexplained,
@@ -43,6 +45,7 @@ from daq.results.facts import (
     OctaveSegments,
     Rank,
     RatesNominal,
+    ReadingsRepeat,
     SamplesMissing,
     SamplesUncounted,
     SegmentsExcluded,
@@ -267,12 +270,39 @@ def _segments(snapshot: Snapshot) -> Iterator[Fact]:
 def _channels(snapshot: Snapshot) -> Iterator[Fact]:
     """Yield channels whose samples are wrong."""
     names = [label.name for label in snapshot.channels]
-    clipped, still = snapshot.diagnostics.clipped, snapshot.diagnostics.stood_still
+    counts, still = snapshot.diagnostics.counts, snapshot.diagnostics.stood_still
+    clipped, wrapped, codes = counts.clipped, counts.wrapped, counts.codes
     if clipped:
         yield ChannelsClipped(
             rank=Rank.INVALIDATES,
             channels=tuple(names[column] for column in clipped),
             shares=tuple(clipped.values()),
+        )
+    if wrapped:
+        yield ChannelsWrap(
+            rank=Rank.INVALIDATES,
+            channels=tuple(names[column] for column in wrapped),
+            bits=tuple(each.bits for each in wrapped.values()),
+        )
+    shares = {snapshot.channels[n].sensor: share for n, share in counts.repeated.items()}
+    rates = {each.name: each.sampling_rate for each in snapshot.sensors}
+    for sensor, share in shares.items():
+        yield ReadingsRepeat(
+            rank=Rank.INVALIDATES,
+            sensors=(sensor,),
+            share=share,
+            refresh=(1 - share) * rates[sensor],
+            polled=rates[sensor],
+        )
+    if codes:
+        is_faulty = any(each.stuck_bits or each.n_missing for each in codes.values())
+        yield CodesMissing(
+            rank=Rank.DELAYS if is_faulty else Rank.TO_KNOW,
+            channels=tuple(names[column] for column in codes),
+            steps=tuple(each.step for each in codes.values()),
+            n_missing=tuple(each.n_missing for each in codes.values()),
+            stuck_bits=tuple(each.stuck_bits for each in codes.values()),
+            bits=tuple(each.bits for each in codes.values()),
         )
     if still:
         yield ChannelsStoodStill(

@@ -68,7 +68,9 @@ def diagnostics_document(snapshot: Snapshot) -> dict[str, Any]:
     if found.diagnosis is not None:
         document |= _diagnosis(found.diagnosis, snapshot)
     for key, by_column in (
-        ("clipped_share", found.clipped),
+        ("clipped_share", found.counts.clipped),
+        ("repeated_share", found.counts.repeated),
+        ("wraps_at_bits", {n: one.bits for n, one in found.counts.wrapped.items()}),
         ("stood_still_s", found.stood_still),
     ):
         if by_column:

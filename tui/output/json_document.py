@@ -341,7 +341,7 @@ _IN_SECONDS = (
     *("segment", "longest", "missing", "overdue", "total", "error", "left"),
     *("corrected", "uncorrected", "delay", "times"),
 )
-_IN_HERTZ = ("below", "bands", "worst_band", "covers", "judged")
+_IN_HERTZ = ("below", "bands", "worst_band", "covers", "judged", "refresh", "polled")
 _SHARES = (
     *("lost", "leakage", "excess", "deviation", "expected", "unexplained", "largest_error"),
     *("added_by_one_degree", "three_sensor", "maximum_likelihood"),

@@ -21,9 +21,11 @@ from daq.results.facts import (
     ChannelsClipped,
     ChannelsStoodStill,
     ChannelsStuck,
+    ChannelsWrap,
     ClockNotUnderstood,
     ClocksFitted,
     ClocksMayExplain,
+    CodesMissing,
     DimensionsChosen,
     DimensionsUndetermined,
     DimensionsUnexplained,
@@ -47,6 +49,7 @@ from daq.results.facts import (
     OctaveSegments,
     Rank,
     RatesNominal,
+    ReadingsRepeat,
     RecordingsLeftOut,
     SamplesMissing,
     SamplesUncounted,
@@ -449,6 +452,54 @@ def _clipped(fact: ChannelsClipped, names: Names) -> Wording:
         f"Clipped: {who} of the samples are at the largest or smallest count of the range: the "
         "noise of these channels is too high.",
         "Use a larger range, or less motion.",
+    )
+
+
+@word.register(ChannelsWrap)
+def _wrap(fact: ChannelsWrap, names: Names) -> Wording:
+    del names
+    each = zip(fact.channels, fact.bits, strict=True)
+    who = ", ".join(f"{name} (at {bits} bits)" for name, bits in each)
+    return Wording(
+        f"the counts of {who} wrap, so the noise is too high: use a larger range, or less motion",
+        f"Overflow: the counts of {who} wrap: a value beyond one end of the range continues at the "
+        "other end. The noise of these channels is too high.",
+        "Use a larger range, or less motion. If the device sends more bits than the bench file or "
+        "its settings say, correct the data type.",
+    )
+
+
+@word.register(CodesMissing)
+def _codes(fact: CodesMissing, names: Names) -> Wording:
+    del names
+    each = []
+    for name, step, missing, stuck, bits in zip(
+        fact.channels, fact.steps, fact.n_missing, fact.stuck_bits, fact.bits, strict=True
+    ):
+        what = [f"in steps of {step} counts"] * (step > 1)
+        what += [f"bit {listed([str(bit) for bit in stuck])} constant"] if stuck else []
+        what += [several(missing, "missing code")] * (missing > 0)
+        each.append(f"{name} ({', '.join(what)}; {bits:.1f} bits are used)")
+    who = ", ".join(each)
+    is_faulty = any(fact.stuck_bits) or any(fact.n_missing)
+    return Wording(
+        f"Codes never occur: {who}",
+        f"Codes never occur: {who}. The resolution is less than the counts suggest.",
+        "Check the digitizer." if is_faulty else "",
+    )
+
+
+@word.register(ReadingsRepeat)
+def _repeat(fact: ReadingsRepeat, names: Names) -> Wording:
+    del names
+    (sensor,) = fact.sensors
+    how = f"it refreshes at {fact.refresh:.3g} Hz, polled at {fact.polled:g} Hz"
+    return Wording(
+        f"{sensor} repeats its values, so the noise is too high: {how}",
+        f"{sensor} repeats its values: {how}. {percent(fact.share)} of its rows repeat the row "
+        "before, and the noise of its channels is too high.",
+        "Set its sampling_rate in the bench file to its refresh rate, or below, or let the device "
+        "refresh faster.",
     )
 
 

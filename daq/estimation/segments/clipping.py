@@ -1,7 +1,6 @@
-"""Finds channels at the end of their range that their devices have not flagged as clipped.
+"""What raw counts show of their limits, and which samples their devices flagged as clipped.
 
-Where a signal is cut off, its largest or smallest count is far more frequent than the neighbouring
-count. Stretches spread over the recording are searched for this, in raw counts.
+Stretches spread over the recording are searched (:mod:`estimator.checks.count_limits`).
 """
 
 from __future__ import annotations
@@ -11,9 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.protocols.block import BlockFlag
+from estimator.checks.count_limits import CountLimits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -22,20 +22,16 @@ if TYPE_CHECKING:
 
 _STRETCHES = 16
 _ROWS = 2048  # of each
-_DISTINCT = 16  # counts: what has fewer may well have a favourite at its end
-_MIN_SAMPLES = 8  # samples at an end
-_TIMES = 5  # more often than the count beside it; a sine reaches 2.4
 
 
-def clipped_shares(record: ReadableSensor) -> dict[str, float]:
-    """Return the share of samples at the end of the range, by name of the channel.
+def limits_of(record: ReadableSensor) -> CountLimits:
+    """Return what the counts of a sensor show of their limits, by column of the sensor.
 
-    Only clipped channels of the huddle test. Blocks flagged as clipped are skipped: the estimate
-    excludes them.
+    Blocks flagged as clipped are skipped: the estimate excludes them.
     """
     rows = _rows(record)
     if len(rows) == 0:
-        return {}
+        return CountLimits()
     counts = np.concatenate([record.intact_counts(int(a), int(b))[0] for a, b in rows])
     which = np.concatenate([np.arange(first, last) for first, last in rows])
     blocks = record.blocks
@@ -44,30 +40,45 @@ def clipped_shares(record: ReadableSensor) -> dict[str, float]:
     used = np.repeat((flags & int(BlockFlag.CLIPPED))[:, None] == 0, counts.shape[1], axis=1)
     for column, begin, end in record.absent:
         used[(which >= begin) & (which < end), column] = False
-    shares = {
-        channel.name: _share(counts[used[:, column], column])
-        for column, channel in enumerate(record.channels)
-        if not channel.auxiliary and used[:, column].any()
-    }
-    return {name: share for name, share in shares.items() if share}
+    main = [n for n, channel in enumerate(record.channels) if not channel.auxiliary]
+    return CountLimits.of(counts, {n: used[:, n] for n in main if used[:, n].any()})
 
 
-def clipped_columns(
+def limits_by_column(
     recordings: Iterable[ReadableRecording], channels: Sequence[tuple[str, Channel]]
-) -> dict[int, float]:
-    """Return the share of samples at the end of the range, by column, of channels with any.
+) -> CountLimits:
+    """Return what the counts of all channels of an estimate show of their limits.
 
-    Of several recordings the largest share.
+    Of several recordings the largest share, and the first wraps and codes.
     """
     columns = {(sensor, channel.name): column for column, (sensor, channel) in enumerate(channels)}
-    shares: dict[int, float] = {}
+    whole = CountLimits({}, {}, {}, {})
     for recording in recordings:
         for record in recording.sensors:
-            for channel, share in clipped_shares(record).items():
-                column = columns.get((record.name, channel))
-                if column is not None:
-                    shares[column] = max(share, shares.get(column, 0.0))
-    return shares
+            known = {
+                n: columns[record.name, channel.name]
+                for n, channel in enumerate(record.channels)
+                if (record.name, channel.name) in columns
+            }
+            found = limits_of(record)
+            whole = CountLimits(
+                _largest(whole.clipped, found.clipped, known),
+                {known[n]: one for n, one in found.wrapped.items() if n in known}
+                | dict(whole.wrapped),
+                _largest(whole.repeated, found.repeated, known),
+                {known[n]: one for n, one in found.codes.items() if n in known} | dict(whole.codes),
+            )
+    return whole
+
+
+def _largest(
+    before: Mapping[int, float], shares: Mapping[int, float], known: Mapping[int, int]
+) -> dict[int, float]:
+    found = dict(before)
+    for n, share in shares.items():
+        if n in known:
+            found[known[n]] = max(share, found.get(known[n], 0.0))
+    return found
 
 
 def in_clipped_blocks(
@@ -96,14 +107,3 @@ def _rows(record: ReadableSensor) -> NDArray[np.int64]:
         return np.array([[0, n_rows]] if n_rows else np.empty((0, 2)), dtype=np.int64)
     first = np.linspace(0, n_rows - _ROWS, _STRETCHES).astype(np.int64)
     return np.column_stack([first, first + _ROWS])
-
-
-def _share(counts: NDArray[np.generic]) -> float:
-    if max((counts == end).sum() for end in (counts.min(), counts.max())) < _MIN_SAMPLES:
-        return 0.0
-    values, times = np.unique(counts, return_counts=True)
-    if len(values) < _DISTINCT:
-        return 0.0
-    ends = ((times[0], times[1]), (times[-1], times[-2]))
-    cut = [int(end) for end, beside in ends if end >= max(_MIN_SAMPLES, _TIMES * beside)]
-    return sum(cut) / len(counts)

@@ -105,7 +105,7 @@ def _doubted(snapshot: Snapshot) -> dict[int, WrongGain]:
         and known.is_certified
         and known.off <= TOLERANCE
     }
-    faulty = {*snapshot.diagnostics.clipped, *snapshot.diagnostics.stood_still}
+    faulty = snapshot.diagnostics.faulty
     found = wrong_gains(diagnosis.responses, snapshot.dims, certified=certified)
     return {each.channel: each for each in found if each.channel not in faulty}
 
@@ -257,7 +257,7 @@ class Bands:
             averages=averages_at(snapshot, centre),
             is_alone=self.alone[:, column],
             is_withdrawn=withdrawn,
-            is_faulty=column in diagnostics.clipped or column in diagnostics.stood_still,
+            is_faulty=column in diagnostics.faulty,
             reach=reach,
         )
 

@@ -12,7 +12,7 @@ import pytest
 import huddle
 from daq.errors import NotARecordingError
 from daq.estimation.estimation import Estimation, estimate
-from daq.estimation.segments.clipping import clipped_shares
+from daq.estimation.segments.clipping import limits_of
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
 from daq.formats.importer import import_files
@@ -20,6 +20,7 @@ from daq.recording.reader import Recording
 from daq.results.facts import ChannelsAbsent, SpanShortened
 from daq.results.known_facts import facts_of
 from estimator.checks.advice import Untested
+from estimator.checks.count_limits import CountLimits
 from estimator.levels.pooled import blocks_of
 from estimator.self_noise.result import Flag, SelfNoise, combined
 from estimator.spectra.segment_rejection import Reason
@@ -244,7 +245,7 @@ def test_a_recording_says_where_channels_have_no_samples(tmp_path: Path) -> None
         absent = file["sensors/B/samples"].attrs["absent"]
         np.testing.assert_array_equal(absent, [[0, 2 * PART, 4 * PART]])
     with Recording.open(path) as recording:
-        assert clipped_shares(recording.sensor("B")) == {}
+        assert limits_of(recording.sensor("B")) == CountLimits({}, {}, {}, {})
     opened = huddle.open(path)
     samples = opened.samples("B")
     assert np.isnan(samples[2 * PART :, 0]).all()

@@ -16,6 +16,8 @@ from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError
 from daq.protocols.block import BlockFlag
+from daq.results.facts import ChannelsWrap, Rank, ReadingsRepeat
+from daq.results.known_facts import facts_of
 from estimator.checks.advice import (
     Copies,
     Gain,
@@ -113,7 +115,7 @@ def test_what_is_wrong_is_said_within_a_minute_while_recording(tmp_path: Path) -
     swapped = [a for a in snapshot.diagnostics.advice if isinstance(a, SwappedChannels)]
     assert swapped
     assert all(1 in each.sensors for each in swapped)
-    assert list(snapshot.diagnostics.clipped) == [9]
+    assert list(snapshot.diagnostics.counts.clipped) == [9]
 
 
 @pytest.mark.parametrize(
@@ -161,7 +163,7 @@ def test_clipped_blocks_are_left_out_unless_that_is_turned_off(tmp_path: Path) -
             writer.append(replace(block, flags=flags, counts=counts))
     writer.close()
     found = estimate([tmp_path / "r.h5"], SETTINGS)
-    assert not found.diagnostics.clipped  # what says so itself is left out
+    assert not found.diagnostics.counts.clipped  # what says so itself is left out
     kept = [start for start in range(0, N_SAMPLES - 99, 50) if not 4900 < start < 5050]
     assert found.left_out == {"gap": 0, "clipped": 2, "transient": 0}
     np.testing.assert_allclose(found.csm, spectra_of(sensors, kept).csm(), rtol=1e-9, atol=1e-3)
@@ -176,13 +178,31 @@ def test_channels_that_are_cut_off_without_saying_so_are_named(tmp_path: Path) -
     sensors["b"].counts[:, 1] = np.clip(sensors["b"].counts[:, 1], -30_000, 20_000)
     sensors["c"].counts[:, 1] = 5
     found = estimate([write(tmp_path / "r.h5", sensors)], replace(SETTINGS, methods=("all",)))
-    shares = found.diagnostics.clipped
+    shares = found.diagnostics.counts.clipped
     assert set(shares) == {4}  # b.c1
     at_ends = np.mean(
         (sensors["b"].counts[:, 1] == 20_000) | (sensors["b"].counts[:, 1] == -30_000)
     )
     assert shares[4] == pytest.approx(at_ends, rel=0.2)
-    assert not estimate([write(tmp_path / "2.h5", bench())], SETTINGS).diagnostics.clipped
+    assert not estimate([write(tmp_path / "2.h5", bench())], SETTINGS).diagnostics.counts.clipped
+
+
+def test_counts_that_wrap_and_readings_that_repeat_invalidate_a_result(tmp_path: Path) -> None:
+    sensors = bench()
+    slow = np.repeat(sensors["a"].counts[::5], 5, axis=0)[:N_SAMPLES]
+    sensors["a"].counts[:] = slow  # polled five times as often as it refreshes
+    n = np.arange(N_SAMPLES)
+    swell = 40_000 * np.sin(2 * np.pi * n / 777)[:, None]
+    sensors["b"].counts[:] = (sensors["b"].counts // 100 + swell + 32768) % 65536 - 32768
+    found = estimate([write(tmp_path / "r.h5", sensors)], SETTINGS)
+    facts = {each.name: each for each in facts_of(found, SETTINGS)}
+    assert isinstance(wrap := facts["channels-wrap"], ChannelsWrap)
+    assert wrap.bits == (16, 16, 16)
+    assert isinstance(repeat := facts["readings-repeat"], ReadingsRepeat)
+    assert repeat.sensors == ("a",)
+    assert repeat.refresh == pytest.approx(repeat.polled / 5, rel=0.01)
+    assert {wrap.rank, repeat.rank} == {Rank.INVALIDATES}
+    assert found.diagnostics.faulty == {*range(6)}
 
 
 @pytest.mark.parametrize(

@@ -287,3 +287,36 @@ def test_one_cause_of_all_channels_of_a_sensor_is_one_row() -> None:
     assert sum(problem in {Problem.DEAD, Problem.HUM} for problem, _, _ in found) == 2
     one = np.array([1.0, 0.0, 0.0])
     assert failures([a, replace(b, samples=b.samples + hum * one), c]) == [(Problem.HUM, "B", "X")]
+
+
+def test_counts_that_wrap_repeat_or_lack_codes_are_found() -> None:
+    """From raw counts: no full scale is known."""
+    rng = np.random.default_rng(5)
+    at = np.arange(2000) / RATE
+    swell = np.rint(40_000 * np.sin(2 * np.pi * 0.7 * at) + rng.normal(0, 9, 2000))
+    noise = np.rint(rng.normal(0, 3000, (2000, 3)))
+    held = noise[(np.arange(2000) * 0.4).astype(int)]
+    wrapped = noise.copy()
+    wrapped[:, 0] = (swell + 32768) % 65536 - 32768
+    stuck = noise.copy()
+    stuck[:, 2] = stuck[:, 2].astype(np.int64) & ~(1 << 4)
+    found = []
+    for sensor, counts in zip(SENSORS, (wrapped, held, stuck), strict=True):
+        now = HostTime(10**10, 10**10)
+        blocks = [Block(sensor.name, 0, counts.astype(np.int32), now)]
+        found.append(SensorPreview.of(sensor, None, blocks))
+    of_counts = {Problem.WRAPPING, Problem.REPEATS, Problem.STUCK_BIT}
+    known = {
+        (each.problem, each.sensor, each.channel): each
+        for each in findings(found)
+        if each.problem in of_counts
+    }
+    assert set(known) == {
+        (Problem.WRAPPING, "A", "X"),
+        (Problem.REPEATS, "B", ""),
+        (Problem.STUCK_BIT, "C", "Z"),
+    }
+    assert known[Problem.WRAPPING, "A", "X"].value == 16
+    repeats = known[Problem.REPEATS, "B", ""]
+    assert repeats.value == pytest.approx(80.0, rel=0.01)
+    assert repeats.wanted == RATE

@@ -20,6 +20,7 @@ from daq.estimation.snapshot_diagnostics import (
 )
 from daq.results.facts import ModelUntested
 from estimator.checks.advice import Untested
+from estimator.checks.count_limits import CountLimits
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
 from tests.tui.example_snapshot import SETTINGS, STRANGER, diagnosed, made_snapshot, rotation, said
@@ -160,7 +161,7 @@ def test_what_is_not_searched_for_among_many_channels_is_said() -> None:
 
 def test_clipped_channels_are_named() -> None:
     snapshot = diagnosed()
-    clipped = replace(snapshot.diagnostics, clipped={3: 0.046})
+    clipped = replace(snapshot.diagnostics, counts=CountLimits({3: 0.046}))
     assert any("Clipped: B.X (4.6 %)" in x for x in said(replace(snapshot, diagnostics=clipped)))
     still = replace(snapshot.diagnostics, stood_still={4: 30.0})
     (line,) = [x for x in said(replace(snapshot, diagnostics=still)) if "Temporarily dead" in x]

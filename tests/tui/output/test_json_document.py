@@ -11,6 +11,7 @@ from daq.results.decision.verdict import LimitResult, TestVerdict
 from daq.results.facts import Fact, WrongSensitivity
 from estimator.checks import advice
 from estimator.checks.advice import Advice, Untested
+from estimator.checks.count_limits import CountLimits
 from estimator.decision.verdict import Obstacle, Verdict
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
@@ -64,7 +65,7 @@ def test_what_is_not_known_is_left_out() -> None:
         left_out={Reason.GAP: 2, Reason.TRANSIENT: 0},
         diagnostics=replace(
             snapshot.diagnostics,
-            clipped={4: 0.25},
+            counts=CountLimits({4: 0.25}),
             stood_still={0: 3.0},
             untested=Untested.TOO_FEW_SENSORS,
         ),
@@ -87,9 +88,9 @@ DIMENSIONLESS = {
     *("cov", "target", "gains", "shares", "share", "statistic", "worst_statistic", "p_value"),
     *("snr", "condition", "ratio", "coherencies", "standard_errors", "share_of_frequencies"),
     *("n_dimensions", "n_effective", "share_of_partners", "share_without", "inflation"),
-    *("delay_samples", "ppm"),
+    *("delay_samples", "ppm", "bits"),
 }
-"""Numbers without a unit; samples and ppm are their own."""
+"""Numbers without a unit; samples, bits and ppm are their own."""
 
 
 def test_numbers_of_facts_have_their_units_in_their_names() -> None:

@@ -71,6 +71,16 @@ EXAMPLES: tuple[Fact, ...] = (
         rank=Rank.TO_KNOW, longest=80.0, n_effective=12.0, below=1.0, only_one=False
     ),
     facts.ChannelsClipped(rank=Rank.INVALIDATES, channels=("A.X",), shares=(0.046,)),
+    facts.ChannelsWrap(rank=Rank.INVALIDATES, channels=("A.X",), bits=(16,)),
+    facts.CodesMissing(
+        rank=Rank.DELAYS,
+        channels=("A.X", "A.Y"),
+        steps=(256, 1),
+        n_missing=(0, 0),
+        stuck_bits=((), (3,)),
+        bits=(11.3, 9.0),
+    ),
+    facts.ReadingsRepeat(rank=Rank.INVALIDATES, sensors=A, share=0.6, refresh=20.0, polled=50.0),
     facts.ChannelsStoodStill(rank=Rank.INVALIDATES, channels=("A.X",), seconds=(30.0,)),
     facts.ClocksFitted(rank=Rank.TO_KNOW, sensors=A, ppm=(4.5,), error=2e-6),
     facts.StatedTimesDrift(

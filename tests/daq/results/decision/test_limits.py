@@ -16,6 +16,7 @@ from daq.estimation.snapshot_diagnostics import Synchronisation
 from daq.results.band_summary import channel_means
 from daq.results.decision.limits import judge
 from estimator.checks.advice import Level, ModelMisfit
+from estimator.checks.count_limits import CountLimits
 from estimator.decision.verdict import MIN_AVERAGES, Obstacle, Verdict
 from estimator.levels.contributions import Source
 from estimator.likelihood.dimension import BandDimension
@@ -219,7 +220,7 @@ def test_noise_that_is_negative_for_certain_does_not_pass() -> None:
 
 def test_the_noise_of_a_clipped_channel_is_an_upper_bound() -> None:
     snapshot = made_snapshot(n_effective=5000.0)
-    clipped = replace(snapshot.diagnostics, clipped=dict.fromkeys(range(9), 0.01))
+    clipped = replace(snapshot.diagnostics, counts=CountLimits(dict.fromkeys(range(9), 0.01)))
     found = verdict_on(replace(snapshot, diagnostics=clipped), 6.5e-12)
     assert found.verdict is Verdict.NOT_DECIDED
     assert found.obstacles == (Obstacle.FAULTY_CHANNEL,)

@@ -1,0 +1,365 @@
+"""What raw counts show of their limits: clipping, wrap, missing codes, repeated rows.
+
+Theory of operation
+-------------------
+No question needs the full scale of a device; each has evidence that ordinary signals do not give:
+
+- *Clipping*: the outermost counts are far more frequent than those beside them. The distribution
+  of a sine rises towards its ends most steeply of all smooth signals: by 2.4 from one interval to
+  the next of the same width.
+- *Wrap*: all counts lie within 2**n, and steps of more than half of that become, once 2**n is
+  taken off, as small as the steps around them. A knock or a spike has no such size.
+- *Codes*: a bit that never changes, or a code without a sample between codes with many.
+- *Repeats*: after a large change of a channel, the next difference is zero as often as it is near
+  zero, unless the device hands out the same reading again. Coarse channels of quiet sensors repeat
+  their counts when they change little. Rows that a device repeats follow each other evenly.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    FloatArray = NDArray[np.float64]
+
+DISTINCT = 16
+"""Counts: a channel with fewer may well have a favourite at its end."""
+MIN_AT_END = 8
+"""Samples at an end."""
+TIMES = 5
+"""Samples at an end over those of any count beside; a sine reaches 2.4."""
+BESIDE = 9
+"""Counts at an end, the outermost included: a sine in step with the sampling has few counts."""
+WIDTHS = (64, 256)
+"""Parts of the range, the outermost of which may hold a soft end: the stage before the digitizer
+clips, and its noise adds to it."""
+VISITS = 4
+"""Times that a signal goes to a soft end from the other side of its median."""
+AT_SOFT_END = 0.25
+"""Largest share of the samples at a soft end: at one that holds more, the signal is at rest."""
+SLOPES, MIN_ON_SLOPES = 1 / 8, 0.03
+"""Part of the range at an end, without the end itself, that a clipped signal also passes: samples
+there over those at the end. Square waves and sines in step with the sampling have none."""
+BITS = range(8, 33)
+"""Sizes of counters and words that wrap."""
+AROUND = 8
+"""Samples on both sides of a step whose steps are compared with it."""
+SMOOTH = 1 / 8
+"""Largest step, as a fraction of 2**n, of a signal whose wraps are known by their steps."""
+MANY_WRAPS = 6
+"""Wraps that are evidence where the counts do not end where words of n bits do."""
+FOLDED = (0.6, 1.6), 30
+"""Samples in the outermost 64th of the range over those beside it, of a rough signal that wraps,
+and their number at least: its distribution is level there; that of others falls, or rises."""
+DISTINCT_CODES = 32
+"""Codes without which nothing can be said of their bits."""
+MIN_PERIODS = 4, 16
+"""Periods of a bit within the range, and those of many that the signal takes: a signal that rests
+at some levels takes few."""
+PER_CODE = 20
+"""Samples of a code beside one without any: it has none by chance with exp(-20)."""
+MIN_REPEATS = 20
+"""Repeated rows, and large changes, from which on a device may repeat its readings."""
+LARGE = 4
+"""Steps of a channel that are a large change."""
+EVEN = 0.6
+"""Standard deviation of the intervals between changes over their mean, of readings that are
+repeated; rows that are equal by chance reach 1."""
+BEYOND_CHANCE = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Wraps:
+    """A channel whose counts wrap.
+
+    Attributes
+    ----------
+    bits : int
+        The counts wrap at 2**bits.
+    n : int
+        Number of wraps in the samples.
+    """
+
+    bits: int
+    n: int
+
+
+@dataclass(frozen=True, slots=True)
+class Codes:
+    """Codes of a channel that never occur.
+
+    Attributes
+    ----------
+    step : int
+        All counts differ by multiples of this.
+    stuck_bits : tuple of int
+        Bits above the step that never change within the range of the signal.
+    n_missing : int
+        Codes without a sample, between codes with many.
+    bits : float
+        Effective number of bits: of the range in steps, less stuck bits.
+    """
+
+    step: int
+    stuck_bits: tuple[int, ...]
+    n_missing: int
+    bits: float
+
+    @property
+    def are_complete(self) -> bool:
+        """Whether every code occurs."""
+        return self.step == 1 and not self.stuck_bits and not self.n_missing
+
+
+@dataclass(frozen=True, slots=True)
+class CountLimits:
+    """What the counts of channels show of their limits, by column; without channels that are fine.
+
+    Attributes
+    ----------
+    clipped : mapping of int to float
+        Share of samples at the ends of the range.
+    wrapped : mapping of int to Wraps
+    repeated : mapping of int to float
+        Share of rows in which the device repeats the row before.
+    codes : mapping of int to Codes
+    """
+
+    clipped: Mapping[int, float] = field(default_factory=dict)
+    wrapped: Mapping[int, Wraps] = field(default_factory=dict)
+    repeated: Mapping[int, float] = field(default_factory=dict)
+    codes: Mapping[int, Codes] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, counts: NDArray[Any], columns: Mapping[int, NDArray[np.bool_]]) -> CountLimits:
+        """Return the limits of one sensor.
+
+        Parameters
+        ----------
+        counts : ndarray, shape (n_samples, n_channels)
+        columns : mapping of int to bool, shape (n_samples,)
+            Channels to look at, with the rows to use of each.
+        """
+        values = {column: counts[rows, column] for column, rows in columns.items() if rows.any()}
+        wrapped = {n: found for n, own in values.items() if (found := wraps(own)) is not None}
+        clipped = {n: share for n, own in values.items() if (share := share_at_ends(own))}
+        known = {n: codes(own) for n, own in values.items()}
+        rows = np.all(list(columns.values()), axis=0) if columns else np.zeros(len(counts), bool)
+        share = share_of_repeats(counts[rows][:, list(columns)])
+        return cls(
+            {n: part for n, part in clipped.items() if n not in wrapped},
+            wrapped,
+            dict.fromkeys(values, share) if share else {},
+            {n: one for n, one in known.items() if one is not None and not one.are_complete},
+        )
+
+    @property
+    def faulty(self) -> set[int]:
+        """Columns whose noise is wrong."""
+        return {*self.clipped, *self.wrapped, *self.repeated}
+
+
+def share_at_ends(counts: NDArray[Any]) -> float:
+    """Return the share of samples at the ends of the range of one channel, 0 if not clipped.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (n_samples,)
+        In the order of time.
+    """
+    if len(counts) < MIN_AT_END:
+        return 0.0
+    hard = max((counts == end).sum() for end in (counts.min(), counts.max())) >= MIN_AT_END
+    if hard:
+        values, times = np.unique(counts, return_counts=True)
+        if len(values) < DISTINCT:
+            return 0.0
+        ends = ((times[0], times[1:BESIDE].max()), (times[-1], times[-BESIDE:-1].max()))
+        cut = [int(end) for end, beside in ends if end >= max(MIN_AT_END, TIMES * beside)]
+        if cut and _has_slopes(values, times, sum(cut)):
+            return sum(cut) / len(counts)
+    signal = counts.astype(np.float64)
+    return sum(max(_at_soft_end(side, parts) for parts in WIDTHS) for side in (signal, -signal))
+
+
+def _has_slopes(values: NDArray[Any], times: NDArray[np.int64], n_cut: int) -> bool:
+    """Return whether a signal also passes the counts near its ends: one in steps does not."""
+    near = float(values[-1] - values[0]) * SLOPES
+    inner = (values > values[0]) & (values < values[-1])
+    inner &= (values < values[0] + near) | (values > values[-1] - near)
+    return int(times[inner].sum()) >= MIN_ON_SLOPES * n_cut
+
+
+def _at_soft_end(values: FloatArray, parts: int) -> float:
+    """Return the share of values in the uppermost of ``parts`` of the range; 0 if not clipped."""
+    top, middle = values.max(), float(np.median(values))
+    width = (top - values.min()) / parts
+    unit = np.diff(np.unique(values)).min(initial=math.inf)
+    if width < 2 * unit:
+        return 0.0
+    below = np.bincount(np.minimum((top - values) / width, parts - 1).astype(np.int64))
+    n_end, n_near = int(below[0]), int(below[1 : int(SLOPES * parts)].sum())
+    few = n_end < max(MIN_REPEATS, TIMES * below[1:BESIDE].max(initial=0))
+    if few or n_end > AT_SOFT_END * len(values) or n_near < MIN_ON_SLOPES * n_end:
+        return 0.0
+    at_end = values > top - width
+    sides = at_end[at_end | (values < middle)]
+    visits = np.count_nonzero(np.diff(sides.astype(np.int8)) == 1) + int(sides[0])
+    return n_end / len(values) if visits >= VISITS else 0.0
+
+
+def wraps(counts: NDArray[Any]) -> Wraps | None:
+    """Return at how many bits the counts of one channel wrap; None if they do not.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (n_samples,)
+        In the order of time; floats only if they are whole.
+    """
+    whole = _whole(counts)
+    if whole is None or len(whole) < 2 * AROUND:
+        return None
+    low, high = int(whole.min()), int(whole.max())
+    bits = (high - low).bit_length()
+    if bits not in BITS:
+        return None
+    size, steps = 1 << bits, np.diff(whole)
+    large = np.flatnonzero(np.abs(steps) > size // 2)
+    ends = ((-size // 2, size // 2 - 1), (0, size - 1))
+    if not len(large):
+        return None
+    is_large = np.zeros(len(steps), bool)
+    is_large[large] = True
+    ordinary = np.where(is_large, 0, np.abs(steps))
+    across = size - np.abs(steps[large])
+    near = large[:, None] + np.arange(-AROUND, AROUND + 1)
+    around = ordinary[np.clip(near, 0, len(steps) - 1)].max(axis=1)
+    fits = (across <= SMOOTH * size) & (across <= 3 * around + MIN_AT_END)
+    slack = int(across.max()) + int(around.max())
+    aligned = any(
+        low - first <= slack and last - high <= slack
+        for first, last in ends
+        if first <= low and high <= last
+    )
+    if fits.mean() > 0.8 and (aligned or len(large) >= MANY_WRAPS):
+        return Wraps(bits, len(large))
+    if any(_is_folded(whole, first, size) for first, _ in ends):
+        return Wraps(bits, len(large))
+    return None
+
+
+def _is_folded(whole: NDArray[np.int64], first: int, size: int) -> bool:
+    """Return whether the distribution goes on level across both ends of a word."""
+    places = (whole - first) * WIDTHS[0] // size
+    if places.min() < 0 or places.max() >= WIDTHS[0]:
+        return False
+    times = np.bincount(places, minlength=WIDTHS[0])
+    (least, most), enough = FOLDED
+    return all(
+        end >= enough and least * beside <= end <= most * beside
+        for end, beside in ((times[0], times[1]), (times[-1], times[-2]))
+    )
+
+
+def codes(counts: NDArray[Any]) -> Codes | None:
+    """Return which codes of one channel never occur; None where nothing can be said.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (n_samples,)
+        Floats only if they are whole.
+    """
+    whole = _whole(counts)
+    if whole is None or not len(whole):
+        return None
+    values, times = np.unique(whole, return_counts=True)
+    if len(values) < DISTINCT_CODES:
+        return None
+    step = int(np.gcd.reduce(np.diff(values)))
+    span = int(values[-1] - values[0]) // step + 1
+    stuck = tuple(_stuck_bits(values, times, step))
+    n_missing = 0 if stuck else _n_missing((values - values[0]) // step, times)
+    return Codes(step, stuck, n_missing, math.log2(span) - len(stuck))
+
+
+def _stuck_bits(values: NDArray[np.int64], times: NDArray[np.int64], step: int) -> list[int]:
+    """Return bits above the step that are constant while the signal passes their periods."""
+    share = np.cumsum(times) / times.sum()
+    inner = values[(share > 0.1) & (share < 0.9)]
+    if len(inner) < DISTINCT_CODES:
+        return []
+    span, bit, found = int(inner[-1] - inner[0]), step.bit_length(), []
+    while (n_periods := span >> bit + 1) >= MIN_PERIODS[0]:
+        n_seen = len(np.unique(inner >> bit + 1))
+        is_constant = len(np.unique(inner >> bit & 1)) == 1
+        if is_constant and n_seen >= max(MIN_PERIODS[0], min(MIN_PERIODS[1], n_periods / 2)):
+            found.append(bit)
+        bit += 1
+    return found
+
+
+def _n_missing(places: NDArray[np.int64], times: NDArray[np.int64]) -> int:
+    """Return the number of codes without a sample whose neighbours have many."""
+    n_samples = int(times.sum())
+    if places[-1] >= n_samples:
+        return 0
+    held = np.zeros(int(places[-1]) + 1, dtype=np.int64)
+    held[places] = times
+    many = held >= PER_CODE
+    beside = sum(many[2 + k : len(many) - 2 + k].astype(int) for k in (-2, -1, 1, 2))
+    return int(np.count_nonzero((held[2:-2] == 0) & (beside >= 3)))
+
+
+def share_of_repeats(counts: NDArray[Any]) -> float:
+    """Return the share of rows in which a device repeats the row before; 0 if it repeats none.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (n_samples, n_channels)
+        Of all channels of one sensor, in the order of time.
+    """
+    if len(counts) < 2 * MIN_REPEATS:
+        return 0.0
+    steps = np.abs(np.diff(counts.astype(np.float64), axis=0))
+    is_equal = np.asarray(~steps.any(axis=1))
+    n_equal = int(is_equal.sum())
+    changes = np.flatnonzero(~is_equal)
+    if n_equal < MIN_REPEATS or len(changes) < MIN_REPEATS:
+        return 0.0
+    intervals = np.diff(changes)
+    if intervals.std() > EVEN * intervals.mean():
+        return 0.0
+    shown = any(_repeats_by_more_than_chance(column, is_equal) for column in steps.T)
+    return n_equal / len(steps) if shown else 0.0
+
+
+def _repeats_by_more_than_chance(steps: FloatArray, is_equal: NDArray[np.bool_]) -> bool:
+    """Return whether rows repeat after large changes of a channel more often than by chance."""
+    moved = steps[steps > 0]
+    if not len(moved):
+        return False
+    unit = moved.min()
+    after = np.flatnonzero(steps[:-1] >= LARGE * unit) + 1
+    # Of a smooth distribution of steps, as many are 0 as are ±1, or ±2: a quarter of these.
+    by_chance = np.count_nonzero((steps[after] > 0) & (steps[after] <= 2 * unit)) / 4
+    most = BEYOND_CHANCE * (by_chance + math.sqrt(by_chance) + 1)
+    return len(after) >= MIN_REPEATS and bool(is_equal[after].sum() > most)
+
+
+def _whole(counts: NDArray[Any]) -> NDArray[np.int64] | None:
+    """Return counts as int64; None if they are no whole numbers of that size."""
+    if counts.dtype.kind == "f":
+        if not np.isfinite(counts).all() or np.abs(counts).max(initial=0) > 1 << 52:
+            return None
+        if (np.rint(counts) != counts).any():
+            return None
+    whole: NDArray[np.int64] = counts.astype(np.int64)
+    return whole
