@@ -148,7 +148,6 @@ class Claims:
         """
         require("pypdf")
         from pypdf import PdfReader  # noqa: PLC0415 - an extra
-        from pypdf.errors import PyPdfError  # noqa: PLC0415
 
         try:
             reader = PdfReader(io.BytesIO(content))
@@ -165,7 +164,7 @@ class Claims:
                 roots={str(run): str(root) for run, root in own.get("roots", {}).items()},
                 text="".join(pages),
             )
-        except (PyPdfError, ValueError, KeyError, TypeError, OSError, ET.ParseError) as error:
+        except Exception as error:  # noqa: BLE001 - of a damaged file, pypdf raises anything
             raise VerificationError(
                 f"{path}: not genuine: no certificate of huddle, or damaged ({error})"
             ) from None
@@ -317,7 +316,11 @@ def _signatures(content: bytes, entry: Entry, wanted: str) -> tuple[list[str], l
     from tui.certificate.signing import signatures  # noqa: PLC0415 - an extra
 
     lines, wrong = [], []
-    for each in signatures(content):
+    try:
+        found = signatures(content)
+    except Exception as error:  # noqa: BLE001 - of a damaged file, pyHanko raises anything
+        return [], [f"its signature cannot be read ({error})"]
+    for each in found:
         if not each.is_intact:
             wrong.append(f"the signature of {each.signer} is not intact, or not of the whole file")
         if entry.signer is not None and each.key_id != entry.signer:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import h5py
+import numpy as np
 import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
@@ -26,7 +27,7 @@ from tests.tui.certificate.laboratory import Laboratory, key, laboratory
 from tui.certificate import issuing
 from tui.certificate.ledger import NAME, Ledger
 from tui.certificate.signing import Signer
-from tui.certificate.verification import JSON_NAME
+from tui.certificate.verification import JSON_NAME, Claims, VerificationError, _signatures
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -379,3 +380,25 @@ def test_who_has_the_key_and_no_ledger_verifies_the_signature(
     code, said = signing.check(path)
     assert code == 3
     assert "was removed" in said
+
+
+def test_a_damaged_certificate_is_refused_whatever_the_damage(signing: Signed) -> None:
+    """By what is inside, or by its signature; no other error escapes the libraries."""
+    content, rng = signing.certificate.read_bytes(), np.random.default_rng(11)
+    (entry,) = (e for e in Ledger(signing.lab.certificates).entries() if e.revision == 1)
+    marks = [b"/Length", b" obj", b"/EF", b"/Names", b"/Filter", b"/ByteRange", b"xref"]
+    for number in range(24):
+        damaged = bytearray(content)
+        at = content.index(marks[number % len(marks)], int(rng.integers(len(content) // 2)))
+        if number % 3:
+            damaged[at + int(rng.integers(12))] = int(rng.integers(1, 255))
+        else:
+            del damaged[at:]
+        if damaged == content:
+            continue
+        try:
+            Claims.of(signing.certificate, bytes(damaged))
+        except VerificationError:
+            continue
+        _, wrong = _signatures(bytes(damaged), entry, "")
+        assert wrong
