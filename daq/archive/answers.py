@@ -170,8 +170,9 @@ def answer(
     every = Estimator(plan, settings, known[0].described.channels)
     years = Years(store, known, settings, zone=zone, progress=progress)
     usable = min(entry.described.usable for entry in known)
-    tally = _Tally(years.grid, _bands(settings, years.grid.frequency, usable))
-    usual = _bands(plan.noise_settings(settings), years.grid.frequency, usable)
+    ends = every.welch.lowest, usable
+    tally = _Tally(years.grid, _bands(settings, years.grid.frequency, *ends))
+    usual = _bands(plan.noise_settings(settings), years.grid.frequency, *ends)
     pooled, lacking = Average(), Counter[int]()
     for file in years.each([years.grid.span(band) for band in usual]):
         pooled.add_sum(unpacked(file["total"][...]), int(file.attrs["n_segments"]))
@@ -269,10 +270,11 @@ class _Tally:
 
 
 def _bands(
-    settings: Settings, frequency: FloatArray, usable: float
+    settings: Settings, frequency: FloatArray, lowest: float, usable: float
 ) -> tuple[tuple[float, float], ...]:
-    """Return the bands of the series; nothing is known above `usable` Hz."""
-    whole = band_within(settings, frequency, float(frequency[frequency <= usable].max()))
+    """Return the bands of the series; nothing is known below `lowest` and above `usable` Hz."""
+    known = lowest, float(frequency[frequency <= usable].max())
+    whole = band_within(settings, frequency, known)
     if settings.band is not None:
         return (whole,)
     octaves = []

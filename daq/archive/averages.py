@@ -16,9 +16,9 @@ from daq.estimation.equalisation import Equalisation
 from daq.estimation.noise_estimates import (
     in_units,
     known_gains,
+    known_part,
     noise_estimates,
     responses,
-    up_to,
 )
 from daq.estimation.snapshot import ChannelLabel, Snapshot
 from daq.estimation.snapshot_diagnostics import (
@@ -114,7 +114,7 @@ class Estimator:
         InsufficientDataError
             If the average is empty.
         """
-        raw = up_to(average.band(self), average.usable)
+        raw = known_part(average.band(self), average.usable)
         band = in_units(raw, self.channels, self.unit)
         estimates = noise_estimates(
             (band,), self.settings, dims=self.dims, gains=self._gains, dimensions=None

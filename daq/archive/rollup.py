@@ -82,10 +82,12 @@ class Grid:
     def of(cls, estimator: Estimator) -> Self:
         """Return the grid of an estimator's spectra."""
         frequency = estimator.welch.frequencies
+        known = estimator.welch.lowest, np.inf
         first, last = np.log2(frequency[[1, -1]]) * PER_OCTAVE
         nominal = 2.0 ** (np.arange(np.floor(first), np.ceil(last) + 1) / PER_OCTAVE)
         edges = set(np.searchsorted(frequency, nominal).tolist())
-        for band in {band_within(estimator.settings, frequency, np.inf), _usual(frequency)}:
+        usual = replace(estimator.settings, band=None)
+        for band in {band_within(each, frequency, known) for each in (estimator.settings, usual)}:
             try:
                 edges |= set(band_edges(frequency, band).tolist())
             except BandError:
@@ -240,10 +242,6 @@ def _sums(values: FloatArray, spans: Sequence[slice]) -> FloatArray:
     for row, span in zip(inside, spans, strict=True):
         row[span] = 1.0
     return np.asarray(inside @ values)
-
-
-def _usual(frequency: FloatArray) -> tuple[float, float]:
-    return float(frequency[1]), 0.9 * float(frequency[-1])
 
 
 def _within(n: int, rho: FloatArray) -> float:

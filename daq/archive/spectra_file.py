@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 FORMAT = "huddle-archive-spectra"
 FORMAT_VERSION = 2
 """1: without summaries."""
-SUMMARY_VERSION = 1
+SUMMARY_VERSION = 2
 """Summaries of another version are made again."""
 DAY_NS = 86400 * 10**9
 STRETCH_DTYPE = np.dtype([("start_utc_ns", "<i8"), ("n_segments", "<i8")])

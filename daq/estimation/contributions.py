@@ -10,6 +10,7 @@ import numpy as np
 
 from daq.estimation.settings import DIMENSIONS
 from estimator.checks.advice import Level, ModelMisfit, SharedNoise, TooFewDimensions
+from estimator.checks.counts import MARGIN
 from estimator.levels.contributions import (
     Contribution,
     Source,
@@ -23,6 +24,8 @@ from estimator.likelihood.dimension import most_testable
 from estimator.self_noise.result import Flag, SelfNoise
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from daq.bench.sensitivity import Sensitivities
     from daq.estimation.snapshot import Snapshot
     from estimator.types import BoolArray, FloatArray
@@ -62,6 +65,7 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
         with np.errstate(invalid="ignore"):
             most = np.fmin(share * motion, unseen * psd)
         found.append(contribution(Source.AXES, shape, below=most, above=most))
+    found += _counts(snapshot, shape)
     if snapshot.rounding:
         most = snapshot.rounding * np.nan_to_num(snapshot.data_psd)
         found.append(contribution(Source.ROUNDING, shape, below=most, above=most))
@@ -88,6 +92,14 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
     if snapshot.sensitivities:
         found += _sensitivities(snapshot, method, shape)
     return tuple(found)
+
+
+def _counts(snapshot: Snapshot, shape: tuple[int, int]) -> Iterator[Contribution]:
+    """Yield what the rounding that like channels share does to their noise."""
+    alike = snapshot.rounded_alike
+    if alike is not None and alike.most.any():
+        below, above = (np.maximum(n * alike.lacking, 0.0) + MARGIN * alike.most for n in (-1, 1))
+        yield contribution(Source.COUNTS, shape, below=below, above=above)
 
 
 def _sensitivities(snapshot: Snapshot, method: str, shape: tuple[int, int]) -> list[Contribution]:

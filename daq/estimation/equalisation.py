@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.estimation.noise_estimates import responses, up_to
+from daq.estimation.noise_estimates import known_part, responses
 from daq.estimation.snapshot_diagnostics import (
     EdgeLeakage,
 )
@@ -290,7 +290,7 @@ class Equalisation:
             left = total - each.n_segments
             csm = (total * whole - each.n_segments * each.csm()) / left
             averages = effective_averages(window, hop, left)
-            band = up_to(Band(self._welch, frequency, csm, left, averages), usable)
+            band = known_part(Band(self._welch, frequency, csm, left, averages), usable)
             found = self._noise((band,))
             if found is None:
                 return None

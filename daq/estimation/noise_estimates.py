@@ -9,6 +9,8 @@ import numpy as np
 
 from daq.bench.units import conversion
 from daq.errors import WrongSettingError
+from daq.estimation.snapshot import RoundedAlike
+from estimator.checks.counts import shared_rounding
 from estimator.errors import InsufficientDataError
 from estimator.levels.bands import bin_correlation
 from estimator.levels.pooled import blocks_of
@@ -48,6 +50,7 @@ USABLE = 0.9
 BY_MOTION = frozenset({"three-sensor", "maximum-likelihood"})
 """Methods that use segments which only some channels have: they pair no channels by number."""
 _WHOLE = 3  # sensors with all channels
+_STRETCHES, _STRETCH = 48, 1024  # samples, of which means are taken
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +95,7 @@ def averages(passes: Sequence[Pass]) -> tuple[Band, ...]:
             if any(octaves.depth(_enough(len(each)), each) for each in octaves.sets.spectra):
                 return ()
             wanted = octaves.bands()[-1].n_effective
-        return tuple(up_to(band, usable) for band in octaves.bands(wanted))
+        return tuple(known_part(band, usable) for band in octaves.bands(wanted))
     spectra = first.spectra
     if len(passes) > 1:
         spectra = CrossSpectra(first.welch, first.n_channels)
@@ -112,7 +115,7 @@ def averages(passes: Sequence[Pass]) -> tuple[Band, ...]:
         n_effective,
         parts=_parts(passes),
     )
-    return (up_to(band, usable),)
+    return (known_part(band, usable),)
 
 
 def _parts(passes: Sequence[Pass]) -> Parts | None:
@@ -206,7 +209,7 @@ def channel_sets(passes: Sequence[Pass], complete: tuple[Band, ...]) -> tuple[Ch
     else:
         by_columns = _sets_of_octaves(octaves, complete)
     found = [
-        ChannelSet(columns, tuple(up_to(band, usable) for band in bands))
+        ChannelSet(columns, tuple(known_part(band, usable) for band in bands))
         for columns, bands in by_columns
     ]
     return tuple(sorted(found, key=lambda each: (-len(each.columns), each.columns)))
@@ -307,13 +310,13 @@ def _spread(
     return SelfNoise.of(method, psd, cumulants, flags)
 
 
-def up_to(band: Band, usable: float) -> Band:
-    """Return averages of which nothing is known above `usable` Hz."""
-    beyond = band.frequencies > usable
-    if not beyond.any():
+def known_part(band: Band, usable: float) -> Band:
+    """Return averages of which nothing is known above `usable` Hz, nor where detrending bends."""
+    unknown = (band.frequencies > usable) | (band.frequencies < band.settings.lowest)
+    if not unknown.any():
         return band
     csm = band.csm.copy()
-    csm[beyond] = np.nan
+    csm[unknown] = np.nan
     return replace(band, csm=csm)
 
 
@@ -366,6 +369,45 @@ def quantisation_psd(
     with np.errstate(divide="ignore", invalid="ignore"):
         psd = steps**2 / (6 * rate) / np.abs(responses(frequency, channels, unit)) ** 2
     return np.where(np.isfinite(psd), psd, np.nan)
+
+
+def rounded_alike(
+    csm: ComplexArray,
+    frequency: FloatArray,
+    channels: Channels,
+    unit: str,
+    *,
+    rates: Mapping[str, float],
+    passes: Sequence[Pass],
+) -> RoundedAlike:
+    """Return what like channels share of their rounding, and what it does to their noise.
+
+    `rates` are those of sensors that count in whole numbers.
+    """
+    names = [sensor for sensor, _ in channels]
+    steps = [channel.sensitivity if name in rates else np.nan for name, channel in channels]
+    counts = responses(frequency, channels, unit) * np.array(steps)
+    sensor = np.unique(names, return_inverse=True)[1]
+
+    def means() -> FloatArray:
+        found = [mean for each in passes for mean in _means(each)]
+        return np.asarray(np.array(found) * np.array(steps))
+
+    found = shared_rounding(csm, frequency, counts=counts, sensor=sensor, means=means)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        most, lacking = (psd / np.abs(counts) ** 2 for psd in found)
+    return RoundedAlike(
+        np.where(np.isfinite(most), most, 0.0), np.where(np.isfinite(lacking), lacking, 0.0)
+    )
+
+
+def _means(one: Pass) -> Iterator[FloatArray]:
+    """Yield the means of stretches of valid grid samples, (n_channels,), in the channels' units."""
+    total = one.aligned.n_available
+    for begin in range(0, total, max(_STRETCH, total // _STRETCHES)):
+        samples, valid = one.aligned.read(begin, min(begin + _STRETCH, total))
+        if valid.any():
+            yield samples[valid].mean(axis=0)
 
 
 def known_gains(settings: Settings, channels: Channels) -> FloatArray:

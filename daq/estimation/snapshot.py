@@ -158,6 +158,21 @@ class Bridged:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class RoundedAlike:
+    """The rounding to counts that channels of several sensors share.
+
+    Attributes
+    ----------
+    most, lacking : float64, shape (n_freqs, n_channels)
+        What each channel shares with another, at most, and what its noise PSD lacks by all; in
+        unit**2/Hz.
+    """
+
+    most: FloatArray
+    lacking: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
     """The estimate at one moment, with everything a front end shows.
 
@@ -199,6 +214,8 @@ class Snapshot:
     quantisation_psd : float64, shape (n_freqs, n_channels), or None
         Noise of counting in whole numbers, in unit**2/Hz; NaN for channels that do not. Of a
         finished estimate.
+    rounded_alike : RoundedAlike or None
+        What channels of several sensors share of it. Of a finished estimate.
     bridged : Bridged or None
         None where no segment with gaps counts.
     not_estimated : tuple of str
@@ -241,6 +258,7 @@ class Snapshot:
     diagnostics: SnapshotDiagnostics = field(default_factory=SnapshotDiagnostics)
     no_segment: NoSegment | None = None
     quantisation_psd: FloatArray | None = None
+    rounded_alike: RoundedAlike | None = None
     bridged: Bridged | None = None
     not_estimated: tuple[str, ...] = ()
     across_axes: tuple[float, ...] = ()

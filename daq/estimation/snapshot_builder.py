@@ -40,6 +40,7 @@ from daq.estimation.noise_estimates import (
     noise_estimates,
     quantisation_psd,
     responses,
+    rounded_alike,
     with_sets,
 )
 from daq.estimation.recording_set import is_complete
@@ -283,6 +284,7 @@ class SnapshotBuilder:
             multi_part=estimates.multi_part,
         )
         left = _not_estimated(latest, channels)
+        counting = _counting_rates(latest) if final else {}
         if final and csm.nbytes > FREED_FROM:
             give_back()
         if final or (self._diagnoses.is_due and not left):
@@ -327,7 +329,10 @@ class SnapshotBuilder:
             sensitivities=_sensitivities(recordings),
             simulated=any(recording.simulated for recording in recordings),
             quantisation_psd=(
-                quantisation_psd(frequency, channels, self._unit, _counting_rates(latest))
+                quantisation_psd(frequency, channels, self._unit, counting) if final else None
+            ),
+            rounded_alike=(
+                rounded_alike(csm, frequency, channels, self._unit, rates=counting, passes=passes)
                 if final
                 else None
             ),

@@ -163,13 +163,17 @@ def band_of(settings: Settings, snapshot: Snapshot) -> tuple[float, float]:
 
     It ends where nothing can be said any more, unless that is all of it.
     """
-    return band_within(settings, snapshot.frequency, highest_known(snapshot))
+    return band_within(settings, snapshot.frequency, known_range(snapshot))
 
 
-def band_within(settings: Settings, frequency: FloatArray, known: float) -> tuple[float, float]:
-    """Return what `band_of` returns, from frequencies of which nothing is known above `known`."""
-    low, high = settings.band or (float(frequency[1]), 0.9 * float(frequency[-1]))
-    return low, min(high, known) if low < known else high
+def band_within(
+    settings: Settings, frequency: FloatArray, known: tuple[float, float]
+) -> tuple[float, float]:
+    """Return what `band_of` returns, from frequencies of which the `known` range is known."""
+    low, high = settings.band or (max(known[0], frequency[1]), 0.9 * float(frequency[-1]))
+    if low >= known[1] or high <= known[0]:
+        return low, high
+    return max(low, known[0]), min(high, known[1])
 
 
 class Spectrum:
@@ -297,10 +301,14 @@ def without_sensitivity(snapshot: Snapshot) -> list[ChannelLabel]:
     ]
 
 
-def highest_known(snapshot: Snapshot) -> float:
-    """Return the frequency in Hz above which clocks that ran freely leave nothing to be said."""
-    known = np.isfinite(snapshot.data_psd).any(axis=1)
-    return float(snapshot.frequency[known].max(initial=0.0))
+def known_range(snapshot: Snapshot) -> tuple[float, float]:
+    """Return the frequencies in Hz between which anything is known; the second 0 if nothing is.
+
+    Below, detrending bends the spectrum; above, clocks that ran freely leave nothing to be said.
+    """
+    frequency = snapshot.frequency
+    known = frequency[1:][np.isfinite(snapshot.data_psd[1:]).any(axis=1)]
+    return (float(known[0]), float(known[-1])) if len(known) else (float(frequency[1]), 0.0)
 
 
 class WithoutPartner(enum.StrEnum):

@@ -411,6 +411,20 @@ class ChannelsStoodStill(Fact):
 
 
 @record
+class RoundedAlike(Fact):
+    """Channels of several sensors are rounded to counts alike, and share a part of that noise.
+
+    Attributes
+    ----------
+    share : float
+        Of the noise, largest of a channel and a third of an octave.
+    """
+
+    name: ClassVar[str] = "rounded-alike"
+    share: float
+
+
+@record
 class ClocksFitted(Fact):
     """The times of samples come from clocks fitted to their arrivals.
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from daq.clocks.clock_model import ClockSource
 from daq.estimation.noise_estimates import BY_MOTION
-from daq.results.band_summary import band_of, channel_means, highest_known
+from daq.results.band_summary import band_of, channel_means, known_range
 from daq.results.clock_effect import reference
 from daq.results.facts import (
     RANK_OF_LEVEL,
@@ -46,6 +46,7 @@ from daq.results.facts import (
     Rank,
     RatesNominal,
     ReadingsRepeat,
+    RoundedAlike,
     SamplesMissing,
     SamplesUncounted,
     SegmentsExcluded,
@@ -78,6 +79,7 @@ from estimator.checks.advice import (
 from estimator.checks.shared_noise import MAX_CHANNELS
 from estimator.decision.verdict import Obstacle, Verdict
 from estimator.errors import BandError
+from estimator.levels.bands import third_octaves
 from estimator.self_noise.result import Flag, Refusal
 from estimator.spectra.segment_rejection import Reason
 
@@ -95,6 +97,8 @@ LEAST_SHARE = 0.01
 """Share of the noise from which a contribution to an interval is a fact; of the time, too."""
 DELAYING_SHARE = 0.1
 """Share of the time of the estimate from which a sensor that shortens it delays the result."""
+MUCH_ROUNDING = 0.1
+"""Share of the noise from which rounding that channels share is a fact."""
 WITHOUT_ESTIMATE = (
     Flag.DEAD_CHANNEL
     | Flag.DUPLICATE
@@ -128,6 +132,7 @@ def facts_of(
         *_recording(snapshot),
         *_segments(snapshot),
         *_channels(snapshot),
+        *_rounded_alike(snapshot),
         *_clocks(snapshot),
         *_model(snapshot),
         *_methods(snapshot),
@@ -312,6 +317,28 @@ def _channels(snapshot: Snapshot) -> Iterator[Fact]:
         )
 
 
+def _rounded_alike(snapshot: Snapshot) -> Iterator[RoundedAlike]:
+    """Yield the channels that share more than a little of their rounding."""
+    edges = third_octaves(snapshot.frequency, *known_range(snapshot))
+    alike = snapshot.rounded_alike
+    if alike is None or not snapshot.results or len(edges) < 2:
+        return
+    noise = next(iter(snapshot.results.values())).noise_psd
+    both = (np.where(np.isfinite(noise), each, 0.0) for each in (alike.most, noise))
+    part, whole = (np.add.reduceat(each[: edges[-1]], edges[:-1]) for each in both)
+    share = np.max(np.where(part > 0, part / np.maximum(np.abs(whole), part), 0.0), axis=0)
+    if (share > MUCH_ROUNDING).any():
+        yield RoundedAlike(
+            rank=Rank.DELAYS,
+            channels=tuple(
+                label.name
+                for label, part in zip(snapshot.channels, share, strict=True)
+                if part > MUCH_ROUNDING / 3  # offsets raise a noise by three times that
+            ),
+            share=float(share.max()),
+        )
+
+
 def _clocks(snapshot: Snapshot) -> Iterator[Fact]:
     """Yield how the times of samples are known, and where they are wrong or may be."""
     clocks, left = snapshot.clocks, snapshot.diagnostics.synchronisation.residual
@@ -355,7 +382,7 @@ def _clocks(snapshot: Snapshot) -> Iterator[Fact]:
     if nominal := tuple(clock.sensor for clock in clocks if math.isnan(clock.residual)):
         yield RatesNominal(rank=Rank.DELAYS, sensors=nominal)
     if any(isinstance(each, _LIKE_A_CLOCK) for each in snapshot.diagnostics.advice):
-        omega = 2 * math.pi * highest_known(snapshot)
+        omega = 2 * math.pi * known_range(snapshot)[1]
         loose = {sensor: late for sensor, late in left.items() if _TURN < omega * late < math.inf}
         if loose:
             yield ClocksMayExplain(
@@ -447,7 +474,7 @@ def _by_changes(snapshot: Snapshot) -> Iterator[Fact]:
 def _methods(snapshot: Snapshot) -> Iterator[Fact]:
     """Yield what the methods assume, and where they give nothing."""
     advice, found = snapshot.diagnostics.advice, snapshot.diagnostics.diagnosis
-    limit, highest = highest_known(snapshot), float(snapshot.frequency[-1])
+    limit, highest = known_range(snapshot)[1], float(snapshot.frequency[-1])
     if limit < highest:
         yield NoEstimateAbove(rank=Rank.TO_KNOW, band=(limit, highest))
     if (n := len(snapshot.channels)) > MAX_CHANNELS:
@@ -492,15 +519,18 @@ def without_estimate(
 ) -> Iterator[WithoutEstimate]:
     """Yield channels with frequencies without a valid estimate; flags in ``besides`` are left out.
 
-    Above the highest frequency that is known, that is one fact of its own.
+    Above the highest frequency that is known, that is one fact of its own; below the lowest, the
+    trend is removed.
     """
-    flags = snapshot.results[method].flags[snapshot.frequency <= highest_known(snapshot)]
+    low, high = known_range(snapshot)
+    inside = (snapshot.frequency >= low) & (snapshot.frequency < high)
+    flags = snapshot.results[method].flags[inside]
     for flag in Flag:
         if not flag & (WITHOUT_ESTIMATE | Flag.NOT_CONVERGED) & ~besides:
             continue
-        counts = ((flags[1:-1] & flag) != 0).sum(axis=0)
+        counts = ((flags & flag) != 0).sum(axis=0)
         if counts.any():
-            n_freqs = len(flags[1:-1])
+            n_freqs = len(flags)
             whole = bool(counts.max() == n_freqs) and bool(flag & WITHOUT_ESTIMATE)
             yield WithoutEstimate(
                 rank=Rank.INVALIDATES if whole else Rank.DELAYS,

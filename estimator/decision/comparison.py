@@ -219,7 +219,7 @@ BENT = 2.0
 
 
 def mask_edges(
-    frequency: FloatArray, mask: FloatArray, points: FloatArray, *, known: float
+    frequency: FloatArray, mask: FloatArray, points: FloatArray, *, known: tuple[float, float]
 ) -> NDArray[np.int64]:
     """Return edges of third-octave bands within a mask's frequencies, each with a bin or more.
 
@@ -234,11 +234,11 @@ def mask_edges(
         PSD of the mask, with the values of its ends beyond them.
     points : float64, shape (n_points,)
         Frequencies that define the mask, in Hz, rising.
-    known : float
-        Frequency above which nothing is known.
+    known : (float, float)
+        Frequencies below and above which nothing is known.
     """
-    low = max(float(points[0]), float(frequency[1]))
-    high = min(float(points[-1]), float(frequency[-2]), known)
+    low = max(float(points[0]), float(frequency[1]), known[0])
+    high = min(float(points[-1]), float(frequency[-2]), known[1])
     if high <= low:
         return np.empty(0, dtype=np.int64)
     edges = third_octaves(frequency, low, high)

@@ -53,6 +53,8 @@ class Source(enum.StrEnum):
     """Gains may follow the loudness of the motion, by which two sensors tell noise from it."""
     STEADY_MOTION = "steady-motion"
     """Motion that changes does not identify the noise of two sensors: it is below a bound."""
+    COUNTS = "counts"
+    """Like channels are rounded to counts alike, and share a part of that."""
     FAULTY = "faulty"
     """The channel is clipped, or was dead for a while: its noise is lower than the estimate."""
     SENSITIVITY = "sensitivity"

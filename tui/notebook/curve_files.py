@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import numpy as np
 
 from daq.recording.reader import Recording
+from daq.results.band_summary import known_range
 from daq.whole_file import replaced, write_whole, wrong_content
 from tui.notebook.tables import to_frame, to_xarray
 from tui.output.csv_text import csv_text, write_metadata
@@ -159,7 +160,9 @@ def _write_uff(snapshot: Snapshot, path: Path, said: Said) -> None:
     pyuff = load("pyuff")
     file = pyuff.UFF(str(path))
     nodes = {name: number for number, name in enumerate(snapshot.sensor_names, start=1)}
-    frequency = snapshot.frequency
+    low, high = known_range(snapshot)  # the library reads NaN as zero
+    known = (snapshot.frequency >= low) & (snapshot.frequency <= high)
+    frequency = snapshot.frequency[known]
     digest = next((each["sha256"] for each in json.loads(said["recordings"])), None)
     span = f"{said['time_coverage_start'][:23]} to {said['time_coverage_end'][:23]}"
     even = np.allclose(np.diff(frequency), frequency[1] - frequency[0])
@@ -197,7 +200,7 @@ def _write_uff(snapshot: Snapshot, path: Path, said: Said) -> None:
                         orddenom_spec_data_type=0,
                         z_axis_spec_data_type=0,
                         x=frequency,
-                        data=np.asarray(values, dtype=np.float64),
+                        data=np.asarray(values[known], dtype=np.float64),
                     ),
                     "add",
                 )

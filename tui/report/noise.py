@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING
 from daq.bench.masks.mask import SOURCES
 from daq.bench.tables.certificate import Rule
 from daq.bench.units import decibels
-from daq.results.band_summary import band_of, channel_means, data_means, without_partners
+from daq.results.band_summary import (
+    band_of,
+    channel_means,
+    data_means,
+    known_range,
+    without_partners,
+)
 from daq.results.decision.conformity import Statement
 from daq.results.precision import channel_covs
 from estimator.decision.verdict import Verdict
@@ -262,7 +268,7 @@ def _snr(data: float, noise: float) -> str:
 
 def _octave_table(snapshot: Snapshot, settings: Settings) -> Table | None:
     """Return the mean noise in bands of an octave or more, by the first method."""
-    bands = list(_octaves(float(snapshot.frequency[1]), float(snapshot.frequency[-2])))
+    bands = list(_octaves(known_range(snapshot)[0], float(snapshot.frequency[-2])))
     if len(bands) < 2:
         return None
     noise = next(iter(snapshot.results.values()))

@@ -51,6 +51,7 @@ from daq.results.facts import (
     RatesNominal,
     ReadingsRepeat,
     RecordingsLeftOut,
+    RoundedAlike,
     SamplesMissing,
     SamplesUncounted,
     SegmentsExcluded,
@@ -543,6 +544,18 @@ def _drift(fact: StatedTimesDrift, names: Names) -> Wording:
         text += " too weak for so short segments, or times step."
     do = "Check whether the clocks were synchronised, or whether waves changed direction."
     return Wording(line, text, f"Choose longer segments. {do}" if fact.uncorrected else do)
+
+
+@word.register(RoundedAlike)
+def _rounded_alike(fact: RoundedAlike, names: Names) -> Wording:
+    del names
+    text = f"{listed(fact.channels)} are rounded to counts alike"
+    return Wording(
+        f"{text}: up to {fact.share:.0%} of their noise; use smaller counts",
+        f"{text}. Up to {fact.share:.0%} of their noise may be taken for motion, or counted more"
+        " than once; the intervals include it.",
+        "Use a smaller range or a higher gain, so that the noise is half a count or more.",
+    )
 
 
 @word.register(StatedTimesUnchecked)

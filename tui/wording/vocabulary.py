@@ -117,6 +117,7 @@ SOURCE_WORDS: Mapping[Source, str] = {
     Source.ROUNDING: "matrices in single precision",
     Source.GAINS: "gains that may follow the loudness",
     Source.STEADY_MOTION: "motion that does not tell noise from motion",
+    Source.COUNTS: "rounding that channels share",
     Source.FAULTY: "a faulty channel",
     Source.SENSITIVITY: "sensitivity",
     Source.TEMPERATURE: "temperature",

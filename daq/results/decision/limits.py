@@ -16,8 +16,8 @@ import numpy as np
 from daq.results.band_summary import (
     Spectrum,
     averages_at,
-    highest_known,
     judged_method,
+    known_range,
     without_partners,
 )
 from daq.results.decision.verdict import LimitResult, TestVerdict
@@ -204,7 +204,8 @@ class Bands:
         """Return the bands of a limit in a spectrum; the last ends where nothing is known."""
         frequency, points = snapshot.frequency, np.asarray(limit.mask.frequency)
         columns = tuple(n for n, each in enumerate(snapshot.channels) if concerns(limit, each))
-        known = highest_known(snapshot) or math.inf
+        lowest, highest = known_range(snapshot)
+        known = lowest, highest or math.inf
         edges = np.empty(0, dtype=np.int64)
         if columns:
             mask = mask_psd(bench, limit, snapshot.channels[columns[0]], frequency)
@@ -293,15 +294,15 @@ def _centres(frequency: FloatArray, edges: NDArray[np.int64]) -> FloatArray:
 
 
 def _judged_range(
-    frequency: FloatArray, points: FloatArray, edges: NDArray[np.int64], known: float
+    frequency: FloatArray, points: FloatArray, edges: NDArray[np.int64], known: tuple[float, float]
 ) -> tuple[float, float]:
     """Return from and to which frequency a mask is judged; its own ends where it is to there."""
     if edges.size < 2:
         return math.nan, math.nan
     low, high, spacing = float(points[0]), float(points[-1]), float(frequency[1])
-    first, last = float(frequency[edges[0]]), min(float(frequency[edges[-1] - 1]), known)
+    first, last = float(frequency[edges[0]]), min(float(frequency[edges[-1] - 1]), known[1])
     return (
-        low if low >= spacing else first,
+        low if low >= known[0] else first,
         high if high <= last + 2 * spacing else last,
     )
 

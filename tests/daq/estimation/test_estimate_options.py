@@ -166,7 +166,8 @@ def test_clipped_blocks_are_left_out_unless_that_is_turned_off(tmp_path: Path) -
     assert not found.diagnostics.counts.clipped  # what says so itself is left out
     kept = [start for start in range(0, N_SAMPLES - 99, 50) if not 4900 < start < 5050]
     assert found.left_out == {"gap": 0, "clipped": 2, "transient": 0}
-    np.testing.assert_allclose(found.csm, spectra_of(sensors, kept).csm(), rtol=1e-9, atol=1e-3)
+    direct = spectra_of(sensors, kept).csm()
+    np.testing.assert_allclose(found.csm[2:], direct[2:], rtol=1e-9, atol=1e-3)
     assert estimate([tmp_path / "r.h5"], replace(SETTINGS, reject=False)).n_dropped == 0
 
 
@@ -245,6 +246,7 @@ def test_octaves_join_at_the_true_noise_from_far_below_one_over_the_segment(tmp_
     for octave in snapshot.octaves:
         inside = (snapshot.frequency > 0) & (snapshot.frequency < RATE / 2)
         inside &= (snapshot.frequency >= octave.low) & (snapshot.frequency <= octave.high)
+        inside[:2] = False  # bent by the mean
         mean = noise.noise_psd[inside].mean()
         std = np.median(noise.cov[inside]) * truth / np.sqrt(inside.sum() * 9 / 1.5)
         assert abs(mean - truth) < 4 * std
@@ -258,7 +260,7 @@ def test_octaves_of_several_recordings_add(tmp_path: Path) -> None:
     assert twice.octaves[-1].n_segments == 2 * once.octaves[-1].n_segments
     top = once.frequency > once.octaves[-1].low
     np.testing.assert_allclose(
-        twice.csm[-top.sum() :], once.csm[top], rtol=1e-9, atol=1e-9 * np.abs(once.csm).max()
+        twice.csm[-top.sum() :], once.csm[top], rtol=1e-9, atol=1e-9 * np.nanmax(np.abs(once.csm))
     )
 
 
@@ -337,7 +339,7 @@ def test_samples_that_are_no_numbers_are_gaps(tmp_path: Path) -> None:
     sensors["c"].counts[7030, 0] = -np.inf
     found = estimate([write(tmp_path / "r.h5", sensors)], SETTINGS)
     assert found.left_out == {"gap": 4, "clipped": 0, "transient": 0}  # 2950, 3000; 6950, 7000
-    assert np.isfinite(found.results["three-sensor"].noise_psd).all()
+    assert np.isfinite(found.results["three-sensor"].noise_psd[2:]).all()
 
 
 @pytest.mark.parametrize(
@@ -352,9 +354,9 @@ def test_a_channel_that_stands_still_is_dead_and_the_others_are_not(
     settings = replace(SETTINGS, methods=("all",), target_cov=0.1)
     found = estimate([write(tmp_path / "r.h5", sensors)], settings)
     for noise in found.results.values():
-        assert np.all(noise.flags[:, 4] & Flag.DEAD_CHANNEL)
+        assert np.all(noise.flags[2:, 4] & Flag.DEAD_CHANNEL)
         assert np.isnan(noise.noise_psd[:, 4]).all()
-    others = np.delete(found.results["maximum-likelihood"].noise_psd[1:-1], 4, axis=1)
+    others = np.delete(found.results["maximum-likelihood"].noise_psd[2:-1], 4, axis=1)
     assert np.isfinite(others).all()
     worst = found.diagnostics.advice[0]
     assert isinstance(worst, NoSignal)
@@ -390,9 +392,9 @@ def test_sensors_with_different_numbers_of_channels(tmp_path: Path) -> None:
     noise, flags = found.results["three-sensor"].noise_psd, found.results["three-sensor"].flags
     alone = np.isnan(noise).all(axis=0)
     assert np.flatnonzero(alone).tolist() == [2, 8]  # only two sensors have a third channel
-    assert np.all(flags[:, alone] & Flag.NO_COUNTERPART)
+    assert np.all(flags[2:, alone] & Flag.NO_COUNTERPART)
     truth = 100.0**2 / (RATE / 2)
-    np.testing.assert_allclose(noise[1:-1, ~alone].mean(axis=0), truth, rtol=0.1)
+    np.testing.assert_allclose(noise[2:-1, ~alone].mean(axis=0), truth, rtol=0.1)
     # By three directions nobody but they themselves feels they cannot be compared.
     assert found.diagnostics.diagnosis is not None
     responses = found.diagnostics.diagnosis.responses

@@ -70,7 +70,7 @@ def test_two_sensors_have_a_noise_where_the_motion_changes(d: int) -> None:
 def test_steady_motion_leaves_an_upper_limit_and_says_what_is_missing() -> None:
     snapshot = estimated(samples(np.random.default_rng(3), change=0.0))
     noise = snapshot.results["multi-part"]
-    assert np.all(noise.flags[1:-6] & Flag.UNIDENTIFIED)
+    assert np.all(noise.flags[2:-6] & Flag.UNIDENTIFIED)
     truth = 2 / RATE * np.repeat(NOISE, 3)
     for mean, true in zip(channel_means(noise, snapshot, SETTINGS, BAND), truth, strict=True):
         assert mean.low[0] <= 0 < true < mean.high[0]

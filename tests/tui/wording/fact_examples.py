@@ -91,6 +91,7 @@ EXAMPLES: tuple[Fact, ...] = (
         left=3e-6,
         reference="C",
     ),
+    facts.RoundedAlike(rank=Rank.DELAYS, channels=("A.X", "B.X"), share=0.24),
     facts.StatedTimesUnchecked(rank=Rank.DELAYS, sensors=A),
     facts.SamplesUncounted(
         rank=Rank.DELAYS,

@@ -21,7 +21,13 @@ from typing import TYPE_CHECKING, Any
 from daq.bench.units import decibels
 from daq.errors import HuddleError
 from daq.recording.reader import Recording
-from daq.results.band_summary import CONSTANT, band_of, channel_means, judged_method
+from daq.results.band_summary import (
+    CONSTANT,
+    band_of,
+    channel_means,
+    judged_method,
+    known_range,
+)
 from estimator.errors import BandError
 from tui.service.records.run_state import BandNoise, utc_text
 from tui.wording.findings import drift_line
@@ -205,7 +211,7 @@ def record_test(
     if not known:
         return []
     about = {name: (each.model, each.serial_number) for name, each in known.items()}
-    low, high = float(snapshot.frequency[1]), float(snapshot.frequency[-2])
+    low, high = known_range(snapshot)[0], float(snapshot.frequency[-2])
     octaves = [each for each in OCTAVES if low <= each[0] and each[1] <= high]
     noise = [
         (run_id, started, snapshot.simulated, *_values(each))

@@ -141,6 +141,6 @@ def test_a_smooth_mask_of_many_points_has_no_more_bands_than_one_of_two() -> Non
     points = np.geomspace(1.0, 90.0, 300)
     mask = 1e-9 * np.clip(spectrum, 1.0, 90.0) ** -4
     many, two = (
-        mask_edges(spectrum, mask, each, known=np.inf) for each in (points, points[[0, -1]])
+        mask_edges(spectrum, mask, each, known=(0.0, np.inf)) for each in (points, points[[0, -1]])
     )
     np.testing.assert_array_equal(many, two)
