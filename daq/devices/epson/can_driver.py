@@ -1,7 +1,10 @@
 """Driver for Epson M-A552 accelerometers on a CAN bus (CANopen); needs the extra ``can``.
 
-All sensors of one port are devices on one bus. The first of them produces the SYNC at which all
-send their samples, so they share one clock and one index. See :mod:`daq.devices.epson.canopen`.
+All sensors of one port are devices on one bus. The first of them that answers produces the SYNC at
+which all send their samples, so they share one clock and one index (see
+:mod:`daq.devices.epson.canopen`). A device that boots, or is silent, is configured and started
+again while the others continue (:mod:`daq.devices.shared_port`). Without SYNC nobody sends: then
+the session ends, and the next one has another producer, if the first does not answer.
 """
 
 from __future__ import annotations
@@ -9,6 +12,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,6 +24,7 @@ from daq.devices.epson import canopen as protocol
 from daq.devices.epson.commands import COUNTS_PER_G, FILTERS, USUAL_FILTER, temperature
 from daq.devices.interface import DeviceInformation, PresentPort
 from daq.devices.port_rules import package, port_label, require_alike
+from daq.devices.shared_port import Presence, answering
 from daq.errors import (
     BenchFileError,
     FileFault,
@@ -26,7 +32,7 @@ from daq.errors import (
     NotConnectedError,
     WrongDeviceError,
 )
-from daq.protocols.block import Quantity, Reading, ReadingTimes
+from daq.protocols.block import Block, Event, EventKind, Quantity, Reading, ReadingTimes
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping, Sequence
@@ -46,6 +52,9 @@ OF_THE_BUS = ("interface", "bitrate", "filter")
 NOTIFIER_CYCLE = 0.1
 """Seconds after which the thread of the adapter looks whether it is to end."""
 NMT_OPERATIONAL, NMT_PRE_OPERATIONAL = 1, 128
+SILENT = 1.0
+"""Seconds without a sample after which a device is started again, or without SYNC, the bus."""
+HEARTBEAT_MS = 500
 
 
 class EpsonCanSettings(BaseModel):
@@ -71,30 +80,80 @@ class EpsonCanSession:
     def __init__(
         self,
         bus: _Bus,
-        nodes: Mapping[str, int],
+        devices: Mapping[str, _Device],
         decoder: protocol.CanDecoder,
         information: tuple[DeviceInformation, ...],
+        clock: HostClock,
+        *,
         n_messages: int,
     ) -> None:
         self.information = information
         self.hint = "expected SYNC and TPDO messages; check power, termination and bitrate"
         self.patience = 10.0
-        self._bus, self._nodes = bus, nodes
-        self._decoder = decoder
+        self._bus, self._devices, self._decoder = bus, devices, decoder
+        self._clock = clock
         self._n_messages = n_messages
+        self._present = {
+            one.sensor: Presence(one.sensor, clock, trouble=one.trouble) for one in information
+        }
+        self._heard_ns: dict[str, int] = {}
 
     async def read(self) -> AsyncIterator[DeviceItem]:
         """Start SYNC and yield blocks, events, and the temperatures once a minute, until closed."""
-        await self._bus.start()
+        devices, present = self._devices, self._present
+        await self._bus.start([d.node for n, d in devices.items() if not present[n].is_gone])
         reading_times = ReadingTimes()
+        now_ns = sync_ns = self._clock.now().monotonic_ns
+        self._heard_ns = dict.fromkeys(devices, now_ns)
         while True:
             messages, at = await self._bus.read(self._n_messages)
+            if any(cob_id == protocol.SYNC for cob_id, _ in messages):
+                sync_ns = at.monotonic_ns
             for item in self._decoder.receive(messages, at):
+                if isinstance(item, Block):
+                    self._heard_ns[item.sensor] = at.monotonic_ns
                 yield item
+            self._check_producer(at, sync_ns)
+            for event in await self._attend(at):
+                yield event
             if reading_times.is_due(at):
-                for sensor, node in self._nodes.items():
-                    for reading in await self._temperature(sensor, node, at):
-                        yield reading
+                for sensor, device in devices.items():
+                    if not present[sensor].is_gone:
+                        for reading in await self._temperature(sensor, device.node, at):
+                            yield reading
+
+    def _check_producer(self, at: HostTime, sync_ns: int) -> None:
+        """Raise NoAnswerError if nobody produces SYNC."""
+        producer = self._bus.producer
+        if (producer, protocol.BOOTED) in self._bus.signs:
+            raise NoAnswerError(f"{self._bus.label}: node {producer}, which sends SYNC, restarted")
+        if (at.monotonic_ns - sync_ns) * 1e-9 / self._clock.speed > SILENT:
+            raise NoAnswerError(f"{self._bus.label}: no SYNC from node {producer} in {SILENT:g} s")
+
+    async def _attend(self, at: HostTime) -> list[Event]:
+        """Start devices again that booted, or have become silent."""
+        signs, self._bus.signs = self._bus.signs, set()
+        found: list[Event] = []
+        for sensor, device in self._devices.items():
+            presence = self._present[sensor]
+            silent = (at.monotonic_ns - self._heard_ns[sensor]) * 1e-9 / self._clock.speed
+            has_booted = (device.node, protocol.BOOTED) in signs
+            if presence.is_gone:
+                if any(node == device.node for node, _ in signs):
+                    presence.lose(at_once=True)
+            elif has_booted or silent > SILENT:
+                text = "the device restarted" if has_booted else f"silent for {SILENT:g} s"
+                found.append(Event(sensor, EventKind.STALLED, text, at))
+                presence.lose(at_once=True)
+            if presence.is_due:
+                found += await presence.try_again(partial(self._start, sensor, device))
+        return found
+
+    async def _start(self, sensor: str, device: _Device) -> None:
+        await device.prepare(self._bus)
+        await self._bus.start_node(device.node)
+        self._decoder.started(sensor)
+        self._heard_ns[sensor] = self._clock.now().monotonic_ns
 
     async def _temperature(self, sensor: str, node: int, at: HostTime) -> list[Reading]:
         """Return the temperature of a device; none if it does not reply."""
@@ -115,6 +174,10 @@ class _Bus:
         self._nodes = tuple(nodes)
         self._wanted = {protocol.SYNC}
         self._wanted |= {base + node for base in protocol.TPDO_COB_IDS for node in nodes}
+        self.producer = 0
+        """Node that produces SYNC."""
+        self.signs: set[tuple[int, int]] = set()
+        """Nodes that booted or sent a heartbeat since the last look, each with its state."""
         self._messages: list[protocol.Message] = []
         self._at: HostTime | None = None
         self._arrived = asyncio.Event()
@@ -132,6 +195,8 @@ class _Bus:
             self._network.NOTIFIER_CYCLE = NOTIFIER_CYCLE
             for cob_id in self._wanted:
                 self._network.subscribe(cob_id, received)
+            for node in self._nodes:
+                self._network.subscribe(protocol.HEARTBEAT + node, received)
             self._network.connect()
 
         def received(cob_id: int, data: bytearray, timestamp: float) -> None:  # in a thread
@@ -151,27 +216,29 @@ class _Bus:
             self._network.add_node(node, dictionary)
 
     def _receive(self, cob_id: int, data: bytes, at: HostTime) -> None:
+        if cob_id & ~0x7F == protocol.HEARTBEAT:
+            self.signs.add((cob_id & 0x7F, data[0] & 0x7F if data else protocol.BOOTED))
+            if data[:1] == b"\0":
+                self._arrived.set()
+            return
         self._messages.append((cob_id, data))
         self._at = at
         if len(self._messages) >= self._n_expected and cob_id != protocol.SYNC:
             self._arrived.set()
 
     async def read(self, n_messages: int) -> tuple[list[protocol.Message], HostTime]:
-        """Return at least so many messages, or what has come in a second."""
+        """Return so many messages or more, or those until a device boots, or a second passed."""
         self._n_expected = n_messages
-        while True:
-            if len(self._messages) >= n_messages:
-                self._arrived.set()
+        if len(self._messages) < n_messages:
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(1.0):
+                async with asyncio.timeout(SILENT):
                     await self._arrived.wait()
-            self._arrived.clear()
-            failure = self._network.notifier.exception if self._network.notifier else None
-            if self._at is not None and self._messages:
-                messages, self._messages = self._messages, []
-                return messages, self._at
-            if failure is not None:
-                raise NotConnectedError(f"{self.label}: the bus closed ({failure})")
+        self._arrived.clear()
+        failure = self._network.notifier.exception if self._network.notifier else None
+        if failure is not None and not self._messages:
+            raise NotConnectedError(f"{self.label}: the bus closed ({failure})")
+        messages, self._messages = self._messages, []
+        return messages, self._at if messages and self._at is not None else self._clock.now()
 
     async def ask(self, node: int, index: int, subindex: int = 0) -> bytes:
         """Read an object of a device."""
@@ -195,20 +262,27 @@ class _Bus:
                 f"{self.label}: {what}: {error}; check power, node_id and bitrate"
             ) from error
 
-    async def start(self) -> None:
-        """Let all devices send, then start SYNC."""
-        for node in self._nodes:
+    async def start(self, nodes: Sequence[int]) -> None:
+        """Let devices send, then let the first of them start SYNC."""
+        for node in nodes:
             await self.set(node, protocol.SAMPLE_COUNTER, 0, 0, 2)
         self._messages.clear()
+        self.signs.clear()
         await asyncio.to_thread(self._network.nmt.send_command, NMT_OPERATIONAL)
+        self.producer = nodes[0]
         produces = protocol.SYNC | protocol.PRODUCES_SYNC
-        await self.set(self._nodes[0], protocol.SYNC_COB_ID, 0, produces, 4)
+        await self.set(nodes[0], protocol.SYNC_COB_ID, 0, produces, 4)
+
+    async def start_node(self, node: int) -> None:
+        """Let one device send, from sample 0."""
+        await self.set(node, protocol.SAMPLE_COUNTER, 0, 0, 2)
+        await asyncio.to_thread(self._network.nodes[node].nmt.send_command, NMT_OPERATIONAL)
 
     async def quiet(self) -> None:
-        """Stop SYNC and all devices."""
+        """Stop all devices, and SYNC."""
         await asyncio.to_thread(self._network.nmt.send_command, NMT_PRE_OPERATIONAL)
-        for node in self._nodes:
-            await self.set(node, protocol.SYNC_COB_ID, 0, protocol.SYNC, 4)
+        if self.producer:
+            await self.set(self.producer, protocol.SYNC_COB_ID, 0, protocol.SYNC, 4)
 
     async def close(self) -> None:
         """Close the adapter."""
@@ -267,20 +341,23 @@ class EpsonCanDriver:
         try:
             await bus.open(first.port.removeprefix(SCHEME), common)
             await bus.quiet()
-            information = [await _identified(bus, sensor, nodes[sensor.name]) for sensor in sensors]
-            for node in nodes.values():
-                await _configure(bus, node, common, first.sampling_rate)
-            period = round(1e6 / first.sampling_rate)
-            await bus.set(common.node_id, protocol.SYNC_PERIOD, 0, period, 4)
+            devices = {
+                sensor.name: _Device(sensor, nodes[sensor.name], settings[sensor.name])
+                for sensor in sensors
+            }
+            information = await answering(
+                {name: partial(one.prepare, bus) for name, one in devices.items()}
+            )
             decoder = protocol.CanDecoder(
                 nodes,
                 first.sampling_rate,
                 full_scale_counts=min(round(common.full_scale * COUNTS_PER_G), 2**31 - 1),
             )
             n_syncs = max(1, round(BLOCK_SECONDS * first.sampling_rate))
+            n_messages = n_syncs * (1 + 2 * len(nodes))
             try:
                 yield EpsonCanSession(
-                    bus, nodes, decoder, tuple(information), n_syncs * (1 + 2 * len(nodes))
+                    bus, devices, decoder, information, clock, n_messages=n_messages
                 )
             finally:
                 with contextlib.suppress(NoAnswerError, WrongDeviceError):
@@ -289,30 +366,46 @@ class EpsonCanDriver:
             await bus.close()
 
 
-async def _identified(bus: _Bus, sensor: Sensor, node: int) -> DeviceInformation:
-    name, hardware, software = [
-        (await bus.ask(node, index)).rstrip(b"\0").decode("ascii", "replace")
-        for index in (protocol.DEVICE_NAME, protocol.HARDWARE, protocol.SOFTWARE)
-    ]
-    if "A552" not in name:
-        raise WrongDeviceError(f"{bus.label}: node {node} is {name!r}; expected an M-A552")
-    return DeviceInformation(
-        sensor.name,
-        model=f"M-{name}{hardware}",
-        firmware=software,
-        sampling_rate=sensor.sampling_rate,
-        details={"node": str(node)},
-    )
+@dataclass(frozen=True, slots=True)
+class _Device:
+    """One device of the bus."""
 
+    sensor: Sensor
+    node: int
+    settings: EpsonCanSettings
 
-async def _configure(bus: _Bus, node: int, settings: EpsonCanSettings, rate: float) -> None:
-    await bus.set(node, protocol.TPDO1, 2, protocol.EVERY_SYNC, 1)
-    name = settings.filter or USUAL_FILTER[round(rate)]
-    await bus.set(node, protocol.FILTER, 1, FILTERS[name], 1)
-    for index, base in zip((protocol.TPDO1, protocol.TPDO2), protocol.TPDO_COB_IDS, strict=True):
-        cob_id = int.from_bytes(await bus.ask(node, index, 1), "little")
-        if cob_id & protocol.PDO_IS_OFF or cob_id & 0x7FF != base + node:
-            await bus.set(node, index, 1, 0x40000000 | (base + node), 4)
+    async def prepare(self, bus: _Bus) -> DeviceInformation:
+        """Identify and configure the device; another one may be the producer of SYNC."""
+        await bus.set(self.node, protocol.SYNC_COB_ID, 0, protocol.SYNC, 4)
+        name, hardware, software = [
+            (await bus.ask(self.node, index)).rstrip(b"\0").decode("ascii", "replace")
+            for index in (protocol.DEVICE_NAME, protocol.HARDWARE, protocol.SOFTWARE)
+        ]
+        if "A552" not in name:
+            raise WrongDeviceError(f"{bus.label}: node {self.node} is {name!r}; expected an M-A552")
+        await self._configure(bus)
+        return DeviceInformation(
+            self.sensor.name,
+            model=f"M-{name}{hardware}",
+            firmware=software,
+            sampling_rate=self.sensor.sampling_rate,
+            details={"node": str(self.node)},
+        )
+
+    async def _configure(self, bus: _Bus) -> None:
+        node, rate = self.node, self.sensor.sampling_rate
+        await bus.set(node, protocol.TPDO1, 2, protocol.EVERY_SYNC, 1)
+        name = self.settings.filter or USUAL_FILTER[round(rate)]
+        await bus.set(node, protocol.FILTER, 1, FILTERS[name], 1)
+        for index, base in zip(
+            (protocol.TPDO1, protocol.TPDO2), protocol.TPDO_COB_IDS, strict=True
+        ):
+            cob_id = int.from_bytes(await bus.ask(node, index, 1), "little")
+            if cob_id & protocol.PDO_IS_OFF or cob_id & 0x7FF != base + node:
+                await bus.set(node, index, 1, 0x40000000 | (base + node), 4)
+        await bus.set(node, protocol.SYNC_PERIOD, 0, round(1e6 / rate), 4)
+        with contextlib.suppress(WrongDeviceError):  # a device without heartbeat
+            await bus.set(node, protocol.HEARTBEAT_TIME, 0, HEARTBEAT_MS, 2)
 
 
 def _settings(sensors: Sequence[Sensor]) -> dict[str, EpsonCanSettings]:

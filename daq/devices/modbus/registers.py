@@ -3,9 +3,8 @@
 Each poll is one sample, recorded with its own instant, independent of the device's own sampling.
 This suits tilt, slow channels and checks; for noise measurements use devices that stream.
 
-Several sensors on one port are slaves on one bus, polled in turn. While other slaves reply, the
-driver retries a silent one with growing delays and a short timeout, and configures it again when it
-replies.
+Several sensors on one port are slaves on one bus, polled in turn. While other slaves reply, a
+silent one is tried again with a short timeout (:mod:`daq.devices.shared_port`).
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ import asyncio
 import contextlib
 from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
@@ -29,6 +29,7 @@ from daq.devices.modbus.registers_protocol import (
     WordOrder,
 )
 from daq.devices.port_rules import port_label, require_address, require_alike
+from daq.devices.shared_port import Presence, answering
 from daq.errors import (
     ABSENT,
     BenchFileError,
@@ -52,9 +53,6 @@ FAILURES = 3
 """Polls without a reply after which a device is lost, if it was silent for so long:"""
 MIN_SILENCE = 1.0
 """Seconds, or as many of the longest timeouts: timeouts are short where replies are quick."""
-FIRST_RETRY, MAX_RETRY = 1.0, 30.0
-"""Delay in s of the next request to a lost device while others on its bus reply; doubled after each
-request, because the others wait meanwhile."""
 GATEWAY_CODES = {10, 11}
 """Modbus exceptions by which a gateway reports that the device does not reply."""
 
@@ -193,10 +191,10 @@ class _Polled:
 class _Poller:
     """Polls one sensor, counts errors, and configures the device again when it replies again."""
 
-    def __init__(self, polled: _Polled, clock: HostClock, *, is_gone: bool) -> None:
+    def __init__(self, polled: _Polled, clock: HostClock, *, trouble: str) -> None:
         self.sensor = polled.sensor.name
-        self.due_ns = float(clock.now().monotonic_ns)
-        self.is_gone = False
+        self.presence = Presence(self.sensor, clock, trouble=trouble)
+        self._due_ns = float(clock.now().monotonic_ns)
         self._polled = polled
         self._clock = clock
         self._period_ns = 1e9 / polled.sensor.sampling_rate
@@ -204,16 +202,18 @@ class _Poller:
         self._replied_ns = self._clock.now().monotonic_ns
         self._min_silence = min(MIN_SILENCE, FAILURES * polled.settings.timeout)
         self._n_wrong: Counter[str] = Counter()
-        self._delay = FIRST_RETRY
         self._decoder = RegisterDecoder(
             self.sensor, polled.registers, sampling_rate=polled.sensor.sampling_rate
         )
-        if is_gone:
-            self._give_up()
+
+    @property
+    def due_ns(self) -> float:
+        """Host time of the next request."""
+        return self.presence.due_ns if self.presence.is_gone else self._due_ns
 
     async def poll(self, bus: ModbusBus) -> list[Block | Event]:
         """Poll once; errors become events."""
-        if self.is_gone:
+        if self.presence.is_gone:
             return await self._retry(bus)
         found: list[Block | Event] = []
         try:
@@ -241,28 +241,12 @@ class _Poller:
         return self._decoder.flush()
 
     async def _retry(self, bus: ModbusBus) -> list[Block | Event]:
-        """Configure a lost device if it replies: it may have lost its settings."""
-        try:
-            with bus.short_timeout():
-                await self._polled.prepare(bus)
-        except NoAnswerError:
-            self._failures += 1
-            self._give_up()
-            return []
-        except WrongDeviceError as error:
-            self._failures += 1
-            self._give_up()
-            return self._event(EventKind.REFUSED, str(error))
-        text = f"answers again, after {self._failures} requests without a reply"
-        self.is_gone, self._failures, self._delay = False, 0, FIRST_RETRY
-        self._replied_ns = self._clock.now().monotonic_ns
-        self.due_ns = float(self._clock.now().monotonic_ns)
-        return [Event(self.sensor, EventKind.CONNECTED, text, self._clock.now())]
-
-    def _give_up(self) -> None:
-        self.is_gone = True
-        self.due_ns = self._clock.now().monotonic_ns + self._delay * 1e9
-        self._delay = min(2 * self._delay, MAX_RETRY)
+        with bus.short_timeout():
+            found = await self.presence.try_again(lambda: self._polled.prepare(bus))
+        if not self.presence.is_gone:
+            self._failures, self._replied_ns = 0, self._clock.now().monotonic_ns
+            self._due_ns = float(self._replied_ns)
+        return [*found]
 
     def _unanswered(self, text: str) -> list[Block | Event]:
         self._failures += 1
@@ -279,10 +263,10 @@ class _Poller:
         now_ns = self._clock.now().monotonic_ns
         silent = (now_ns - self._replied_ns) * 1e-9 / self._clock.speed
         if self._failures >= FAILURES and silent >= self._min_silence:
-            self._give_up()
+            self.presence.lose()
             return
-        late = max(0, int((now_ns - self.due_ns) // self._period_ns))
-        self.due_ns += (late + 1) * self._period_ns
+        late = max(0, int((now_ns - self._due_ns) // self._period_ns))
+        self._due_ns += (late + 1) * self._period_ns
 
 
 class RegisterSession:
@@ -302,9 +286,9 @@ class RegisterSession:
 
     async def read(self) -> AsyncIterator[Block | Event]:
         """Poll all sensors of the bus, each at its rate."""
-        troubled = {one.sensor for one in self.information if one.trouble}
         pollers = [
-            _Poller(one, self._clock, is_gone=one.sensor.name in troubled) for one in self._polled
+            _Poller(one, self._clock, trouble=about.trouble)
+            for one, about in zip(self._polled, self.information, strict=True)
         ]
         while True:
             poller = min(pollers, key=lambda one: one.due_ns)
@@ -319,7 +303,7 @@ class RegisterSession:
                 raise
             for item in found:
                 yield item
-            if all(one.is_gone for one in pollers):
+            if all(one.presence.is_gone for one in pollers):
                 names = ", ".join(repr(one.sensor) for one in pollers)
                 raise NoAnswerError(
                     f"{self._bus.label}: {names} did not answer several polls in a row"
@@ -359,17 +343,10 @@ class RegisterDriver:
             stop_bits=first.stop_bits,
             echo=first.echo,
         ) as bus:
-            information, errors = [], []
-            for one in polled:
-                try:
-                    information.append(await one.prepare(bus))
-                except (NoAnswerError, WrongDeviceError) as error:
-                    errors.append(error)
-                    name = one.sensor.name
-                    information.append(DeviceInformation(sensor=name, trouble=str(error)))
-            if len(errors) == len(polled):
-                raise errors[0]
-            yield RegisterSession(bus, clock, polled, tuple(information))
+            information = await answering(
+                {one.sensor.name: partial(one.prepare, bus) for one in polled}
+            )
+            yield RegisterSession(bus, clock, polled, information)
 
 
 def _configured(sensors: Sequence[Sensor]) -> list[_Polled]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import re
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -173,8 +174,13 @@ async def test_lost_messages_are_gaps_of_their_sensor() -> None:
 
 async def test_a_device_that_does_not_answer_is_named() -> None:
     said = r"node 2.*check power, node_id and bitrate"
-    with serving(1) as (_, channel), pytest.raises(NoAnswerError, match=said):
-        await read(sensors(channel, "A", "B"), 1)
+    with serving(1) as (_, channel):
+        with pytest.raises(NoAnswerError, match=said):
+            await read(sensors(channel, "B"), 1)
+        async with DRIVER.open(sensors(channel, "A", "B"), SystemClock()) as session:
+            known, missing = session.information
+    assert not known.trouble
+    assert re.search(said, missing.trouble)
 
 
 async def test_another_device_is_refused() -> None:

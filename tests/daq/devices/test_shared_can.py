@@ -1,0 +1,152 @@
+"""Devices of a CAN bus that come and go, against an own peer: nobody costs the others rows."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.bench.channel import Channel
+from daq.bench.model import Sensor
+from daq.devices.registry import driver_type
+from daq.errors import NoAnswerError
+from daq.host_clock import SystemClock
+from daq.protocols.block import Block, BlockFlag, Event, EventKind
+from tests.daq.devices.can_peer import Peer
+from tests.waiting import limit
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from daq.devices.interface import DeviceInformation
+    from daq.protocols.block import DeviceItem
+
+RATE = 100.0
+DRIVER = driver_type("epson-can")
+NODES = {"A": 1, "B": 2, "C": 3}
+_channels = itertools.count()
+pytestmark = pytest.mark.peer
+
+
+@contextlib.contextmanager
+def bus() -> Iterator[tuple[Peer, list[Sensor]]]:
+    channel = f"huddle-shared-{next(_channels)}"
+    peer = Peer(channel, list(NODES.values()), RATE)
+    sensors = [
+        Sensor(
+            name=name,
+            driver="epson-can",
+            port=f"can://{channel}",
+            sampling_rate=RATE,
+            channels=tuple(Channel(name=axis, sensitivity=1.7e6) for axis in "xyz"),
+            settings={"node_id": node, "interface": "virtual"},
+        )
+        for name, node in NODES.items()
+    ]
+    try:
+        yield peer, sensors
+    finally:
+        peer.close()
+
+
+async def session(
+    sensors: list[Sensor], until: int
+) -> tuple[tuple[DeviceInformation, ...], list[DeviceItem], str]:
+    """Read until a tick of the bus; return also why the session ended."""
+    found: list[DeviceItem] = []
+    async with asyncio.timeout(limit(60)), DRIVER.open(sensors, SystemClock()) as opened:
+        try:
+            async for item in opened.read():
+                found.append(item)
+                if isinstance(item, Block) and item.counts[-1, 0] >= until:
+                    break
+        except NoAnswerError as error:
+            return opened.information, found, str(error)
+    return opened.information, found, ""
+
+
+def rows_of(found: list[DeviceItem], name: str) -> tuple[list[int], list[int]]:
+    """Return the indices and ticks of all rows of a sensor."""
+    blocks = [b for b in found if isinstance(b, Block) and b.sensor == name]
+    assert all((b.counts[:, 1] == NODES[name]).all() for b in blocks)
+    index = [i for b in blocks for i in range(b.first_sample, b.end_sample)]
+    return index, [int(tick) for b in blocks for tick in b.counts[:, 0]]
+
+
+def check_rows(found: list[DeviceItem], *, complete: set[str]) -> None:
+    """See that rows of one SYNC have one index, and that nobody lost a row for another."""
+    origins = set()
+    for name in NODES:
+        index, ticks = rows_of(found, name)
+        origins |= set((np.array(ticks, int) - np.array(index, int)).tolist())
+        if name in complete:
+            assert index == list(range(len(index)))
+    assert len(origins) == 1
+
+
+@pytest.mark.parametrize("away", [50, pytest.param(250, marks=pytest.mark.long)])
+@pytest.mark.parametrize("name", ["B", pytest.param("C", marks=pytest.mark.long)])
+async def test_a_node_that_restarts_is_started_again_and_costs_nobody(name: str, away: int) -> None:
+    with bus() as (peer, sensors):
+        node = peer.nodes[NODES[name]]
+        peer.schedule = {200: [node.leave], 200 + away: [node.come]}
+        _, found, why = await session(sensors, 450 + away)
+    assert not why
+    check_rows(found, complete=set(NODES) - {name})
+    _, ticks = rows_of(found, name)
+    missing = set(range(ticks[0], ticks[-1] + 1)) - set(ticks)
+    assert missing == set(range(min(missing), max(missing) + 1))  # one gap
+    assert len(missing) >= away
+    assert ticks[-1] > 400 + away
+    (again,) = [b for b in found if isinstance(b, Block) and b.sensor == name and b.reason]
+    assert again.flags & BlockFlag.CLOCK_RESTART
+    assert again.flags & BlockFlag.MISSING_ESTIMATED
+    kinds = [e.kind for e in found if isinstance(e, Event) and e.sensor == name]
+    assert kinds == [EventKind.STALLED, EventKind.CONNECTED]
+
+
+async def test_a_node_that_is_missing_at_first_joins_at_its_place() -> None:
+    with bus() as (peer, sensors):
+        node = peer.nodes[2]
+        node.leave()
+        peer.schedule = {300: [node.come]}
+        information, found, why = await session(sensors, 550)
+    assert not why
+    assert [bool(one.trouble) for one in information] == [False, True, False]
+    check_rows(found, complete={"A", "C"})
+    assert len(rows_of(found, "B")[0]) > 50
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        ["producer restarts", "C is dead"],
+        pytest.param(["producer dies", "C is dead"], marks=pytest.mark.long),
+        pytest.param(["producer dies"], marks=pytest.mark.long),
+    ],
+    ids="-".join,
+)
+async def test_the_bus_goes_on_without_its_producer_and_a_dead_node(order: list[str]) -> None:
+    with bus() as (peer, sensors):
+        producer, dead = peer.nodes[1], peer.nodes[3]
+        peer.schedule = {200: [producer.leave]}
+        if "C is dead" in order:
+            peer.schedule[120] = [dead.leave]
+        if "producer restarts" in order:
+            peer.schedule[250] = [producer.come]
+        _, before, why = await session(sensors, 10**6)
+        assert "node 1" in why
+        information, after, why = await session(sensors, peer.tick + 400)
+    assert not why
+    gone = {"A"} if "producer dies" in order else set()
+    gone |= {"C"} if "C is dead" in order else set()
+    alive = {"A", "B", "C"} - gone
+    assert {one.sensor for one in information if not one.trouble} == alive
+    check_rows(before, complete={"A", "B"})
+    check_rows(after, complete=alive)
+    for name in alive:
+        assert len(rows_of(after, name)[0]) > 80
