@@ -126,10 +126,18 @@ class Examined:
     about: Bench | None
     objections: tuple[Objection, ...]
 
-    @property
-    def paths(self) -> list[Path]:
-        """Of the recordings."""
-        return [source.path for source in self.found]
+    def check(self) -> None:
+        """Refuse what no certificate may be made of.
+
+        Raises
+        ------
+        NotIssuedError
+            With all objections.
+        """
+        if self.objections:
+            raise NotIssuedError("\n".join(map(str, self.objections)))
+        if not self.order.by:
+            raise NotIssuedError("nobody authorises the certificate; expected --by NAME")
 
 
 def examine(
@@ -252,7 +260,8 @@ def issue(
             f"the result is invalid:\n{lines}\n--despite REASON issues a certificate that prints"
             " the reason on page 1"
         )
-    if [source.sha256 for source in sources(examined.paths)] != [s.sha256 for s in found]:
+    now = sources([source.path for source in found])
+    if [source.sha256 for source in now] != [source.sha256 for source in found]:
         raise NotIssuedError("a recording was changed while it was estimated; try again")
     prefix = "HT" if about is None else about.certificate.prefix
     runs = [(source.path.name, source.run_id, source.sha256) for source in found]

@@ -121,7 +121,7 @@ def issue(
     from tui.output.console import console, notices
 
     require("matplotlib", "jinja2", "fpdf", *(["pyhanko"] if sign is not None else []))
-    from tui.certificate.issuing import NotIssuedError, Order, examine, issue, specimen, with_stated
+    from tui.certificate.issuing import Order, examine, issue, specimen, with_stated
 
     if is_specimen and sign is not None:
         raise typer.BadParameter("--sign: a specimen is not signed")
@@ -146,10 +146,8 @@ def issue(
             known=known_to_services,
             folders=() if folder is None else (folder.absolute(),),
         )
-    if examined.objections and not is_specimen:
-        raise NotIssuedError("\n".join(map(str, examined.objections)))
-    if not by and not is_specimen:
-        raise typer.BadParameter("nobody authorises the certificate; expected --by NAME")
+    if not is_specimen:
+        examined.check()
     snapshot, settings, recorded = estimated(files, start=start, end=end, **wanted)
     with notices().status("making the certificate"):
         if is_specimen:

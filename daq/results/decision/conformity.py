@@ -64,7 +64,8 @@ class Conformity:
     statement : Statement
         By the rule.
     risk : float
-        Probability that the noise is above the limit in any band; NaN where nothing is known.
+        Probability that the noise is above the limit in any band; NaN where nothing is known of
+        a band.
     frequency : float
         Centre in Hz of the band where that is likeliest.
     k : float
@@ -199,7 +200,7 @@ def risk_of_item(
     Returns
     -------
     risk : float
-        NaN where nothing is known of any band; bands of which nothing is known do not count.
+        NaN where nothing is known of a band.
     worst : int
     """
     nodes, weights = np.polynomial.hermite_e.hermegauss(NODES if deviation else 1)
@@ -208,9 +209,7 @@ def risk_of_item(
     )
     weights = weights / weights.sum()
     worst = int(np.nan_to_num(weights @ of_bands, nan=-1.0).argmax())
-    if np.isnan(of_bands).all():
-        return math.nan, worst
-    return float(weights @ (1 - np.nanprod(1 - of_bands, axis=1))), worst
+    return float(weights @ (1 - np.prod(1 - of_bands, axis=1))), worst
 
 
 def risk_above(limit: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:

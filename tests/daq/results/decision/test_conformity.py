@@ -104,6 +104,11 @@ def test_the_risk_is_the_share_of_draws_above_the_limit(share: float) -> None:
 def test_nothing_known_has_no_risk() -> None:
     unknown = np.full((len(QUANTILES), 1), np.inf)
     assert np.isnan(risk_above(LIMIT, -unknown, unknown)[0])
+    known = np.tile(np.array([[0.1]]), (len(QUANTILES), 1))
+    both = np.hstack([known, -unknown]), np.hstack([known, unknown])
+    risk, worst = risk_of_item(np.ones(2), *both, 0.01)
+    assert np.isnan(risk)  # of a band that nothing is known of
+    assert worst == 0
 
 
 @pytest.mark.parametrize("deviation", [0.0, 0.02, 0.1])
