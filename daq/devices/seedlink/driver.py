@@ -4,6 +4,9 @@
 sensors of a port share one connection. The driver uses version 4 of the protocol if the server
 offers it, else 3.
 
+A station that the server refuses costs the others nothing: it is requested again, on a second
+connection that replaces the first once the server has the station (:mod:`daq.devices.shared_port`).
+
 Blocks state the digitizer's UTC, so no clock model is fitted. After a reconnection each station
 continues with the packet after its last one. No samples are lost while the server still has the
 packets, and repeated samples are recorded once. Packets that the server no longer has become a gap
@@ -15,6 +18,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ssl
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 from urllib.parse import urlsplit
@@ -26,8 +30,10 @@ from daq.devices.interface import DeviceInformation
 from daq.devices.port_rules import port_label, require_alike
 from daq.devices.seedlink import packets
 from daq.devices.seedlink.decoder import SeedLinkDecoder, Selection
+from daq.devices.shared_port import Presence
 from daq.errors import (
     BenchFileError,
+    DeviceError,
     FileFault,
     NoAnswerError,
     NotConnectedError,
@@ -37,7 +43,7 @@ from daq.transport.address import USUAL_NUMBERS, host_and_port
 from daq.transport.ports import open_port
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Mapping, Sequence
+    from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
     from contextlib import AbstractAsyncContextManager
 
     from daq.bench.model import Sensor
@@ -144,22 +150,20 @@ class SeedLinkSession:
 
     def __init__(
         self,
-        stream: ByteStream,
-        decoder: SeedLinkDecoder,
+        link: _Link,
         *,
         information: tuple[DeviceInformation, ...],
         buffered: list[Block | Event],
-        patience: float,
         resumed: bool,
     ) -> None:
         self.information = information
-        self.decoder = decoder
+        self.decoder = link.decoder
         self.resumed = resumed
         """Whether blocks continue the index of the session before."""
-        self.patience = patience
+        self.patience = link.settings.patience
         """See :class:`daq.devices.interface.PatientSession`."""
         self.hint = "the server sends no records; check its digitizer"
-        self._stream = stream
+        self._link = link
         self._buffered = buffered
 
     async def read(self) -> AsyncIterator[Block | Event]:
@@ -167,11 +171,106 @@ class SeedLinkSession:
         buffered, self._buffered = self._buffered, []
         for item in buffered:
             yield item
+        link = self._link
+        refused = {
+            name: Presence(name, link.clock, trouble=why) for name, why in link.refused.items()
+        }
         while True:
-            received, at = await self._stream.read()
+            received, at = await link.read(refused.values())
             for item in self.decoder.receive(received, at):
                 yield item
             self.decoder.check()
+            for presence in [one for one in refused.values() if one.is_due]:
+                for event in await presence.try_again(partial(link.replace, presence.sensor)):
+                    yield event
+                for item in link.taken():
+                    yield item
+            refused = {name: one for name, one in refused.items() if one.is_gone}
+
+
+class _Link:
+    """The connection to a server, which is replaced when the server has a refused station."""
+
+    def __init__(
+        self, sensors: Sequence[Sensor], clock: HostClock, decoder: SeedLinkDecoder
+    ) -> None:
+        self.clock = clock
+        self.decoder = decoder
+        self.label = port_label(sensors)
+        self.settings = SeedLinkSettings.model_validate(sensors[0].settings)
+        self.refused: dict[str, str] = {}
+        """Why the server refused the station of a sensor."""
+        self.server: _Server
+        self._first = sensors[0]
+        self._selections = _selections(sensors)
+        self._found: list[Block | Event] = []
+        self._stack = contextlib.AsyncExitStack()
+
+    async def open(self) -> None:
+        """Connect, and select all stations that the server has."""
+        stack, server, refused = await self._connected("")
+        self._stack, self.server, self.refused = stack, server, refused
+        self._begin()
+
+    async def replace(self, sensor: str) -> None:
+        """Connect again with the station of a sensor, and close the connection before."""
+        stack, server, refused = await self._connected(sensor)
+        before, self._stack, self.server, self.refused = self._stack, stack, server, refused
+        await before.aclose()
+        self._begin()
+
+    async def read(self, refused: Iterable[Presence]) -> tuple[bytes, HostTime]:
+        """Return received bytes, or none when a refused station is due."""
+        dues = [one.due_ns for one in refused]
+        wait = None
+        if dues:
+            left = (min(dues) - self.clock.now().monotonic_ns) * 1e-9 / self.clock.speed
+            wait = max(0.0, left)
+        try:
+            async with asyncio.timeout(wait):
+                return await self.server.stream.read()
+        except TimeoutError as error:
+            if isinstance(error, DeviceError):
+                raise
+            return b"", self.clock.now()
+
+    def taken(self) -> list[Block | Event]:
+        """Return the items that came with the replies of a new connection."""
+        found, self._found = self._found, []
+        return found
+
+    async def aclose(self) -> None:
+        """Close the connection."""
+        await self._stack.aclose()
+
+    def _begin(self) -> None:
+        self.decoder.begin(self.server.version)
+        if self.server.rest is not None:
+            self._found += self.decoder.receive(*self.server.rest)
+
+    async def _connected(
+        self, wanted: str
+    ) -> tuple[contextlib.AsyncExitStack, _Server, dict[str, str]]:
+        """Connect; raise WrongDeviceError if the server refuses ``wanted``, or all stations."""
+        settings, label = self.settings, self.label
+        host, number = _address(self._first)
+        tls = None
+        if settings.is_encrypted(number):
+            try:
+                tls = await asyncio.to_thread(settings.context)
+            except OSError as error:
+                text = f"{label}: settings.ca_file cannot be read: {error}"
+                raise NotConnectedError(text) from error
+        async with contextlib.AsyncExitStack() as stack:
+            stream = await stack.enter_async_context(
+                open_port(f"socket://{host}:{number}", self.clock, label=label, tls=tls)
+            )
+            server = _Server(stream, is_encrypted=tls is not None)
+            await server.greet(settings.protocol)
+            if settings.credentials is not None:
+                await server.authenticate(settings.read_credentials(self._first))
+            refused = await server.choose(self._selections, self.decoder.last, wanted=wanted)
+            return stack.pop_all(), server, refused
 
 
 class SeedLinkDriver:
@@ -230,38 +329,20 @@ def _address(sensor: Sensor) -> tuple[str, int]:
 async def _opened(
     sensors: Sequence[Sensor], clock: HostClock, before: SeedLinkSession | None
 ) -> AsyncIterator[SeedLinkSession]:
-    first = sensors[0]
-    selections = _selections(sensors)
-    settings = SeedLinkSettings.model_validate(first.settings)
-    host, number = _address(first)
-    label = port_label(sensors)
-    tls = None
-    if settings.is_encrypted(number):
-        try:
-            tls = await asyncio.to_thread(settings.context)
-        except OSError as error:
-            raise NotConnectedError(f"{label}: settings.ca_file cannot be read: {error}") from error
-    async with open_port(f"socket://{host}:{number}", clock, label=label, tls=tls) as stream:
-        server = _Server(stream, is_encrypted=tls is not None)
-        await server.greet(settings.protocol)
-        if settings.credentials is not None:
-            await server.authenticate(settings.read_credentials(first))
-        decoder = before.decoder if before is not None else None
-        if decoder is None:
-            dtypes = {s.name: SeedLinkDriver().counts_dtype(s) for s in sensors}
-            decoder = SeedLinkDecoder(selections, dtypes, hold=settings.late)
-        await server.choose(selections, decoder.last)
-        decoder.begin(server.version)
-        buffered: list[Block | Event] = []
-        if server.rest is not None:
-            buffered += decoder.receive(*server.rest)
-        await _listen(stream, decoder, settings.patience / clock.speed, buffered)
+    decoder = before.decoder if before is not None else None
+    if decoder is None:
+        dtypes = {s.name: SeedLinkDriver().counts_dtype(s) for s in sensors}
+        late = SeedLinkSettings.model_validate(sensors[0].settings).late
+        decoder = SeedLinkDecoder(_selections(sensors), dtypes, hold=late)
+    link = _Link(sensors, clock, decoder)
+    async with contextlib.aclosing(link):
+        await link.open()
+        buffered = link.taken()
+        await _listen(link, buffered)
         yield SeedLinkSession(
-            stream,
-            decoder,
-            information=_information(sensors, decoder, server, label, settings.patience),
+            link,
+            information=_information(sensors, link),
             buffered=buffered,
-            patience=settings.patience,
             resumed=before is not None,
         )
 
@@ -275,7 +356,7 @@ class _Server:
         self.software = self.organisation = ""
         self.rest: tuple[bytes, HostTime] | None = None
         """Bytes received after the last reply."""
-        self._stream = stream
+        self.stream = stream
         self._buffer = b""
         self._at: HostTime | None = None
 
@@ -285,12 +366,12 @@ class _Server:
         self.software, self.organisation = await self._line("HELLO"), await self._line("HELLO")
         if "seedlink" not in self.software.lower():
             raise WrongDeviceError(
-                f"{self._stream.label}: expected a SeedLink server, got {self.software[:60]!r}"
+                f"{self.stream.label}: expected a SeedLink server, got {self.software[:60]!r}"
             )
         offered = packets.speaks_version_4(self.software)
         if wanted == "4" and not offered:
             raise WrongDeviceError(
-                f"{self._stream.label}: settings.protocol is 4, but the server does not offer it:"
+                f"{self.stream.label}: settings.protocol is 4, but the server does not offer it:"
                 f" {self.software[:80]!r}"
             )
         if offered and wanted != "3":
@@ -301,27 +382,50 @@ class _Server:
         """State who the client is."""
         if self.version == 3:
             raise WrongDeviceError(
-                f"{self._stream.label}: the server speaks SeedLink 3, which has no credentials;"
+                f"{self.stream.label}: the server speaks SeedLink 3, which has no credentials;"
                 " remove settings.credentials"
             )
         await self._ask(packets.auth_command(credentials), shown="AUTH …")
 
     async def choose(
-        self, selections: Mapping[str, Selection], last: Mapping[str, tuple[int, int]]
-    ) -> None:
-        """Select stations and channels, and start the transfer."""
-        stations: dict[str, list[Selection]] = {}
-        for selection in selections.values():
-            stations.setdefault(selection.station_id, []).append(selection)
-        for station, chosen in stations.items():
-            one = chosen[0]
-            await self._ask(packets.station_command(self.version, one.network, one.station))
-            for pattern in dict.fromkeys(p for selection in chosen for p in selection.patterns):
-                await self._ask(packets.select_command(self.version, *pattern))
-            await self._ask(packets.data_command(self.version, last.get(station)))
+        self,
+        selections: Mapping[str, Selection],
+        last: Mapping[str, tuple[int, int]],
+        *,
+        wanted: str = "",
+    ) -> dict[str, str]:
+        """Select stations and channels, and start the transfer; return why sensors are refused.
+
+        Raises
+        ------
+        WrongDeviceError
+            If the server refuses the sensor ``wanted``, or all of them.
+        """
+        stations: dict[str, list[str]] = {}
+        for name in sorted(selections, key=lambda name: name != wanted):  # the wanted one first
+            stations.setdefault(selections[name].station_id, []).append(name)
+        refused: dict[str, WrongDeviceError] = {}
+        for station, names in stations.items():
+            try:
+                await self._choose([selections[name] for name in names], last.get(station))
+            except WrongDeviceError as error:
+                if wanted in names:
+                    raise
+                refused |= dict.fromkeys(names, error)
+        if len(refused) == len(selections):
+            raise next(iter(refused.values()))
         await self._send("END")
         if self._buffer and self._at is not None:
             self.rest = self._buffer, self._at
+        return {name: str(error) for name, error in refused.items()}
+
+    async def _choose(self, chosen: Sequence[Selection], last: tuple[int, int] | None) -> None:
+        """Select one station and its channels."""
+        one = chosen[0]
+        await self._ask(packets.station_command(self.version, one.network, one.station))
+        for pattern in dict.fromkeys(p for selection in chosen for p in selection.patterns):
+            await self._ask(packets.select_command(self.version, *pattern))
+        await self._ask(packets.data_command(self.version, last))
 
     async def _ask(self, command: str, *, shown: str = "") -> None:
         await self._send(command)
@@ -330,12 +434,12 @@ class _Server:
             is_about_access = bool(shown) or "AUTH" in reply
             which = "credentials" if is_about_access else "network, station, location and channels"
             raise WrongDeviceError(
-                f"{self._stream.label}: expected OK to {shown or command!r}, got {reply[:80]!r};"
+                f"{self.stream.label}: expected OK to {shown or command!r}, got {reply[:80]!r};"
                 f" check {which}"
             )
 
     async def _send(self, command: str) -> None:
-        await self._stream.write(command.encode("ascii") + packets.LINE_END)
+        await self.stream.write(command.encode("ascii") + packets.LINE_END)
 
     async def _line(self, command: str) -> str:
         try:
@@ -343,48 +447,44 @@ class _Server:
                 while packets.LINE_END not in self._buffer:
                     if len(self._buffer) > packets.RECORD_SIZE:
                         break
-                    received, self._at = await self._stream.read()
+                    received, self._at = await self.stream.read()
                     self._buffer += received
         except TimeoutError as error:
             raise NoAnswerError(
-                f"{self._stream.label}: no answer to {command!r} in {REPLY_TIMEOUT:g} s; is it a"
+                f"{self.stream.label}: no answer to {command!r} in {REPLY_TIMEOUT:g} s; is it a"
                 " SeedLink server?"
             ) from error
         line, found, self._buffer = self._buffer.partition(packets.LINE_END)
         text = line.decode("ascii", "replace").strip()
         if not found:
             raise WrongDeviceError(
-                f"{self._stream.label}: expected a line in answer to {command!r}, got {text[:60]!r}"
+                f"{self.stream.label}: expected a line in answer to {command!r}, got {text[:60]!r}"
             )
         return text
 
 
-async def _listen(
-    stream: ByteStream, decoder: SeedLinkDecoder, seconds: float, buffered: list[Block | Event]
-) -> None:
-    """Listen until the streams of every sensor are decided, for at most ``seconds``."""
+async def _listen(link: _Link, buffered: list[Block | Event]) -> None:
+    """Listen until the streams of every sensor are decided, for at most the patience."""
     with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(seconds):
-            while decoder.silent:
-                received, at = await stream.read()
-                buffered += decoder.receive(received, at)
+        async with asyncio.timeout(link.settings.patience / link.clock.speed):
+            while not set(link.decoder.silent) <= set(link.refused):
+                received, at = await link.server.stream.read()
+                buffered += link.decoder.receive(received, at)
 
 
-def _information(
-    sensors: Sequence[Sensor],
-    decoder: SeedLinkDecoder,
-    server: _Server,
-    label: str,
-    patience: float,
-) -> tuple[DeviceInformation, ...]:
-    found = []
+def _information(sensors: Sequence[Sensor], link: _Link) -> tuple[DeviceInformation, ...]:
+    found, decoder, server, label = [], link.decoder, link.server, link.label
     for sensor in sensors:
+        if trouble := link.refused.get(sensor.name):
+            found.append(DeviceInformation(sensor=sensor.name, trouble=trouble))
+            continue
         if sensor.name in decoder.silent:
             there = ", ".join(decoder.heard(sensor.name)) or "none"
             settings = SeedLinkSettings.model_validate(sensor.settings)
             trouble = (
                 f"{label}: the {len(sensor.channels)} streams of {sensor.name!r} not received in"
-                f" {patience:g} s; of {settings.network}.{settings.station} that match: {there}"
+                f" {settings.patience:g} s; of {settings.network}.{settings.station} that match:"
+                f" {there}"
             )
             found.append(DeviceInformation(sensor=sensor.name, trouble=trouble))
             continue

@@ -12,6 +12,9 @@ Version 3 (SeisComP, "SeedLink" 2 to 3.3)::
     SL  sequence, 6 hexadecimal digits  miniSEED 2 record of 512 bytes
     SLINFO  * or blank                  miniSEED 2 record of 512 bytes, in reply to INFO
 
+Some servers send records of other lengths, 256 bytes for example, as blockette 1000 says. Whether
+shorter ones are padded to 512 bytes shows where the next packet begins.
+
 Version 4 (FDSN, 2023), little-endian::
 
     SE  format u8  subformat u8  payload length u32  sequence u64  id length u8  station id  payload
@@ -40,6 +43,10 @@ Version: TypeAlias = Literal[3, 4]
 WRAP = 1 << 24
 """Modulus of sequence numbers in version 3."""
 RECORD_SIZE = 512
+_FIXED_HEADER, _RECORD_HEADER = 48, 56
+"""Bytes of a record before its first blockette, and up to the end of blockette 1000."""
+_BLOCKETTE_1000, _EXPONENTS = 1000, range(7, 13)
+"""Its type, and binary logarithms of record lengths in use."""
 MAX_PAYLOAD = 1 << 20
 """Maximum length of a payload in bytes; longer ones are not packets."""
 LINE_END = b"\r\n"
@@ -127,12 +134,22 @@ def encode_packet(packet: Packet, version: Version) -> bytes:
     return head + packet.payload.ljust(RECORD_SIZE, b"\0")
 
 
+def _record_size(head: bytes) -> int:
+    """Return the length of a miniSEED 2 record by its blockette 1000; the usual one without."""
+    for order in (">", "<"):
+        kind, _, _, _, exponent = struct.unpack_from(f"{order}HHBBB", head, _FIXED_HEADER)
+        if kind == _BLOCKETTE_1000 and exponent in _EXPONENTS:
+            return 1 << int(exponent)
+    return RECORD_SIZE
+
+
 class PacketFinder:
     """Decodes the bytes of a connection into packets."""
 
     def __init__(self, version: Version) -> None:
         self._version = version
         self._buffer = bytearray()
+        self._pads: bool | None = None  # whether short records are padded, once that is known
 
     def receive(self, data: bytes) -> list[Packet]:
         """Decode bytes, cut anywhere; return the completed packets.
@@ -164,10 +181,22 @@ class PacketFinder:
         match = _SEQUENCE.fullmatch(head)
         if match is None and not head.startswith(b"SLINFO"):
             self._refuse(head)
-        if len(buffer) < _HEADER_3 + RECORD_SIZE:
+        size = RECORD_SIZE
+        if match is not None and self._pads is not True:
+            if len(buffer) < _HEADER_3 + _RECORD_HEADER:
+                return None
+            size = _record_size(bytes(buffer[_HEADER_3 : _HEADER_3 + _RECORD_HEADER]))
+        end = _HEADER_3 + size
+        if size < RECORD_SIZE and self._pads is None:
+            following = bytes(buffer[end : end + 2])
+            if len(following) < 2:
+                return None
+            self._pads = following != b"SL"
+            end = _HEADER_3 + (RECORD_SIZE if self._pads else size)
+        if len(buffer) < end:
             return None
-        payload = bytes(buffer[_HEADER_3 : _HEADER_3 + RECORD_SIZE])
-        del buffer[: _HEADER_3 + RECORD_SIZE]
+        payload = bytes(buffer[_HEADER_3:end])
+        del buffer[:end]
         return Packet(int(match[1], 16) if match else None, payload)
 
     def _next_4(self) -> Packet | None:

@@ -1,0 +1,165 @@
+"""Stations of a SeedLink server that come and go, against an own server: others lose nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections import defaultdict
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.bench.channel import Channel
+from daq.bench.model import Sensor
+from daq.devices import shared_port
+from daq.devices.interface import Resuming
+from daq.devices.registry import driver_type
+from daq.devices.seedlink.packets import PacketFinder
+from daq.errors import NotConnectedError, WrongDeviceError
+from daq.host_clock import SystemClock
+from daq.protocols.block import Block, Event, EventKind
+from tests.daq.devices.seedlink_peer import RATE, Server, record, value
+from tests.waiting import limit
+
+if TYPE_CHECKING:
+    from contextlib import AbstractAsyncContextManager
+
+    from daq.devices.interface import Session
+    from daq.protocols.block import DeviceItem
+
+DRIVER = driver_type("seedlink")
+NAMES = ["AAA", "BBB", "CCC"]
+
+
+def sensors(port: str) -> list[Sensor]:
+    return [
+        Sensor(
+            name=name,
+            driver="seedlink",
+            port=port,
+            sampling_rate=RATE,
+            channels=(Channel(name="HNZ", sensitivity=1e6),),
+            settings={"network": "XX", "station": name, "late": 0.2, "patience": 5.0},
+        )
+        for name in NAMES
+    ]
+
+
+class Reader:
+    """Reads a session in the background, and knows what came of each sensor."""
+
+    def __init__(self) -> None:
+        self.items: list[DeviceItem] = []
+        self.rows: defaultdict[str, int] = defaultdict(int)
+        self._changed = asyncio.Event()
+
+    async def run(self, session: Session) -> None:
+        """Read to the end."""
+        async for item in session.read():
+            self.items.append(item)
+            if isinstance(item, Block):
+                self.rows[item.sensor] += item.n_samples
+            self._changed.set()
+
+    async def until(self, server: Server, **rows: int) -> None:
+        """Let the server make records until each sensor has so many rows more."""
+        wanted = {name: self.rows[name] + more for name, more in rows.items()}
+        async with asyncio.timeout(limit(30)):
+            while any(self.rows[name] < n for name, n in wanted.items()):
+                server.make()
+                self._changed.clear()
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._changed.wait(), 0.05)
+
+    def check(self, name: str) -> None:
+        """See that rows of a sensor are one stretch, each what the server made."""
+        blocks = [b for b in self.items if isinstance(b, Block) and b.sensor == name]
+        counts = np.concatenate([b.counts[:, 0] for b in blocks]).tolist()
+        index = [i for b in blocks for i in range(b.first_sample, b.end_sample)]
+        assert index == list(range(len(index)))
+        station = NAMES.index(name)
+        begin = next(k for k in range(100_003) if value(station, k) == counts[0])
+        assert counts == [value(station, begin + k) for k in range(len(counts))]
+
+
+async def test_a_refused_station_costs_the_others_nothing_and_comes_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(shared_port, "FIRST_RETRY", 0.1)
+    async with Server(NAMES) as server:
+        server.refuses = {"BBB"}
+        opening = asyncio.create_task(_opened(server))
+        while not opening.done():
+            server.make()
+            await asyncio.wait([opening], timeout=0.05)
+        session, stack, reader, task = opening.result()
+        about = {one.sensor: one.trouble for one in session.information}
+        assert "ERROR" in about["BBB"]
+        assert not about["AAA"]
+        assert not about["CCC"]
+        await reader.until(server, AAA=400, CCC=400)
+        assert reader.rows["BBB"] == 0
+        server.refuses = set()
+        await reader.until(server, AAA=400, BBB=400, CCC=400)
+        kinds = [e.kind for e in reader.items if isinstance(e, Event)]
+        assert kinds == [EventKind.CONNECTED]
+        for name in NAMES:
+            reader.check(name)
+        server.refuses = {"CCC", "AAA"}  # a hang-up: the next session has BBB alone
+        server.hang_up()
+        with pytest.raises(NotConnectedError):
+            await task
+        await stack.aclose()
+        opening = asyncio.create_task(_opened(server, session))
+        while not opening.done():
+            server.make()
+            await asyncio.wait([opening], timeout=0.05)
+        session, stack, again, task = opening.result()
+        assert [bool(one.trouble) for one in session.information] == [True, False, True]
+        again.items, again.rows = reader.items, reader.rows
+        await again.until(server, BBB=200)
+        server.refuses = {"CCC"}
+        await again.until(server, BBB=200, AAA=200)
+        server.refuses = set()
+        await again.until(server, BBB=200, AAA=200, CCC=200)
+        for name in NAMES:
+            again.check(name)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        await stack.aclose()
+
+
+async def _opened(
+    server: Server, before: Session | None = None
+) -> tuple[Session, contextlib.AsyncExitStack, Reader, asyncio.Task[None]]:
+    stack = contextlib.AsyncExitStack()
+    bench = sensors(server.port)
+    assert isinstance(DRIVER, Resuming)
+    opened: AbstractAsyncContextManager[Session] = (
+        DRIVER.open(bench, SystemClock())
+        if before is None
+        else DRIVER.resume(bench, SystemClock(), before)
+    )
+    session = await stack.enter_async_context(opened)
+    reader = Reader()
+    return session, stack, reader, asyncio.create_task(reader.run(session))
+
+
+async def test_a_server_that_refuses_all_stations_is_named() -> None:
+    async with Server(NAMES) as server:
+        server.refuses = set(NAMES)
+        with pytest.raises(WrongDeviceError, match="expected OK to 'STATION AAA XX'"):
+            await _opened(server)
+
+
+@pytest.mark.parametrize("size", [256, 512, 1024])
+@pytest.mark.parametrize("padded", [False, True])
+@pytest.mark.parametrize("step", [1, 7, 10_000])
+def test_records_have_the_length_that_they_state(size: int, padded: bool, step: int) -> None:
+    finder = PacketFinder(3)
+    records = [record("AAA", 0, turn, size=size) for turn in range(5)]
+    line = b"".join(b"SL%06X" % n + r.ljust(512 * padded, b"\0") for n, r in enumerate(records))
+    found = [p for k in range(0, len(line), step) for p in finder.receive(line[k : k + step])]
+    assert [one.sequence for one in found] == list(range(5))
+    assert [one.payload[:size] for one in found] == records
