@@ -10,10 +10,15 @@ neighbouring bins, and its scatter would contain the cost. Project, then pool:
    from each sub-block, so that a response may vary over the block however strong the motion is.
 3. The other q - r directions are taken from the mean of the projected sub-blocks, one set for the
    block. A response that varies leaks little there: SNR times the square of its variation.
-4. With Q_b the projector off both in sub-block b, whitened by the noise psi, the noise of a bin is
-   linear in its matrix X: ``psi o inv(J_b) diag(Q_b X Q_b)`` with ``J_b = |Q_b|**2``, corrected for
-   the averages that the directions take. psi (weights only, so without bias) is the mean of the
-   block, found in a few rounds.
+4. With Q_b the projector off both in sub-block b, whitened by the noise, the noise of a bin is
+   linear in its matrix X. The noise of a sensor is a matrix, as in the paper's formula: what only
+   its own channels share is noise, and no dimension of the motion. The elements B_cd of these
+   matrices solve ``(Q_b X Q_b)_ij = sum_cd Q_ic B_cd Q_dj``, ij and cd being pairs of channels of
+   one sensor, corrected for the averages that the directions take. The matrices that whiten
+   (weights only, so without bias) are the mean of the block, found in a few rounds.
+
+Dimensions in which the sensors agree no more than noise would are left in the noise; what motion
+they may hold widens the interval.
 
 k doubles while that resolves more dimensions and leaves four sub-blocks. The noise of a band is the
 mean of its bins; so are its cumulants with powers of the weights (`estimator.levels.interval`).
@@ -46,15 +51,21 @@ FEW = 5.0
 LEAST_PARTS = 4
 """Sub-blocks of a block at least, where they are made larger than `ENOUGH` asks for."""
 LEAKS = 3.0
-"""Standard deviations by which the noise of larger sub-blocks is above that of smaller ones, from
-which they are not used."""
+"""Standard deviations by which the noise of larger sub-blocks is above that of smaller ones, or
+differs from it, from which they are not used."""
+SHOWN = 2.0
+"""Standard deviations by which sensors agree more than noise does, from which motion shows."""
+UNSEEN = 0.67
+"""Variance of the noise, over that of a PSD, by the square of the motion that does not show: so
+much that the interval holds the noise however much of this motion there is."""
 ROUNDS = 6
 SETTLED = 1e-3
-"""Change of ln psi in a round, of weights only, from which there is no further round."""
+"""Change of the log of the noise in a round, of weights only, from which there is no further
+round."""
 SAMPLED = 15
 """Sub-blocks of a block by which the number of resolved dimensions is decided."""
-_STEP = 1.5  # of ln psi in one round
-_FLOOR = 1e-7  # of psi over the channel's PSD
+_STEP = 1.5  # of the log of the noise in one round
+_FLOOR = 1e-7  # of the noise over the PSD
 _BYTES_AT_ONCE = 1 << 23  # of the matrices of blocks that are fitted together
 _TRACE_BYTES = 1 << 24  # of products of all channels' differentials that exist together
 
@@ -109,7 +120,8 @@ class _Fit:
 
     ``projector`` and ``white``, the whitened mean matrix, are those of the sub-blocks. ``gain``
     corrects for the averages that directions take, ``left`` are those that are left. ``resolved``,
-    ``psi`` of the weights, and ``level``, the mean noise, are those of the blocks.
+    ``whitener`` W of the weights, which makes the noise ``W N W*`` one, and ``level``, the mean
+    noise, are those of the blocks.
     """
 
     parts: _Parts
@@ -118,7 +130,7 @@ class _Fit:
     gain: FloatArray
     left: FloatArray
     resolved: IntArray
-    psi: FloatArray
+    whitener: ComplexArray
     level: FloatArray
 
 
@@ -213,31 +225,33 @@ def _pool(
 
     at = np.arange(len(begin))
     parts, mean = cut(at, sizes)
-    psi = 1 / np.einsum("bii->bi", np.linalg.inv(mean)).real
-    fit = _fitted(mean, parts, q, psi, n_effective=n_effective)
-    _read(found, matrix, fit)
-    level, psi, best = fit.level.copy(), fit.psi.copy(), fit.resolved.copy()
+    fit = _fitted(mean, parts, q, sensor, n_effective=n_effective, resolve=False)
+    _read(found, matrix, fit, sensor)
+    level, whitener, best = fit.level.copy(), fit.whitener.copy(), fit.resolved.copy()
     enough = int(np.searchsorted(averages[1:], max(ENOUGH, 1.5 * p))) + 1
     k = np.minimum(enough, sizes)
     largest = k * 2 ** np.log2(np.maximum(sizes // (k * LEAST_PARTS), 1)).astype(np.int64)
     # what the largest sub-blocks do not resolve, smaller ones do not either
     parts, mean = cut(at, largest)
-    at = at[_n_resolved(_white(mean, psi[parts.block]), parts, q, sensor) > 0]
+    at = at[_n_resolved(_white(mean, whitener[parts.block]), parts, q, sensor) > 0]
     while len(at):
         parts, mean = cut(at, k[at])
-        r = _n_resolved(_white(mean, psi[at][parts.block]), parts, q[at], sensor)
+        r = _n_resolved(_white(mean, whitener[at][parts.block]), parts, q[at], sensor)
         more = at[r > best[at]]
         if len(more):
             parts, mean = cut(more, k[more])
-            fit = _fitted(mean, parts, q[more], psi[more], sensor=sensor, n_effective=n_effective)
+            fit = _fitted(mean, parts, q[more], sensor, n_effective=n_effective)
             # a strong dimension whose response varies looks like a further one in a larger
-            # sub-block; what leaks of it makes the noise larger
-            larger = ((fit.level - level[more]) / psi[more]).mean(axis=1)
-            leaks = larger > LEAKS / np.sqrt(p * parts.whole)
+            # sub-block; what leaks of it makes the noise of some channels larger
+            noise = (np.abs(np.linalg.inv(whitener[more])) ** 2).sum(axis=2)
+            change = (fit.level - level[more]) / noise
+            leaks = change.mean(axis=1) > LEAKS / np.sqrt(p * parts.whole)
+            leaks |= np.square(change).mean(axis=1) > LEAKS**2 / parts.whole
+            leaks &= best[more] > 0  # without smaller ones, the whole block leaks most
             better = (fit.resolved > best[more]) & ~leaks
-            _read(found, matrix, fit, better)
+            _read(found, matrix, fit, sensor, better)
             here = more[better]
-            level[here], psi[here] = fit.level[better], fit.psi[better]
+            level[here], whitener[here] = fit.level[better], fit.whitener[better]
             best[here] = fit.resolved[better]
         k[at] *= 2
         at = at[(best[at] < q[at]) & (k[at] <= largest[at])]
@@ -313,86 +327,142 @@ def _fitted(
     mean: ComplexArray,
     parts: _Parts,
     q: IntArray,
-    psi: FloatArray,
+    sensor: IntArray,
     *,
     n_effective: float,
-    sensor: IntArray | None = None,
+    resolve: bool = True,
 ) -> _Fit:
-    """Find directions and noise of blocks in a few rounds; no dimension resolved without `sensor`.
+    """Find directions and noise of blocks in a few rounds; no dimension resolved unless asked.
 
     `mean` are the matrices of the sub-blocks.
     """
     p = mean.shape[1]
     own, N, whole = parts.block, parts.averages, parts.whole
-    total = np.einsum("bii->bi", parts.mean(mean)).real
+    a, b = _pairs(sensor)
     column = np.arange(p)[::-1]  # eigenvalues ascend: the leading one is the last
-    r = np.zeros(len(q), np.int64)
+    r, wanted = np.zeros(len(q), np.int64), q
+    # noise at first: what the other sensors do not predict
+    alone = np.linalg.inv(np.where(sensor[:, None] == sensor, np.linalg.inv(mean), 0))
+    alone *= (N / (N - p * (1 - 1 / (sensor[-1] + 1))))[:, None, None]
+    whitener = np.linalg.inv(np.linalg.cholesky(parts.mean(alone)))
     for turn in range(ROUNDS):
-        X = _white(mean, psi[own])
+        X = _white(mean, whitener[own])
         P = np.broadcast_to(np.eye(p, dtype=np.complex128), X.shape)
-        if sensor is not None:
-            r = _n_resolved(X, parts, q, sensor)
+        if resolve:
+            r = _n_resolved(X, parts, wanted, sensor)
             V = np.linalg.eigh(X)[1] * (column < r[own, None])[:, None, :]
             P = P - V @ V.conj().swapaxes(1, 2)
         g = N / (N - r[own])
+        T = parts.mean(g[:, None, None] * (P @ X @ P)) if resolve else X
+        A = np.linalg.eigh(T)[1]
+        q = r + _shown(
+            T, A, parts.mean(P), resolved=r, wanted=wanted, averages=whole, sensor=sensor
+        )
         weak = q - r
         Q = P
         if weak.any():
-            T = X if sensor is None else parts.mean(g[:, None, None] * (P @ X @ P))
-            A = np.linalg.eigh(T)[1] * (column < weak[:, None])[:, None, :]
+            A = A * (column < weak[:, None])[:, None, :]
             PA = P @ A[own]
             gram = A[own].conj().swapaxes(1, 2) @ PA
             unused = (column >= weak[own, None]).astype(float)
             gram += unused[:, :, None] * np.eye(p)
             Q = P - PA @ np.linalg.solve(gram, PA.conj().swapaxes(1, 2))
         loss = 1 + weak / np.maximum(whole - q, 1.0)
-        y = g[:, None] * np.einsum("bij,bij->bi", Q @ X, Q.conj()).real
-        inverse = _inverse(parts.mean(np.abs(Q) ** 2))
-        x = psi * loss[:, None] * np.einsum("bij,bj->bi", inverse, parts.mean(y))
+        y = g[:, None] * (Q @ X @ Q)[:, a, b]
+        coupling = _coupling(Q, a, b)
+        noise = loss[:, None] * _times(_inverse(parts.mean(coupling)), parts.mean(y))
         kept = parts.mean(np.einsum("bii->bi", Q).real)
-        floor = 0.5 * psi / np.maximum(kept, 1e-9) / np.sqrt(whole)[:, None]
-        new = np.maximum(np.maximum(x, floor), _FLOOR * total)
-        step = np.clip(np.log(new / psi), -_STEP, _STEP)
+        floor = 0.5 / np.maximum(kept, 1e-9) / np.sqrt(whole)[:, None]
+        floor = np.maximum(floor, _FLOOR * np.einsum("bii->bi", parts.mean(X)).real)
+        size, axes = _axes(noise, floor, sensor)
+        step = np.clip(np.log(size), -_STEP, _STEP)
         if turn == ROUNDS - 1 or np.abs(step).max() < SETTLED:
             break
-        psi = psi * np.exp(step)
-    noise = np.einsum("bij,bj->bi", _inverse(np.abs(Q) ** 2), y)
+        shorter = (axes * np.exp(-step / 2)[:, None, :]) @ axes.conj().swapaxes(1, 2)
+        whitener = shorter @ whitener
+    # motion that the sensors' agreement does not show may be in the other dimensions
+    n_sensors = sensor[-1] + 1
+    hidden = SHOWN * np.sqrt(2 * _degrees(sensor, q)) / ((1 - 1 / n_sensors) * p * n_sensors)
+    unseen = 1 + UNSEEN * hidden * (1 - q / np.maximum(wanted, 1)) * (wanted > 0)
+    mean_noise = loss[:, None] * parts.mean(_times(_inverse(coupling), y))
+    root: ComplexArray = np.asarray(np.linalg.inv(whitener), np.complex128)
     return _Fit(
         parts=parts,
         projector=Q,
         white=X,
         gain=g * loss[own],
-        left=n_effective * (1 - r[own] / N - weak[own] / whole[own]),
+        left=n_effective * (1 - r[own] / N - weak[own] / whole[own]) / unseen[own],
         resolved=r,
-        psi=psi,
-        level=loss[:, None] * psi * parts.mean(noise),
+        whitener=whitener,
+        level=_times(root[:, :, a] * root[:, :, b].conj(), mean_noise).real,
     )
 
 
-def _read(found: Pooled, matrix: ComplexArray, fit: _Fit, wanted: BoolArray | None = None) -> None:
+def _pairs(sensor: IntArray) -> tuple[IntArray, IntArray]:
+    """Return rows and columns of the elements of the noise matrices of all sensors."""
+    a, b = np.nonzero(sensor[:, None] == sensor)
+    return a, b
+
+
+def _coupling(Q: ComplexArray, a: IntArray, b: IntArray) -> ComplexArray:
+    """Return how elements of the noise appear beside the motion: ``Q_ac conj(Q_bd)``."""
+    return np.asarray(Q[:, a[:, None], a] * Q[:, b[:, None], b].conj())
+
+
+def _times(matrices: ComplexArray, vectors: ComplexArray) -> ComplexArray:
+    return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])
+
+
+def _axes(
+    noise: ComplexArray, floor: FloatArray, sensor: IntArray
+) -> tuple[FloatArray, ComplexArray]:
+    """Return sizes, at least the mean `floor` of a sensor, and axes of the noise of every block.
+
+    `noise` has the elements `_pairs` of whitened noise; the axes are columns, shape (n, p, p).
+    """
+    n, p = floor.shape
+    matrix = np.zeros((n, p, p), np.complex128)
+    a, b = _pairs(sensor)
+    matrix[:, a, b] = noise
+    size, axes = np.empty((n, p)), np.zeros((n, p, p), np.complex128)
+    for i in range(int(sensor[-1]) + 1):
+        of = np.flatnonzero(sensor == i)
+        block = matrix[:, of[:, None], of]
+        w, u = np.linalg.eigh((block + block.conj().swapaxes(1, 2)) / 2)
+        size[:, of] = np.maximum(w, floor[:, of].mean(axis=1, keepdims=True))
+        axes[:, of[:, None], of] = u
+    return size, axes
+
+
+def _read(
+    found: Pooled,
+    matrix: ComplexArray,
+    fit: _Fit,
+    sensor: IntArray,
+    wanted: BoolArray | None = None,
+) -> None:
     """Write noise and cumulants of the bins of some blocks: of all, or of the wanted ones."""
     parts, Q = fit.parts, fit.projector
+    a, b = _pairs(sensor)
     at = np.repeat(np.arange(len(parts.count)), parts.count)
-    psi = fit.psi[parts.block]
-    # y of a bin is linear in its matrix
-    inverse = _inverse(np.abs(Q) ** 2)
+    root = np.linalg.inv(fit.whitener)[parts.block]
+    # noise of a bin is linear in the projected matrix: the weights of its elements
+    weight = (root[:, :, a] * root[:, :, b].conj()) @ _inverse(_coupling(Q, a, b))
     if len(parts.block) == len(parts.first):  # few: directions that all bins of a block share
-        n, p = psi.shape
-        outer = Q.swapaxes(1, 2)[:, :, :, None].conj() * Q.swapaxes(1, 2)[:, :, None, :]
-        s = 1 / np.sqrt(psi)
-        outer *= (s[:, :, None] * s[:, None, :])[:, None]
-        per = ((fit.gain[:, None] * psi)[:, :, None] * inverse) @ outer.reshape(n, p, p * p)
+        n, p = Q.shape[:2]
+        G = Q @ fit.whitener[parts.block]
+        outer = G[:, a, :, None] * G[:, b, None, :].conj()
+        per = fit.gain[:, None, None] * weight @ outer.reshape(n, len(a), p * p)
         flat = matrix[parts.bins].reshape(-1, p * p).view(np.float64)
         of = np.split(flat, parts.start[1:])
         taken = per.conj().view(np.float64).swapaxes(1, 2)
         noise = np.concatenate([some @ by for some, by in zip(of, taken, strict=True)])
     else:
-        white = _white(matrix[parts.bins], psi[at])
-        y = np.einsum("fij,fij->fi", Q[at] @ white, Q[at].conj()).real * fit.gain[at, None]
-        noise = psi[at] * np.einsum("fij,fj->fi", inverse[at], y)
-    projected = Q @ fit.white @ Q * fit.gain[:, None, None]
-    traces = _traces(inverse, projected)
-    scaled = np.stack([traces[m] * psi ** (m + 2) / fit.left[:, None] ** (m + 1) for m in range(3)])
+        white = _white(matrix[parts.bins], fit.whitener[parts.block][at])
+        y = (Q[at] @ white @ Q[at])[:, a, b]
+        noise = fit.gain[at, None] * _times(weight[at], y).real
+    traces = _traces(weight, Q @ fit.white @ Q * fit.gain[:, None, None], sensor)
+    scaled = np.stack([traces[m] / fit.left[:, None] ** (m + 1) for m in range(3)])
     middle = np.add.reduceat(noise, parts.start) / parts.count[:, None]
     cumulants = moved(scaled[:, at], noise - middle[at])
     use = np.ones(len(at), np.bool_) if wanted is None else wanted[parts.block][at]
@@ -400,9 +470,8 @@ def _read(found: Pooled, matrix: ComplexArray, fit: _Fit, wanted: BoolArray | No
     found.cumulants[:, parts.bins[use]] = cumulants[:, use]
 
 
-def _white(matrix: ComplexArray, psi: FloatArray) -> ComplexArray:
-    s = 1 / np.sqrt(psi)
-    return matrix * s[:, :, None] * s[:, None, :]
+def _white(matrix: ComplexArray, whitener: ComplexArray) -> ComplexArray:
+    return np.asarray(whitener @ matrix @ whitener.conj().swapaxes(1, 2))
 
 
 def _n_resolved(X: ComplexArray, parts: _Parts, q: IntArray, sensor: IntArray) -> IntArray:
@@ -442,30 +511,76 @@ def _stand_out(
     return r
 
 
-def _inverse(J: FloatArray) -> FloatArray:
+def _shown(
+    T: ComplexArray,
+    axes: ComplexArray,
+    projector: ComplexArray,
+    *,
+    resolved: IntArray,
+    wanted: IntArray,
+    averages: FloatArray,
+    sensor: IntArray,
+) -> IntArray:
+    """Return how many weak dimensions of each block show: with fewer, sensors agree beyond noise.
+
+    `T` is the whitened mean matrix without resolved dimensions, `axes` are its eigenvectors,
+    ascending, and `projector` is the mean of those that took the resolved dimensions off.
+    """
+    n, p = T.shape[:2]
+    apart = sensor[:, None] != sensor
+    found = wanted - resolved
+    open_ = np.ones(n, np.bool_)
+    rest, without = T, projector
+    for number in range(int(found.max(initial=0))):
+        if number:
+            u = axes[:, :, -number, None]
+            off = np.eye(p) - u @ u.conj().swapaxes(1, 2)
+            rest, without = off @ rest @ off, off @ without @ off
+        size = np.einsum("bii->b", without).real / np.einsum("bii->b", rest).real
+        error = np.abs(rest * size[:, None, None] - without) ** 2
+        degrees = _degrees(sensor, resolved + number)
+        statistic = averages * np.where(apart, error, 0.0).sum(axis=(1, 2))
+        fits = statistic < degrees + SHOWN * np.sqrt(2 * degrees)
+        found = np.where(open_ & fits, np.minimum(found, number), found)
+        open_ &= ~fits
+    return found
+
+
+def _degrees(sensor: IntArray, q: IntArray) -> FloatArray:
+    """Return the degrees of freedom that q dimensions leave between sensors, at least one."""
+    p = len(sensor)
+    left = (p - q) ** 2 - (sensor[:, None] == sensor).sum()
+    return np.asarray(np.maximum(left, 1.0))
+
+
+def _inverse(J: ComplexArray) -> ComplexArray:
     """Invert information matrices, scaled to a unit diagonal."""
-    D = np.sqrt(np.maximum(np.einsum("bii->bi", J), 1e-30))
+    D = np.sqrt(np.maximum(np.einsum("bii->bi", J).real, 1e-30))
     scaled = J / (D[:, :, None] * D[:, None, :]) + 1e-10 * np.eye(J.shape[1])
     return np.asarray(np.linalg.inv(scaled) / (D[:, :, None] * D[:, None, :]))
 
 
-def _traces(inverse: FloatArray, projected: ComplexArray) -> FloatArray:
-    """Return ``tr((M_i X)**k)``, k = 2, 3, 4, of each channel's differential M_i.
+def _traces(weight: ComplexArray, projected: ComplexArray, sensor: IntArray) -> FloatArray:
+    """Return ``tr((C_i Y)**k)``, k = 2, 3, 4, for every channel: shape (3, n, p).
 
-    ``M_i = Q diag(inverse_i) Q``, so that with ``Y = Q X Q``, `projected`, these are the traces of
-    the powers of ``diag(inverse_i) Y``. Shape (3, n, p).
+    The noise of channel i is ``tr(C_i Y)``, with Y, `projected`, the matrix without the motion and
+    C_i, whose elements are `weight`, one block for each sensor.
     """
-    n, p = inverse.shape[:2]
+    n, p = weight.shape[:2]
     step = max(1, _TRACE_BYTES // (16 * p**3))
     parts = [
-        _traces_of_some(inverse[low : low + step], projected[low : low + step])
+        _traces_of_some(weight[low : low + step], projected[low : low + step], sensor)
         for low in range(0, max(n, 1), step)
     ]
     return np.concatenate(parts, axis=1)
 
 
-def _traces_of_some(inverse: FloatArray, projected: ComplexArray) -> FloatArray:
-    B = inverse[:, :, :, None] * projected[:, None]
+def _traces_of_some(weight: ComplexArray, projected: ComplexArray, sensor: IntArray) -> FloatArray:
+    n, p = weight.shape[:2]
+    a, b = _pairs(sensor)
+    C = np.zeros((n, p, p, p), np.complex128)
+    C[:, :, b, a] = weight
+    B = (C + C.conj().swapaxes(2, 3)) / 2 @ projected[:, None]
     twice = B @ B
     return np.stack(
         [

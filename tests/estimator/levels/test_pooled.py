@@ -78,6 +78,43 @@ def test_levels_of_bands_and_bins_are_covered(snr: tuple[float, ...]) -> None:
     assert mean == pytest.approx(1, abs=0.015)
 
 
+@pytest.mark.parametrize(
+    ("sensors", "snr"), [(3, 0.3), (3, 30.0), (8, 0.1), (8, 0.0)], ids=["3", "3", "8", "8"]
+)
+def test_what_the_channels_of_one_sensor_share_is_its_noise(sensors: int, snr: float) -> None:
+    """As by hum, or one noisy element of a symmetric triaxial sensor: no motion is removed."""
+    rng, shared = np.random.default_rng(7), np.array([4.0, 2.0, 0.0])
+    noise = np.eye(3 * sensors, dtype=np.complex128)
+    noise[3:6, 3:6] += np.outer(shared, shared)
+    true, held, ratios = np.diag(noise).real, [], []
+    for _ in range(8):
+        axes = [np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in range(sensors)]
+        H = np.concatenate(axes)
+        csm = np.broadcast_to(snr * H @ H.T + noise, (40, *noise.shape))
+        found = pooled_noise(
+            drawn(rng, csm, 189),
+            np.zeros(40, np.int64),
+            np.full(40, 3),
+            dims=(3,) * sensors,
+            n_effective=189,
+            correlation=ONE,
+        )
+        level = band_levels(found.noise, found.cumulants, np.array([0, 40]), ONE)
+        low, high = level.interval()
+        held.append((low[0] <= true) & (true <= high[0]))
+        ratios.append((level.mean[0] / true)[3:5])
+    assert np.mean(held) > 0.95 - 4 * np.sqrt(0.05 * 0.95 / (24 * sensors))
+    assert np.mean(held, axis=0)[3:5].mean() > 0.7  # a diagonal model holds none of these
+    # eight draws of 7560 averages: 0.4 % standard error
+    np.testing.assert_allclose(np.mean(ratios, axis=0), 1.0, atol=0.02)
+
+
+@pytest.mark.parametrize("snr", [0.0, 0.02, 0.05])
+def test_motion_that_hardly_shows_is_in_the_interval(snr: float) -> None:
+    bands, _, _ = coverage((snr,) * 3, np.ones(9), n=189, draws=8)
+    assert bands > 0.95 - 4 * np.sqrt(0.05 * 0.95 / 72)
+
+
 def test_few_averages_are_covered() -> None:
     bands, bins, _ = coverage((0.3, 0.3), np.ones(6), n=12, draws=20)
     assert bands > 0.95 - 4 * np.sqrt(0.05 * 0.95 / 120)
