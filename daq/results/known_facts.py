@@ -326,7 +326,8 @@ def _rounded_alike(snapshot: Snapshot) -> Iterator[RoundedAlike]:
     noise = next(iter(snapshot.results.values())).noise_psd
     both = (np.where(np.isfinite(noise), each, 0.0) for each in (alike.most, noise))
     part, whole = (np.add.reduceat(each[: edges[-1]], edges[:-1]) for each in both)
-    share = np.max(np.where(part > 0, part / np.maximum(np.abs(whole), part), 0.0), axis=0)
+    largest = np.maximum(np.abs(whole), part)
+    share = np.max(np.where(part > 0, part / np.where(part > 0, largest, 1.0), 0.0), axis=0)
     if (share > MUCH_ROUNDING).any():
         yield RoundedAlike(
             rank=Rank.DELAYS,
