@@ -6,7 +6,7 @@ PEER := tests/peers/async_labjack_peer
 PEER_CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/huddle-tests/async_labjack
 SOURCES := huddle.py daq estimator sim_devices tui tests benchmarks docs examples
 
-.PHONY: demo test test-long peers check bench studies docs session torture clean
+.PHONY: demo test test-long peers check bench studies docs session torture mutants clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -57,6 +57,9 @@ session: $(VENV)/.installed-dev  ## drive a whole test on simulated devices; wri
 
 torture: $(VENV)/.installed-dev  ## kills, power cuts, disk errors, flipped bits; writes docs/validation/torture.md
 	$(BIN)/python -m tests.torture
+
+mutants: $(VENV)/.installed-dev  ## change 200 lines one at a time, and run the tests of each; hours
+	$(BIN)/python -m tests.mutants
 
 clean:
 	rm -rf $(VENV) build docs/_figures .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

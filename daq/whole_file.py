@@ -122,7 +122,7 @@ def replaced(path: Path, *, free: bool = False) -> Iterator[Path]:
         yield part
         put_in_place(part, path, free=free)
     except OSError as error:
-        if error.errno is not None and str(error.filename or part) == str(part):
+        if error.errno is not None and error.filename in {None, part, str(part)}:
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
     finally:
@@ -233,11 +233,7 @@ def create_private(path: Path) -> None:
 def sync_file(path: Path) -> None:
     """Make the contents of a closed file durable over a power loss."""
     # Windows syncs only files open for writing; elsewhere a file may be read-only
-    handle = os.open(path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+    _sync(path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
 
 
 def sync_directory(path: Path) -> None:
@@ -245,11 +241,17 @@ def sync_directory(path: Path) -> None:
     if sys.platform == "win32":
         return
     try:
-        handle = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+        _sync(path, os.O_RDONLY)
     except OSError as error:
         if error.errno not in _NO_FOLDER_SYNC:
             raise
+
+
+def _sync(path: Path, flags: int) -> None:
+    handle = os.open(path, flags)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error  # which it lacks
+    finally:
+        os.close(handle)

@@ -95,3 +95,38 @@ def test_commands_compute_nothing() -> None:
         if name.parts[0] not in ARRAYS_IN and {"numpy", "scipy"} & set(imports):
             computing.add(name.as_posix())
     assert computing == ARRAYS_OF
+
+
+OTHER_WRITERS = {
+    "daq/recording/storage/journal.py": "the hidden copy of a repair, which is verified",
+    "daq/recording/repair.py": "the hidden copy of a repair, which is verified",
+    "daq/formats/readers/packed.py": "unpacked files in a temporary folder",
+    "daq/transport/wire_log.py": "a log that grows while devices are read",
+    "tui/output/console.py": "pipes and devices, and lines that `huddle watch` appends",
+    "tui/service/processes/finish.py": "a file of the kernel",
+    "tui/commands/demo.py": "a bench file in a temporary folder",
+}
+"""Modules that open files for writing, and why not through `daq.whole_file`."""
+
+
+def test_every_derived_file_goes_through_the_writer() -> None:
+    root = Path(__file__).parents[1]
+    writes = re.compile(
+        r"""(?<!formatter)\.write_(text|bytes)\(|\.open\("[wax]|\.open\("r\+|h5py\.File\([^)]*"(w|a|r\+)"
+        |\.savefig\([^,)]*(path|out|png|svg|pdf)\b|os\.(replace|rename)\(|to_netcdf\([a-z]*path""",
+        re.VERBOSE,
+    )
+    sources = {
+        str(each.relative_to(root)): each
+        for part in ("daq", "tui")
+        for each in (root / part).rglob("*.py")
+    }
+    found = {
+        name for name, each in sources.items() if writes.search(each.read_text(encoding="utf-8"))
+    }
+    through = {
+        "daq/whole_file.py",
+        "daq/recording/storage/whole_hdf5.py",
+        "daq/recording/writer.py",
+    }
+    assert found - through == set(OTHER_WRITERS)

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tests.torture import fault_commands
 from tests.torture.bench_files import bench_faults
 from tests.torture.crashes import disk_faults, kill_faults
 from tests.torture.damaged_files import (
@@ -22,6 +23,8 @@ from tests.torture.damaged_files import (
     make_recording,
     tally,
 )
+from tests.torture.faulty_disk import FaultyDisk, library
+from tests.torture.faulty_disk import torture as torture_command
 from tests.torture.long_history import N_RUNS, command_faults, loop_faults, make_history
 from tests.torture.power_cuts import MODELS, faults, recorded, shim
 from tests.torture.service_database import database_faults
@@ -33,6 +36,8 @@ if TYPE_CHECKING:
 
 PAGE = Path(__file__).parents[2] / "docs" / "validation" / "torture.md"
 KILLS, CUTS, DISK_ERRORS = 300, 100, 50
+PLACES, SLOW_PLACES = 1000, 40
+"""Most calls of a command that fail, each in a run of its own, for each kind of fault."""
 CHANGES = {
     "flipped bits": ("bits", 100_000),
     "flipped bits in block tables": ("blocks", 10_000),
@@ -65,6 +70,10 @@ TAIL = """
 - *Disk errors*: from a random call on, once or permanently, `pwrite`, `fsync`, `write` or
   `ftruncate` fails with ENOSPC or EIO. One `pwrite` or `write` that fails must not end the
   recording; otherwise the recorder must end with an error message.
+- *Faults of commands*: of a command, the n-th call that writes, truncates, syncs, renames or
+  closes a file fails with EIO, once or from there on, or with ENOSPC from there on. The result must
+  be that of a run without faults, or the command must end with a message and exit code 3; a file
+  that has its name is complete; no signal ends a process; the next run gives the result.
 - *Flipped bits*: one bit of a closed recording, in 80 % of the cases outside of the samples; one
   bit of a row of a table of blocks; or one of the headers in the global heap of a recording of
   version 1. *Changed sectors*: 512 bytes that become zero, random, or those of another sector.
@@ -147,6 +156,27 @@ def _power_and_disk(share: float, folder: Path) -> Iterator[Row]:
     yield Row("disk errors", n, disk_faults(library, folder, n, seed=2))
 
 
+def _faults(share: float, folder: Path) -> Iterator[Row]:
+    """Let every call of commands fail that changes a file; of devices' commands, a few."""
+    built = library(folder)
+    if built is None:
+        print("no gcc, or not Linux: no faults of commands")
+        return
+    (folder / "inputs").mkdir()
+    with (
+        fault_commands.devices(folder / "inputs") as bench,
+        FaultyDisk(built, folder) as disk,
+    ):
+        made = fault_commands.commands(folder / "inputs")
+        slow = fault_commands.device_commands(bench)
+        for name, command in (made | slow).items():
+            places = _share(SLOW_PLACES if name in slow else PLACES, share)
+            for found in torture_command(disk, command, n_places=places):
+                said = ", ".join(f"{n} {kind}" for kind, n in found.counts.items())
+                remark = f" ({said}; {found.n_calls} calls)"
+                yield Row(f"{name}, {found.fault}", found.n_places, found.wrong, remark)
+
+
 def _changed_files(share: float, folder: Path) -> Iterator[Row]:
     for name, (kind, n_cases) in CHANGES.items():
         yield _changes(name, kind, _share(n_cases, share), folder)
@@ -195,6 +225,7 @@ def _day(share: float, _: Path) -> Iterator[Row]:
 _KINDS = {
     "kills": _kills,
     "power cuts and disk errors": _power_and_disk,
+    "faults of commands": _faults,
     "changed files": _changed_files,
     "database": _database,
     "bench files": _bench_files,

@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
+from datetime import UTC, datetime, timedelta
 from importlib import resources
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pypdf import PdfReader
 from scipy.io import loadmat
 
 from daq.bench.loading import dump
-from daq.devices.bench_file import parse
+from daq.bench.tables.unattended import Schedule, ScheduledRun
+from daq.devices.bench_file import load, parse
 from daq.errors import RecordingError
 from daq.estimation.estimation import estimate
 from daq.recording.reader import Recording
@@ -28,6 +32,11 @@ from daq.recording.storage.journal import journal_path
 from tests.daq.archive import months
 from tests.torture.after_crash import fault_after_repair, last_acknowledged
 from tests.torture.faulty_disk import Command
+from tests.tui.certificate.laboratory import DESPITE, laboratory
+from tui.certificate.ledger import Ledger
+from tui.certificate.verification import JSON_NAME
+from tui.service.records.run_state import RunState
+from tui.service.records.store import RunStore
 from tui.simulation.devices import simulated
 
 if TYPE_CHECKING:
@@ -50,6 +59,7 @@ def commands(inputs: Path) -> dict[str, Command]:
     np.savez(inputs / "counts.npz", sampling_rate=100.0, **counts)
     make_key(inputs / "lab.key")
     killed(inputs / "killed.h5")
+    laboratory(inputs / "laboratory")
 
     def copies(*names: str) -> Callable[[Path], object]:
         return lambda disk: [shutil.copy(inputs / name, disk / name) for name in names]
@@ -113,6 +123,16 @@ def commands(inputs: Path) -> dict[str, Command]:
             )
         ),
         Command(
+            "issue",
+            lambda disk: shutil.copytree(inputs / "laboratory", disk, dirs_exist_ok=True),
+            of(
+                *("issue", "DISK/night.h5", "--by", "Grace Hopper", "--bench", "DISK/bench.toml"),
+                *("--despite", DESPITE),
+            ),
+            _certified,
+            needs_free_name=True,
+        ),
+        Command(
             "report",
             copies("night.h5"),
             of("report", "DISK/night.h5", *options, "--out", "DISK/r.html"),
@@ -165,6 +185,15 @@ def device_commands(bench: Path) -> dict[str, Command]:
     def of(*words: str) -> Callable[[Path], list[str]]:
         return lambda disk: [word.replace("DISK", str(disk)) for word in words]
 
+    def scheduled(disk: Path) -> None:
+        begin = datetime(2026, 3, 1, 12, tzinfo=UTC)
+        runs = tuple(
+            ScheduledRun(name=f"run{number}", at=begin + timedelta(hours=number), duration=12.0)
+            for number in range(3)
+        )
+        served = load(bench).model_copy(update={"schedule": Schedule(runs=runs)})
+        (disk / "bench.toml").write_text(dump(served), encoding="utf-8")
+
     made = [
         Command(
             "record",
@@ -176,10 +205,11 @@ def device_commands(bench: Path) -> dict[str, Command]:
         Command(
             "run",
             lambda _: None,
-            of("run", str(bench), *duration, "--json", "DISK/r.json", "--segment", "2s"),
+            of("run", str(bench), *duration, "--json", "DISK/r.json"),
             _run,
             records="r.h5",
         ),
+        Command("serve", scheduled, of("serve", "DISK/bench.toml"), _served),
     ]
     return {each.name: each for each in made}
 
@@ -238,6 +268,44 @@ def _recorded(disk: Path) -> dict[str, Any]:
     return {"recording": "whole"} if paths and _whole(paths[-1]) else {}
 
 
+def _certified(disk: Path) -> dict[str, Any]:
+    """Return the results in a certificate; it must be in the ledger."""
+    ledger = Ledger(disk / "certificates")
+    paths = list((disk / "certificates").glob("*.pdf"))
+    for path in paths:
+        sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+        if not any(e.sha256 == sha256 and e.state == "issued" for e in ledger.entries()):
+            raise ValueError(f"{path}: not in the ledger")
+    if not paths:
+        return {}
+    attached = PdfReader(paths[-1]).attachments[JSON_NAME][0]
+    return {"certificate": json.loads(attached)["channels"]}
+
+
+def _served(disk: Path) -> dict[str, Any]:
+    """Return whether a service has done a run: recordings whole, and results those of them."""
+    for path in sorted(disk.rglob("[!.]*.h5")):
+        if _whole(path):
+            with Recording.open(path) as recording:
+                stored = recording.results()
+            _check_results([path], stored)
+    store = next(disk.rglob("runs.sqlite"), None)
+    runs = RunStore(store.parent).runs() if store is not None else ()
+    done = [run for run in runs if run.state == RunState.DONE]
+    if store is not None and not all(_whole(store.parent / p) for run in done for p in run.parts):
+        raise ValueError("a run is done, and its recordings are not whole")
+    return {"run": "done"} if done else {}
+
+
+def _check_results(paths: list[Path], stored: dict[Any, Any]) -> None:
+    """Raise an error if stored results are not those of their recordings."""
+    snapshot = estimate(paths) if stored else None
+    for method, (arrays, _) in stored.items():
+        noise = None if snapshot is None else snapshot.results[str(method)].noise_psd
+        if noise is None or not np.array_equal(arrays["noise_psd"], noise, equal_nan=True):
+            raise ValueError("the stored result is not that of the recording")
+
+
 def _run(disk: Path) -> dict[str, Any]:
     """Return what of a run is there: its result must be the estimate of the recordings."""
     found = _recorded(disk)
@@ -247,11 +315,7 @@ def _run(disk: Path) -> dict[str, Any]:
     with Recording.open(paths[-1]) as recording:
         stored = recording.results()
     if stored:
-        snapshot = estimate(paths)
-        for method, (arrays, _) in stored.items():
-            noise = snapshot.results[str(method)].noise_psd
-            if not np.array_equal(arrays["noise_psd"], noise, equal_nan=True):
-                raise ValueError("the stored result is not that of the recording")
+        _check_results(paths, stored)
         found["result"] = sorted(map(str, stored))
     if (disk / "r.json").exists():
         document = json.loads((disk / "r.json").read_text(encoding="utf-8"))

@@ -9,24 +9,32 @@ is not. The same command without faults must give the numbers of the fault-free 
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import errno
 import json
 import mmap
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
+import time
 import traceback
 from collections import Counter
 from dataclasses import dataclass, field
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from tui.service.clock import SystemTime
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
+    from datetime import datetime
 
 FOREVER = 1 << 30
 FAULTS = {
@@ -35,6 +43,8 @@ FAULTS = {
     "ENOSPC": (errno.ENOSPC, True),
 }
 TROUBLE = 3
+_LEAD_S, _SERVED_S = 1.5, 60
+"""Seconds before a run of a service, and for it."""
 _HEAD, _KINDS = 4, 65536
 _CALLS = {"w": "write", "t": "truncate", "s": "fsync", "n": "rename", "c": "close"}
 _NOISE = re.compile(r"Traceback|Exception ignored|error in huddle itself|HDF5-DIAG")
@@ -249,8 +259,6 @@ def _wrong(disk: FaultyDisk, command: Command, plain: Plain, struck: _Struck) ->
         return
     if struck.code != TROUBLE or not struck.said.strip():
         yield "neither right nor refused with a message"
-    if left := [each.name for each in disk.disk.rglob(".*.part")]:
-        yield f"left behind: {left}"
     if missing or not command.needs_free_name:
         yield from _wrong_next(disk, command, plain)
 
@@ -263,8 +271,11 @@ def _wrong_next(disk: FaultyDisk, command: Command, plain: Plain) -> Iterator[st
             yield f"repair: exit {code}: {said[-300:]}"
         return
     code, said = disk.run(command.arguments(disk.disk))
-    if code != plain.code or not _same(command.found(disk.disk), plain.found):
+    is_taken = command.needs_free_name and code in {2, TROUBLE}  # found, or finished by this run
+    if not (code == plain.code or is_taken) or not _same(command.found(disk.disk), plain.found):
         yield f"the next run: exit {code}: {said[-300:]}"
+    if left := [each.name for each in disk.disk.rglob(".*.part")]:
+        yield f"left behind: {left}"
 
 
 def _same(a: Any, b: Any) -> bool:  # noqa: ANN401 - any numbers
@@ -282,7 +293,9 @@ def serve() -> None:
     import daq.archive.task  # noqa: PLC0415 - loaded once
     import daq.recording.repair  # noqa: F401, PLC0415
     import tui.commands.archive  # noqa: PLC0415
-    import tui.commands.estimate  # noqa: F401, PLC0415
+    import tui.commands.estimate  # noqa: PLC0415
+    import tui.service.processes.steps  # noqa: PLC0415
+    import tui.service.service  # noqa: F401, PLC0415
     from tui.commands.main import main  # noqa: PLC0415
 
     for line in sys.stdin:
@@ -334,7 +347,57 @@ def _write(path: Path) -> None:
     os._exit(code)  # as the recorder does
 
 
-PROGRAMS = {"store": _store, "write": _write}
+class _ClockFrom(SystemTime):
+    """Begins at a given time."""
+
+    def __init__(self, begin: datetime) -> None:
+        self._begin = begin - timedelta(seconds=time.monotonic())
+
+    def now(self) -> datetime:
+        """Return the time."""
+        return self._begin + timedelta(seconds=time.monotonic())
+
+    def is_synchronised(self) -> bool:
+        """Return that it is right."""
+        return True
+
+
+def _serve(path: Path) -> None:
+    """Serve a bench from just before its first run that is not over, until it is over."""
+    from daq.devices.bench_file import load  # noqa: PLC0415
+    from daq.errors import HuddleError  # noqa: PLC0415
+    from tui.commands.serve import serve_runs  # noqa: PLC0415
+    from tui.service.records.run_state import RunState  # noqa: PLC0415
+    from tui.service.records.store import RunStore  # noqa: PLC0415
+
+    bench = load(path)
+    store = RunStore(bench.recording_directory)
+    if bench.schedule is None:
+        raise ValueError("no schedule")
+    begins = sorted(run.at for run in bench.schedule.runs if run.at is not None)
+    known = {run.due for run in store.runs() if run.is_over} if store.path.exists() else set()
+    begin = next(at for at in begins if at not in known)
+
+    async def until_over() -> None:
+        clock = _ClockFrom(begin - timedelta(seconds=_LEAD_S))
+        task = asyncio.create_task(serve_runs(path, bench, {}, clock=clock))
+        for _ in range(_SERVED_S * 10):
+            await asyncio.sleep(0.1)
+            with contextlib.suppress(HuddleError):
+                runs = store.runs() if store.path.exists() else ()
+                if task.done() or any(run.due >= begin and run.is_over for run in runs):
+                    break
+        if not task.done():
+            os.kill(os.getpid(), signal.SIGTERM)
+        await task
+
+    asyncio.run(until_over())
+    found = [run for run in store.runs() if run.due == begin]
+    if not found or found[0].state != RunState.DONE:
+        raise HuddleError(", ".join(f"{run.state}: {run.reason}" for run in found) or "no run")
+
+
+PROGRAMS = {"store": _store, "write": _write, "serve": _serve}
 
 
 if __name__ == "__main__":

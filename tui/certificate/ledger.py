@@ -146,8 +146,8 @@ class Ledger:
 
     @property
     def exists(self) -> bool:
-        """Whether there is a ledger."""
-        return self._path.is_file()
+        """Whether there is a ledger: an empty file is of a disk that refused it."""
+        return self._path.is_file() and self._path.stat().st_size > 0
 
     @contextmanager
     def held(self, *, patience: float = PATIENCE) -> Iterator[None]:
@@ -299,7 +299,10 @@ class Ledger:
         return path
 
     def void(self, entry: Entry, why: str) -> None:
-        """Mark a number without a certificate."""
+        """Mark a number without a certificate, unless it has one that lacks only its name."""
+        if self._is_issued(entry):
+            return
+        _part(self.folder / f"{entry.number}-r{entry.revision}.pdf").unlink(missing_ok=True)
         self._add(
             {
                 "kind": "void",
@@ -309,6 +312,10 @@ class Ledger:
                 "why": why,
             }
         )
+
+    def _is_issued(self, entry: Entry) -> bool:
+        key = "issued", entry.number, entry.revision
+        return any(key == (r["kind"], r["number"], r["revision"]) for r, _ in self._records())
 
     def signed_rows(self, wanted: str = "") -> dict[str, int]:
         """Return how many rows each key has signed, by its id.

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from daq.bench.end_condition import EndCondition
 from daq.errors import HuddleError
-from daq.whole_file import create_private, replaced
+from daq.whole_file import create_private, hidden, put_in_place, remove, replaced
 from tui.service.records.run_state import (
     NEXT,
     UNFINISHED,
@@ -391,22 +391,24 @@ class RunStore:
         target = self._copies / f"{day:%Y-%m-%d}.sqlite"
         if target.exists() or not self.path.exists():
             return
+        new = hidden(target)
         try:
             self._copies.mkdir(mode=0o700, exist_ok=True)
-            with replaced(target) as new:
-                create_private(new)
-                with (
-                    contextlib.closing(sqlite3.connect(self.path, timeout=_BUSY)) as source,
-                    contextlib.closing(sqlite3.connect(new)) as copied,
-                ):
-                    # In steps, so that other connections write meanwhile.
-                    source.backup(copied, pages=_STEP, sleep=0.0)
-                if problem := _check(new):
-                    raise sqlite3.DatabaseError(problem)
+            create_private(new)
+            with (
+                contextlib.closing(sqlite3.connect(self.path, timeout=_BUSY)) as source,
+                contextlib.closing(sqlite3.connect(new)) as copied,
+            ):
+                # In steps, so that other connections write meanwhile.
+                source.backup(copied, pages=_STEP, sleep=0.0)
+            if _check(new) == "":
+                put_in_place(new, target)
             for old in self.copies()[COPIES:]:
                 old.unlink()
         except (sqlite3.Error, OSError) as error:
             raise StoreError(f"{target}: the database of runs cannot be copied: {error}") from error
+        finally:
+            remove(new)
 
     def restore(self, now: datetime) -> tuple[Path | None, Path | None]:
         """Move a damaged database away, and put its newest good copy in its place.
