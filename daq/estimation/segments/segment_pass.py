@@ -282,6 +282,7 @@ class Pass:
         """
         if self._undisturbed is None:
             spectra, self._all = self._all, CrossSpectra(self.welch, self.n_channels, threads=1)
+            self._ends = None  # the sums begin again: no parts of time are kept of them
             return spectra
         self._selected = None
         return self._undisturbed.spectra() if last else self._undisturbed.drain()
