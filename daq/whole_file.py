@@ -183,21 +183,48 @@ class RememberingFile(io.FileIO):
     """A file for HDF5, whose first failed write is remembered and not reported.
 
     HDF5 writes some chunks when it frees objects, where nothing can be raised, and can crash after
-    a write that failed. So after a failure all writes appear to succeed; `check` raises it.
+    a write that failed. So after a failure all writes appear to succeed; `check` raises it. What is
+    written then is kept in memory: HDF5 can go around in a circle in what it did not write.
     """
 
     def __init__(self, path: Path, mode: str, permissions: int = _PUBLIC) -> None:
         super().__init__(path, mode, opener=lambda name, flags: os.open(name, flags, permissions))
         self._failure: OSError | None = None
+        self._kept: list[tuple[int, bytes]] = []
 
     def write(self, content: Any, /) -> int:  # noqa: ANN401 - any buffer
         """Write all of the content."""
         view = memoryview(content).cast("B")
+        at = self.tell()
         done = 0
         while done < len(view) and self._failure is None:
             with self._remembered():
                 done += super().write(view[done:]) or 0
+        if self._failure is not None:
+            self._kept.append((at, bytes(view)))
+            self.seek(at + len(view))
         return len(view)
+
+    def readinto(self, buffer: Any, /) -> int:  # noqa: ANN401 - any buffer
+        """Read what was written, whether the disk has it or not."""
+        if self._failure is None:
+            return super().readinto(buffer) or 0
+        view = memoryview(buffer).cast("B")
+        at, n_read = self.tell(), super().readinto(view) or 0
+        view[n_read:] = bytes(len(view) - n_read)
+        for begin, content in self._kept:
+            first, last = max(at, begin), min(at + len(view), begin + len(content))
+            if first < last:
+                view[first - at : last - at] = content[first - begin : last - begin]
+        self.seek(at + len(view))
+        return len(view)
+
+    def seek(self, offset: int, whence: int = 0, /) -> int:
+        """Go to a place; the end is behind all that was written."""
+        if whence == io.SEEK_END and self._kept:
+            end = max(begin + len(content) for begin, content in self._kept)
+            return super().seek(max(end, super().seek(0, io.SEEK_END)) + offset)
+        return super().seek(offset, whence)
 
     def truncate(self, size: int | None = None) -> int:
         """Set the size of the file."""

@@ -57,3 +57,14 @@ def test_no_fault_of_the_disk_loses_what_devices_sent(tmp_path: Path, inputs: Pa
     with devices(inputs) as bench:
         made = device_commands(bench)
         assert wrong(tmp_path, made, dict.fromkeys(made, 2), *FAULTS) == []
+
+
+def test_a_file_is_on_the_disk_before_and_after_it_has_its_name(tmp_path: Path) -> None:
+    """Of each of two files: written, closed, synced, named, and its folder synced."""
+    built = library(tmp_path)
+    if built is None:
+        pytest.skip("no gcc, or not Linux: no call is seen")
+    with FaultyDisk(built, tmp_path) as disk:
+        disk.disk.mkdir()
+        assert disk.run(["sign", "--new-key", str(disk.disk / "key")])[0] == 0
+        assert disk.calls == 2 * "wcsns"
