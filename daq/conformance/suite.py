@@ -58,7 +58,8 @@ LATENCY = 0.3
 EARLY = 0.02
 """Seconds by which it may be earlier: clocks of simulators are read before or after sampling."""
 RATE_ERROR = 0.005
-"""Relative difference between the rate of the device and that of the bench file."""
+"""Relative difference between the rate of the device and that of the bench file, beside the error
+of the clock by which the rate is measured: ``EARLY`` at both ends of the rows."""
 MAX_DRIFT = 0.06
 """Seconds by which the delay of host times may change from the first half of a session to the
 second."""
@@ -416,10 +417,12 @@ def _is_time(slope: float, sensor: Sensor) -> bool:
     return abs(slope * sensor.sampling_rate / 1e9 - 1) <= 0.05
 
 
-def check_rate(sensor: Sensor, rate: float | None, *, source: str = "stated") -> None:
-    """See that a rate, if one is known, is that of the bench file."""
+def check_rate(
+    sensor: Sensor, rate: float | None, *, source: str = "stated", error: float = 0.0
+) -> None:
+    """See that a rate, if one is known with a relative ``error``, is that of the bench file."""
     off = rate / sensor.sampling_rate - 1 if rate is not None else 0.0
-    assert abs(off) <= RATE_ERROR, (
+    assert abs(off) <= RATE_ERROR + error, (
         f"{sensor.name}: {source} rate {rate:.5g} Hz, {off:+.1%} off the bench file's"
     )
 
@@ -480,7 +483,8 @@ def check_truth(
         assert abs(drift) <= MAX_DRIFT, f"{name}: host time runs away by {drift:.3f} s"
     elapsed = sent.due[place[-1]] - sent.due[place[0]]
     if elapsed > 0 and steady:
-        check_rate(sensor, (place[-1] - place[0]) / elapsed, source="measured")
+        rate = (place[-1] - place[0]) / elapsed
+        check_rate(sensor, rate, source="measured", error=2 * EARLY / elapsed)
     return int(place[-1]) + 1
 
 

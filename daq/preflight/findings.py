@@ -89,6 +89,8 @@ class Problem(enum.StrEnum):
     """The bench file has no serial number."""
     NO_FULL_SCALE = "no-full-scale"
     """Neither driver nor data sheet say what the full scale is."""
+    UNCOUNTED = "uncounted"
+    """The device states neither a counter nor times: missing samples would not be seen."""
     UNEVEN = "uneven"
     """Samples arrive too unevenly for the rate to be known well."""
     TOO_FEW_SAMPLES = "too-few-samples"

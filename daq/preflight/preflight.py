@@ -201,6 +201,8 @@ def _rate(each: SensorPreview) -> Iterator[Finding]:
         yield _of(Problem.UNEVEN, each, each.arrival_scatter)
     if each.n_missing > MISSING_SHARE * (n_samples + each.n_missing):
         yield _of(Problem.MISSING, each, each.n_missing)
+    elif not each.is_counted:
+        yield _of(Problem.UNCOUNTED, each)
 
 
 def _clock(each: SensorPreview) -> Iterator[Finding]:

@@ -67,6 +67,8 @@ class SensorPreview:
         Whether a sample reached the end of the range, by the device or by the counts.
     n_missing : int
         Samples missing between the kept ones.
+    is_counted : bool
+        Whether the device states a counter or times that show missing samples.
     trouble : str
         Why the sensor does not deliver, or is not the one in the bench file; empty if it is.
     """
@@ -81,6 +83,7 @@ class SensorPreview:
     limits: CountLimits = field(default_factory=CountLimits)
     is_clipping: bool = False
     n_missing: int = 0
+    is_counted: bool = True
     trouble: str = ""
 
     @classmethod
@@ -112,6 +115,9 @@ class SensorPreview:
             limits=limits,
             is_clipping=bool(limits.clipped)
             or any(BlockFlag.CLIPPED in block.flags for block in blocks),
+            is_counted=any(
+                each.device_counter is not None or each.instants_ns is not None for each in blocks
+            ),
             n_missing=blocks[-1].end_sample - blocks[0].first_sample - len(counts),
             trouble=trouble,
         )

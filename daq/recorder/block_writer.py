@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from collections import defaultdict, deque
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -38,8 +39,13 @@ _ROUTINE = {
 }
 """Kinds of events that are logged as information; all others are warnings."""
 _REPORT_INTERVAL_NS = 1_000_000_000
-MAX_EVENTS_PER_SECOND = 20
-"""Maximum number of events of one kind and sensor written per second."""
+_FORGOTTEN_NS = 60 * _REPORT_INTERVAL_NS
+"""Longest time between two reports of one condition, and time after which it is a new one."""
+_NUMBERS = re.compile(r"\d+")
+MAX_TEXT = 200
+"""Bytes of an event's text."""
+MAX_TEXTS = 20
+"""Texts of one kind and sensor that are told apart: noise on a line has no end of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,31 +121,44 @@ class _Unsafe:
         return rest
 
 
-class _RateLimit:
-    """Limits events of one kind of one sensor: noise on a line must not fill the file."""
+class _Fold:
+    """Folds events of one sensor and kind that say the same, but for their numbers.
+
+    The first is written at once. Later ones are counted, and written together at intervals that
+    double: a condition that lasts for weeks must not fill the file.
+    """
 
     def __init__(self) -> None:
-        self._since_ns = -_REPORT_INTERVAL_NS
+        self._interval_ns = _REPORT_INTERVAL_NS
+        self._reported_ns = 0
+        self._last: Event | None = None
         self._n = 0
 
     def passed(self, event: Event) -> Iterator[Event]:
-        """Yield the events to write now: this one, after the number of omitted ones."""
-        if event.kind == EventKind.MARK:  # a user's remark is never omitted
+        """Yield what is to be written now."""
+        now_ns = event.received.monotonic_ns
+        quiet = self._last is None or now_ns - self._last.received.monotonic_ns > _FORGOTTEN_NS
+        if quiet:
+            yield from self.left_out()
+            self._interval_ns, self._reported_ns = _REPORT_INTERVAL_NS, now_ns
+            self._last = event
             yield event
             return
-        now_ns = event.received.monotonic_ns
-        if now_ns - self._since_ns >= _REPORT_INTERVAL_NS:
-            yield from self.left_out(event)
-            self._since_ns, self._n = now_ns, 0
+        self._last = event
         self._n += 1
-        if self._n <= MAX_EVENTS_PER_SECOND:
-            yield event
+        if now_ns - self._reported_ns >= self._interval_ns:
+            yield from self.left_out()
+            self._interval_ns = min(2 * self._interval_ns, _FORGOTTEN_NS)
+            self._reported_ns = now_ns
 
-    def left_out(self, event: Event) -> Iterator[Event]:
-        """Yield an event with the number of omitted events of this kind, if there are any."""
-        n = self._n - MAX_EVENTS_PER_SECOND
-        if n > 0:
-            yield replace(event, text=f"{n} more events of this kind before")
+    def left_out(self) -> Iterator[Event]:
+        """Yield one event for all that were counted and not written."""
+        if self._last is not None and self._n:
+            seconds = (self._last.received.monotonic_ns - self._reported_ns) * 1e-9
+            times = f", {self._n} times in {max(seconds, 1.0):.0f} s" if self._n > 1 else ""
+            text = self._last.text.encode()[: MAX_TEXT - len(times)].decode(errors="ignore")
+            yield replace(self._last, text=text + times)
+        self._n = 0
 
 
 class BlockWriter:
@@ -169,7 +188,7 @@ class BlockWriter:
             name: _Sensor(rate, thermometers.get(name), speed)
             for name, rate in sampling_rates.items()
         }
-        self._limits: defaultdict[tuple[str, str], _RateLimit] = defaultdict(_RateLimit)
+        self._folds: defaultdict[tuple[str, str], dict[str, _Fold]] = defaultdict(dict)
         self._items: deque[Item] = deque()
         self._reading_times: defaultdict[tuple[str, str], ReadingTimes] = defaultdict(ReadingTimes)
         self._unsafe_events: list[Event | Reading] = []
@@ -260,8 +279,8 @@ class BlockWriter:
                     self._write_gap(name, sensor, gap)
             if not sensor.state.is_lost:
                 sensor.state = SensorState.ENDED
-        for (name, kind), limit in self._limits.items():
-            for event in limit.left_out(Event(name, kind, "", now)):
+        for fold in [one for folds in self._folds.values() for one in folds.values()]:
+            for event in fold.left_out():
                 self._record(event)
         self._record(Event("", EventKind.STOPPED, reason, now))
 
@@ -290,7 +309,14 @@ class BlockWriter:
         return min(s.indexer.next_sample / s.rate for s in self._sensors.values())
 
     def _write_event(self, event: Event) -> None:
-        for passed in self._limits[event.sensor, event.kind].passed(event):
+        if event.kind == EventKind.MARK:  # a user's remark is never omitted
+            self._record(event)
+            return
+        folds = self._folds[event.sensor, event.kind]
+        said = _NUMBERS.sub("", event.text)
+        if said not in folds and len(folds) >= MAX_TEXTS:
+            said = next(reversed(folds))
+        for passed in folds.setdefault(said, _Fold()).passed(event):
             self._record(passed)
 
     def _write_reading(self, reading: Reading) -> None:
@@ -313,7 +339,7 @@ class BlockWriter:
         if sensor.late_event is not None:
             self._write_event(sensor.late_event)
         sensor.state, sensor.late_event = item.state, None
-        self._write_event(item.event)
+        self._record(item.event)  # the state of the sensor follows from it
 
     def _begin_session(self, item: Connected) -> None:
         for name in item.sensors if item.reason else ():

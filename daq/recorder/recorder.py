@@ -16,6 +16,7 @@ import asyncio
 import contextlib
 import logging
 import math
+import shutil
 import signal
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -23,6 +24,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from daq.bench.durations import format_duration
 from daq.devices.bench_file import is_simulated
 from daq.devices.registry import driver_type
 from daq.errors import DeviceError, DiskError, RecordingError
@@ -56,6 +58,8 @@ COMMIT_INTERVAL, MIN_COMMIT_INTERVAL = 1.0, 0.25
 CANCEL_TIMEOUT = CLOSE_TIMEOUT + 2.0
 """Seconds that all connections may take to end."""
 _BATCH_INTERVAL = 0.25
+SPACE_FOR = 3600.0
+"""Seconds of a recording without a duration for which the disk must have room without a warning."""
 MIN_CONTINUATION = 60.0
 """Seconds that a continuation file must last; a disk that fails sooner ends the run."""
 _LAST_BLOCKS = 1.0
@@ -303,6 +307,7 @@ class _Recorder:
         writer = self._new_file(self._path, created=self._started, attributes=attributes)
         writer.event(Event("", EventKind.STARTED, f"{len(ordered)} sensors", self._started))
         _LOGGER.info("recording to %s", self._path, extra={"recording": str(self._path)})
+        self._report_space(ordered, duration)
         rates = {layout.name: layout.sampling_rate for layout in ordered}
         rows = BlockWriter(writer, rates, thermometers, speed=self._clock.speed)
         rows.write(
@@ -392,7 +397,7 @@ class _Recorder:
         now, before = self._clock.now(), self._file
         lasted = (now.monotonic_ns - self._file_started.monotonic_ns) / 1e9
         if before != self._path and lasted < MIN_CONTINUATION:
-            raise error
+            raise DiskError(f"{error}; {self._safe()}") from error
         path = next(each for each in continuation_names(self._path) if not each.exists())
         attributes: dict[str, str | float] = {CONTINUES: writer.run_id}
         following = None
@@ -402,11 +407,30 @@ class _Recorder:
         except RecordingError:
             if following is not None:
                 following.discard()
-            raise error from None
+            raise DiskError(f"{error}; {self._safe()}") from error
         self._file, self._file_started = path, now
         _LOGGER.error("%s; the recording continues in %s", error, path)
         text = f"continues {before.name}, which could no longer be written"
         writer.write([Event("", EventKind.STATUS, text, now)])
+
+    def _safe(self) -> str:
+        """Return how much of each sensor is safe on the disk."""
+        rates = {sensor.name: sensor.sampling_rate for sensor in self._bench.sensors}
+        seconds = [one.samples / rates[name] for name, one in self._status.sensors.items()]
+        return f"{min(seconds, default=0.0):.0f} s of every sensor are safe"
+
+    def _report_space(self, layouts: Sequence[SensorLayout], duration: float | None) -> None:
+        """Log how long the free space lasts, as a warning if that is too short."""
+        wanted = sum(
+            layout.sampling_rate * len(layout.channels) * layout.dtype.itemsize
+            for layout in layouts
+        )
+        with contextlib.suppress(OSError):
+            free = shutil.disk_usage(self._path.absolute().parent).free
+            is_enough = free / wanted >= (SPACE_FOR if duration is None else duration)
+            level = logging.INFO if is_enough else logging.WARNING
+            lasts = format_duration(round(free / wanted))
+            _LOGGER.log(level, "%.0f MB of free space last for %s or longer", free / 1e6, lasts)
 
     def _acknowledge(self, writer: BlockWriter, committed: Committed) -> None:
         sensors = writer.progress(committed)

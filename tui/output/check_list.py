@@ -72,6 +72,8 @@ SENTENCES: Mapping[Problem, str] = {
     " huddle check --write adds it",
     Problem.NO_FULL_SCALE: "not checked, because the bench file has no full scale of {sensor}: give"
     " full_scale in its data_sheet",
+    Problem.UNCOUNTED: "rates as in the bench file; not checked whether samples are missing,"
+    " because {sensor} sends no counter and no times",
     Problem.UNEVEN: "not checked, because the samples of {sensor} arrive unevenly",
     Problem.TOO_FEW_SAMPLES: "not checked, because {sensor} has not sent enough samples",
     Problem.TOO_SLOW: "not checked, because {sensor} is sampled too slowly",
@@ -83,7 +85,7 @@ SENTENCES: Mapping[Problem, str] = {
 MERGED = frozenset(
     {
         Problem.NO_SERIAL_NUMBER, Problem.NOT_IN_FILE, Problem.NO_FULL_SCALE, Problem.UNEVEN,
-        Problem.TOO_FEW_SAMPLES, Problem.TOO_SLOW, Problem.NOT_COMPARABLE,
+        Problem.UNCOUNTED, Problem.TOO_FEW_SAMPLES, Problem.TOO_SLOW, Problem.NOT_COMPARABLE,
     }
 )  # fmt: skip
 """Problems of several sensors that are one line."""

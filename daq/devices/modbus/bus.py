@@ -344,7 +344,7 @@ class ModbusBus:
             address,
             count,
             f"device {device_id}, function {function}, registers {address} to"
-            f" {address + count - 1}",
+            f" {address + count - 1} ({address:#06x} to {address + count - 1:#06x})",
         )
         elapsed_ns = answer.received.monotonic_ns - sent.monotonic_ns
         self._devices[device_id].replied(elapsed_ns * 1e-9 / self._clock.speed)
@@ -371,7 +371,7 @@ class ModbusBus:
 
     async def write(self, device_id: int, address: int, value: int) -> None:
         """Write one register by function 6; raise the errors of :meth:`read`."""
-        text = f"device {device_id}, function 6, register {address} ← {value}"
+        text = f"device {device_id}, function 6, register {address} ({address:#06x}) ← {value}"
         try:
             await self._exchange(device_id, rtu.WRITE_SINGLE, address, value, text)
         except NoAnswerError:

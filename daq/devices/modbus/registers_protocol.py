@@ -175,7 +175,10 @@ class RegisterMap:
 
     def __str__(self) -> str:
         """Return the ranges of registers to read."""
-        return ", ".join(f"{first} to {first + count - 1}" for first, count in self.reads())
+        return ", ".join(
+            f"{first} to {first + count - 1} ({first:#06x} to {first + count - 1:#06x})"
+            for first, count in self.reads()
+        )
 
     def counts(self, registers: NDArray[np.uint16]) -> CountsArray:
         """Decode readings: registers (n, n_needed) → counts (n, n_channels) of :attr:`dtype`."""

@@ -185,7 +185,7 @@ async def test_silent_or_wrong_devices_do_not_hide_others_on_their_port(
     assert len(said) == 2
     assert "'A'" in said[0]
     assert "serial number 'another', got 'A0000007'" in said[0]
-    assert "'Q': expected registers 48 to 52 of device 81" in said[1]
+    assert "'Q': expected registers 48 to 52 (0x0030 to 0x0034) of device 81" in said[1]
 
 
 def test_the_search_is_described() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import re
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from daq.errors import (
     NotConnectedError,
 )
 from daq.protocols.block import Event, EventKind
-from daq.recorder.block_writer import MAX_EVENTS_PER_SECOND
+from daq.recorder.block_writer import MAX_TEXTS
 from daq.recorder.connection import CLOSE_TIMEOUT
 from daq.recorder.recorder import RecorderStatus, record
 from daq.recording.reader import Recording
@@ -340,19 +341,31 @@ async def test_an_event_of_a_device_is_recorded(tmp_path: Path) -> None:
 
 
 async def test_a_device_full_of_events_does_not_fill_the_file(tmp_path: Path) -> None:
+    """Ten events a second for 100 s that say the same, other kinds, and texts without end."""
     run = Run(tmp_path / "r.h5", "a")
     async with run.going():
-        now = run.clock.now()
+        begin = run.clock.now()
+        items = run.device("a").items
         for k in range(1000):
-            run.device("a").items.put_nowait(Event("a", "checksum", f"noise {k}", now))
-        run.device("a").items.put_nowait(Event("a", "status", "another kind", now))
+            at = replace(begin, monotonic_ns=begin.monotonic_ns + k * 10**8)
+            items.put_nowait(Event("a", "refused", f"device busy ({k + 1} so far)", at))
+        items.put_nowait(Event("a", "status", "another kind", begin))
+        for k in range(1000):
+            letters = "".join(chr(97 + int(c)) for c in str(k))
+            items.put_nowait(Event("a", "checksum", f"noise {letters}", begin))
         run.send("a", 0, 100)
         await run.until("a", 100)
     with Recording.open(run.path) as recording:
-        texts = [e.text for e in recording.events if e.sensor == "a" and e.kind != "connected"]
-    expected = [f"noise {k}" for k in range(MAX_EVENTS_PER_SECOND)]
-    assert texts == [
-        *expected,
-        "another kind",
-        f"{1000 - MAX_EVENTS_PER_SECOND} more events of this kind before",
+        events = [e for e in recording.events if e.sensor == "a" and e.kind != "connected"]
+    texts = [e.text for e in events if e.kind == "refused"]
+    assert texts[:4] == [
+        "device busy (1 so far)",
+        "device busy (11 so far), 10 times in 1 s",
+        "device busy (31 so far), 20 times in 2 s",
+        "device busy (71 so far), 40 times in 4 s",
     ]
+    assert len(texts) == 8
+    folded = [re.search(r", (\d+) times", text) for text in texts[1:]]
+    assert sum(int(each[1]) for each in folded if each) == 999
+    assert [e.text for e in events if e.kind == "status"] == ["another kind"]
+    assert len([e for e in events if e.kind == "checksum"]) == MAX_TEXTS + 1
