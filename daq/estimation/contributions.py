@@ -84,6 +84,7 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
         found.append(contribution(Source.GAINS, shape, below=lever, above=lever))
         unknown = (noise.flags & Flag.UNIDENTIFIED) != 0  # anywhere below the bound
         found.append(contribution(Source.STEADY_MOTION, shape, below=np.where(unknown, psd, 0.0)))
+    found += _changes(snapshot, psd)
     faulty = sorted(diagnostics.faulty)
     if faulty:
         below = np.zeros(shape)
@@ -100,6 +101,17 @@ def _counts(snapshot: Snapshot, shape: tuple[int, int]) -> Iterator[Contribution
     if alike is not None and alike.most.any():
         below, above = (np.maximum(n * alike.lacking, 0.0) + MARGIN * alike.most for n in (-1, 1))
         yield contribution(Source.COUNTS, shape, below=below, above=above)
+
+
+def _changes(snapshot: Snapshot, psd: FloatArray) -> list[Contribution]:
+    """Return what responses that change leave of the motion in the noise."""
+    found = snapshot.diagnostics.diagnosis
+    steady = None if found is None else found.stability
+    if steady is None or not steady.changes:
+        return []
+    motion = np.maximum(np.nan_to_num(snapshot.data_psd) - psd, 0.0)
+    below = np.minimum(steady.added * motion, psd)
+    return [contribution(Source.CHANGES, psd.shape, below=below)]
 
 
 def _sensitivities(snapshot: Snapshot, method: str, shape: tuple[int, int]) -> list[Contribution]:
@@ -144,9 +156,9 @@ def with_contributions(snapshot: Snapshot) -> Snapshot:
     """
     found = snapshot.diagnostics.diagnosis
     steady = None if found is None else found.stability
-    inflation = max(1.0, 1.0 if steady is None else steady.inflation)
-    if inflation > 1:
-        scale = np.array([inflation, inflation**2, inflation**3])[:, None, None]
+    if steady is not None and steady.inflation > 1:
+        inflation = steady.inflation_at(snapshot.frequency)
+        scale = np.stack([inflation, inflation**2, inflation**3])[:, :, None]
         results = {
             name: SelfNoise.of(name, each.noise_psd, scale * each.cumulants, each.flags)
             for name, each in snapshot.results.items()

@@ -287,6 +287,7 @@ def diagnosis(
                     neighbours=neighbours(band),
                     vertical=vertical,
                     course=course if len(bands) == 1 else None,
+                    parts=band.parts,
                     maxima=maxima,
                 )
             except InsufficientDataError:

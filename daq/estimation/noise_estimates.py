@@ -126,10 +126,11 @@ def _parts(passes: Sequence[Pass]) -> Parts | None:
         return None
     origin = passes[0].aligned.start_utc_ns
     parts = []
-    for each, of_pass in zip(passes, known, strict=True):
+    for run, (each, of_pass) in enumerate(zip(passes, known, strict=True)):
         later = (each.aligned.start_utc_ns - origin) * 1e-9
         parts += [
-            replace(part, begin=part.begin + later, end=part.end + later) for part in of_pass.each
+            replace(part, begin=part.begin + later, end=part.end + later, run=run)
+            for part in of_pass.each
         ]
     return Parts(known[0].bins, tuple(parts))
 

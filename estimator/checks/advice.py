@@ -48,6 +48,8 @@ class AdviceKind(enum.StrEnum):
     """Single segments differ from all others beyond their common motion."""
     NOISE_CHANGES = "noise-changes"
     """The noise differs between parts of the recording."""
+    RESPONSE_CHANGES = "response-changes"
+    """The gain or the direction of a sensor changes during the recording."""
     MOTION_ACROSS = "motion-across"
     """Sensors of fewer than three channels do not measure motion across their planes or axes."""
     MISSING_DIMENSION = "missing-dimension"
@@ -536,3 +538,34 @@ class NoiseChanges(Advice):
     expected: float
     n_parts: int
     inflation: float
+
+
+@record
+class ResponseChanges(Advice):
+    """The gain or the direction of a sensor changes during the recording.
+
+    Attributes
+    ----------
+    channel : int or None
+        The channel whose gain changes; None: all channels of the sensor.
+    is_turn : bool
+        Whether the sensor turns; its gains otherwise.
+    size : float
+        Change of the gain, as a fraction of the gain before; of a turn in radians.
+    error : float
+        Standard error of the size.
+    begin, end : float
+        Seconds from the start, between which it changes; equal for a step.
+    variance : float
+        Noise that the change adds in the average of all segments, as a fraction of the motion's
+        PSD, for the worst channel.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.RESPONSE_CHANGES
+    channel: int | None
+    is_turn: bool
+    size: float
+    error: float
+    begin: float
+    end: float
+    variance: float

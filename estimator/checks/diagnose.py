@@ -13,7 +13,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.checks.advice import DisturbedSegments, Level, NoiseChanges, Untested
+from estimator.checks.advice import (
+    DisturbedSegments,
+    Level,
+    NoiseChanges,
+    ResponseChanges,
+    Untested,
+)
 from estimator.checks.band import BandDiagnosis
 from estimator.checks.relative_response import (
     PairProducts,
@@ -63,7 +69,9 @@ if TYPE_CHECKING:
 
     from estimator.checks.advice import Advice
     from estimator.checks.stability import SegmentCourse, Stability
+    from estimator.likelihood.goodness_of_fit import BandTest
     from estimator.self_noise.coherency import Coherency
+    from estimator.spectra.parts import Parts
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 NAMED = 5
@@ -74,18 +82,33 @@ LARGE = 0.5
 SMALL = 0.05
 
 
-def changes(stability: Stability, times: FloatArray, sensor_of: IntArray) -> Iterator[Advice]:
-    """Yield advice on disturbed segments, or else on changing noise.
+def changes(
+    stability: Stability, times: FloatArray | None, sensor_of: IntArray
+) -> Iterator[Advice]:
+    """Yield advice on changing responses, and on disturbed segments or else on changing noise.
 
     Parameters
     ----------
     stability : Stability
-    times : float64, shape (n_segments,)
-        Start times of the segments, s.
+    times : float64, shape (n_segments,), or None
+        Start times of the segments, s; None where no segment is disturbed.
     sensor_of : int64, shape (n_channels,)
     """
+    for change in stability.changes:
+        own = sensor_of == change.sensor
+        yield ResponseChanges(
+            level=Level.WARNING,
+            sensors=(change.sensor,),
+            channel=change.channel,
+            is_turn=change.is_turn,
+            size=change.size,
+            error=change.error,
+            begin=change.begin,
+            end=change.end,
+            variance=float(stability.added[own].max()),
+        )
     n_disturbed = len(stability.disturbed)
-    if n_disturbed:
+    if n_disturbed and times is not None:
         level = Level.WARNING if stability.excess >= SMALL else Level.NOTE
         yield DisturbedSegments(
             level=Level.PROBLEM if stability.excess >= LARGE else level,
@@ -99,8 +122,10 @@ def changes(stability: Stability, times: FloatArray, sensor_of: IntArray) -> Ite
         return
     found = stability.parts
     more = np.sqrt(np.maximum(found.deviation**2 - found.expected**2, 0.0))
-    ratio = (found.n_parts - 1) * (found.deviation / found.expected) ** 2
-    seen = ratio > critical_value(found.n_parts - 1, REJECT / ratio.size)
+    tested = int(np.isfinite(found.statistic).sum())
+    if not tested:
+        return
+    seen = found.statistic > critical_value(found.n_parts - 1, REJECT / tested)
     strength = np.where(seen & (more > MATERIAL), more, 0.0)
     if not strength.any():
         return
@@ -113,7 +138,7 @@ def changes(stability: Stability, times: FloatArray, sensor_of: IntArray) -> Ite
         deviation=float(found.deviation[group, channel]),
         expected=float(found.expected[group, channel]),
         n_parts=found.n_parts,
-        inflation=stability.inflation,
+        inflation=float(stability.inflations[group]),
     )
 
 
@@ -183,6 +208,7 @@ def diagnose(
     neighbours: FloatArray | None = None,
     vertical: int | None = None,
     course: SegmentCourse | None = None,
+    parts: Parts | None = None,
     maxima: Maxima | None = None,
 ) -> Diagnostics:
     """Diagnose a huddle test.
@@ -209,8 +235,10 @@ def diagnose(
     vertical : int, optional
         Index of the vertical channel of every sensor, for the horizontal angles.
     course : SegmentCourse, optional
-        Spectra of single segments, all channels: reveal disturbances and changes, for which the
-        tests are then corrected.
+        Spectra of single segments, all channels: reveal disturbances.
+    parts : Parts, optional
+        Averages in parts of time, all channels: reveal changes of noise and of responses. Tests are
+        corrected for changes of the noise.
     maxima : Maxima, optional
         Fits of the same matrices, which are not kept for others.
 
@@ -281,20 +309,30 @@ def diagnose(
             found = tuple(replace(b, shared=_without(b.shared, left)) for b in found)
     between = HANN_HALF if neighbours is None else neighbours
     if isinstance(tested, Maximum) and q >= d:
-        if course is not None:
+        if parts is not None and parts.each:
             steady = stability(
-                course, tested, frequency, n_effective=n_effective, neighbours=between
+                course,
+                parts.of_channels(there.channels),
+                tested,
+                frequency,
+                insides,
+                dims=there.dims,
+                n_effective=n_effective,
+                neighbours=between,
             )
         if steady is not None:
-            steady = steady.among(there.channels, sum(dims))
-            found = tuple(replace(b, test=deflated(b.test, steady.inflation)) for b in found)
+            steady = steady.among(there.channels, there.sensors, sum(dims))
+            found = tuple(
+                replace(b, test=_allowed(b.test, by))
+                for b, by in zip(found, steady.inflations.tolist(), strict=True)
+            )
         shared = shared_noise(
             tested,
             insides,
             dims=there.dims,
             n_effective=n_effective,
             neighbours=between,
-            inflation=1.0 if steady is None else steady.inflation,
+            inflation=1.0 if steady is None else steady.inflations,
         )
         shared = None if shared is None else shared.among(there.channels, sum(dims))
     responses = _responses(csm, given, frequency, there, vertical=vertical, coherence=canonical)
@@ -322,12 +360,28 @@ def diagnose(
             moved=left,
             further=(
                 ()
-                if steady is None or course is None
-                else tuple(changes(steady, course.times, np.repeat(np.arange(len(dims)), dims)))
+                if steady is None
+                else tuple(
+                    changes(
+                        steady,
+                        None if course is None else course.times,
+                        np.repeat(np.arange(len(dims)), dims),
+                    )
+                )
             ),
         ),
         stability=steady,
     )
+
+
+def _allowed(test: BandTest, inflation: float) -> BandTest:
+    """Return the test of a band whose noise changes, not far below its expectation.
+
+    A statistic far below shows that the factor is that of other frequencies: it would let any
+    misfit pass.
+    """
+    most = test.statistic / test.degrees if test.degrees else 1.0
+    return deflated(test, min(inflation, max(1.0, most)))
 
 
 def _without(shared: FloatArray, sensors: frozenset[int]) -> FloatArray:

@@ -107,7 +107,7 @@ def shared_noise(
     dims: tuple[int, ...],
     n_effective: float,
     neighbours: FloatArray,
-    inflation: float = 1.0,
+    inflation: FloatArray | float = 1.0,
 ) -> SharedPairs | None:
     """Find the pairs of channels that share noise.
 
@@ -122,7 +122,7 @@ def shared_noise(
     n_effective : float
     neighbours : float64, shape (n_lags,)
         From `estimator.likelihood.goodness_of_fit.neighbour_correlation`.
-    inflation : float
+    inflation : float64, shape (n_bands,), or float
         Variance of the scores over that for steady noise.
 
     Returns
@@ -137,8 +137,11 @@ def shared_noise(
         pair_scores(maximum, band, n_effective=n_effective, neighbours=neighbours) for band in bands
     ]
     known = [number for number, each in enumerate(found) if each is not None]
+    of_band = np.broadcast_to(inflation, (len(bands),)).tolist()
     scores = {
-        number: each.deflated(inflation) for number, each in enumerate(found) if each is not None
+        number: each.deflated(of_band[number])
+        for number, each in enumerate(found)
+        if each is not None
     }
     if not known:
         return None
@@ -179,7 +182,7 @@ def shared_noise(
         )
     )
     explained = [
-        scores[n].explained(chosen, amount) * inflation if n in of_bands else 0.0
+        scores[n].explained(chosen, amount) * of_band[n] if n in of_bands else 0.0
         for n in range(len(bands))
     ]
     return SharedPairs(

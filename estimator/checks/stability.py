@@ -1,24 +1,39 @@
 """Stability of a test: disturbed segments, and scatter between parts of a recording.
 
-The averages of a fit are divided by time. Channels are whitened by their noise; P is the projector
-on the directions without motion. The residual ``P x`` of an undisturbed segment has the power P_ii
-in every channel. The noise of part b of the recording follows from
-
-    ``ln psi_b - ln psi = J^-1 diag(P S_b P - P)``,   ``J = |P_ij|**2``,
-
-linear in its averages S_b. If the noise is steady, the parts scatter like their averages. If the
-noise changes, they scatter more, and so do the scores of shared noise and the model test.
+Averages of parts of time, of which `estimator.checks.steadiness` has the theory, show whether noise
+and responses are steady. Where the noise changes, scores of shared noise and the model test scatter
+more, by one factor a band. Single segments show disturbances.
 """
 
 from __future__ import annotations
 
+import functools
+import math
+import operator
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimator.checks.steadiness import (
+    BINS_AT_ONCE,
+    FALSE_ALARM,
+    MIN_DEGREES,
+    MIN_PARTS,
+    Levels,
+    Regression,
+    ResponseChange,
+    ResponseScores,
+    grouped,
+    joined_parts,
+    noise_levels,
+    regression,
+    response_change,
+    variance_of_changes,
+)
 from estimator.likelihood import fisher
+from estimator.likelihood.goodness_of_fit import critical_value
 from estimator.likelihood.score_test import usable
 from estimator.median import median
 
@@ -28,10 +43,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from estimator.likelihood.factor_analysis import Maximum
+    from estimator.spectra.parts import Parts
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
-PARTS = 12
-"""Number of compared parts of a recording."""
 MIN_SEGMENTS = 4
 """Minimum number of segments per part."""
 FREQUENCIES = 8
@@ -42,8 +56,10 @@ MAX_DISTURBED = 0.2
 """Maximum share of disturbed segments; with more, the noise changes and no segment is excluded."""
 PAIR_BYTES = 1 << 24
 """Bytes of products of pairs of channels with all others that exist together: 16 MB."""
-SIGNIFICANCE = 2.0
+SIGNIFICANCE = 3.0
 """Standard errors by which scatter must exceed its expectation to be significant."""
+LEAST_DEGREES = 20.0
+"""Degrees of freedom of the noise of a part from which a band is tested."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,27 +91,43 @@ class Scatter:
     Attributes
     ----------
     n_parts : int
-    deviation : float64, shape (n_groups, n_channels)
-    expected : float64, shape (n_groups, n_channels)
+    deviation : float64, shape (n_bands, n_channels)
+        NaN for bands that are not tested.
+    expected : float64, shape (n_bands, n_channels)
         Expected deviation for steady noise.
+    statistic : float64, shape (n_bands, n_channels)
+        Bartlett's, chi-squared with ``n_parts - 1`` degrees for steady noise.
     """
 
     n_parts: int
     deviation: FloatArray
     expected: FloatArray
+    statistic: FloatArray
+
+    @classmethod
+    def of(cls, levels: Sequence[Levels | None], n_channels: int) -> Scatter:
+        """Return the scatter of the levels of each band; NaN where there are none."""
+        unknown = np.full(n_channels, np.nan)
+        return cls(
+            max((len(each.level) for each in levels if each is not None), default=0),
+            np.stack([unknown if each is None else each.deviation for each in levels]),
+            np.stack([unknown if each is None else each.expected for each in levels]),
+            np.stack([unknown if each is None else each.statistic for each in levels]),
+        )
 
     @property
     def typically_expected(self) -> FloatArray:
-        """Return medians of `expected` over the live channels, (n_groups,); NaN without any."""
+        """Return medians of `expected` over the live channels, (n_bands,); NaN without any."""
         rows = [row[np.isfinite(row)] for row in self.expected]
         return np.array([median(row) if len(row) else np.nan for row in rows])
 
     def among(self, channels: Sequence[int], n_channels: int) -> Scatter:
         """Return the same with channels numbered among all, dead ones included."""
-        deviation, expected = np.full((2, len(self.deviation), n_channels), np.nan)
+        deviation, expected, statistic = np.full((3, len(self.deviation), n_channels), np.nan)
         deviation[:, list(channels)] = self.deviation
         expected[:, list(channels)] = self.expected
-        return replace(self, deviation=deviation, expected=expected)
+        statistic[:, list(channels)] = self.statistic
+        return replace(self, deviation=deviation, expected=expected, statistic=statistic)
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,21 +136,25 @@ class Stability:
 
     Attributes
     ----------
-    low, high : float64, shape (n_groups,)
-        Limits of the groups of frequencies, Hz.
+    low, high : float64, shape (n_bands,)
+        First and last frequency of the bands, Hz.
     parts : Scatter
         Scatter between parts of equal length.
     runs : Scatter or None
         Scatter between recordings; None for one recording.
-    inflation : float
+    inflations : float64, shape (n_bands,)
         Variance of the scores of pairs of channels over that for steady noise; 1 unless
         significantly more.
+    changes : tuple of ResponseChange
+        Responses that change, by sensor, the clearest first.
+    added : float64, shape (n_channels,)
+        What these changes add to the noise, as a fraction of the PSD of the motion.
     n_segments : int
         Number of examined segments.
     disturbed : int64, shape (n_disturbed,)
         Indices of the disturbed segments.
     excess : float
-        Noise added by these segments, as a fraction, for the worst group and channel.
+        Noise added by these segments, as a fraction, for the worst band and channel.
     channel : int
         That channel.
     """
@@ -127,27 +163,54 @@ class Stability:
     high: FloatArray
     parts: Scatter
     runs: Scatter | None
-    inflation: float
+    inflations: FloatArray
+    changes: tuple[ResponseChange, ...]
+    added: FloatArray
     n_segments: int
     disturbed: IntArray
     excess: float
     channel: int
 
-    def among(self, channels: Sequence[int], n_channels: int) -> Stability:
-        """Return the same with channels numbered among all, dead ones included."""
+    @property
+    def inflation(self) -> float:
+        """The largest of `inflations`."""
+        return float(self.inflations.max(initial=1.0))
+
+    def inflation_at(self, frequency: FloatArray) -> FloatArray:
+        """Return the inflation at frequencies, shape (n_freqs,); 1 outside of the bands."""
+        place = np.maximum(np.searchsorted(self.low, frequency, side="right") - 1, 0)
+        inside = (frequency >= self.low[place]) & (frequency <= self.high[place])
+        return np.where(inside, self.inflations[place], 1.0)
+
+    def among(self, channels: Sequence[int], sensors: Sequence[int], n_channels: int) -> Stability:
+        """Return the same with channels and sensors numbered among all, dead ones included."""
+        added = np.zeros(n_channels)
+        added[list(channels)] = self.added
         return replace(
             self,
             parts=self.parts.among(channels, n_channels),
             runs=None if self.runs is None else self.runs.among(channels, n_channels),
             channel=channels[self.channel],
+            added=added,
+            changes=tuple(
+                replace(
+                    each,
+                    sensor=sensors[each.sensor],
+                    channel=None if each.channel is None else channels[each.channel],
+                )
+                for each in self.changes
+            ),
         )
 
 
 def stability(
-    course: SegmentCourse,
+    course: SegmentCourse | None,
+    parts: Parts,
     maximum: Maximum,
     frequency: FloatArray,
+    insides: Sequence[BoolArray],
     *,
+    dims: tuple[int, ...],
     n_effective: float,
     neighbours: FloatArray,
 ) -> Stability | None:
@@ -155,11 +218,17 @@ def stability(
 
     Parameters
     ----------
-    course : SegmentCourse
+    course : SegmentCourse or None
+        Single segments, among which disturbed ones are looked for.
+    parts : Parts
     maximum : Maximum
         Maximum of the likelihood for the averages of all segments, at all frequencies.
     frequency : float64, shape (n_freqs,)
         Hz.
+    insides : sequence of bool, shape (n_freqs,)
+        Frequencies of each band.
+    dims : tuple of int
+        Channels of each sensor.
     n_effective : float
         Number of independent averages of all segments.
     neighbours : float64, shape (n_lags,)
@@ -168,47 +237,183 @@ def stability(
     Returns
     -------
     Stability or None
-        None with too few segments or frequencies.
+        None with too few parts or frequencies.
     """
-    there = np.flatnonzero(course.bins < len(frequency))
-    there = there[usable(maximum.take(course.bins[there]), n_effective)]
-    n_segments, bins = len(course.spectra), course.bins[there]
-    n_parts = min(PARTS, n_segments // MIN_SEGMENTS)
-    if n_parts < 3 or len(bins) < FREQUENCIES:
+    good = usable(maximum, n_effective)
+    places = np.flatnonzero(parts.bins < len(frequency))
+    places = places[good[parts.bins[places]]]
+    averages = parts.averages * (n_effective / parts.averages.sum())
+    q = maximum.n_factors
+    groups = grouped(averages, q + max(MIN_DEGREES, maximum.psi.shape[1]))
+    if len(groups) < MIN_PARTS or len(places) < FREQUENCIES:
         return None
-    at = maximum.take(bins)
-    groups = np.array_split(np.arange(len(bins)), len(bins) // FREQUENCIES)
-    residuals = _Residuals(course, there, at, groups)
-    out = _disturbed(residuals)
-    lags = np.abs(bins[:, None] - bins)
-    correlation = np.concatenate([[1.0], neighbours, [0.0]])[np.minimum(lags, len(neighbours) + 1)]
-    numbers, lengths = np.unique(course.runs, return_counts=True)
-    several = len(numbers) > 1 and min(lengths) >= MIN_SEGMENTS
-    divisions = [
-        np.array_split(np.arange(n_segments), n_parts),
-        [np.flatnonzero(~out)] if out.any() else [],
-        [np.flatnonzero(course.runs == run) for run in numbers] if several else [],
-    ]
-    covariances = residuals.covariances(divisions)
-
-    def parts(which: int) -> _Parts:
-        return _Parts(
-            divisions[which], covariances[which], residuals.projector, n_effective, correlation
+    runs = np.array([each.run for each in parts.each])
+    by_run = [np.flatnonzero(runs == run) for run in sorted(set(runs.tolist()))]
+    several = len(by_run) > 1 and all(averages[run].sum() > q + MIN_DEGREES for run in by_run)
+    n_channels = maximum.psi.shape[1]
+    begin = np.array([parts.each[some[0]].begin for some in groups])
+    end = np.array([parts.each[some[-1]].end for some in groups])
+    correlation = np.concatenate([[1.0], neighbours, [0.0]])
+    bands = []
+    for inside in insides:
+        some = places[inside[parts.bins[places]]]
+        bands.append(
+            _band(
+                parts,
+                averages,
+                maximum,
+                some,
+                groups=groups,
+                by_run=by_run if several else [],
+                correlation=correlation,
+                dims=dims,
+            )
         )
-
-    of_parts = parts(0)
-    excess = parts(1).lack(groups) if out.any() else np.zeros((1, residuals.n_channels))
+    if not any(band is not None for band in bands):
+        return None
+    levels = [None if band is None else band.levels for band in bands]
+    changes, added = _changed(bands, dims, begin, end)
+    out, excess = np.zeros(0, np.bool_), np.zeros((1, n_channels))
+    if course is not None and len(course.spectra) >= MIN_SEGMENTS * MIN_PARTS:
+        out, excess = _disturbed_segments(course, maximum, good)
     return Stability(
-        low=frequency[bins[[group[0] for group in groups]]],
-        high=frequency[bins[[group[-1] for group in groups]]],
-        parts=of_parts.scatter(groups),
-        runs=parts(2).scatter(groups) if several else None,
-        inflation=max(of_parts.inflation(), of_parts.inflation_by_level(groups)),
-        n_segments=n_segments,
+        low=np.array([frequency[inside][0] for inside in insides]),
+        high=np.array([frequency[inside][-1] for inside in insides]),
+        parts=Scatter.of(levels, n_channels),
+        runs=(
+            Scatter.of([None if band is None else band.of_runs for band in bands], n_channels)
+            if several
+            else None
+        ),
+        inflations=np.array([1.0 if band is None else band.inflation for band in bands]),
+        changes=changes,
+        added=added,
+        n_segments=parts.n_segments,
         disturbed=np.flatnonzero(out),
         excess=float(excess.max()),
         channel=int(excess.max(axis=0).argmax()),
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Band:
+    """What the parts show of one band."""
+
+    levels: Levels
+    of_runs: Levels | None
+    inflation: float
+    responses: ResponseScores
+
+
+def _band(
+    parts: Parts,
+    averages: FloatArray,
+    maximum: Maximum,
+    places: IntArray,
+    *,
+    groups: Sequence[IntArray],
+    by_run: Sequence[IntArray],
+    correlation: FloatArray,
+    dims: tuple[int, ...],
+) -> _Band | None:
+    """Return what the parts show at some of their frequencies; None where that is too little."""
+    if not len(places):
+        return None
+    n_pieces = -(-len(places) // BINS_AT_ONCE)
+    levels, of_runs, responses = [], [], []
+    scores = _Scores(len(groups), sum(dims))
+    for some in np.array_split(places, n_pieces):
+        bins = parts.bins[some]
+        lags = np.minimum(np.abs(bins[:, None] - bins), len(correlation) - 1)
+        csm, at, own = parts.csm(some), maximum.take(bins), correlation[lags]
+        if not np.isfinite(csm).all():
+            return None
+        found = regression(joined_parts(csm, averages, groups), at)
+        piece = noise_levels(found, own)
+        levels.append(piece)
+        scores.add(found, own)
+        each = ResponseScores(dims, len(groups))
+        each.add(found, own)
+        responses.append(each)
+        if by_run:
+            of_run = regression(joined_parts(csm, averages, by_run), at)
+            of_runs.append(noise_levels(of_run, own))
+    whole = Levels.joined(levels)
+    if np.median(whole.degrees) < LEAST_DEGREES:
+        return None
+    return _Band(
+        whole,
+        Levels.joined(of_runs) if of_runs else None,
+        scores.inflation(whole),
+        functools.reduce(operator.add, responses),
+    )
+
+
+def _changed(
+    bands: Sequence[_Band | None],
+    dims: tuple[int, ...],
+    begin: FloatArray,
+    end: FloatArray,
+) -> tuple[tuple[ResponseChange, ...], FloatArray]:
+    """Return the responses that change, and what this adds as a fraction of the motion's PSD.
+
+    The fraction has the shape (n_channels,).
+
+    Noise that changes, in any channel, scatters the scores more: they are weighted by the part's
+    loudest channel where the noise of the band is not steady.
+    """
+    n_parts = len(begin)
+    total = ResponseScores(dims, n_parts)
+    for band in (each for each in bands if each is not None):
+        unsteady = band.levels.statistic > critical_value(n_parts - 1, FALSE_ALARM)
+        level = np.ones(n_parts)
+        if unsteady.any():
+            level = np.maximum(1.0, band.levels.level[:, unsteady].max(axis=1))
+        total = total + band.responses.weighted(level)
+    added = np.zeros(sum(dims))
+    first = np.cumsum([0, *dims])
+    changes = []
+    left = list(range(len(dims)))
+    taken: list[int] = []
+    while len(left) > 1:
+        tests = {number: total.test(number, taken) for number in left}
+        strength = {
+            number: (chi - df) / math.sqrt(2 * max(df, 1)) for number, (chi, df) in tests.items()
+        }
+        sensor = max(strength, key=lambda each: strength[each])
+        chi, df = tests[sensor]
+        if not (df > 0 and chi > critical_value(df, FALSE_ALARM / len(dims))):
+            break
+        own = total.without(taken)
+        change = response_change(own, sensor, begin, end, int(first[sensor]))
+        changes.append(change)
+        added[first[sensor] : first[sensor + 1]] = variance_of_changes(own, sensor)
+        left.remove(sensor)
+        taken.append(sensor)
+    return tuple(changes), added
+
+
+def _disturbed_segments(
+    course: SegmentCourse, maximum: Maximum, good: BoolArray
+) -> tuple[BoolArray, FloatArray]:
+    """Return which segments are disturbed, and the noise they add, (n_groups, n_channels)."""
+    there = np.flatnonzero(course.bins < len(good))
+    there = there[good[course.bins[there]]]
+    bins = course.bins[there]
+    none = np.zeros(len(course.spectra), np.bool_), np.zeros((1, maximum.psi.shape[1]))
+    if len(bins) < FREQUENCIES:
+        return none
+    at = maximum.take(bins)
+    groups = np.array_split(np.arange(len(bins)), len(bins) // FREQUENCIES)
+    residuals = _Residuals(course, there, at, groups)
+    out = _disturbed(residuals)
+    if not out.any():
+        return none
+    inverse = fisher.covariance(np.abs(residuals.projector) ** 2)
+    own = np.einsum("fpp->fp", residuals.projector).real
+    excess = np.einsum("fpq,fq->fp", inverse, residuals.powers(~out) - own)
+    lack = [1 / np.maximum(1 + excess[group].mean(axis=0), 0.01) - 1 for group in groups]
+    return out, np.stack(lack)
 
 
 class _Residuals:
@@ -250,27 +455,9 @@ class _Residuals:
                 residual[:, place] = x - x @ motion.conj() @ motion.T
             yield residual
 
-    def covariances(self, divisions: Sequence[Sequence[IntArray]]) -> list[FloatArray]:
-        """Return real parts of mean products of channels over each part of several divisions.
-
-        Parameters
-        ----------
-        divisions : sequence of sequence of int64
-            Segments of each part.
-
-        Returns
-        -------
-        list of float64, shape (n_parts, n_bins, n_channels, n_channels)
-        """
-        shape = (len(self._columns), self.n_channels, self.n_channels)
-        found = [np.empty((len(parts), *shape)) for parts in divisions]
-        for group, residual in zip(self._groups, self, strict=True):
-            for parts, covariance in zip(divisions, found, strict=True):
-                for number, some in enumerate(parts):
-                    part = residual[some]
-                    products = np.matmul(part.transpose(1, 2, 0), part.swapaxes(0, 1).conj())
-                    covariance[number, group] = products.real / len(part)
-        return found
+    def powers(self, some: BoolArray) -> FloatArray:
+        """Return mean powers of the residuals over some segments, shape (n_bins, n_channels)."""
+        return np.concatenate([np.mean(np.abs(each[some]) ** 2, axis=0) for each in self])
 
 
 def _disturbed(residuals: Iterable[ComplexArray]) -> BoolArray:
@@ -282,104 +469,62 @@ def _disturbed(residuals: Iterable[ComplexArray]) -> BoolArray:
     return out if out.mean() <= MAX_DISTURBED else np.zeros_like(out)
 
 
-class _Parts:
-    """Parts of the segments, and the noise in them.
+class _Scores:
+    """Products of the noise of two channels in every part, over the frequencies of a band.
 
     Parameters
     ----------
-    parts : sequence of int64
-        Segments of each.
-    covariance : float64, shape (n_parts, n_freqs, n_channels, n_channels)
-        Of the residuals, its real part.
-    projector : complex128, shape (n_freqs, n_channels, n_channels)
-    n_effective : float
-    correlation : float64, shape (n_freqs, n_freqs)
+    n_channels : int
+    n_parts : int
     """
 
-    def __init__(
-        self,
-        parts: Sequence[IntArray],
-        covariance: FloatArray,
-        projector: ComplexArray,
-        n_effective: float,
-        correlation: FloatArray,
-    ) -> None:
-        total = sum(map(len, parts))
-        self._n_parts, self._projector, self._correlation = len(parts), projector, correlation
-        # Independent averages per part, from the mean of the variances.
-        self._averages = n_effective * len(parts) / sum(total / len(part) for part in parts)
-        self._covariance = covariance
-        self._inverse = fisher.covariance(np.abs(projector) ** 2)
-        diagonal = np.einsum("bfpp->bfp", covariance) - np.einsum("fpp->fp", projector).real
-        self._noise = np.einsum("fpq,bfq->bfp", self._inverse, diagonal)
+    def __init__(self, n_parts: int, n_channels: int) -> None:
+        self._i, self._j = np.array(list(combinations(range(n_channels), 2))).T
+        self._n_channels = n_channels
+        n_pairs = len(self._i)
+        self._score = np.zeros((n_parts, n_pairs))
+        self._theory, self._own = np.zeros(n_pairs), np.zeros(n_pairs)
 
-    def scatter(self, groups: list[IntArray]) -> Scatter:
-        """Return the scatter of the noise between parts, and its expectation for steady noise."""
-        root = np.sqrt(np.einsum("fpp->fp", self._inverse) / self._averages)
-        deviation = [self._noise[:, group].mean(axis=1).std(axis=0, ddof=1) for group in groups]
-        expected = [
-            np.sqrt(
-                np.einsum(
-                    "fp,fg,gp->p", root[group], self._correlation[np.ix_(group, group)], root[group]
-                )
-            )
-            / len(group)
-            for group in groups
-        ]
-        return Scatter(self._n_parts, np.stack(deviation), np.stack(expected))
+    def add(self, found: Regression, correlation: FloatArray) -> None:
+        """Add frequencies."""
+        n_freqs = len(found.projector)
+        at_once = max(1, PAIR_BYTES // (16 * n_freqs * self._n_channels))
+        averages = 1 / np.mean(1 / found.averages)
+        own = np.einsum("fpp->fp", found.projector).real
+        inverse = fisher.covariance(np.abs(found.projector) ** 2)
+        noise = np.einsum("fpq,bfq->bfp", inverse, np.einsum("bfpp->bfp", found.covariance) - own)
+        for low in range(0, len(self._i), at_once):
+            some = slice(low, low + at_once)
+            i, j = self._i[some], self._j[some]
+            projector = found.projector
+            with_noise = 2 * (projector[:, :, i].conj() * projector[:, :, j]).real
+            score = 2 * found.covariance[:, :, i, j]
+            score -= np.einsum("bfp,fpa->bfa", noise, with_noise)
+            known = 2 * (projector[:, i, j] ** 2 + projector[:, i, i] * projector[:, j, j]).real
+            known -= np.einsum("fpa,fpq,fqa->fa", with_noise, inverse, with_noise)
+            root = np.sqrt(np.clip(known, 0.0, None))
+            self._score[:, some] += score.sum(axis=1)
+            self._theory[some] += np.einsum("fa,fg,ga->a", root, correlation, root) / averages
+            self._own[some] += known.sum(axis=0)
 
-    def lack(self, groups: list[IntArray]) -> FloatArray:
-        """Return the excess of the noise of all segments over the first part, as a fraction."""
-        return np.stack(
-            [1 / np.maximum(1 + self._noise[0, group].mean(axis=0), 0.01) - 1 for group in groups]
-        )
-
-    def inflation_by_level(self, groups: list[IntArray]) -> float:
-        """Return the variance of products of two channels' noise with jointly changing levels.
-
-        Noise of level l_b in part b has products of variance ``mean(l_b l_b')``; the fit expects
-        the product of the means.
-        """
-        i, j = np.array(list(combinations(range(self._noise.shape[2]), 2))).T
-        found = []
-        for group, steady in zip(groups, self.scatter(groups).expected, strict=True):
-            level = 1 + self._noise[:, group].mean(axis=1)
-            together = (level[:, i] * level[:, j]).mean(axis=0)
-            significant = together > 1 + 2 * SIGNIFICANCE * steady[i] * steady[j]
-            found.append(np.where(significant, together, 1.0))
-        product = np.array(found)
-        # The largest single number would mostly be chance: use means of rows and columns.
-        return float(max(product.mean(axis=0).max(), product.mean(axis=1).max()))
-
-    def inflation(self) -> float:
+    def inflation(self, levels: Levels) -> float:
         """Return the variance of the scores of pairs over that for steady noise.
 
-        Valid for any rate of change of the noise; 1 unless significantly more.
+        Valid for any rate of change of the noise; 1 unless significantly more. Noise of level l_b
+        in part b has products of variance ``mean(l_b l_b')``; the fit expects the product of the
+        means.
         """
-        n_freqs, n_channels, _ = self._projector.shape
-        pairs = np.array(list(combinations(range(n_channels), 2)))
-        at_once = max(1, PAIR_BYTES // (16 * n_freqs * n_channels))
-        parts = [
-            self._pair_scatter(*pairs[low : low + at_once].T)
-            for low in range(0, len(pairs), at_once)
-        ]
-        found, theory, own = (np.concatenate(each, axis=-1) for each in zip(*parts, strict=True))
-        known = own.sum(axis=0) > 0.1 * own.sum(axis=0).max()
-        if not known.any():
-            return 1.0
-        ratio = float(np.mean(found[known] / theory[known]))
+        significant = self._own > 0.1 * max(self._own.max(), np.finfo(np.float64).tiny)
+        n_parts = len(self._score)
+        ratio = 1.0
+        if significant.any():
+            found = self._score.var(axis=0, ddof=1)
+            ratio = float(np.mean(found[significant] / self._theory[significant]))
         # The number of independent scores is about the number of channels.
-        error = float(np.sqrt(2 / ((self._n_parts - 1) * n_channels)))
-        return ratio if ratio > 1 + SIGNIFICANCE * error else 1.0
-
-    def _pair_scatter(self, i: IntArray, j: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the variance of pairs' scores, that for steady noise, and the information."""
-        projector = self._projector
-        with_noise = 2 * (projector[:, :, i].conj() * projector[:, :, j]).real
-        score = 2 * self._covariance[:, :, i, j]
-        score -= np.einsum("bfp,fpa->bfa", self._noise, with_noise)
-        own = 2 * (projector[:, i, j] ** 2 + projector[:, i, i] * projector[:, j, j]).real
-        own -= np.einsum("fpa,fpq,fqa->fa", with_noise, self._inverse, with_noise)
-        root = np.sqrt(np.clip(own, 0.0, None))
-        theory = np.einsum("fa,fg,ga->a", root, self._correlation, root) / self._averages
-        return score.sum(axis=1).var(axis=0, ddof=1), theory, own
+        error = float(np.sqrt(2 / ((n_parts - 1) * self._n_channels)))
+        together = (levels.level[:, self._i] * levels.level[:, self._j]).mean(axis=0)
+        steady = levels.expected[self._i] * levels.expected[self._j]
+        changed = together > 1 + SIGNIFICANCE * steady
+        # The largest single number would mostly be chance.
+        product = float(np.where(changed, together, 1.0).mean())
+        return max(ratio if ratio > 1 + SIGNIFICANCE * error else 1.0, product)

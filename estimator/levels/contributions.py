@@ -55,6 +55,8 @@ class Source(enum.StrEnum):
     """Motion that changes does not identify the noise of two sensors: it is below a bound."""
     COUNTS = "counts"
     """Like channels are rounded to counts alike, and share a part of that."""
+    CHANGES = "changes"
+    """The gain or the direction of the sensor changed: motion is left in its noise."""
     FAULTY = "faulty"
     """The channel is clipped, or was dead for a while: its noise is lower than the estimate."""
     SENSITIVITY = "sensitivity"

@@ -11,12 +11,14 @@ costs a pass no product. In float64 the difference is as exact as the sum.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from estimator.types import ComplexArray, FloatArray, IntArray
 
 MOST = 24
@@ -68,6 +70,9 @@ class Part:
         Independent averages.
     begin, end : float
         Seconds since the start of the first recording.
+    n_segments : int
+    run : int
+        Number of its recording, from 0.
     """
 
     before: FloatArray | None
@@ -76,6 +81,8 @@ class Part:
     averages: float
     begin: float
     end: float
+    n_segments: int = 0
+    run: int = 0
 
     def csm(self, some: slice | IntArray) -> ComplexArray:
         """Return the averages at some of the kept frequencies."""
@@ -108,6 +115,27 @@ class Parts:
     def averages(self) -> FloatArray:
         """Independent averages of each part, shape (n_parts,)."""
         return np.array([part.averages for part in self.each])
+
+    @property
+    def n_segments(self) -> int:
+        """Segments of all parts."""
+        return sum(part.n_segments for part in self.each)
+
+    def of_channels(self, channels: Sequence[int]) -> Parts:
+        """Return the parts of some channels, in ascending order."""
+        own = np.ix_(channels, channels)
+
+        def packed(total: FloatArray | None) -> FloatArray | None:
+            return None if total is None else total[:, own[0], own[1]]
+
+        return Parts(
+            self.bins,
+            tuple(
+                replace(part, before=packed(part.before), after=part.after[:, own[0], own[1]])
+                for part in self.each
+            ),
+            None if self.response is None else self.response[:, list(channels)],
+        )
 
     def csm(self, some: slice | IntArray = slice(None)) -> ComplexArray:
         """Return the matrices of all parts at some of the kept frequencies.

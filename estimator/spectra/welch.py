@@ -293,7 +293,15 @@ class CrossSpectra:
                 last = end * hop + self.settings.segment_length - hop
                 scale = self._density(own)[self.ends.bins]
                 found.append(
-                    Part(before, after, scale, averages, place_before * hop / rate, last / rate)
+                    Part(
+                        before,
+                        after,
+                        scale,
+                        averages,
+                        place_before * hop / rate,
+                        last / rate,
+                        n_segments=own,
+                    )
                 )
             place_before, count_before, before = end, count, after
         return tuple(found)

@@ -29,6 +29,7 @@ from estimator.checks.advice import (
     NoSharedMotion,
     NoSignal,
     NotOrthogonal,
+    ResponseChanges,
     ReversedPolarity,
     Rotated,
     SharedNoise,
@@ -67,12 +68,15 @@ class Names:
     in_use : frozenset of str
         Settings that no advice need recommend: ``auto`` if the dimension is chosen from the data,
         and the methods of the results.
+    start_utc_ns : int
+        UTC of the start; 0: not known.
     """
 
     sensors: tuple[str, ...]
     channels: tuple[str, ...]
     dims: tuple[int, ...]
     in_use: frozenset[str] = frozenset()
+    start_utc_ns: int = 0
 
     @classmethod
     def of(cls, snapshot: Snapshot) -> Names:
@@ -80,7 +84,7 @@ class Names:
         channels = tuple(label.name for label in snapshot.channels)
         chosen = ("auto",) if snapshot.diagnostics.dimensions else ()
         in_use = frozenset((*snapshot.results, *chosen))
-        return cls(snapshot.sensor_names, channels, snapshot.dims, in_use)
+        return cls(snapshot.sensor_names, channels, snapshot.dims, in_use, snapshot.start_utc_ns)
 
     def list_sensors(self, sensors: Sequence[int]) -> str:
         """Return sensors as a list."""
@@ -637,6 +641,47 @@ def _short_changes(advice: NoiseChanges, names: Names) -> str:
     return (
         f"The noise of {names.channels[advice.channel]} changes by {percent(advice.deviation)} at "
         f"{where(advice)}: estimate parts (--start, --end)"
+    )
+
+
+@alert.register(ResponseChanges)
+def _short_response_changes(advice: ResponseChanges, names: Names) -> str:
+    return f"{_response_change(advice, names)}; {_remedy(advice)}"
+
+
+def _response_change(advice: ResponseChanges, names: Names) -> str:
+    """Return what changed, by how much and when."""
+    (sensor,) = (names.sensors[number] for number in advice.sensors)
+    if advice.is_turn:
+        what = f"Sensor {sensor} turned by {math.degrees(abs(advice.size)):.2g}°"
+    else:
+        whose = sensor if advice.channel is None else names.channels[advice.channel]
+        direction = "rose" if advice.size > 0 else "fell"
+        what = f"The gain of {whose} {direction} by {percent(abs(advice.size))}"
+    begin, end = (_clock_time(names, at) for at in (advice.begin, advice.end))
+    return f"{what} at {begin}" if begin == end else f"{what} from {begin} to {end}"
+
+
+def _clock_time(names: Names, seconds: float) -> str:
+    if not names.start_utc_ns:
+        return f"{seconds:.0f} s"
+    return f"{datetime.fromtimestamp(names.start_utc_ns * 1e-9 + seconds, UTC):%H:%M:%S}"
+
+
+def _remedy(advice: ResponseChanges) -> str:
+    return "fix the sensor" if advice.is_turn else "let the sensor settle"
+
+
+@explain.register(ResponseChanges)
+def _responses_change(advice: ResponseChanges, names: Names) -> Explanation:
+    own = names.list_sensors(advice.sensors)
+    return Explanation(
+        f"{_response_change(advice, names)} (standard error "
+        + (f"{math.degrees(advice.error):.1g}°" if advice.is_turn else f"{percent(advice.error)}")
+        + f"). This leaves up to {percent(advice.variance)} of the motion's PSD in the noise of "
+        f"{own}; the interval includes it.",
+        f"{_remedy(advice).capitalize()} and record again, or estimate the time before or after "
+        "(--start, --end).",
     )
 
 

@@ -115,6 +115,7 @@ SOURCE_WORDS: Mapping[Source, str] = {
     Source.AXES: "axes that may be off",
     Source.DIMENSIONS: "the number of dimensions",
     Source.ROUNDING: "matrices in single precision",
+    Source.CHANGES: "a response that changed",
     Source.GAINS: "gains that may follow the loudness",
     Source.STEADY_MOTION: "motion that does not tell noise from motion",
     Source.COUNTS: "rounding that channels share",

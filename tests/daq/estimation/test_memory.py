@@ -13,6 +13,7 @@ from daq.estimation.estimation import bytes_of
 from estimator.checks.stability import SegmentCourse, stability
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.goodness_of_fit import HANN_HALF
+from estimator.spectra.parts import Part, Parts
 from estimator.spectra.welch import SegmentSpectra
 from tests.traced_memory import peak_of
 
@@ -56,9 +57,23 @@ def test_segments_are_divided_without_a_copy_of_all_residuals() -> None:
     times, recording = np.arange(float(n_segments)), np.zeros(n_segments, np.int64)
     course = SegmentCourse(spectra, np.arange(n_kept), times, recording)
     frequency = np.arange(1.0, n_kept + 1)
+    sums = np.einsum("ksfp,ksfq->kfpq", *2 * [exact.reshape(20, 50, n_kept, p)], optimize=True)
+    each = tuple(
+        Part(None, np.where(np.tri(p, dtype=bool), own.real, own.imag), np.ones(n_kept), 25, k, k)
+        for k, own in enumerate(sums / 50)
+    )
 
     def divide() -> None:
-        found = stability(course, maximum, frequency, n_effective=500.0, neighbours=HANN_HALF)
+        found = stability(
+            course,
+            Parts(np.arange(n_kept), each),
+            maximum,
+            frequency,
+            [np.ones(n_kept, np.bool_)],
+            dims=(3, 3, 3),
+            n_effective=500.0,
+            neighbours=HANN_HALF,
+        )
         assert found is not None
 
     assert peak_of(divide) < 2 * spectra.nbytes

@@ -20,6 +20,7 @@ from estimator.checks.advice import (
     NoSharedMotion,
     NoSignal,
     NotOrthogonal,
+    ResponseChanges,
     ReversedPolarity,
     Rotated,
     SharedNoise,
@@ -115,6 +116,34 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
             "add up to 40 % to the noise",
             "--reject",
         ),
+    ),
+    (
+        ResponseChanges(
+            level=Level.WARNING,
+            sensors=(1,),
+            channel=4,
+            is_turn=False,
+            size=-0.05,
+            error=0.0004,
+            begin=420.0,
+            end=420.0,
+            variance=6e-4,
+        ),
+        ("The gain of b.y fell by 5 % at 420 s", "0.06 % of the motion's PSD", "--start"),
+    ),
+    (
+        ResponseChanges(
+            level=Level.WARNING,
+            sensors=(1,),
+            channel=None,
+            is_turn=True,
+            size=8.7e-4,
+            error=5e-5,
+            begin=100.0,
+            end=300.0,
+            variance=2e-7,
+        ),
+        ("Sensor b turned by 0.05° from 100 s to 300 s", "Fix the sensor"),
     ),
     (
         NoiseChanges(

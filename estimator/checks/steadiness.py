@@ -1,0 +1,425 @@
+"""Steadiness of the noise and of the responses, between parts of a recording.
+
+Theory of operation
+-------------------
+Channels are whitened by the noise of the fit. U spans the motion, and P projects on the directions
+beside it. In every part the residual ``P x`` is regressed on ``U* x``:
+
+- What the regression leaves has ``n_k - q`` degrees of freedom of noise, whatever the motion of the
+  part does, and whatever the responses do. So its level tells whether the *noise* is steady, for
+  motion of any strength and colour. Levels are compared by Bartlett's test.
+- The regression itself, ``D_k = P S_k U (U* S_k U)^-1``, is zero but for its scatter if *responses*
+  are steady. The response ``1 + G_k`` of one sensor moves it to ``P G_k U``. Given ``U* x``,
+  ``D_k`` is exactly normal. Its score for a real matrix ``G_k``, equal at all frequencies of a
+  band, is compared with the information, for each sensor.
+
+What could break the first test is motion of more dimensions than the fit has: it is noise to both.
+What could break the second is noise that follows the motion, such as distortion.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.likelihood import fisher
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from estimator.likelihood.factor_analysis import Maximum
+    from estimator.types import ComplexArray, FloatArray, IntArray
+
+MIN_PARTS = 3
+MIN_DEGREES = 2.0
+"""Averages of a part beyond those that its regression takes, at least."""
+BINS_AT_ONCE = 48
+SMALLEST_LEVEL = 1e-3
+"""Of the noise of a part: estimates of few averages may be negative."""
+FALSE_ALARM = 2e-3
+"""Probability that steady responses of any sensor are found to change."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Divided:
+    """Averages of parts of time at some frequencies, few enough that each part has averages.
+
+    Attributes
+    ----------
+    csm : complex128, shape (n_parts, n_bins, n_channels, n_channels)
+    averages : float64, shape (n_parts,)
+    """
+
+    csm: ComplexArray
+    averages: FloatArray
+
+
+def grouped(averages: FloatArray, least: float) -> list[IntArray]:
+    """Return neighbouring parts that are joined, so that each group has `least` averages."""
+    groups: list[list[int]] = [[]]
+    total = 0.0
+    for number, own in enumerate(averages.tolist()):
+        if total >= least:
+            groups.append([])
+            total = 0.0
+        groups[-1].append(number)
+        total += own
+    if total < least and len(groups) > 1:
+        groups[-2:] = [groups[-2] + groups[-1]]
+    return [np.array(each) for each in groups]
+
+
+def joined_parts(csm: ComplexArray, averages: FloatArray, groups: Sequence[IntArray]) -> Divided:
+    """Return the averages of groups of parts."""
+    sums = [averages[some].sum() for some in groups]
+    means = [
+        np.tensordot(averages[some] / total, csm[some], axes=1)
+        for some, total in zip(groups, sums, strict=True)
+    ]
+    return Divided(np.stack(means), np.array(sums))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Regression:
+    """Residuals of some frequencies in every part, regressed on the motion of the part.
+
+    Attributes
+    ----------
+    covariance : float64, shape (n_parts, n_bins, n_channels, n_channels)
+        Real part, whose expectation is the projector if the noise is steady.
+    coefficients : complex128, shape (n_parts, n_bins, n_channels, n_factors)
+        ``D_k``.
+    motion : complex128, shape (n_parts, n_bins, n_factors, n_factors)
+        ``n_k U* S_k U``.
+    directions : complex128, shape (n_bins, n_channels, n_factors)
+        U.
+    projector : complex128, shape (n_bins, n_channels, n_channels)
+    averages : float64, shape (n_parts,)
+        Of each part, less those of its regression.
+    scale : float64, shape (n_bins, n_channels)
+        From units to whitened channels.
+    """
+
+    covariance: FloatArray
+    coefficients: ComplexArray
+    motion: ComplexArray
+    directions: ComplexArray
+    projector: ComplexArray
+    averages: FloatArray
+    scale: FloatArray
+
+
+def regression(parts: Divided, at: Maximum) -> Regression:
+    """Regress the residuals of every part on its motion."""
+    n, q = parts.averages, at.n_factors
+    U = at.eigenvectors
+    share = (np.abs(U) ** 2 @ at.eigenvalues[:, :, None])[:, :, 0]
+    fitted = np.einsum("fpp->fp", at.rest).real + share
+    weight = n / n.sum()
+    power = np.einsum("k,kfpp->fp", weight, parts.csm).real
+    scale = np.sqrt(fitted / power)
+    S = parts.csm * scale[:, :, None] * scale[:, None, :]
+    SU = S @ U
+    across = U.conj().swapaxes(1, 2) @ SU
+    across = (across + across.conj().swapaxes(2, 3)) / 2
+    beside = at.projector
+    PSU = beside @ SU
+    D = np.linalg.solve(across.swapaxes(2, 3), PSU.swapaxes(2, 3)).swapaxes(2, 3)
+    left = (beside @ S @ beside - D @ PSU.conj().swapaxes(2, 3)).real
+    free = (n - q) / n
+    return Regression(
+        covariance=left / free[:, None, None, None],
+        coefficients=D,
+        motion=n[:, None, None, None] * across,
+        directions=U,
+        projector=beside,
+        averages=n - q,
+        scale=scale,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Levels:
+    """Noise of parts as a fraction of the mean, over some frequencies.
+
+    Attributes
+    ----------
+    level : float64, shape (n_parts, n_channels)
+    degrees : float64, shape (n_parts, n_channels)
+        Complex degrees of freedom: the variance of a level is their inverse.
+    """
+
+    level: FloatArray
+    degrees: FloatArray
+
+    @classmethod
+    def joined(cls, pieces: Sequence[Levels]) -> Levels:
+        """Return the mean over pieces of a band, of as many frequencies each."""
+        inverse = np.mean([1 / each.degrees for each in pieces], axis=0) / len(pieces)
+        return cls(np.mean([each.level for each in pieces], axis=0), 1 / inverse)
+
+    @property
+    def statistic(self) -> FloatArray:
+        """Return Bartlett's statistic, chi-squared with n_parts - 1 degrees; (n_channels,)."""
+        nu, level = self.degrees, np.maximum(self.level, SMALLEST_LEVEL)
+        total = nu.sum(axis=0)
+        mean = (nu * level).sum(axis=0) / total
+        found = 2 * (total * np.log(mean) - (nu * np.log(level)).sum(axis=0))
+        more = ((1 / (2 * nu)).sum(axis=0) - 1 / (2 * total)) / (3 * (len(nu) - 1))
+        return np.asarray(found / (1 + more))
+
+    @property
+    def deviation(self) -> FloatArray:
+        """Return the standard deviation between parts, shape (n_channels,)."""
+        return np.asarray(self.level.std(axis=0, ddof=1))
+
+    @property
+    def expected(self) -> FloatArray:
+        """Return that of steady noise, shape (n_channels,)."""
+        return np.asarray(np.sqrt(np.mean(1 / self.degrees, axis=0)))
+
+
+def noise_levels(found: Regression, correlation: FloatArray) -> Levels:
+    """Return the noise of every part; `correlation` of bins has the shape (n_bins, n_bins)."""
+    inverse = fisher.covariance(np.abs(found.projector) ** 2)
+    own = np.einsum("fpp->fp", found.projector).real
+    excess = np.einsum("kfpp->kfp", found.covariance) - own
+    noise = np.einsum("fpq,kfq->kfp", inverse, excess)
+    root = np.sqrt(np.einsum("fpp->fp", inverse))
+    variance = np.einsum("fp,fg,gp->p", root, correlation, root) / len(root) ** 2
+    return Levels(1 + noise.mean(axis=1), found.averages[:, None] / variance)
+
+
+class ResponseScores:
+    """Scores of changes of every sensor's response in every part, summed over frequencies.
+
+    Parameters
+    ----------
+    dims : tuple of int
+    n_parts : int
+    """
+
+    def __init__(self, dims: tuple[int, ...], n_parts: int) -> None:
+        edges = np.cumsum([0, *dims])
+        pairs = [
+            (a, b)
+            for low, high in itertools.pairwise(edges)
+            for a in range(low, high)
+            for b in range(low, high)
+        ]
+        self._to, self._from = np.array(pairs).T
+        squares = np.cumsum([0, *(d * d for d in dims)])
+        self.of_sensor = [slice(low, high) for low, high in itertools.pairwise(squares)]
+        n = len(pairs)
+        self.score, self.information = np.zeros((n_parts, n)), np.zeros((n_parts, n, n))
+        self.dims = dims
+
+    def add(self, found: Regression, correlation: FloatArray) -> None:
+        """Add frequencies."""
+        a, b = self._to, self._from
+        U, P, s = found.directions, found.projector, found.scale
+        ratio = s[:, a] / s[:, b]
+        DWU = found.coefficients @ found.motion @ U.conj().swapaxes(1, 2)
+        score = (ratio * DWU[:, :, a, b].real).sum(axis=1)
+        M = U @ found.motion @ U.conj().swapaxes(1, 2)
+        PP = P[:, a[:, None], a] * (ratio[:, :, None] * ratio[:, None, :])
+        # variance of the score, with neighbours correlated, over the independent one
+        more = float(correlation.sum() / len(correlation))
+        for k in range(len(self.score)):
+            turned = M[k][:, b, :][:, :, b].swapaxes(1, 2)  # [f, (a,b), (c,e)] = M[e, b]
+            information = np.einsum("fij,fij->ij", PP, turned).real
+            weight = 2 / more
+            self.score[k] += weight * score[k]
+            self.information[k] += weight * information
+
+    def sensor(self, sensor: int) -> tuple[FloatArray, FloatArray]:
+        """Return score (n_parts, d*d) and information (n_parts, d*d, d*d) of a sensor."""
+        own = self.of_sensor[sensor]
+        return self.score[:, own], self.information[:, own, own]
+
+    def _like(self, score: FloatArray, information: FloatArray) -> ResponseScores:
+        found = ResponseScores(self.dims, len(score))
+        found.score, found.information = score, information
+        return found
+
+    def __add__(self, other: ResponseScores) -> ResponseScores:
+        return self._like(self.score + other.score, self.information + other.information)
+
+    def weighted(self, level: FloatArray) -> ResponseScores:
+        """Return the scores where the noise has `level` in each part, shape (n_parts,)."""
+        return self._like(self.score / level[:, None], self.information / level[:, None, None])
+
+    def without(self, sensors: Sequence[int]) -> ResponseScores:
+        """Return what is left of the scores after the changes of some sensors are fitted."""
+        if not sensors:
+            return self
+        own = np.concatenate([np.arange(self.score.shape[1])[self.of_sensor[i]] for i in sensors])
+        score, information = self.score.copy(), self.information.copy()
+        for k, each in enumerate(self.information):
+            inverse = np.linalg.pinv(each[np.ix_(own, own)], rcond=1e-9, hermitian=True)
+            taken = each[:, own] @ inverse
+            score[k] -= taken @ self.score[k, own]
+            information[k] -= taken @ each[own]
+        return self._like(score, information)
+
+    def test(self, sensor: int, known: Sequence[int] = ()) -> tuple[float, float]:
+        """Return chi-squared and degrees of a sensor, beside those known to change."""
+        return _chi_squared(*self.without(known).sensor(sensor))
+
+
+def _chi_squared(score: FloatArray, information: FloatArray) -> tuple[float, float]:
+    total = information.sum(axis=0)
+    if not np.isfinite(total).all():
+        return math.nan, math.nan
+    basis = _basis(total)
+    statistic, rank = 0.0, -basis.shape[1]
+    for s, each in zip(score, information, strict=True):
+        values, vectors = np.linalg.eigh(basis.T @ each @ basis)
+        known = values > 1e-9  # of one
+        along = vectors[:, known].T @ (basis.T @ s)
+        statistic += float(np.sum(along**2 / values[known]))
+        rank += int(known.sum())
+    return statistic, float(rank)
+
+
+def _basis(total: FloatArray) -> FloatArray:
+    """Return a basis in which the information of all parts is 1."""
+    root = np.sqrt(np.maximum(np.diag(total), np.finfo(np.float64).tiny))
+    values, vectors = np.linalg.eigh(total / root[:, None] / root)
+    known = values > 1e-9 * values[-1]
+    return np.asarray(vectors[:, known] / np.sqrt(values[known]) / root[:, None])
+
+
+@dataclass(frozen=True, slots=True)
+class ResponseChange:
+    """A change of a sensor's response.
+
+    Attributes
+    ----------
+    sensor : int
+    channel : int or None
+        Channel whose gain changes; None: all channels of the sensor.
+    is_turn : bool
+        Whether the sensor turns.
+    size : float
+        Change of the gain over the gain before, or radians.
+    error : float
+        Standard error of the size.
+    begin, end : float
+        Seconds from the start: between these it changes. Equal to within a part: a step.
+    is_step : bool
+    deviation : float
+        Standard deviation of the response over the recording, relative to the mean.
+    statistic, degrees : float
+        Chi-squared statistic of the test, and its degrees of freedom.
+    """
+
+    sensor: int
+    channel: int | None
+    is_turn: bool
+    size: float
+    error: float
+    begin: float
+    end: float
+    is_step: bool
+    deviation: float
+    statistic: float
+    degrees: float
+
+
+def _patterns(d: int) -> list[tuple[int | None, bool, FloatArray]]:
+    """Return gains of all channels, of each, and turns: unit matrices, flattened."""
+    found: list[tuple[int | None, bool, FloatArray]] = [(None, False, np.eye(d).reshape(1, -1))]
+    if d > 1:
+        found += [(a, False, np.eye(d * d)[[a * d + a]]) for a in range(d)]
+        turns = []
+        for a in range(d):
+            for b in range(a + 1, d):
+                turn = np.zeros((d, d))
+                turn[a, b], turn[b, a] = 1, -1
+                turns.append(turn.reshape(-1))
+        found.append((None, True, np.array(turns)))
+    return found
+
+
+def _courses(n: int) -> list[tuple[bool, int, int, FloatArray]]:
+    """Return steps and ramps from part `begin` to part `end`, from 0 to 1."""
+    place = np.arange(n)
+    steps = [(True, at, at, (place >= at).astype(float)) for at in range(1, n)]
+    ramps = [
+        (False, low, high, np.clip((place - low + 0.5) / (high - low), 0, 1))
+        for low in range(n - 2)
+        for high in range(low + 3, n + 1)
+    ]
+    return steps + ramps
+
+
+def response_change(
+    scores: ResponseScores, sensor: int, begin: FloatArray, end: FloatArray, first_channel: int
+) -> ResponseChange:
+    """Return the one change of a sensor's response that explains most of its scores."""
+    score, information = scores.sensor(sensor)
+    statistic, degrees = _chi_squared(score, information)
+    d = scores.dims[sensor]
+    best: tuple[float, tuple[int | None, bool, FloatArray], tuple[bool, int, int, FloatArray]]
+    best, size, error = (-math.inf, _patterns(d)[0], _courses(len(score))[0]), 0.0, math.inf
+    total = information.sum(axis=0)
+    for pattern in _patterns(d):
+        rows = pattern[2]
+        for course in _courses(len(score)):
+            c = course[3]
+            # The mean of the response over the recording is that of the fit.
+            own = np.tensordot(c, information, axes=1)
+            middle = rows @ (
+                np.tensordot(c**2, information, axes=1) - own @ np.linalg.pinv(total) @ own
+            )
+            fisher_ = middle @ rows.T
+            along = rows @ (c @ score)
+            size_here = np.linalg.pinv(fisher_, hermitian=True) @ along
+            explained = float(along @ size_here)
+            gained = explained - 4 * len(rows) - (0 if course[0] else 4)
+            if gained > best[0]:
+                best = (gained, pattern, course)
+                length = float(np.linalg.norm(size_here))
+                size = length if pattern[1] else float(size_here[0])
+                error = math.sqrt(max(0.0, float(np.trace(np.linalg.pinv(fisher_)))) / len(rows))
+    _, (channel, is_turn, _), (is_step, low, high, c) = best
+    weight = np.einsum("kii->k", information)
+    weight = weight / weight.sum()
+    mean = float(weight @ c)
+    before = 1 - mean * size  # gains are relative to the mean
+    return ResponseChange(
+        sensor=sensor,
+        channel=None if channel is None else first_channel + channel,
+        is_turn=is_turn,
+        size=size if is_turn else size / before,
+        error=error,
+        begin=float(begin[low]),
+        end=float(begin[low] if is_step else end[high - 1]),
+        is_step=is_step,
+        deviation=abs(size) * math.sqrt(float(weight @ (c - mean) ** 2)),
+        statistic=statistic,
+        degrees=degrees,
+    )
+
+
+def variance_of_changes(scores: ResponseScores, sensor: int) -> FloatArray:
+    """Return the variance of a sensor's response between parts, shape (d,).
+
+    As a fraction of the PSD of motion that is alike in all its channels: without what the scatter
+    of the scores adds, and 0 at least.
+    """
+    score, information = scores.sensor(sensor)
+    d = scores.dims[sensor]
+    weight = np.einsum("kii->k", information)
+    added = np.zeros(d)
+    for s, each, share in zip(score, information, weight / weight.sum(), strict=True):
+        inverse = np.linalg.pinv(each, rcond=1e-9, hermitian=True)
+        g = (inverse @ s).reshape(d, d)
+        spread = np.diag(inverse).reshape(d, d)
+        added += share * (g**2 - spread).sum(axis=1)
+    return np.maximum(added, 0.0)
