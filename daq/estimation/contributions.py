@@ -78,12 +78,7 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
         above = taken if source is Source.SHARED_NOISE else 0.0
         if share.any() or np.any(above):
             found.append(contribution(source, shape, above=above, share=share[:, None]))
-    changing = diagnostics.multi_part
-    if changing is not None and method == "multi-part":
-        lever = np.nan_to_num(changing.lever)
-        found.append(contribution(Source.GAINS, shape, below=lever, above=lever))
-        unknown = (noise.flags & Flag.UNIDENTIFIED) != 0  # anywhere below the bound
-        found.append(contribution(Source.STEADY_MOTION, shape, below=np.where(unknown, psd, 0.0)))
+    found += _by_motion_that_changes(snapshot, method, psd)
     found += _changes(snapshot, psd)
     faulty = sorted(diagnostics.faulty)
     if faulty:
@@ -93,6 +88,20 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
     if snapshot.sensitivities:
         found += _sensitivities(snapshot, method, shape)
     return tuple(found)
+
+
+def _by_motion_that_changes(snapshot: Snapshot, method: str, psd: FloatArray) -> list[Contribution]:
+    """Return what may be wrong with the noise of two sensors."""
+    changing = snapshot.diagnostics.multi_part
+    if changing is None or method != "multi-part":
+        return []
+    lever = np.nan_to_num(changing.lever)
+    # anywhere below the bound
+    unknown = (snapshot.results[method].flags & Flag.UNIDENTIFIED) != 0
+    return [
+        contribution(Source.GAINS, psd.shape, below=lever, above=lever),
+        contribution(Source.STEADY_MOTION, psd.shape, below=np.where(unknown, psd, 0.0)),
+    ]
 
 
 def _counts(snapshot: Snapshot, shape: tuple[int, int]) -> Iterator[Contribution]:

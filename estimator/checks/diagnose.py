@@ -126,7 +126,9 @@ def changes(
     if not tested:
         return
     seen = found.statistic > critical_value(found.n_parts - 1, REJECT / tested)
-    strength = np.where(seen & (more > MATERIAL), more, 0.0)
+    # Within the part of a step, motion is left in the noise of a sensor whose response changes.
+    named = np.isin(sensor_of, [each.sensor for each in stability.changes])
+    strength = np.where(seen & (more > MATERIAL) & ~named, more, 0.0)
     if not strength.any():
         return
     group, channel = np.unravel_index(int(strength.argmax()), strength.shape)

@@ -58,7 +58,7 @@ PAIR_BYTES = 1 << 24
 """Bytes of products of pairs of channels with all others that exist together: 16 MB."""
 SIGNIFICANCE = 3.0
 """Standard errors by which scatter must exceed its expectation to be significant."""
-LEAST_DEGREES = 20.0
+LEAST_DEGREES = 8.0
 """Degrees of freedom of the noise of a part from which a band is tested."""
 
 
@@ -522,9 +522,8 @@ class _Scores:
             ratio = float(np.mean(found[significant] / self._theory[significant]))
         # The number of independent scores is about the number of channels.
         error = float(np.sqrt(2 / ((n_parts - 1) * self._n_channels)))
-        together = (levels.level[:, self._i] * levels.level[:, self._j]).mean(axis=0)
-        steady = levels.expected[self._i] * levels.expected[self._j]
-        changed = together > 1 + SIGNIFICANCE * steady
-        # The largest single number would mostly be chance.
-        product = float(np.where(changed, together, 1.0).mean())
+        level = levels.level / levels.level.mean(axis=0)
+        square = (level**2).mean(axis=0)  # of like noise, the product
+        changed = square > 1 + SIGNIFICANCE * levels.expected**2
+        product = float(np.where(changed, square, 1.0).max())
         return max(ratio if ratio > 1 + SIGNIFICANCE * error else 1.0, product)

@@ -40,6 +40,12 @@ MIN_DEGREES = 2.0
 BINS_AT_ONCE = 48
 SMALLEST_LEVEL = 1e-3
 """Of the noise of a part: estimates of few averages may be negative."""
+SHARES = (0.0, 0.25, 0.5, 0.75)
+"""Of a part, after which a step is looked for."""
+RAMP = 4
+"""Parts of a ramp, at least."""
+COST = 4.0
+"""Of each parameter of a change, in terms of chi-squared: simple changes are named."""
 FALSE_ALARM = 2e-3
 """Probability that steady responses of any sensor are found to change."""
 
@@ -310,10 +316,7 @@ class ResponseChange:
     error : float
         Standard error of the size.
     begin, end : float
-        Seconds from the start: between these it changes. Equal to within a part: a step.
-    is_step : bool
-    deviation : float
-        Standard deviation of the response over the recording, relative to the mean.
+        Seconds from the start: between these it changes. Equal for a step.
     statistic, degrees : float
         Chi-squared statistic of the test, and its degrees of freedom.
     """
@@ -325,8 +328,6 @@ class ResponseChange:
     error: float
     begin: float
     end: float
-    is_step: bool
-    deviation: float
     statistic: float
     degrees: float
 
@@ -346,16 +347,28 @@ def _patterns(d: int) -> list[tuple[int | None, bool, FloatArray]]:
     return found
 
 
-def _courses(n: int) -> list[tuple[bool, int, int, FloatArray]]:
-    """Return steps and ramps from part `begin` to part `end`, from 0 to 1."""
-    place = np.arange(n)
-    steps = [(True, at, at, (place >= at).astype(float)) for at in range(1, n)]
-    ramps = [
-        (False, low, high, np.clip((place - low + 0.5) / (high - low), 0, 1))
-        for low in range(n - 2)
-        for high in range(low + 3, n + 1)
-    ]
-    return steps + ramps
+@dataclass(frozen=True, slots=True, eq=False)
+class _Course:
+    """A step, or a ramp, of a response: from 0 to 1 over the parts, between two times."""
+
+    begin: float
+    end: float
+    height: FloatArray
+
+
+def _courses(begin: FloatArray, end: FloatArray) -> list[_Course]:
+    """Return steps, also within parts, and ramps over several parts."""
+    n, place, found = len(begin), np.arange(len(begin)), []
+    for at in range(n):
+        for share in SHARES if at else SHARES[1:]:  # of the part before the step
+            height = (place > at) + (1 - share) * (place == at)
+            time = float(begin[at] + share * (end[at] - begin[at]))
+            found.append(_Course(time, time, height))
+    for low in range(n - RAMP + 1):
+        for high in range(low + RAMP, n + 1):
+            height = np.clip((place - low + 0.5) / (high - low), 0, 1)
+            found.append(_Course(float(begin[low]), float(end[high - 1]), height))
+    return found
 
 
 def response_change(
@@ -365,43 +378,37 @@ def response_change(
     score, information = scores.sensor(sensor)
     statistic, degrees = _chi_squared(score, information)
     d = scores.dims[sensor]
-    best: tuple[float, tuple[int | None, bool, FloatArray], tuple[bool, int, int, FloatArray]]
-    best, size, error = (-math.inf, _patterns(d)[0], _courses(len(score))[0]), 0.0, math.inf
-    total = information.sum(axis=0)
-    for pattern in _patterns(d):
-        rows = pattern[2]
-        for course in _courses(len(score)):
-            c = course[3]
-            # The mean of the response over the recording is that of the fit.
-            own = np.tensordot(c, information, axes=1)
-            middle = rows @ (
-                np.tensordot(c**2, information, axes=1) - own @ np.linalg.pinv(total) @ own
-            )
-            fisher_ = middle @ rows.T
-            along = rows @ (c @ score)
-            size_here = np.linalg.pinv(fisher_, hermitian=True) @ along
-            explained = float(along @ size_here)
-            gained = explained - 4 * len(rows) - (0 if course[0] else 4)
-            if gained > best[0]:
-                best = (gained, pattern, course)
-                length = float(np.linalg.norm(size_here))
-                size = length if pattern[1] else float(size_here[0])
-                error = math.sqrt(max(0.0, float(np.trace(np.linalg.pinv(fisher_)))) / len(rows))
-    _, (channel, is_turn, _), (is_step, low, high, c) = best
+    patterns, courses = _patterns(d), _courses(begin, end)
+    best, pattern, course = -math.inf, patterns[0], courses[0]
+    size, error = 0.0, math.inf
+    total = np.linalg.pinv(information.sum(axis=0), rcond=1e-9, hermitian=True)
+    for each in courses:
+        c = each.height
+        # The mean of the response over the recording is that of the fit.
+        own = np.tensordot(c, information, axes=1)
+        known = np.tensordot(c**2, information, axes=1) - own @ total @ own
+        along = c @ score
+        for one in patterns:
+            rows = one[2]
+            variance = np.linalg.pinv(rows @ known @ rows.T, hermitian=True)
+            found = variance @ (rows @ along)
+            gained = float(found @ (rows @ along)) - COST * len(rows)
+            gained -= COST if each.begin < each.end else 0.0
+            if gained > best:
+                best, pattern, course = gained, one, each
+                size = float(np.linalg.norm(found)) if one[1] else float(found[0])
+                error = math.sqrt(float(np.trace(variance)) / len(rows))
+    channel, is_turn, _ = pattern
     weight = np.einsum("kii->k", information)
-    weight = weight / weight.sum()
-    mean = float(weight @ c)
-    before = 1 - mean * size  # gains are relative to the mean
+    before = 1 - size * float(weight @ course.height) / weight.sum()  # gains relative to the mean
     return ResponseChange(
         sensor=sensor,
         channel=None if channel is None else first_channel + channel,
         is_turn=is_turn,
         size=size if is_turn else size / before,
         error=error,
-        begin=float(begin[low]),
-        end=float(begin[low] if is_step else end[high - 1]),
-        is_step=is_step,
-        deviation=abs(size) * math.sqrt(float(weight @ (c - mean) ** 2)),
+        begin=course.begin,
+        end=course.end,
         statistic=statistic,
         degrees=degrees,
     )

@@ -236,7 +236,7 @@ def _stability(found: Stability) -> dict[str, Any]:
         "high_hz": found.high,
         "parts": _scatter(found.parts),
         "runs": None if found.runs is None else _scatter(found.runs),
-        "inflation": found.inflations,
+        "inflation": found.inflation,
         "segments": found.n_segments,
         "disturbed": found.disturbed,
         "excess_share": found.excess,

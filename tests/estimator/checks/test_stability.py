@@ -88,7 +88,7 @@ def test_steady_noise_scatters_as_expected() -> None:
     assert len(found.disturbed) == 0
     assert found.inflation == 1
     n_parts = found.parts.n_parts
-    assert n_parts == 300 // 26 + 1  # of 13 segments, joined until they have twelve averages
+    assert n_parts == 23  # 24 of 13 segments; the last one has one, and is joined
     assert found.runs is not None
     assert found.runs.n_parts == 3
     for scatter, parts in ((found.parts, n_parts), (found.runs, 3)):

@@ -1,0 +1,114 @@
+"""A bench that changes: what changes is named, sized and dated, and intervals allow for it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import huddle
+from estimator.checks.advice import NoiseChanges, ResponseChanges
+from tui.wording.findings import Names, alert
+
+if TYPE_CHECKING:
+    from daq.estimation.snapshot import Snapshot
+
+RATE = 40.0
+N = round(1200 * RATE)
+NOISE = 2 / RATE  # PSD of white noise of variance 1
+
+
+def estimated(kind: str, seed: int, *, ratio: float = 1e4, n: int = N) -> Snapshot:
+    """White motion of this ratio to white noise; something changes in sensor B."""
+    rng = np.random.default_rng([seed, 4747])
+    time = np.arange(n) / n
+    motion = np.sqrt(ratio) * rng.standard_normal((n, 3))
+    if kind == "stops":
+        motion[n // 2 :] = 0
+    if kind == "red":
+        motion = 1e-2 * np.cumsum(np.cumsum(motion - motion.mean(axis=0), axis=0), axis=0)
+    later = time >= 0.4
+    samples = {}
+    for name in "ABC":
+        turn = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
+        felt = motion @ turn.T
+        if name == "B" and kind == "step":
+            felt[later, 0] *= 0.95
+        elif name == "B" and kind == "ramp":
+            felt *= (1 + 0.03 * (time - 0.5))[:, None]
+        elif name == "B" and kind == "settles":
+            felt[later] = felt[later] @ Rotation.from_rotvec([0, 0, np.radians(0.05)]).as_matrix()
+        elif kind == "temperature":
+            felt *= 1 + 0.02 * rng.standard_normal(3) * (np.sin(np.pi * time) - 0.5)[:, None]
+        samples[name] = felt + rng.standard_normal((n, 3))
+    return huddle.self_noise(samples, fs=RATE, segment="5s").snapshot
+
+
+@pytest.mark.parametrize(
+    ("kind", "ratio", "size", "words"),
+    [
+        ("step", 1e4, -0.05, ("The gain of B.1 fell by", " at 4")),
+        ("ramp", 1e4, 0.03, ("The gain of B rose by 3", "from 0 s to")),
+        ("settles", 1e6, np.radians(0.05), ("Sensor B turned by 0.0", " at 4")),
+    ],
+)
+def test_a_response_that_changes_is_named_sized_and_dated(
+    kind: str, ratio: float, size: float, words: tuple[str, ...]
+) -> None:
+    snapshot = estimated(kind, 1, ratio=ratio)
+    found = snapshot.diagnostics.advice
+    (change,) = [each for each in found if isinstance(each, ResponseChanges)]
+    text = alert(
+        change,
+        Names(
+            snapshot.sensor_names, tuple(label.name for label in snapshot.channels), snapshot.dims
+        ),
+    )
+    for each in words:
+        assert each in text
+    assert change.size == pytest.approx(size, rel=0.05)
+    if kind != "ramp":
+        assert change.begin == change.end == pytest.approx(480, abs=50 / 4)  # a quarter of a part
+    assert not any(isinstance(each, NoiseChanges) for each in found)
+    # The interval holds the expected noise, of which the estimate is far off.
+    noise = snapshot.results["three-sensor"]
+    inside = slice(5, 90)
+    own = slice(3, 6)
+    low, high = noise.low[inside, own], noise.high[inside, own]
+    assert np.mean((low <= NOISE) & (high >= NOISE)) > 0.93
+
+
+def test_gains_that_follow_one_temperature_are_found() -> None:
+    found = estimated("temperature", 2).diagnostics.advice
+    assert any(isinstance(each, ResponseChanges) for each in found)
+
+
+@pytest.mark.parametrize("kind", ["steady", "stops", "red"])
+def test_a_steady_bench_raises_no_alarm(kind: str) -> None:
+    """Ten tests of responses at 0.2 %, and of noise in all bands at 0.1 %."""
+    for seed in range(3):
+        snapshot = estimated(kind, seed, ratio=1e4, n=N // 2)
+        kinds = ResponseChanges | NoiseChanges
+        assert not [each for each in snapshot.diagnostics.advice if isinstance(each, kinds)]
+        assert all(clock.is_understood for clock in snapshot.clocks)
+
+
+def test_steady_noise_of_more_than_4096_segments_scatters_as_all_of_them() -> None:
+    rng = np.random.default_rng(3)
+    n = round(5200 * 0.5 * RATE)
+    motion = 30 * rng.standard_normal((n, 1))
+    samples = {name: motion + rng.standard_normal((n, 1)) for name in "ABC"}
+    found = huddle.self_noise(samples, fs=RATE, segment="1s").snapshot
+    assert found.n_segments > 4096
+    diagnosis = found.diagnostics.diagnosis
+    assert diagnosis is not None
+    assert diagnosis.stability is not None
+    assert diagnosis.stability.n_segments == found.n_segments
+    scatter = diagnosis.stability.parts
+    known = np.isfinite(scatter.statistic)
+    degrees = (scatter.n_parts - 1) * int(known.sum())
+    mean = float(scatter.statistic[known].sum()) / degrees
+    assert mean == pytest.approx(1, abs=5 * np.sqrt(2 / degrees))
+    assert diagnosis.stability.inflation == 1
