@@ -331,8 +331,8 @@ class DelayEstimator:
         # What P predicts without its noise, which no sensor follows. Of few segments that is hardly
         # known: as much as R is off by is taken off beside.
         by_noise = inflated * x0.shape[2] * xj.shape[2] / freedom * len(omega)
-        # Nor does any follow P's share of the reference's own noise, which is all there is where the
-        # motion stops: at most one, in the units of R, at each frequency and channel.
+        # Nor does any follow P's share of the reference's own noise, which is all there is where
+        # the motion stops: at most one, in the units of R, at each frequency and channel.
         by_noise += xj.shape[2] * len(omega)
         meant = total / inflated - by_noise
         far = ~known & (2 * meant / kappa > _FAR_SIGNIFICANT) & (self.is_wide and self.has_frame)
