@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 MIN_PARTS = 3
 MIN_DEGREES = 2.0
 """Averages of a part beyond those that its regression takes, at least."""
-BINS_AT_ONCE = 48
+BINS_AT_ONCE = 24
 SMALLEST_LEVEL = 1e-3
 """Of the noise of a part: estimates of few averages may be negative."""
 SHARES = (0.0, 0.25, 0.5, 0.75)
