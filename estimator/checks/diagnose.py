@@ -43,7 +43,6 @@ from estimator.likelihood.dimension import bands
 from estimator.likelihood.factor_analysis import Maxima, Maximum, joined
 from estimator.likelihood.goodness_of_fit import (
     HANN_HALF,
-    REJECT,
     ModelTest,
     critical_value,
     deflated,
@@ -78,6 +77,11 @@ NAMED = 5
 """Maximum number of disturbed segments with reported times."""
 MATERIAL = 0.1
 """Change of the noise between parts, as a fraction, from which it is reported."""
+UNSTEADY = 1e-5
+"""Probability that steady noise is reported to change, if levels were exactly chi-squared: they are
+differences of such, whose tails are longer."""
+LEAST_KNOWN = 0.2
+"""Standard error of a part's noise, as a fraction, up to which changes are reported."""
 LARGE = 0.5
 SMALL = 0.05
 
@@ -125,7 +129,8 @@ def changes(
     tested = int(np.isfinite(found.statistic).sum())
     if not tested:
         return
-    seen = found.statistic > critical_value(found.n_parts - 1, REJECT / tested)
+    seen = found.statistic > critical_value(found.n_parts - 1, UNSTEADY / tested)
+    seen &= found.expected < LEAST_KNOWN
     # Within the part of a step, motion is left in the noise of a sensor whose response changes.
     named = np.isin(sensor_of, [each.sensor for each in stability.changes])
     strength = np.where(seen & (more > MATERIAL) & ~named, more, 0.0)
