@@ -61,7 +61,7 @@ LEAVE = 3
 CHANGES = 1e-4
 """Probability of a change of the motion as large as seen, by chance, below which it counts."""
 _GUARD = 5e-4  # by which scatter that looks like changing motion exceeds what is taken off
-_CLEAR = 20.0  # information on a response in a bin: scatter of 1/sqrt(20) of the noise
+_CLEAR = 20.0  # information on a response in a bin, by its dimensions: with less, few cover
 _FLOOR = 3e-3  # of N over its start, in any direction
 _ROUNDS = 60
 _HALVINGS = 14
@@ -555,7 +555,7 @@ def _estimate(
     variance = _left(*raw) + usual - _left(p, cross, r)
     determined = _determined(point.mixed_part(certain) + contrasts, diagonal)
     beyond = chdtri(freedom, _GUARD) / freedom - 1
-    clear = np.median(np.linalg.eigvalsh(r - beyond * scatter)[:, 0]) > _CLEAR
+    clear = np.median(np.linalg.eigvalsh(r - beyond * scatter)[:, 0]) > q * _CLEAR
     deviation = np.sqrt(parts.alike) * _sandwich(
         point.mixed_part(usual) + contrasts, point.mixed_part(variance) + contrasts, diagonal
     )
@@ -693,7 +693,8 @@ def _sandwich(information: FloatArray, variance: FloatArray, diagonal: list[int]
     both = scale[:, None] * scale
     w, u = np.linalg.eigh(information / both)
     inverse = (u / np.maximum(w, _ZERO)) @ u.T
-    found = np.diag(inverse @ (variance / both) @ inverse)
+    with np.errstate(over="ignore", invalid="ignore"):  # of what is not identified
+        found = np.nan_to_num(np.diag(inverse @ (variance / both) @ inverse), nan=np.inf)
     return np.asarray(np.sqrt(np.maximum(found, 0.0))[diagonal] / scale[diagonal])
 
 
