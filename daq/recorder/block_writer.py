@@ -38,6 +38,8 @@ _ROUTINE = {
     EventKind.CLOCK,
 }
 """Kinds of events that are logged as information; all others are warnings."""
+_NEVER_FOLDED = {EventKind.MARK, EventKind.CONNECTED}
+"""A user's remarks, and the events that end the loss of a sensor."""
 _REPORT_INTERVAL_NS = 1_000_000_000
 _FORGOTTEN_NS = 60 * _REPORT_INTERVAL_NS
 """Longest time between two reports of one condition, and time after which it is a new one."""
@@ -309,7 +311,7 @@ class BlockWriter:
         return min(s.indexer.next_sample / s.rate for s in self._sensors.values())
 
     def _write_event(self, event: Event) -> None:
-        if event.kind == EventKind.MARK:  # a user's remark is never omitted
+        if event.kind in _NEVER_FOLDED:
             self._record(event)
             return
         folds = self._folds[event.sensor, event.kind]
