@@ -375,6 +375,12 @@ class CrossSpectra:
         import zipfile  # noqa: PLC0415 - only of parts of an estimate
 
         try:
+            with zipfile.ZipFile(io.BytesIO(content)) as packed:
+                is_packed = {each.compress_type for each in packed.infolist()} != {
+                    zipfile.ZIP_STORED
+                }
+            if is_packed:  # it could become a thousand times as much
+                raise EstimatorError("not a serialised cross-spectral matrix: compressed")
             with np.load(io.BytesIO(content), allow_pickle=False) as archive:
                 fields = json.loads(str(archive["settings"]))
                 if isinstance(fields["window"], list):  # JSON has no tuples

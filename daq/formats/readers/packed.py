@@ -1,7 +1,7 @@
 """Files inside ``.gz``, ``.bz2``, ``.xz``, ``.zip`` and ``.tar``, unpacked into a folder.
 
-Archives of archives are not opened. What grows more than a thousandfold holds no samples, and is
-refused before it fills the disk.
+Archives of archives are not opened. What grows beyond 32 MB and more than a hundredfold holds no
+samples, and is refused before it fills the disk.
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ _SINGLE: dict[str, Callable[[Path], gzip.GzipFile | bz2.BZ2File | lzma.LZMAFile]
     ".xz": lzma.LZMAFile,
 }
 _TARS = (".tar", ".tgz", ".tar.gz", ".tar.bz2", ".tar.xz")
-_MOST = 1000
+_MOST = 100
 """Bytes that a packed byte may become."""
-_AT_LEAST = 1 << 20
+_AT_LEAST = 1 << 25
+"""Bytes that any packed file may become."""
 _CHUNK = 1 << 20
 
 
@@ -62,8 +63,8 @@ def unpacked(path: Path, folder: Path) -> list[Path]:
                     left -= len(chunk)
                     if left < 0:
                         raise ImportFormatError(
-                            f"{path}: it unpacks to more than {_MOST} times its size; expected"
-                            " samples"
+                            f"{path}: it unpacks to more than {_MOST} times its size, and to"
+                            " more than 32 MB; expected samples"
                         )
                     file.write(chunk)
             found.append(target)

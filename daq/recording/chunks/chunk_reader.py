@@ -7,13 +7,15 @@ whoever reads them finds out what is damaged.
 
 from __future__ import annotations
 
+import contextlib
+import math
 import os
 import threading
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daq.recording.chunks.packing import PIPELINE, RAW, unpacked
+from daq.recording.chunks.packing import PIPELINE, RAW, InflationError, check_chunk, unpacked
 
 if TYPE_CHECKING:
     import h5py
@@ -85,6 +87,9 @@ class ChunkedRows:
         self._kept: tuple[int, NDArray[Any]] = (0, np.empty((0, *columns), self._dtype))
         self._lock = threading.Lock()
         self._direct = filters == PIPELINE and tuple(columns) == dataset.shape[1:]
+        self._n_bytes = math.prod(dataset.chunks) * dataset.dtype.itemsize
+        self._checked: set[int] = set()
+        """First rows of the chunks that inflate to no more than their size."""
         self._n_fetched = 0
         self._raw: RawChunks | None = None
         self.is_closed = False
@@ -121,7 +126,21 @@ class ChunkedRows:
                     rows = self._decompressed(known, low, last_row, n_rows)
                     if rows is not None:
                         return rows[first_row - low : last_row - low]
+        self._check_chunks(first_row, last_row)
         return np.asarray(self._dataset[first_row:last_row])
+
+    def _check_chunks(self, first_row: int, last_row: int) -> None:
+        """Refuse chunks that HDF5 would inflate beyond their size; each is looked at once."""
+        if self._dataset.compression is None:
+            return
+        fetch, n_bytes = self._dataset.id.read_direct_chunk, self._n_bytes
+        last = min(last_row, len(self._dataset))
+        for row in range(first_row // self._length * self._length, last, self._length):
+            if row not in self._checked:
+                with contextlib.suppress(RuntimeError, ValueError, KeyError):  # HDF5 names it
+                    mask, content = fetch((row, *self._corner))
+                    check_chunk(mask, content, n_bytes)
+                self._checked.add(row)
 
     def _decompressed(
         self, known: NDArray[Any], low: int, last_row: int, n_rows: int
@@ -137,6 +156,8 @@ class ChunkedRows:
         try:
             if not self._filled(rows[len(known) :], start):
                 return None
+        except InflationError:
+            raise
         except (OSError, RuntimeError):
             return None
         rows = rows[: n_rows - low]

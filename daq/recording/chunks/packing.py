@@ -15,6 +15,7 @@ written any more, and not checked.
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING, Any
 
 import h5py
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["PIPELINE", "RAW", "deflate", "packed", "unpacked"]
+__all__ = ["PIPELINE", "RAW", "InflationError", "check_chunk", "deflate", "packed", "unpacked"]
 
 PIPELINE = (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32)
 """The filters of a dataset in chunks."""
@@ -40,6 +41,10 @@ _NO_FLETCHER = 0b100
 _LEVEL = 1
 _GAIN = 1 / 3
 """The share of its bytes that a chunk must lose to be compressed."""
+
+
+class InflationError(OSError):
+    """A chunk of a damaged or foreign file becomes more than its dataset says."""
 
 
 def packed(chunk: NDArray[Any]) -> tuple[bytes, int]:
@@ -67,6 +72,11 @@ def unpacked(stored: Sequence[tuple[int, bytes]], rows: NDArray[Any]) -> bool:
         Mask and bytes of each chunk.
     rows : ndarray
         As long as the chunks together.
+
+    Raises
+    ------
+    InflationError
+        If a stream becomes more than its chunk: HDF5 would inflate all of it.
     """
     size = rows.itemsize
     places = rows.view(np.uint8).reshape(len(stored), -1)
@@ -82,10 +92,13 @@ def unpacked(stored: Sequence[tuple[int, bytes]], rows: NDArray[Any]) -> bool:
             return False
         else:
             try:
-                streams.append(deflate.decompress(content, deflate.MAX_WBITS, n_bytes))
+                inflate = deflate.decompressobj()
+                streams.append(inflate.decompress(content, n_bytes + 1))
             except deflate.error:  # type: ignore[misc]  # a class: its stub says instance
                 return False
-            if len(streams[-1]) != n_bytes:
+            if len(streams[-1]) > n_bytes:
+                raise InflationError(f"a chunk of {n_bytes} bytes inflates to more")
+            if len(streams[-1]) != n_bytes or not inflate.eof:
                 return False
             shuffled.append(number)
     if streams:
@@ -95,3 +108,17 @@ def unpacked(stored: Sequence[tuple[int, bytes]], rows: NDArray[Any]) -> bool:
         for place in range(size):  # in turn: for few bytes a value this is the fastest
             whole[which, :, place] = parts[:, place]
     return True
+
+
+def check_chunk(mask: int, content: bytes, n_bytes: int) -> None:
+    """Inflate a chunk as far as its dataset says, before HDF5 inflates all of it.
+
+    Raises
+    ------
+    InflationError
+        If it becomes more.
+    """
+    if not mask & 0b10 and len(content) * 1100 > n_bytes:
+        with contextlib.suppress(deflate.error):  # type: ignore[arg-type]  # a class, as above
+            if len(deflate.decompressobj().decompress(content, n_bytes + 1)) > n_bytes:
+                raise InflationError(f"a chunk of {n_bytes} bytes inflates to more")

@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daq.recording import file_format
+from daq.recording.storage.refusals import MAX_CHUNK
 from daq.recording.storage.retries import repeated
 from daq.recording.storage.superblock import Superblock
 from daq.recording.storage.whole_hdf5 import WholeHdf5
@@ -41,7 +42,11 @@ if TYPE_CHECKING:
 
 _MAGIC = b"huddle-journal 1\n"
 _FRAME = struct.Struct("<II")
-_MAX_FRAME = 1 << 30
+_INFLATION, _AT_LEAST = 100, 1 << 24
+"""Bytes that a packed byte may become, in the mean of a journal, and bytes that any may become.
+
+Rows of tables and the head of a new file are packed up to fifty times; deflate itself could pack
+zeros a thousand times."""
 _WINDOW = 1 << 20
 """Bytes before the previous end of a recording in which HDF5 may still place a chunk."""
 CHUNKED = ("samples", "instants")
@@ -211,21 +216,38 @@ def read_journal(recording: Path) -> JournalContents | None:
         if found is None:
             found = JournalContents(Superblock(payload, len(payload)).cleared_file())
         else:
-            _add(found, payload)
+            try:
+                _add(found, payload)
+            except (
+                ValueError,
+                LookupError,
+                TypeError,
+                AttributeError,
+                ArithmeticError,
+                RecursionError,
+            ):
+                break  # not of our writer: what came before it counts
     return found
 
 
 def _frames(path: Path) -> Iterator[bytes]:
     try:
         with path.open("rb") as file:
+            held = os.fstat(file.fileno()).st_size
+            left = max(_AT_LEAST, _INFLATION * held)
             if file.read(len(_MAGIC)) != _MAGIC:
                 return
             while len(head := file.read(_FRAME.size)) == _FRAME.size:
                 length, crc32 = _FRAME.unpack(head)
-                packed = file.read(min(length, _MAX_FRAME))
+                packed = file.read(min(length, held))
                 if len(packed) < length or zlib.crc32(packed) != crc32:
                     return
-                yield zlib.decompress(packed)
+                inflate = zlib.decompressobj()
+                payload = inflate.decompress(packed, left + 1)
+                left -= len(payload)
+                if left < 0 or not inflate.eof:
+                    return
+                yield payload
     except (FileNotFoundError, zlib.error):
         return
 
@@ -233,7 +255,9 @@ def _frames(path: Path) -> Iterator[bytes]:
 def _add(found: JournalContents, payload: bytes) -> None:
     head, _, rest = payload.partition(b"\n")
     described = json.loads(head)
-    found.counts = np.array(described["counts"], np.int64)
+    counts = np.array(described["counts"], np.int64)
+    if counts.ndim != 2 or counts.shape[1] != 3 or counts.min() < 0:
+        raise ValueError(f"counts of shape {counts.shape}; expected (n_sensors + 1, 3)")
     at = 0
     for sensor, kinds in described["stored"].items():
         for name, chunks in zip(CHUNKED, kinds, strict=True):
@@ -246,6 +270,7 @@ def _add(found: JournalContents, payload: bytes) -> None:
         for name, length in zip(names, lengths, strict=True):
             found.tables[sensor, name] += rest[at : at + length]
             at += length
+    found.counts = counts
 
 
 def rebuild(damaged: Path, contents: JournalContents, copy: Path) -> None:
@@ -298,7 +323,7 @@ def _put_chunks(
         content = kept
         if offset >= 0:
             source.seek(offset)
-            content = source.read(size)
+            content = source.read(min(size, 2 * MAX_CHUNK))
         dataset.id.write_direct_chunk((number * length, *corner), content, mask)
     dataset.resize(min(n_rows, dataset.shape[0]), axis=0)
 

@@ -1,0 +1,101 @@
+"""What is packed becomes no more than its file can hold, whoever wrote it."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import zlib
+from typing import TYPE_CHECKING
+
+import h5py
+import numpy as np
+import pytest
+
+from daq.recording.chunks.chunk_reader import ChunkedRows
+from daq.recording.chunks.packing import PIPELINE, InflationError
+from daq.recording.storage.journal import journal_path, read_journal
+from estimator.errors import EstimatorError
+from estimator.spectra.welch import CrossSpectra
+from tests.traced_memory import peak_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+MAGIC = b"huddle-journal 1\n"
+
+
+def forged(recording: Path, payloads: Sequence[bytes]) -> None:
+    """Write a journal as its theory of operation says, by other code."""
+    frames = [zlib.compress(each, 9) for each in payloads]
+    heads = [struct.pack("<II", len(each), zlib.crc32(each)) for each in frames]
+    content = b"".join(head + frame for head, frame in zip(heads, frames, strict=True))
+    journal_path(recording).write_bytes(MAGIC + content)
+
+
+def created() -> bytes:
+    """Return a small HDF5 file."""
+    held = io.BytesIO()
+    with h5py.File(held, "w", libver="latest") as file:
+        file.attrs["run_id"] = "0" * 32
+    return held.getvalue()
+
+
+def commit(size: int = 0) -> bytes:
+    """Return the payload of a commit, with bytes that nothing reads behind it."""
+    head = json.dumps({"counts": [[0, 0, 0]], "stored": {}, "tables": {}})
+    return head.encode() + b"\n" + bytes(size)
+
+
+@pytest.mark.parametrize("n_frames", [1, 20])
+def test_a_journal_becomes_no_more_than_its_file_can_hold(tmp_path: Path, n_frames: int) -> None:
+    path = tmp_path / "r.h5"
+    forged(path, [created(), *[commit((100 << 20) // n_frames)] * n_frames])
+    assert journal_path(path).stat().st_size < 200_000
+    assert peak_of(lambda: read_journal(path)) < 60 << 20
+    forged(path, [created(), commit()])
+    found = read_journal(path)
+    assert found is not None
+    assert found.counts is not None
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"", b"[]", b"{}", b'{"counts": 1, "stored": [], "tables": {}}', b"\xff", b"[" * 9999],
+)
+def test_a_journal_ends_where_it_is_not_of_a_recorder(tmp_path: Path, payload: bytes) -> None:
+    path = tmp_path / "r.h5"
+    forged(path, [created(), commit(), payload])
+    found = read_journal(path)
+    assert found is not None
+    assert found.counts is not None
+    assert found.counts.tolist() == [[0, 0, 0]]
+
+
+@pytest.mark.parametrize("rows", [(0, 2000), (10, 20)])
+def test_a_chunk_inflates_to_no_more_than_its_rows(tmp_path: Path, rows: tuple[int, int]) -> None:
+    path = tmp_path / "r.h5"
+    length = 1000
+    with h5py.File(path, "w") as file:
+        made = file.create_dataset(
+            "samples", (2 * length, 3), "i4", chunks=(length, 3),
+            shuffle=True, compression="gzip", fletcher32=True,
+        )  # fmt: skip
+        made[...] = 7
+        made.id.write_direct_chunk((0, 0), zlib.compress(bytes(64 << 20), 9), 0b100)
+        plist = made.id.get_create_plist()
+        assert tuple(plist.get_filter(n)[0] for n in range(3)) == PIPELINE
+    with h5py.File(path) as file:
+        reader = ChunkedRows(file["samples"])
+        with pytest.raises(InflationError, match="inflates to more"):
+            reader.read(*rows, 2 * length)
+        assert (reader.read(length, 2 * length, 2 * length) == 7).all()
+        assert (reader.read(length + 1, length + 9, 2 * length) == 7).all()
+
+
+def test_sums_of_another_computer_are_not_packed() -> None:
+    packed = io.BytesIO()
+    np.savez_compressed(packed, settings="{}", n_segments=1, sum=np.zeros((1 << 20, 3)))
+    with pytest.raises(EstimatorError, match="compressed"):
+        CrossSpectra.from_bytes(packed.getvalue())
