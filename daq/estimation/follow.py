@@ -377,7 +377,7 @@ class _Sensors:
             self._address = self._address or control_address(self._path)
             if self._address is None:
                 return {}
-            sensors = ask(self._address, "status")["sensors"]
+            sensors = ask(self._address, "status", folder=self._path.resolve().parent)["sensors"]
         except (HuddleError, OSError):
             return {}
         return {name: sensor["state"] for name, sensor in sensors.items()}

@@ -208,7 +208,7 @@ class _Recorder:
             for sensors in self._bench.ports().values()
         ]
         start = asyncio.Event()
-        async with control.serve(self._answer) as address:
+        async with control.serve(self._answer, self._path.parent) as address:
             tasks = [
                 asyncio.create_task(c.run(self._queue, start), name=c.port) for c in connections
             ]

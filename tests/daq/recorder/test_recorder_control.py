@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import stat
 from typing import TYPE_CHECKING
 
 import pytest
@@ -21,6 +22,12 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.virtual_time
 
 
+async def connected(recording: Path) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    """Connect as somebody with the account of the recorder."""
+    (beside,) = recording.parent.glob(".*.control")
+    return await asyncio.open_unix_connection(str(beside))
+
+
 async def test_a_silent_client_of_the_control_port_does_not_delay_the_end(
     tmp_path: Path,
 ) -> None:
@@ -30,7 +37,7 @@ async def test_a_silent_client_of_the_control_port_does_not_delay_the_end(
         await run.until("a", 100)
         address = control_address(run.path)
         assert address is not None
-        reader, writer = await asyncio.open_connection("127.0.0.1", address[0])
+        reader, writer = await connected(run.path)
         await asyncio.to_thread(ask, run.path, "stop")
     with contextlib.suppress(ConnectionError):
         assert await reader.read() == b""
@@ -50,10 +57,18 @@ async def test_commands_of_the_control_port_are_executed(tmp_path: Path) -> None
         address = control_address(run.path)
         assert address is not None
         port, token = address
-        with pytest.raises(ControlRefusedError, match="wrong token"):
-            await asyncio.to_thread(ask, (port, "0" * 32), "stop")
+        assert port == 0
+        (beside,) = tmp_path.glob(".*.control")  # noqa: ASYNC240 - nothing else runs
+        assert stat.S_IMODE(beside.stat().st_mode) == 0o600
+        reader, writer = await connected(run.path)
+        writer.write(b"0" * 32 + b" stop\n")
+        assert b"wrong token" in await reader.readline()
+        writer.close()
+        await writer.wait_closed()
+        with pytest.raises(NotConnectedError):
+            await asyncio.to_thread(ask, (port, "0" * 32), "stop", folder=tmp_path)
         with pytest.raises(ControlRefusedError, match="unknown command 'dance'"):
-            await asyncio.to_thread(ask, (port, token), "dance")
+            await asyncio.to_thread(ask, (port, token), "dance", folder=tmp_path)
         await asyncio.to_thread(ask, run.path, "stop")
         assert (await task).closed
     with pytest.raises(NotConnectedError, match="no recorder is writing it"):
@@ -91,11 +106,8 @@ async def test_invalid_requests_to_the_control_port_have_no_effect(tmp_path: Pat
     async with run.going():
         run.send("a", 0, 100)
         await run.until("a", 100)
-        address = control_address(run.path)
-        assert address is not None
-        port, _ = address
         for nonsense in (b"", b"\n", b"\xff" * 100 + b"\n", b"x" * 100_000):
-            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            reader, writer = await connected(run.path)
             with contextlib.suppress(ConnectionError):
                 writer.write(nonsense)
                 writer.write_eof()

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import socket
+import stat
+import sys
+from typing import TYPE_CHECKING
 
 import pytest
 
 from daq.errors import NotConnectedError
 from daq.recording.control import HOST, MAX_CONNECTIONS, Answer, Command, ask, serve
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 @pytest.mark.parametrize(
@@ -31,18 +38,46 @@ def test_no_bytes_are_sent_to_an_invalid_address(port: int | None, token: str) -
             listening.accept()
 
 
-async def test_the_number_of_connections_is_limited() -> None:
-    async def answer(_command: Command, _text: str) -> Answer:
-        return {"well": True}
+async def _well(_command: Command, _text: str) -> Answer:
+    return {"well": True}
 
-    async with serve(answer) as (port, token):
-        open_ones = [await asyncio.open_connection(HOST, port) for _ in range(MAX_CONNECTIONS)]
-        reader, writer = await asyncio.open_connection(HOST, port)
-        with pytest.raises((ConnectionError, asyncio.IncompleteReadError)):
-            await reader.readexactly(1)
-        writer.close()
-        first_reader, first_writer = open_ones[0]
-        first_writer.write(f"{token} status\n".encode())
-        assert await first_reader.readline() == b'{"well": true}\n'
-        for _, each in open_ones:
+
+async def test_silent_connections_give_way_to_the_owner() -> None:
+    async with serve(_well) as (port, token):
+        silent = [await asyncio.open_connection(HOST, port) for _ in range(2 * MAX_CONNECTIONS)]
+        answer = await asyncio.to_thread(ask, (port, token), "status")
+        assert answer == {"well": True}
+        reader, _ = silent[0]
+        assert await reader.read() == b""  # the longest silent one was dropped
+        for _, each in silent:
             each.close()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Unix sockets")
+@pytest.mark.parametrize("depth", [0, 6])
+async def test_a_socket_lies_beside_a_recording_however_long_its_path_is(
+    tmp_path: Path, depth: int
+) -> None:
+    folder = tmp_path.joinpath(*["a folder with a long name"] * depth)
+    folder.mkdir(parents=True, exist_ok=True)
+    async with serve(_well, folder) as (port, token):
+        if depth and sys.platform != "linux":
+            assert port > 0
+            return
+        assert port == 0
+        (path,) = folder.iterdir()
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+        assert token[:8] not in path.name
+        found = await asyncio.to_thread(ask, (port, token), "status", folder=folder)
+        assert found == {"well": True}
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Unix sockets")
+async def test_the_socket_of_a_killed_recorder_is_removed(tmp_path: Path) -> None:
+    left = tmp_path / ".0123456789abcdef.control"
+    with socket.socket(socket.AF_UNIX) as killed:
+        killed.bind(str(left))
+    os.utime(left, (0, 0))
+    async with serve(_well, tmp_path):
+        assert not left.exists()
