@@ -23,6 +23,7 @@ import base64
 import contextlib
 import hashlib
 import json
+import re
 import sqlite3
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -403,9 +404,14 @@ class Ledger:
             ).fetchone()
         previous, records = "", []
         for number, (row, text, own) in enumerate(found, start=1):
-            record = json.loads(text) if hashlib.sha256(text.encode()).hexdigest() == own else {}
+            record = _record(text, own)
             if row != number or record.get("previous") != previous:
                 raise LedgerError(f"{self._path}: changed by hand: row {number} breaks the chain")
+            if not _is_plain(record):
+                raise LedgerError(
+                    f"{self._path}: row {number} is no row of a ledger; expected a record of a"
+                    " certificate, whose file is its number and revision, in this folder"
+                )
             records.append((record, own))
             previous = own
         written = counted[0] if counted else 0
@@ -449,6 +455,34 @@ class Ledger:
                 return False
         except LedgerError:
             return True
+
+
+def _record(text: object, own: object) -> dict[str, Any]:
+    """Return the record of a row; empty if its hash is not that of the text."""
+    if not isinstance(text, str) or hashlib.sha256(text.encode()).hexdigest() != own:
+        return {}
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _is_plain(record: Mapping[str, Any]) -> bool:
+    """Whether a record has what is read of it, and names no file but its own certificate.
+
+    A ledger may come from elsewhere: its files are read, and shown in the pages.
+    """
+    number, kind = record.get("number"), record.get("kind")
+    if not isinstance(number, str) or not isinstance(record.get("revision"), int):
+        return False
+    if kind == "allotted":
+        return isinstance(record.get("recordings"), list) and isinstance(record.get("at"), str)
+    if kind != "issued":
+        return kind == "void"
+    own = re.escape(f"{number}-r{record['revision']}")
+    is_file = re.fullmatch(rf"{own}\.[a-z]+", str(record.get("file"))) is not None
+    return is_file and not set(number) & set("/\\\0") and isinstance(record.get("sha256"), str)
 
 
 def _entry(record: Mapping[str, Any], own: str, state: State) -> Entry:

@@ -144,3 +144,25 @@ def test_a_changed_ledger_is_detected(tmp_path: Path, statement: str) -> None:
         ledger.entries()
     with pytest.raises(LedgerError, match="changed by hand"):
         issue(ledger, "d")
+
+
+@pytest.mark.parametrize(
+    "file", ["../../lab.toml", "/etc/passwd", "lab.toml", "LAB-2026-0001-r0.pdf/../x", "", None]
+)
+def test_a_ledger_from_elsewhere_names_certificates_only(tmp_path: Path, file: object) -> None:
+    ledger = Ledger(tmp_path)
+    entry = issue(ledger, "a")
+    assert [each.file for each in ledger.entries()] == ["LAB-2026-0001-r0.pdf"]
+    record = {"kind": "issued", "number": entry.number, "revision": 0, "file": file}
+    ledger._add({"at": AT.isoformat(), "sha256": "0" * 64} | record)  # noqa: SLF001 - a forger
+    with pytest.raises(LedgerError, match="row 3 is no row of a ledger"):
+        ledger.entries()
+
+
+@pytest.mark.parametrize("record", [{}, {"kind": "allotted"}, {"kind": "void", "number": 3}])
+def test_a_row_that_is_no_record_is_named(tmp_path: Path, record: dict[str, object]) -> None:
+    ledger = Ledger(tmp_path)
+    issue(ledger, "a")
+    ledger._add(record)  # noqa: SLF001 - a forger
+    with pytest.raises(LedgerError, match="row 3 is no row of a ledger"):
+        ledger.entries()
