@@ -47,6 +47,12 @@ def web(
             help="Port (default: from the bench file, or 8040; 0: any free one).",
         ),
     ] = None,
+    insecure: Annotated[
+        bool,
+        typer.Option(
+            "--insecure", help="Serve beyond this computer without TLS: others may read passwords."
+        ),
+    ] = False,
     password: Annotated[
         bool, typer.Option("--password", help="Ask for a password, and print its hash.")
     ] = False,
@@ -68,7 +74,7 @@ def web(
     elif token:
         _print_token()
     elif bench is not None:
-        _serve(bench, {"address": address, "port": port})
+        _serve(bench, {"address": address, "port": port, "insecure": insecure or None})
 
 
 def _serve(path: Path, changes: dict[str, Any]) -> None:

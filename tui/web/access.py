@@ -4,12 +4,16 @@ Theory of operation
 -------------------
 Looking and steering are two rights, each with a secret in the bench file: a hash of a password or
 of a token, or the variable of the environment that holds a token. Who gives a secret gets a cookie
-with name, right and end, authenticated by a key that only the server has. The key is a file beside
-the recordings, so that a restart ends no visit; the secret is part of what is authenticated, so
-that a new secret ends all. Programs send a token as ``Authorization: Bearer``.
+with number, name, right and end, authenticated by a key that only the server has. The key is a file
+in the state directory of the user, never among recordings, which others may write or copy. So a
+restart ends no visit; the secret is part of what is authenticated, so that a new secret ends all;
+and the numbers of visits that were ended by a log out are kept in a file until their cookies end.
+Programs send a token as ``Authorization: Bearer``.
 
-Each wrong secret counts against the network that it came from. Forms that change anything carry a
-token made from the cookie, which pages of other sites cannot read.
+Each wrong password counts against the name it was given for and the network it came from, and
+against the network alone, because names are free. Tokens are long and random: wrong ones are
+counted apart, and a right one is accepted whatever others send from the same network. Forms that
+change anything carry a token made from the cookie, which pages of other sites cannot read.
 """
 
 from __future__ import annotations
@@ -26,6 +30,7 @@ import time
 from collections import OrderedDict
 from dataclasses import dataclass
 from enum import StrEnum
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daq.errors import HuddleError
@@ -34,17 +39,16 @@ from tui.service.records.places import file_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
-    from pathlib import Path
 
     from daq.bench.model import Bench
     from daq.bench.tables.unattended import Web
 
 LASTS = 12 * 3600.0
 """Seconds for which a cookie is good."""
-ATTEMPTS, WITHIN = 5, 60.0
-"""Wrong secrets from one network within so many seconds, after which no more are looked at."""
+ATTEMPTS, OF_NETWORK, WITHIN = 5, 30, 60.0
+"""Wrong secrets for one name, and of one network, within so many seconds; then none is read."""
 NETWORKS = 10_000
-"""Networks whose attempts are remembered, at most."""
+"""Names and networks whose attempts are remembered, at most."""
 SHORTEST_TOKEN = 16
 SHORTEST_PASSWORD = 10
 _SCRYPT = {"n": 2**15, "r": 8, "p": 1, "maxmem": 2**26}
@@ -76,11 +80,17 @@ class Visitor:
     right : Right
     form_token : str
         That forms of this visitor carry; empty without a login.
+    number : str
+        Of the visit; empty without a login.
+    ends : float
+        UTC in s since 1970, of the visit.
     """
 
     name: str
     right: Right
     form_token: str = ""
+    number: str = ""
+    ends: float = 0.0
 
     @property
     def may_steer(self) -> bool:
@@ -89,7 +99,7 @@ class Visitor:
 
 
 class TooManyAttemptsError(HuddleError):
-    """Too many wrong secrets came from this network; the message has the seconds to wait."""
+    """Too many wrong secrets came; the message has the seconds to wait."""
 
     def __init__(self, seconds: float) -> None:
         self.seconds = max(1, round(seconds))
@@ -135,56 +145,129 @@ def _resolved(secret: str | None, environment: Mapping[str, str]) -> str | None:
 _KEY_BYTES = 32
 
 
-def server_key(bench: Bench) -> bytes:
-    """Return the key of the server of a bench; make it the first time.
+def state_folder() -> Path:
+    """Return the folder of what servers remember: that of the service, or of the user."""
+    given = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+    if given:
+        return Path(given) / ".web"
+    home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    return Path(home) / "huddle" / "web"
+
+
+def state_path(bench: Bench, suffix: str) -> Path:
+    """Return a file of the server of a bench; benches differ by name and folder of recordings."""
+    folder = str(bench.recording_directory.resolve())
+    own = hashlib.sha256(folder.encode()).hexdigest()[:16]
+    return state_folder() / f"{file_name(bench.name)}-{own}.{suffix}"
+
+
+def server_key(path: Path) -> bytes:
+    """Return the key of a server; make it the first time.
 
     Raises
     ------
+    AccessError
+        If others may read it.
     OSError
-        If the folder of the recordings cannot be written.
+        If it cannot be read or written.
     """
-    path: Path = bench.recording_directory / f".{file_name(bench.name)}.web-key"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if path.is_file() and path.stat().st_size < _KEY_BYTES:
-        path.unlink()  # of an earlier version that was killed while it wrote
-    with contextlib.suppress(FileExistsError):  # another process makes it, too
-        if not path.is_file():
+    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    if not path.is_file():
+        with contextlib.suppress(FileExistsError):  # another process makes it, too
             write_whole(path, secrets.token_bytes(_KEY_BYTES), mode=PRIVATE, free=True)
+    check_private(path, 0o077)
     return path.read_bytes()
 
 
+def check_private(path: Path, others: int) -> None:
+    """Refuse a key that others may read.
+
+    Parameters
+    ----------
+    path : Path
+    others : int
+        The bits of its mode that must be 0.
+
+    Raises
+    ------
+    AccessError
+    """
+    if os.name == "posix" and (mode := path.stat().st_mode & others):
+        raise AccessError(f"{path}: others may read it (mode {mode:04o}); expected chmod 600")
+
+
+class Ended:
+    """Visits that were ended by a log out, kept until their cookies end.
+
+    Parameters
+    ----------
+    path : Path
+        A line of JSON for each: its number and the end of its cookie.
+    now : callable
+        UTC in s since 1970.
+    """
+
+    def __init__(self, path: Path, now: Callable[[], float] = time.time) -> None:
+        self._path, self._now = path, now
+        self._ends: dict[str, float] = {}
+        with contextlib.suppress(FileNotFoundError):
+            for line in path.read_text(encoding="utf-8").splitlines():
+                with contextlib.suppress(ValueError, TypeError):  # cut off by a kill
+                    number, ends = json.loads(line)
+                    self._ends[str(number)] = float(ends)
+
+    def __contains__(self, number: str) -> bool:
+        return number in self._ends
+
+    def add(self, number: str, ends: float) -> None:
+        """End a visit.
+
+        Raises
+        ------
+        OSError
+            If that cannot be written: it is ended until the next start only.
+        """
+        now = self._now()
+        self._ends = {each: end for each, end in self._ends.items() if end >= now}
+        self._ends[number] = ends
+        lines = (json.dumps(each) for each in self._ends.items())
+        write_whole(self._path, "".join(f"{line}\n" for line in lines).encode(), mode=PRIVATE)
+
+
 class _Attempts:
-    """Wrong secrets by network, the newest last."""
+    """Wrong secrets by what they count against, the newest last."""
 
     def __init__(self, now: Callable[[], float]) -> None:
         self._now = now
-        self._times: OrderedDict[str, list[float]] = OrderedDict()
+        self._times: OrderedDict[tuple[str, ...], list[float]] = OrderedDict()
 
-    def begin(self, client: str) -> str:
-        """Count an attempt from an address as wrong for now; return its network.
+    def begin(self, limits: Mapping[tuple[str, ...], int]) -> None:
+        """Count an attempt as wrong for now, against each of these.
 
         Raises
         ------
         TooManyAttemptsError
             If there were too many; this one must not be looked at.
         """
-        network, now = _network(client), self._now()
-        times = [each for each in self._times.get(network, ()) if now - each < WITHIN]
-        if len(times) >= ATTEMPTS:
-            raise TooManyAttemptsError(times[0] + WITHIN - now)
-        self._times[network] = [*times, now]
-        self._times.move_to_end(network)
+        now, found = self._now(), {}
+        for key, most in limits.items():
+            found[key] = [each for each in self._times.get(key, ()) if now - each < WITHIN]
+            if len(found[key]) >= most:
+                raise TooManyAttemptsError(found[key][0] + WITHIN - now)
+        for key, times in found.items():
+            self._times[key] = [*times, now]
+            self._times.move_to_end(key)
         while len(self._times) > NETWORKS:
             self._times.popitem(last=False)
-        return network
 
-    def was_right(self, network: str) -> None:
+    def was_right(self, limits: Mapping[tuple[str, ...], int]) -> None:
         """Take back what `begin` has counted."""
-        if self._times.get(network):
-            self._times[network].pop()
+        for key in limits:
+            if self._times.get(key):
+                self._times[key].pop()
 
 
-def _network(client: str) -> str:
+def network_of(client: str) -> str:
     """Return what one person has of addresses: one of version 4, 2⁶⁴ of version 6."""
     try:
         address = ipaddress.ip_address(client)
@@ -204,6 +287,8 @@ class Access:
         The table of the bench file.
     key : bytes
         Known to the server alone.
+    ended : Ended
+        Visits that are over.
     environment : mapping, optional
         Of the process, if not given.
     now : callable
@@ -219,6 +304,7 @@ class Access:
         self,
         web: Web,
         key: bytes,
+        ended: Ended,
         *,
         environment: Mapping[str, str] | None = None,
         now: Callable[[], float] = time.time,
@@ -230,7 +316,7 @@ class Access:
             for right, line in found.items()
             if (secret := _resolved(line, environment)) is not None
         }
-        self._key, self._now = key, now
+        self._key, self._ended, self._now = key, ended, now
         self._attempts = _Attempts(now)
 
     @property
@@ -249,12 +335,21 @@ class Access:
         Raises
         ------
         TooManyAttemptsError
-            If too many wrong ones came from the network of this client.
+            If too many wrong ones came for this name, or from the network of this client.
         """
-        right = self._right_of(client, given, self._secrets)
+        network = network_of(client)
+        limits = {("password", network): OF_NETWORK, ("password", network, name): ATTEMPTS}
+        self._attempts.begin(limits)
+        right = _right_of(given, self._secrets)
         if right is None:
             return None
-        told = {"name": name, "right": right, "ends": self._now() + LASTS}
+        self._attempts.was_right(limits)
+        told = {
+            "number": secrets.token_hex(16),
+            "name": name,
+            "right": right,
+            "ends": self._now() + LASTS,
+        }
         about = base64.urlsafe_b64encode(json.dumps(told).encode()).decode()
         return f"{about}.{self._mac(right, about)}"
 
@@ -263,14 +358,25 @@ class Access:
         about, _, mac = cookie.partition(".")
         try:
             told = json.loads(base64.urlsafe_b64decode(about))
-            right, ends, name = Right(told["right"]), float(told["ends"]), str(told["name"])
-        except (ValueError, KeyError, TypeError, RecursionError):
+            right, ends = Right(told["right"]), float(told["ends"])
+            name, number = str(told["name"]), str(told["number"])
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
             return None
-        if right not in self._secrets or not hmac.compare_digest(mac, self._mac(right, about)):
+        if right not in self._secrets or not _same(mac, self._mac(right, about)):
             return None
-        if ends < self._now():
+        if ends < self._now() or number in self._ended:
             return None
-        return Visitor(name, right, self._mac(right, "form", cookie))
+        return Visitor(name, right, self._mac(right, "form", cookie), number, ends)
+
+    def log_out(self, visitor: Visitor) -> None:
+        """End a visit.
+
+        Raises
+        ------
+        OSError
+            If it ends until the next start of the server only.
+        """
+        self._ended.add(visitor.number, visitor.ends)
 
     def by_token(self, client: str, token: str) -> Visitor | None:
         """Return the program that sends a token; passwords are for people.
@@ -278,27 +384,31 @@ class Access:
         Raises
         ------
         TooManyAttemptsError
-            If too many wrong ones came from the network of this client.
+            If it is wrong, and too many wrong ones came from the network of this client.
         """
         tokens = {r: s for r, s in self._secrets.items() if s.startswith("sha256:")}
-        right = self._right_of(client, token, tokens)
-        return None if right is None else Visitor("token", right)
+        right = _right_of(token, tokens)
+        if right is None:
+            self._attempts.begin({("token", network_of(client)): OF_NETWORK})
+            return None
+        return Visitor("token", right)
 
     @property
     def anybody(self) -> Visitor | None:
         """Who has not logged in; None where that is needed to look."""
         return Visitor("", Right.READ) if self.is_open else None
 
-    def _right_of(self, client: str, given: str, known: Mapping[Right, str]) -> Right | None:
-        network = self._attempts.begin(client)
-        if len(given) > _LONGEST:
-            return None
-        for right, secret in known.items():
-            if _fits(secret, given):
-                self._attempts.was_right(network)
-                return right
-        return None
-
     def _mac(self, right: Right, *parts: str) -> str:
         message = "\0".join((right, self._secrets[right], *parts))
         return hmac.new(self._key, message.encode(), "sha256").hexdigest()
+
+
+def _right_of(given: str, known: Mapping[Right, str]) -> Right | None:
+    if len(given) > _LONGEST:
+        return None
+    return next((right for right, secret in known.items() if _fits(secret, given)), None)
+
+
+def _same(given: str, wanted: str) -> bool:
+    """Compare in constant time; of two texts, only those in ASCII can be compared."""
+    return hmac.compare_digest(given.encode("utf-8", "replace"), wanted.encode())

@@ -1,4 +1,12 @@
-"""The server of the pages: which address shows what, and who may ask for it."""
+"""The server of the pages: which address shows what, and who may ask for it.
+
+Theory of operation
+-------------------
+`Guard` stands before the routes: it answers only to names of this server, finds out who asks, and
+adds the headers that every answer has. `Server.routes` is the table of addresses, each with the
+right that it needs; the endpoint of a route looks at that right itself, so that no spelling of an
+address leads past it. What no route has is denied to who may not look.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +14,14 @@ import asyncio
 import hmac
 import json
 import logging
+import re
 import socket
+from collections import Counter
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from functools import partial
 from http import HTTPStatus
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl, quote, urlencode, urlsplit
 
@@ -18,7 +30,7 @@ from markupsafe import Markup
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import HTMLResponse, RedirectResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
@@ -32,19 +44,30 @@ from tui.application.plan import TestPlan
 from tui.application.test_view.units import units_of
 from tui.output.console import finite
 from tui.output.results import averages_line, curves_csv
-from tui.web.access import Access, TooManyAttemptsError, Visitor, server_key
+from tui.service.records.places import file_name
+from tui.web.access import (
+    Access,
+    Ended,
+    Right,
+    TooManyAttemptsError,
+    Visitor,
+    check_private,
+    network_of,
+    server_key,
+    state_path,
+)
 from tui.web.chart import choice_of, numbers, picture
+from tui.web.connections import Connections, most_connections
 from tui.web.html import page
 from tui.web.live import Live
 from tui.web.months import Months
 from tui.web.pages import about_test
-from tui.web.tests import PAGE, NoSuchTestError, Tests, compared
+from tui.web.tests import PAGE, NoSuchTestError, Tests, compared, content_of
+from tui.web.work import TooMuchWorkError, Work
 from tui.wording.verdict_text import WORDS
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
-    from concurrent.futures import Future
-    from pathlib import Path
+    from collections.abc import AsyncIterator, Awaitable, Callable, Hashable, Mapping
     from types import FrameType
 
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -57,9 +80,12 @@ if TYPE_CHECKING:
 _LOGGER = logging.getLogger(__name__)
 PATIENCE = 10.0
 """Seconds for which a page waits for an estimate, before it says that it is being made."""
-LARGEST_FORM = 1 << 14
-"""Bytes."""
+LARGEST_FORM, SLOWEST_FORM = 1 << 14, 10.0
+"""Bytes, and seconds."""
+STREAMS = 32
+"""Running tests that one address may follow at the same time: half of its connections."""
 _LOOPBACK = frozenset({"localhost", "127.0.0.1", "[::1]"})
+_HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(:\d{1,5})?")
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:;"
     " connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
@@ -76,8 +102,7 @@ _HEADERS = {
     "cross-origin-resource-policy": "same-origin",
     "cache-control": "no-store",
 }
-_OPEN = ("/login", "/static/")
-"""Paths that need no right."""
+_HSTS = {"strict-transport-security": "max-age=31536000"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,9 +141,12 @@ class Guard:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer, or refuse."""
-        if scope["type"] != "http":
+        if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
+        if scope["type"] != "http":
+            raise ValueError(f"a connection of type {scope['type']}; expected http")
+        added = _HEADERS | (_HSTS if scope["scheme"] == "https" else {})
 
         async def guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -127,7 +155,7 @@ class Guard:
                     *message["headers"],
                     *(
                         (name.encode(), value.encode())
-                        for name, value in _HEADERS.items()
+                        for name, value in added.items()
                         if name.encode() not in given
                     ),
                 ]
@@ -137,47 +165,52 @@ class Guard:
         refusal = self._foreign(request)
         if refusal is None:
             try:
-                visitor = await self._visitor(request)
+                scope["state"]["visitor"] = self._visitor(request)
             except TooManyAttemptsError as error:
                 refusal = _too_many(error)
-            else:
-                scope["state"]["visitor"] = visitor
-                refusal = self._refused(request, visitor)
         await (self._app if refusal is None else refusal)(scope, receive, guarded)
 
     def _foreign(self, request: Request) -> Response | None:
-        """Refuse what another site sends in the name of a visitor."""
+        """Refuse what is asked of another server, or sent by another site for a visitor."""
         host = request.headers.get("host", "")
-        name = host.rpartition(":")[0] if host.rpartition(":")[2].isdigit() else host
-        # Where anybody on this computer may look, the names of other sites must not lead here.
-        if self._access.is_open and name.lower() not in self._place.hosts:
+        named = _HOST.fullmatch(host)
+        if named is None:
+            return Response("expected Host: name:port", HTTPStatus.BAD_REQUEST)
+        name, (own, _) = named[1].lower(), request.scope.get("server") or ("", None)
+        # A name of another site could lead here, and its pages could then read what is shown.
+        if name not in self._place.hosts and name.strip("[]") != own:
             return Response(f"{name}: not a name of this server", HTTPStatus.MISDIRECTED_REQUEST)
         origin = request.headers.get("origin")
-        if request.method == "POST" and origin is not None and urlsplit(origin).netloc != host:
-            return Response("this form is of another site", HTTPStatus.FORBIDDEN)
+        if request.method == "POST" and origin is not None:
+            try:
+                other = urlsplit(origin).netloc != host
+            except ValueError:
+                return Response("expected Origin: http://name:port", HTTPStatus.BAD_REQUEST)
+            if other:
+                return Response("this form is of another site", HTTPStatus.FORBIDDEN)
         return None
 
-    async def _visitor(self, request: Request) -> Visitor | None:
+    def _visitor(self, request: Request) -> Visitor | None:
         kind, _, token = request.headers.get("authorization", "").partition(" ")
         if kind.lower() == "bearer":
             return self._access.by_token(client_of(request), token.strip())
         cookie = request.cookies.get(self._place.cookie, "")
         return self._access.by_cookie(cookie) or self._access.anybody
 
-    def _refused(self, request: Request, visitor: Visitor | None) -> Response | None:
-        path = request.url.path
-        if visitor is not None or path.startswith(_OPEN):
-            return None
-        wants_page = "text/html" in request.headers.get("accept", "")
-        if request.method == "GET" and wants_page and "authorization" not in request.headers:
-            query = f"?{request.url.query}" if request.url.query else ""
-            return _see(f"/login?{urlencode({'next': path + query})}")
-        return Response("log in, or send a token", HTTPStatus.UNAUTHORIZED)
+
+def _refused(request: Request) -> Response:
+    """Ask who may not look to log in."""
+    wants_page = "text/html" in request.headers.get("accept", "")
+    if request.method == "GET" and wants_page and "authorization" not in request.headers:
+        asked = request.scope["query_string"].decode("latin-1")
+        path = quote(request.scope["path"]) + (f"?{asked}" if asked else "")
+        return _see(f"/login?{urlencode({'next': path})}")
+    return Response("log in, or send a token", HTTPStatus.UNAUTHORIZED)
 
 
 def client_of(request: Request) -> str:
     """Return the address that a request came from."""
-    return "" if request.client is None else request.client.host
+    return "" if request.client is None else request.client.host[:64]
 
 
 def _see(path: str) -> Response:
@@ -215,9 +248,13 @@ class Server:
     ) -> None:
         self._controls, self._bench, self._web = controls, bench, web
         self._check = check
-        self._access = Access(web, server_key(bench))
+        for path in bench.recording_directory.glob(f".{file_name(bench.name)}.web-key"):
+            path.unlink()  # of an earlier version: who reads the recordings could log in with it
+        key = server_key(state_path(bench, "key"))
+        self._access = Access(web, key, Ended(state_path(bench, "ended")))
+        self._n_streams: Counter[str] = Counter()
         self._live = Live(controls, status)
-        self._tests = Tests(controls, lambda: self._live.followed)
+        self._tests = Tests(controls, bench, lambda: self._live.followed)
         self._months = Months(bench)
         self._checking = asyncio.Lock()
         """Passwords are hashed one at a time: each takes a tenth of a second of a core."""
@@ -231,70 +268,93 @@ class Server:
             If the port is taken, or a certificate cannot be read.
         """
         web = self._web
-        config = uvicorn.Config(
-            "",
-            host=web.address,
-            port=web.port,
-            log_config=None,
-            access_log=False,
-            server_header=False,
-            proxy_headers=False,
-            timeout_graceful_shutdown=3,
-            ssl_certfile=web.certificate,
-            ssl_keyfile=web.key,
-        )
-        listening = _bound(web.address, web.port)
+        if web.key is not None:
+            check_private(Path(web.key), 0o007)
+        self._connections = Connections(most_connections(), trusted=web.proxies)
+        listening = self._connections.listening(web.address, web.port)
         with listening:
-            names = {*_LOOPBACK, *(name.lower() for name in web.hosts)}
-            place = Place(
-                web.address,
-                listening.getsockname()[1],
-                web.certificate is not None,
-                frozenset(names),
+            names = {*_LOOPBACK, *(name.lower() for name in (*web.hosts, socket.gethostname()))}
+            is_secure = web.certificate is not None
+            place = Place(web.address, listening.getsockname()[1], is_secure, frozenset(names))
+            config = uvicorn.Config(
+                self.application(place),
+                loop="asyncio",
+                http=self._connections.protocol(_HEADERS | (_HSTS if is_secure else {})),
+                ws="none",
+                log_config=None,
+                log_level="error",
+                access_log=False,
+                server_header=False,
+                proxy_headers=bool(web.proxies),
+                forwarded_allow_ips=list(web.proxies),
+                timeout_graceful_shutdown=3,
+                ssl_certfile=web.certificate,
+                ssl_keyfile=web.key,
             )
-            config.app = self.application(place)
             server = _Uvicorn(config, self._live.end)
             ready(place.url)
             server.run(sockets=[listening])
+
+    @property
+    def routes(
+        self,
+    ) -> tuple[tuple[str, Right | None, Callable[[Request], Awaitable[Response]], str], ...]:
+        """Every address: its path, the right that it needs (None: none), endpoint and methods."""
+        read, steer, test = Right.READ, Right.STEER, "/tests/{name}"
+        return (
+            ("/", read, self._now, "GET"),
+            ("/events", read, self._events, "GET"),
+            ("/now/curves", read, self._now_curves, "GET"),
+            ("/tests", read, self._list, "GET"),
+            (test, read, self._test, "GET"),
+            (f"{test}/curves", read, self._test_curves, "GET"),
+            (f"{test}/report.html", read, self._report, "GET"),
+            (f"{test}/report.pdf", read, self._report, "GET"),
+            (f"{test}/result.json", read, self._json, "GET"),
+            (f"{test}/curves.csv", read, self._csv, "GET"),
+            (f"{test}/certificate/{{number}}", read, self._certificate, "GET"),
+            ("/sensors", read, self._sensors, "GET"),
+            ("/sensors.png", read, self._picture, "GET"),
+            ("/archive", read, self._archive, "GET"),
+            ("/archive/days.png", read, self._picture, "GET"),
+            ("/archive/density.png", read, self._picture, "GET"),
+            ("/login", None, self._log_in, "GET POST"),
+            ("/logout", read, self._log_out, "POST"),
+            ("/start", steer, self._start, "GET POST"),
+            ("/stop", steer, self._stop, "GET POST"),
+            ("/mark", steer, self._mark, "POST"),
+        )
 
     def application(self, place: Place) -> ASGIApp:
         """Return the application that answers requests."""
         self._place = place
         routes = [
-            Route("/", self._now),
-            Route("/events", self._events),
-            Route("/now/curves", self._now_curves),
-            Route("/tests", self._list),
-            Route("/tests/{name}", self._test),
-            Route("/tests/{name}/curves", self._test_curves),
-            Route("/tests/{name}/report.html", self._report),
-            Route("/tests/{name}/report.pdf", self._report),
-            Route("/tests/{name}/result.json", self._json),
-            Route("/tests/{name}/curves.csv", self._csv),
-            Route("/tests/{name}/certificate/{number:int}", self._certificate),
-            Route("/sensors", self._sensors),
-            Route("/sensors.png", self._picture),
-            Route("/archive", self._archive),
-            Route("/archive/days.png", self._picture),
-            Route("/archive/density.png", self._picture),
-            Route("/login", self._log_in, methods=["GET", "POST"]),
-            Route("/logout", self._log_out, methods=["POST"]),
-            Route("/start", self._start, methods=["GET", "POST"]),
-            Route("/stop", self._stop, methods=["GET", "POST"]),
-            Route("/mark", self._mark, methods=["POST"]),
-            Mount("/static", StaticFiles(packages=[("tui.web", "static")])),
+            Route(path, _with_right(right, endpoint), methods=methods.split())
+            for path, right, endpoint, methods in self.routes
         ]
+        static = Mount("/static", StaticFiles(packages=[("tui.web", "static")]))
+        every = Route(
+            "/{path:path}", _with_right(Right.READ, self._nothing), methods=["GET", "POST"]
+        )
         handlers: dict[Any, Any] = dict.fromkeys(
-            (HuddleError, EstimatorError, HTTPException), self._failed
+            (HuddleError, EstimatorError, HTTPException, OSError, ClientDisconnect), self._failed
         )
         handlers[Exception] = self._broken
-        made = Starlette(routes=routes, exception_handlers=handlers, lifespan=self._lifespan)
+        made = Starlette(
+            routes=[*routes, static, every], exception_handlers=handlers, lifespan=self._lifespan
+        )
+        made.router.redirect_slashes = False
         return Guard(made, self._access, place)
+
+    async def _nothing(self, _request: Request) -> Response:
+        raise HTTPException(HTTPStatus.NOT_FOUND, "There is no such page.")
 
     @asynccontextmanager
     async def _lifespan(self, app: Starlette) -> AsyncIterator[None]:
         del app
+        watching = asyncio.create_task(self._connections.watch())
         yield
+        watching.cancel()
         self._tests.close()
         await run_in_threadpool(self._live.close)
 
@@ -317,10 +377,12 @@ class Server:
         return HTMLResponse(page(template, **about, **values), code)
 
     async def _failed(self, request: Request, error: Exception) -> Response:
-        code: int = HTTPStatus.INTERNAL_SERVER_ERROR
+        code: int = HTTPStatus.CONFLICT  # a file is not as it should be
         text = str(error)
         if isinstance(error, NoSuchTestError):
             code = HTTPStatus.NOT_FOUND
+        elif isinstance(error, TooMuchWorkError):
+            code = HTTPStatus.TOO_MANY_REQUESTS
         elif isinstance(error, HTTPException):
             code, text = error.status_code, error.detail
         return self._page(
@@ -328,7 +390,7 @@ class Server:
         )
 
     async def _broken(self, request: Request, error: Exception) -> Response:
-        _LOGGER.error("error in the page %s", request.url.path, exc_info=error)
+        _LOGGER.error("error in the page %s", request.scope["path"], exc_info=error)
         return self._page(
             request,
             "message",
@@ -347,7 +409,20 @@ class Server:
     async def _events(self, request: Request) -> Response:
         if request.method == "HEAD":
             return Response()
-        return StreamingResponse(self._live.events(), media_type="text/event-stream")
+        client = client_of(request)
+        if self._n_streams[client] >= STREAMS and client not in self._web.proxies:
+            raise HTTPException(HTTPStatus.TOO_MANY_REQUESTS, "Too many pages are followed.")
+
+        async def events() -> AsyncIterator[bytes]:
+            self._n_streams[client] += 1
+            try:
+                async for each in self._live.events():
+                    yield each
+            finally:
+                self._n_streams[client] -= 1
+                self._n_streams += Counter()  # drops those that follow none any more
+
+        return StreamingResponse(events(), media_type="text/event-stream")
 
     async def _now_curves(self, request: Request) -> Response:
         return await self._curves(self._live.state, request.query_params)
@@ -361,7 +436,7 @@ class Server:
 
     async def _list(self, request: Request) -> Response:
         asked = request.query_params
-        first = int(asked.get("first", "0")) if asked.get("first", "0").isdecimal() else 0
+        first = _number(asked.get("first", "0"))
         text, verdict = asked.get("text", ""), asked.get("verdict", "")
         found = await run_in_threadpool(
             lambda: self._tests.listed(text=text, verdict=verdict, first=first)
@@ -388,12 +463,58 @@ class Server:
         asked = [request.path_params["name"]]
         if other := request.query_params.get("with"):
             asked.append(other)
-        futures = [self._tests.estimated(name) for name in asked]
-        found = [await _waited(each) for each in futures]
-        known = [each for each in found if each is not None]
-        if len(known) < len(found):
-            return None
+        known: list[State] = []
+        for name in asked:
+            key = await run_in_threadpool(self._tests.key_of, name)
+            made = await self._made(
+                request, self._tests.work, key, partial(self._tests.estimate, key[0]), PATIENCE
+            )
+            if made is None:
+                return None
+            known.append(made)
         return known[0] if len(known) == 1 else compared(known[0], known[1])
+
+    async def _made(
+        self,
+        request: Request,
+        work: Work,
+        key: Hashable,
+        act: Callable[[], Any],
+        patience: float | None = None,
+    ) -> Any:  # noqa: ANN401 - whatever is made
+        """Return what long work makes; None if it takes longer than the patience (s).
+
+        Raises
+        ------
+        ClientDisconnect
+            If the visitor leaves: work that has not begun, and that nobody else wants, is dropped.
+        TooMuchWorkError
+            If too much waits for this visitor.
+        """
+        visitor: Visitor = request.state.visitor
+        piece = work.ask(visitor.number or network_of(client_of(request)), key, act)
+        made = asyncio.wrap_future(piece.future)
+        made.add_done_callback(lambda each: each.cancelled() or each.exception())
+        gone = asyncio.create_task(_gone(request))
+        try:
+            await asyncio.wait({made, gone}, timeout=patience, return_when=asyncio.FIRST_COMPLETED)
+            if made.done():
+                return made.result()
+            if gone.done():
+                raise ClientDisconnect
+            return None
+        finally:
+            if gone.done() or not gone.cancel():
+                work.leave(piece)
+
+    async def _report_of(self, request: Request, kind: str) -> tuple[State, bytes] | None:
+        """Return a test and its result as a file of a kind; None while the test is estimated."""
+        state = await self._state(request)
+        if state is None:
+            return None
+        key = await run_in_threadpool(self._tests.key_of, request.path_params["name"])
+        act = partial(self._tests.report, state, kind)
+        return state, await self._made(request, self._tests.work, (kind, key), act)
 
     def _later(self, request: Request) -> Response:
         return self._page(
@@ -409,10 +530,11 @@ class Server:
         if state is None:
             return self._later(request)
         about = await run_in_threadpool(_chart, state, request.query_params)
-        document, certificates = await asyncio.wrap_future(
-            self._tests.in_worker(
-                lambda: (self._tests.document(state), self._tests.certificates(state))
-            )
+        document, certificates = await self._made(
+            request,
+            self._tests.reading,
+            None,
+            lambda: (self._tests.document(state), self._tests.certificates(state)),
         )
         listed = await run_in_threadpool(self._tests.listed)
         name = request.path_params["name"]
@@ -440,13 +562,11 @@ class Server:
         return await self._curves(state, request.query_params)
 
     async def _report(self, request: Request) -> Response:
-        state = await self._state(request)
-        if state is None:
+        suffix = ".pdf" if request.scope["path"].endswith(".pdf") else ".html"
+        found = await self._report_of(request, suffix)
+        if found is None:
             return self._later(request)
-        suffix = request.url.path[request.url.path.rindex(".") :]
-        content = await asyncio.wrap_future(
-            self._tests.in_worker(lambda: self._tests.report(state, suffix))
-        )
+        state, content = found
         if suffix == ".pdf":
             return _download(content, "application/pdf", f"{state.name}.pdf")
         return HTMLResponse(content, headers={"content-security-policy": REPORT_POLICY})
@@ -455,10 +575,11 @@ class Server:
         state = await self._state(request)
         if state is None:
             return self._later(request)
-        found = await asyncio.wrap_future(
-            self._tests.in_worker(
-                lambda: json.dumps(finite(self._tests.document(state)), ensure_ascii=False)
-            )
+        found = await self._made(
+            request,
+            self._tests.reading,
+            None,
+            lambda: json.dumps(finite(self._tests.document(state)), ensure_ascii=False),
         )
         return _download(found.encode(), "application/json", f"{state.name}.json")
 
@@ -473,33 +594,33 @@ class Server:
         state = await self._state(request)
         if state is None:
             return self._later(request)
-        found = await asyncio.wrap_future(
-            self._tests.in_worker(lambda: self._tests.certificates(state))
+        found = await self._made(
+            request, self._tests.reading, None, lambda: self._tests.certificates(state)
         )
-        number = request.path_params["number"]
-        if number >= len(found):
+        number = _number(request.path_params["number"], -1)
+        if not 0 <= number < len(found):
             raise NoSuchTestError("no such certificate")
         _, path = found[number]
-        content = await run_in_threadpool(path.read_bytes)
+        content = await run_in_threadpool(content_of, path)
         return _download(content, "application/pdf", path.name)
 
     async def _sensors(self, request: Request) -> Response:
-        about = await asyncio.wrap_future(self._tests.in_worker(self._months.sensors))
+        about = await self._made(request, self._tests.work, None, self._months.sensors)
         return self._page(request, "sensors", title="Sensors", **about)
 
     async def _archive(self, request: Request) -> Response:
-        about = await asyncio.wrap_future(self._tests.in_worker(self._months.archive))
+        about = await self._made(request, self._tests.work, None, self._months.archive)
         return self._page(request, "archive", title="Archive", **about)
 
     async def _picture(self, request: Request) -> Response:
-        name = request.url.path.rpartition("/")[2].removesuffix(".png")
+        name = request.scope["path"].rpartition("/")[2].removesuffix(".png")
         months = self._months
 
         def drawn() -> bytes:
             return months.sensors_picture() if name == "sensors" else months.archive_picture(name)
 
         try:
-            content = await asyncio.wrap_future(self._tests.in_worker(drawn))
+            content = await self._made(request, self._tests.work, None, drawn)
         except LookupError as error:
             raise HTTPException(HTTPStatus.NOT_FOUND, str(error)) from None
         return Response(content, media_type="image/png")
@@ -531,8 +652,7 @@ class Server:
                     cookie,
                     httponly=True,
                     samesite="strict",
-                    secure=self._place.is_secure
-                    or request.headers.get("x-forwarded-proto") == "https",
+                    secure=request.scope["scheme"] == "https",
                 )
                 return response
             _LOGGER.warning("wrong password for the pages from %s", client)
@@ -548,21 +668,20 @@ class Server:
 
     async def _log_out(self, request: Request) -> Response:
         _check_form(request, await _form(request))
+        await run_in_threadpool(self._access.log_out, request.state.visitor)
         response = _see("/")
         response.delete_cookie(self._place.cookie, httponly=True, samesite="strict")
         return response
 
     async def _steering(self, request: Request) -> tuple[Visitor, dict[str, str]]:
-        """Return who steers, and the form; refuse others.
+        """Return who steers, and the form.
 
         Raises
         ------
         HTTPException
-            If the visitor may not steer, or the form is not of these pages.
+            If the form is not of these pages.
         """
-        visitor: Visitor | None = request.state.visitor
-        if visitor is None or not visitor.may_steer:
-            raise HTTPException(HTTPStatus.FORBIDDEN, "This needs the right to start and stop.")
+        visitor: Visitor = request.state.visitor
         form = await _form(request) if request.method == "POST" else {}
         if request.method == "POST":
             _check_form(request, form)
@@ -663,26 +782,33 @@ class _Uvicorn(uvicorn.Server):
         super().handle_exit(sig, frame)
 
 
-def _bound(address: str, port: int) -> socket.socket:
-    """Return a listening socket.
+def _with_right(
+    right: Right | None, endpoint: Callable[[Request], Awaitable[Response]]
+) -> Callable[[Request], Awaitable[Response]]:
+    """Return an endpoint that answers only to who has a right."""
 
-    Raises
-    ------
-    OSError
-        Naming address and port, if it cannot be had.
-    """
-    family = socket.AF_INET6 if ":" in address else socket.AF_INET
-    try:
-        return socket.create_server((address, port), family=family)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, f"{address} port {port}") from error
+    async def answer(request: Request) -> Response:
+        visitor: Visitor | None = request.state.visitor
+        if right is None:
+            return await endpoint(request)
+        if visitor is None:
+            return _refused(request)
+        if right is Right.STEER and not visitor.may_steer:
+            raise HTTPException(HTTPStatus.FORBIDDEN, "This needs the right to start and stop.")
+        return await endpoint(request)
+
+    return answer
 
 
-async def _waited(future: Future[State]) -> State | None:
-    try:
-        return await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(future)), PATIENCE)
-    except TimeoutError:
-        return None
+async def _gone(request: Request) -> None:
+    """Return when the visitor has left."""
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
+
+
+def _number(text: str, otherwise: int = 0) -> int:
+    """Return a whole number that an address has."""
+    return int(text) if text.isascii() and text.isdecimal() and len(text) < 10 else otherwise
 
 
 def _chart(state: State, asked: Mapping[str, str]) -> dict[str, Any]:
@@ -715,13 +841,18 @@ async def _form(request: Request) -> dict[str, str]:
     Raises
     ------
     HTTPException
-        If it is too large.
+        If it is too large, or comes too slowly.
     """
     content = b""
-    async for part in request.stream():
-        content += part
-        if len(content) > LARGEST_FORM:
-            raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "The form is too large.")
+    try:
+        async with asyncio.timeout(SLOWEST_FORM):
+            async for part in request.stream():
+                content += part
+                if len(content) > LARGEST_FORM:
+                    code = HTTPStatus.REQUEST_ENTITY_TOO_LARGE
+                    raise HTTPException(code, "The form is too large.")
+    except TimeoutError:
+        raise HTTPException(HTTPStatus.REQUEST_TIMEOUT, "The form came too slowly.") from None
     return dict(parse_qsl(content.decode("utf-8", "replace"), keep_blank_values=True))
 
 

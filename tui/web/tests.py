@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import os
 import threading
-from collections import OrderedDict
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -19,19 +18,20 @@ from tui.certificate.ledger import ledger_of
 from tui.output.json_document import document
 from tui.runs.catalogue import Entry, catalogue
 from tui.runs.estimate_settings import settings_for
+from tui.web.work import Work
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from daq.bench.model import Bench
     from tui.application.controls import Controls
     from tui.certificate.ledger import Entry as Certificate
 
-KEPT = 8
-"""Estimates that are kept."""
 PAGE = 50
 """Tests on a page of the list."""
-_Key = tuple[str, int, int]
+Key = tuple["Path", int, int]
+"""Recording, time of its last change, and size."""
 
 
 class NoSuchTestError(HuddleError):
@@ -49,28 +49,33 @@ class Found:
 class Tests:
     """The closed recordings of a bench.
 
-    One thread makes all estimates and reports, one after the other: whoever looks at pages takes
-    no more than one core, and a test that many look at is estimated once.
+    One thread makes all estimates, reports and pictures, one after the other, and another one reads
+    documents and ledgers: many who look at a test have it estimated once, and no page waits for a
+    report.
 
     Parameters
     ----------
     controls : Controls
+    bench : Bench
+        Whose ledger has the certificates, whatever bench file a recording has.
     followed : callable
         Returns the recording that is followed just now: HDF5 must not open it a second time.
     """
 
     __test__ = False  # for pytest
 
-    def __init__(self, controls: Controls, followed: Callable[[], Path | None]) -> None:
-        self._controls, self._followed = controls, followed
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="estimates")
-        self._kept: OrderedDict[_Key, Future[State]] = OrderedDict()
+    def __init__(
+        self, controls: Controls, bench: Bench, followed: Callable[[], Path | None]
+    ) -> None:
+        self._controls, self._bench, self._followed = controls, bench, followed
+        self.work, self.reading = Work("estimates"), Work("documents")
         self._known: dict[Path, Entry] = {}
-        self._lock, self._listing = threading.Lock(), threading.Lock()
+        self._listing = threading.Lock()
 
     def close(self) -> None:
-        """Make no further estimate."""
-        self._worker.shutdown(wait=False, cancel_futures=True)
+        """Begin no further work."""
+        self.work.close()
+        self.reading.close()
 
     def listed(self, *, text: str = "", verdict: str = "", first: int = 0) -> Found:
         """Return tests, the newest first, whose name, bench or operator has a text. Blocks.
@@ -115,8 +120,8 @@ class Tests:
         """Return whether a recording is still being written, or followed to its end."""
         return path == self._followed() or is_being_written(path)
 
-    def estimated(self, name: str) -> Future[State]:
-        """Return the estimate of a test, begun if it is not kept.
+    def key_of(self, name: str) -> Key:
+        """Return what is the same for a test as long as its recording is.
 
         Raises
         ------
@@ -127,17 +132,10 @@ class Tests:
         if self.is_running(path):
             raise NoSuchTestError(f"{name} is still being recorded: its result follows at its end")
         about = path.stat()
-        key = name, about.st_mtime_ns, about.st_size
-        with self._lock:
-            found = self._kept.get(key)
-            if found is None or (found.done() and found.exception() is not None):
-                found = self._kept[key] = self._worker.submit(self._estimate, path)
-            self._kept.move_to_end(key)
-            while len(self._kept) > KEPT:
-                self._kept.popitem(last=False)
-        return found
+        return path, about.st_mtime_ns, about.st_size
 
-    def _estimate(self, path: Path) -> State:
+    def estimate(self, path: Path) -> State:
+        """Return the estimate of a test. Blocks."""
         settings, bench = settings_for(path)
         try:
             snapshot = estimate([path], settings)
@@ -152,10 +150,6 @@ class Tests:
             judged_by=bench,
             verdict=judge(bench, snapshot, settings),
         )
-
-    def in_worker(self, act: Callable[[], Any]) -> Future[Any]:
-        """Do what takes long where estimates are made: reports, documents."""
-        return self._worker.submit(act)
 
     def document(self, state: State) -> dict[str, Any]:
         """Return the result as `huddle estimate --json` writes it. Blocks."""
@@ -185,7 +179,7 @@ class Tests:
             If the ledger cannot be read.
         """
         *_, path = _known(state)
-        ledger = ledger_of(path, state.judged_by)
+        ledger = ledger_of(path, self._bench)
         if not ledger.exists:
             return []
         (source, *_) = sources([path])
@@ -194,6 +188,22 @@ class Tests:
             for entry in ledger.entries()
             if source.run_id in entry.runs and entry.file
         ]
+
+
+def content_of(certificate: Path) -> bytes:
+    """Return the content of a certificate; a link in its place is not followed.
+
+    Raises
+    ------
+    NoSuchTestError
+        If it is not there.
+    """
+    try:
+        handle = os.open(certificate, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
+    except OSError as error:
+        raise NoSuchTestError(f"{certificate.name}: {error.strerror}") from error
+    with os.fdopen(handle, "rb") as file:
+        return file.read()
 
 
 def compared(state: State, other: State) -> State:

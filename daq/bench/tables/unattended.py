@@ -227,6 +227,10 @@ class Web(Table):
     """Who may also start, stop, mark and confirm; nobody where it is not given."""
     hosts: tuple[str, ...] = ()
     """Further names of this computer in addresses of the pages, as behind a reverse proxy."""
+    proxies: tuple[Annotated[str, AfterValidator(_address)], ...] = ()
+    """Addresses of reverse proxies, which state visitors in X-Forwarded-For; nobody else may."""
+    insecure: bool = False
+    """Whether passwords and pages may cross the network in clear text."""
     certificate: Annotated[str, Field(min_length=1)] | None = None
     """Absolute path of a TLS certificate (PEM)."""
     key: Annotated[str, Field(min_length=1)] | None = None
@@ -253,6 +257,12 @@ class Web(Table):
             raise ValueError(
                 f"address {address}: other computers reach it; expected read = a line that huddle"
                 " web --password or huddle web --token prints"
+            )
+        is_far = not ipaddress.ip_address(address).is_loopback
+        if is_far and self.certificate is None and not self.insecure:
+            raise ValueError(
+                f"address {address}: passwords would cross the network in clear text; expected"
+                " certificate and key, or insecure = true (--insecure) where nobody can listen"
             )
 
 

@@ -125,7 +125,11 @@ def serving(bench: Path, *, port: int = 0) -> Iterator[Server]:
     command = python_command("tui", "web", str(bench), "--port", str(port))
     with out.open("wb") as stdout, log.open("ab") as stderr:
         process = subprocess.Popen(
-            command, stdout=stdout, stderr=stderr, env=os.environ | {"PYTHONUNBUFFERED": "1"}
+            command,
+            stdout=stdout,
+            stderr=stderr,
+            env=os.environ
+            | {"PYTHONUNBUFFERED": "1", "XDG_STATE_HOME": str(bench.parent / "state")},
         )
     try:
 

@@ -1,0 +1,134 @@
+"""Long work for pages: a queue for each visitor, and one thread that serves them in turn.
+
+Theory of operation
+-------------------
+Who asks for work that is being done or kept shares it. A visitor may have `WAITING` pieces in their
+queue; the thread takes one from each queue in turn, so that nobody waits for the queue of another.
+Work that has not begun is dropped when all who asked for it have left. The results of the last
+`KEPT` pieces with a key are kept.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict, deque
+from concurrent.futures import Future
+from typing import TYPE_CHECKING, Any
+
+from daq.errors import HuddleError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Hashable
+
+WAITING = 4
+"""Pieces of work that wait for one visitor, at most."""
+KEPT = 16
+"""Results that are kept, at most: estimates, reports, documents."""
+
+
+class TooMuchWorkError(HuddleError):
+    """A visitor asks for more work than may wait for them."""
+
+
+class Piece:
+    """Work, its result, and how many wait for it."""
+
+    def __init__(self, act: Callable[[], Any], visitor: str, key: Hashable) -> None:
+        self.act, self.visitor, self.key = act, visitor, key
+        self.future: Future[Any] = Future()
+        self.n_waiting = 0
+
+
+class Work:
+    """One thread that works for all visitors in turn."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._queues: OrderedDict[str, deque[Piece]] = OrderedDict()
+        self._known: OrderedDict[Hashable, Piece] = OrderedDict()
+        self._changed = threading.Lock()
+        self._thread: threading.Thread | None = None
+
+    def ask(self, visitor: str, key: Hashable, act: Callable[[], Any]) -> Piece:
+        """Return work, begun later unless it is known; `leave` gives it back.
+
+        Parameters
+        ----------
+        visitor : str
+            Whose queue it waits in.
+        key : hashable
+            Of the same result; None for a result that is neither shared nor kept.
+        act : callable
+            Does the work.
+
+        Raises
+        ------
+        TooMuchWorkError
+            If too much waits for this visitor.
+        """
+        with self._changed:
+            piece = self._known.get(key)
+            if piece is None or _has_failed(piece.future):
+                queue = self._queues.setdefault(visitor, deque())
+                if len(queue) >= WAITING:
+                    raise TooMuchWorkError(
+                        f"{WAITING} pages wait to be made for you; try again in a moment"
+                    )
+                piece = Piece(act, visitor, key)
+                queue.append(piece)
+                if self._thread is None:
+                    self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+                    self._thread.start()
+            piece.n_waiting += 1
+            if key is not None:
+                self._known[key] = piece
+                self._known.move_to_end(key)
+                done = [known for known, each in self._known.items() if each.future.done()]
+                for known in done[: max(0, len(done) - KEPT)]:
+                    del self._known[known]
+            return piece
+
+    def leave(self, piece: Piece) -> None:
+        """Drop work that nobody waits for any more, unless it has begun."""
+        with self._changed:
+            piece.n_waiting -= 1
+            queue = self._queues.get(piece.visitor)
+            if piece.n_waiting <= 0 and queue is not None and piece in queue:
+                queue.remove(piece)
+                piece.future.cancel()
+                self._known.pop(piece.key, None)
+                if not queue:
+                    del self._queues[piece.visitor]
+
+    def close(self) -> None:
+        """Begin no further work."""
+        with self._changed:
+            for queue in self._queues.values():
+                for piece in queue:
+                    piece.future.cancel()
+            self._queues.clear()
+
+    def _next(self) -> Piece | None:
+        """Return the next piece, of the visitor who has waited longest; None ends the thread."""
+        with self._changed:
+            if not self._queues:
+                self._thread = None
+                return None
+            visitor, queue = self._queues.popitem(last=False)
+            piece = queue.popleft()
+            if queue:
+                self._queues[visitor] = queue  # behind all others
+            return piece
+
+    def _run(self) -> None:
+        while (piece := self._next()) is not None:
+            if not piece.future.set_running_or_notify_cancel():
+                continue
+            try:
+                piece.future.set_result(piece.act())
+            except BaseException as error:  # noqa: BLE001 - whoever waits for it raises it
+                piece.future.set_exception(error)
+
+
+def _has_failed(future: Future[Any]) -> bool:
+    return future.done() and (future.cancelled() or future.exception() is not None)
