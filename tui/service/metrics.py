@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 from typing import TYPE_CHECKING, Any
 
 from daq.errors import HuddleError
@@ -15,6 +16,10 @@ if TYPE_CHECKING:
     from daq.bench.tables.unattended import Metrics
     from tui.service.hooks import HookRunner
     from tui.service.service import Service
+
+
+PATIENCE, MAX_THREADS = 5.0, 64
+"""Seconds for which a connection may be silent, and threads of the service with connections."""
 
 
 class MetricsError(HuddleError):
@@ -69,6 +74,9 @@ class ServiceMetrics:
                 f"metrics: {settings.address} port {settings.port}: {error.strerror}; expected a"
                 " free port of this computer"
             ) from error
+        # Each connection has a thread of the service: silent ones end, and more are not taken.
+        server.RequestHandlerClass.timeout = PATIENCE
+        server.verify_request = lambda *_: threading.active_count() < MAX_THREADS
         try:
             yield int(server.server_port)
         finally:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import socket
 import sys
+import threading
 import urllib.request
 from typing import TYPE_CHECKING
 
@@ -13,10 +15,11 @@ import pytest
 
 from daq.bench.tables.unattended import Metrics
 from tests.tui.service.bench_files import HOURLY, Place
+from tests.waiting import wait_until
 from tui.commands.serve import is_alive, signs_of_life
 from tui.output.logs.lines import JournalHandler, fields_of
 from tui.service.hooks import HookRunner
-from tui.service.metrics import MetricsError, ServiceMetrics
+from tui.service.metrics import MAX_THREADS, MetricsError, ServiceMetrics
 from tui.service.notify import Notifier, watchdog_interval
 from tui.service.window import STALL
 
@@ -86,6 +89,12 @@ async def test_metrics_show_runs_sensors_and_disk(tmp_path: Path) -> None:
         with pytest.raises(MetricsError, match=f"port {port}: Address already in use"):
             metrics.served(Metrics(port=port)).__enter__()
         address = f"http://127.0.0.1:{port}/metrics"
+        with contextlib.ExitStack() as stack:
+            for _ in range(3 * MAX_THREADS):
+                stack.enter_context(socket.create_connection(("127.0.0.1", port)))
+            wait_until(lambda: threading.active_count() >= MAX_THREADS, "all threads are taken")
+            assert threading.active_count() <= MAX_THREADS
+        wait_until(lambda: threading.active_count() < MAX_THREADS, "threads have ended")
         text = await asyncio.to_thread(_read, address)
     service.request_stop()
     await task
