@@ -39,6 +39,9 @@ if TYPE_CHECKING:
 
     from daq.bench.estimate_settings import EstimateSettings
 
+LINES_AT_ONCE, LINES_A_SECOND = 200, 5
+"""Lines of a child that are logged at once, and on average: its log must not fill the disk."""
+LONGEST_LINE = 1 << 16
 MAX_LINES = 20
 """Lines that are no log records, of which the last are kept: a traceback of the interpreter's."""
 
@@ -52,15 +55,17 @@ class ChildLog:
         What the process is, for lines that are no log records.
     """
 
-    def __init__(self, name: str) -> None:
-        self._name = name
+    def __init__(self, name: str, now: Callable[[], float] = time.monotonic) -> None:
+        self._name, self._now = name, now
         self._pending = b""
+        self._room, self._since, self._n_left_out = float(LINES_AT_ONCE), now(), 0
         self._errors: list[str] = []
         self._others: deque[str] = deque(maxlen=MAX_LINES)
 
     def feed(self, content: bytes) -> None:
         """Take output, in pieces of any length."""
         *lines, self._pending = (self._pending + content).split(b"\n")
+        self._pending = self._pending[:LONGEST_LINE]
         for line in lines:
             self._take(line.decode(errors="replace").rstrip())
 
@@ -72,14 +77,29 @@ class ChildLog:
     def _take(self, line: str) -> None:
         record = logs.record_of(line)
         if record is None:
-            self._others.append(line)
-            _LOGGER.error("%s wrote: %s", self._name, line)
+            self._others.append(line[:LONGEST_LINE])
+            if self._has_room():
+                _LOGGER.error("%s wrote: %s", self._name, line[:LONGEST_LINE])
             return
         errors = getattr(record, "errors", None)
         if isinstance(errors, list):  # of this failure our own will say
             self._errors += map(str, errors)
-        else:
+        elif self._has_room():
             logs.write(record)
+
+    def _has_room(self) -> bool:
+        """Whether another line may be logged; the number of those that may not is logged later."""
+        now = self._now()
+        self._room = min(LINES_AT_ONCE, self._room + (now - self._since) * LINES_A_SECOND)
+        self._since = now
+        if self._room < 1:
+            self._n_left_out += 1
+            return False
+        self._room -= 1
+        if self._n_left_out:
+            n, self._n_left_out = self._n_left_out, 0
+            _LOGGER.warning("%s wrote %d further lines, which are left out", self._name, n)
+        return True
 
 
 POLL = 0.05

@@ -13,7 +13,7 @@ from tui.output.console import notices
 from tui.output.logs import lines as logs
 from tui.output.logs.lines import configure
 from tui.output.logs.options import LogFormat, LogLevel
-from tui.runs.recorder_process import ChildLog
+from tui.runs.recorder_process import LINES_AT_ONCE, ChildLog
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -172,3 +172,18 @@ def test_why_a_command_failed_does_not_act_on_a_terminal(
 @pytest.mark.parametrize("line", ["", "[]", "{}", "1", '{"time": 1, "level": "info"}', "\x00"])
 def test_other_lines_are_no_records(line: str) -> None:
     assert logs.record_of(line) is None
+
+
+def test_a_child_that_writes_without_end_does_not_fill_the_log(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    now = [0.0]
+    child = ChildLog("the pages", now=lambda: now[0])
+    child.feed(b"socket.accept() out of system resource\n" * 100_000)
+    assert len(caplog.records) == LINES_AT_ONCE
+    now[0] = 10.0
+    child.feed(b"x\n")
+    assert "the pages wrote 99800 further lines" in caplog.text
+    child.feed(b"x" * 10_000_000)
+    child.feed(b"\n")
+    assert max(len(each.getMessage()) for each in caplog.records) < 100_000
