@@ -42,6 +42,7 @@ from estimator.decision.verdict import Verdict
 from estimator.errors import EstimatorError
 from tui.application.plan import TestPlan
 from tui.application.test_view.units import units_of
+from tui.certificate.ledger import LedgerError
 from tui.output.console import finite
 from tui.output.results import averages_line, curves_csv
 from tui.service.records.places import file_name
@@ -76,6 +77,7 @@ if TYPE_CHECKING:
     from daq.bench.tables.unattended import Web
     from tui.application.controls import Controls
     from tui.application.state import State
+    from tui.certificate.ledger import Entry
 
 _LOGGER = logging.getLogger(__name__)
 PATIENCE = 10.0
@@ -530,11 +532,11 @@ class Server:
         if state is None:
             return self._later(request)
         about = await run_in_threadpool(_chart, state, request.query_params)
-        document, certificates = await self._made(
+        document, certificates, problem = await self._made(
             request,
             self._tests.reading,
             None,
-            lambda: (self._tests.document(state), self._tests.certificates(state)),
+            lambda: (self._tests.document(state), *self._certificates(state)),
         )
         listed = await run_in_threadpool(self._tests.listed)
         name = request.path_params["name"]
@@ -551,9 +553,17 @@ class Server:
             base=f"/tests/{quote(name)}",
             averages=averages_line(state.snapshot) if state.snapshot is not None else "",
             certificates=certificates,
+            problem=problem,
             others=others,
             other=request.query_params.get("with", ""),
         )
+
+    def _certificates(self, state: State) -> tuple[list[tuple[Entry, Path]], str]:
+        """Return the certificates of a test, or why there are none to be trusted."""
+        try:
+            return self._tests.certificates(state), ""
+        except LedgerError as error:
+            return [], str(error)
 
     async def _test_curves(self, request: Request) -> Response:
         state = await self._state(request)

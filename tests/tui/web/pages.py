@@ -112,17 +112,26 @@ class Server:
     process: subprocess.Popen[bytes]
     log: Path
 
+    def descriptors(self) -> int | None:
+        """Return how many descriptors the server has open; None where that cannot be seen."""
+        try:
+            return len(os.listdir(f"/proc/{self.process.pid}/fd"))  # noqa: PTH208 - all that counts
+        except FileNotFoundError:
+            return None
+
     def visit(self) -> Visit:
         """Return somebody new."""
         return Visit(self.url.rstrip("/"))
 
 
 @contextmanager
-def serving(bench: Path, *, port: int = 0) -> Iterator[Server]:
-    """Serve the pages of a bench until the context ends."""
+def serving(bench: Path, *, port: int = 0, descriptors: int = 0) -> Iterator[Server]:
+    """Serve the pages of a bench until the context ends, with so many descriptors."""
     log = bench.with_suffix(".log")
     out = bench.with_suffix(".out")
-    command = python_command("tui", "web", str(bench), "--port", str(port))
+    command = [*python_command("tui", "web", str(bench), "--port", str(port))]
+    if descriptors:
+        command = ["sh", "-c", f'ulimit -n {descriptors}; exec "$@"', "sh", *command]
     with out.open("wb") as stdout, log.open("ab") as stderr:
         process = subprocess.Popen(
             command,
