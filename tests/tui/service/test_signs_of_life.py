@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import socket
 import sys
-import threading
 import urllib.request
 from typing import TYPE_CHECKING
 
@@ -15,11 +13,11 @@ import pytest
 
 from daq.bench.tables.unattended import Metrics
 from tests.tui.service.bench_files import HOURLY, Place
-from tests.waiting import wait_until
+from tests.waiting import limit
 from tui.commands.serve import is_alive, signs_of_life
 from tui.output.logs.lines import JournalHandler, fields_of
 from tui.service.hooks import HookRunner
-from tui.service.metrics import MAX_THREADS, MetricsError, ServiceMetrics
+from tui.service.metrics import MetricsError, ServiceMetrics
 from tui.service.notify import Notifier, watchdog_interval
 from tui.service.window import STALL
 
@@ -76,7 +74,10 @@ def test_the_interval_is_half_of_what_systemd_allows(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.virtual_time
-async def test_metrics_show_runs_sensors_and_disk(tmp_path: Path) -> None:
+async def test_metrics_show_runs_sensors_and_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tui.service.metrics.PATIENCE", 0.5)
     place = Place(tmp_path, HOURLY)
     service = place.service()
     hook_runner = HookRunner(lambda: service.bench.hooks, place.store, tmp_path, place.clock)
@@ -89,12 +90,10 @@ async def test_metrics_show_runs_sensors_and_disk(tmp_path: Path) -> None:
         with pytest.raises(MetricsError, match=f"port {port}: Address already in use"):
             metrics.served(Metrics(port=port)).__enter__()
         address = f"http://127.0.0.1:{port}/metrics"
-        with contextlib.ExitStack() as stack:
-            for _ in range(3 * MAX_THREADS):
-                stack.enter_context(socket.create_connection(("127.0.0.1", port)))
-            wait_until(lambda: threading.active_count() >= MAX_THREADS, "all threads are taken")
-            assert threading.active_count() <= MAX_THREADS
-        wait_until(lambda: threading.active_count() < MAX_THREADS, "threads have ended")
+        with monkeypatch.context() as patched:
+            patched.setattr("tui.service.metrics.MAX_THREADS", 0)
+            assert await asyncio.to_thread(_silent, port) == b""  # not taken
+        assert await asyncio.to_thread(_silent, port) == b""  # its time is over
         text = await asyncio.to_thread(_read, address)
     service.request_stop()
     await task
@@ -105,6 +104,12 @@ async def test_metrics_show_runs_sensors_and_disk(tmp_path: Path) -> None:
     assert lines['huddle_sensor_samples{sensor="a"}'] == "7.0"
     assert lines['huddle_sensor_state{sensor="a",state="live"}'] == "1.0"
     assert float(lines["huddle_disk_free_bytes"]) > 0
+
+
+def _silent(port: int) -> bytes:
+    """Connect and say nothing; return what comes before the end."""
+    with socket.create_connection(("127.0.0.1", port), timeout=limit(60)) as silent:
+        return silent.recv(1)
 
 
 def _read(address: str) -> str:
