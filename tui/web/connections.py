@@ -79,7 +79,6 @@ class Connections:
 
     def admit(self, raw: socket.socket, address: str) -> bool:
         """Count a new connection; return False if it must be closed."""
-        self.sweep()
         is_over = self._n_of[address] >= self._of_address and address not in self._trusted
         if (is_over or len(self._held) >= self._total) and not self._make_room(
             address if is_over else None
