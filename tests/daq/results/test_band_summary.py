@@ -1,0 +1,42 @@
+"""Levels above what the other sensors leave unpredicted are withdrawn."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from daq.results.band_summary import Levels, Spectrum
+from tests.tui.example_snapshot import SETTINGS, made_snapshot
+
+
+def levels() -> Levels:
+    snapshot = made_snapshot()
+    noise = snapshot.results["three-sensor"]
+    found = Spectrum(noise, snapshot, SETTINGS).levels(np.array([2, 8, 16]))
+    return replace(found, contributions=())
+
+
+def bounded_by(share: float) -> Levels:
+    """Return levels whose bound is this share of them."""
+    found = levels()
+    scatter = found.of_scatter
+    factors = share ** np.arange(2, len(scatter.cumulants) + 2)  # variance, third, fourth
+    cumulants = scatter.cumulants * factors.reshape(-1, *(1,) * (scatter.cumulants.ndim - 1))
+    return replace(found, bound=replace(scatter, mean=share * scatter.mean, cumulants=cumulants))
+
+
+def test_a_withdrawn_level_has_no_lower_end() -> None:
+    found = bounded_by(0.01)
+    low, high = found.ends()
+    assert found.withdrawn().all()
+    assert np.isneginf(low).all()
+    assert (high < 0.1 * found.mean).all()
+
+
+def test_a_level_below_its_bound_keeps_its_ends() -> None:
+    found = bounded_by(100.0)
+    low, high = found.ends()
+    assert not found.withdrawn().any()
+    assert (low > 0.1 * found.mean).all()
+    assert (high > found.mean).all()
