@@ -9,7 +9,7 @@ import numpy as np
 
 from estimator.errors import EstimatorError, UnknownMethodError
 from estimator.levels.interval import unpredicted
-from estimator.levels.pooled import pooled_noise, unresolved_blocks
+from estimator.levels.pooled import ENOUGH, pooled_noise, unresolved_blocks
 from estimator.likelihood.maximum_likelihood import maximum_likelihood
 from estimator.self_noise.coherency import coherency
 from estimator.self_noise.result import Flag, SelfNoise
@@ -173,7 +173,8 @@ def _with_neighbours(
 ) -> SelfNoise:
     """Return a result whose bins take the directions of the motion from neighbours where needed.
 
-    They do in blocks whose bins do not resolve all dimensions, where the likelihood of a channel is
+    They do in blocks whose bins do not resolve all dimensions, by maximum likelihood where sensors
+    have several channels, whose noise is a matrix, where the likelihood of a channel is
     largest at zero noise at some, and where motion has more dimensions than sensors have channels,
     if the sensors are enough: bins alone do not divide the noise well among channels then. `blocks`
     is negative at bins that have no neighbours.
@@ -218,7 +219,9 @@ def _with_neighbours(
     )
     at_zero = ((found.flags[rows] & (Flag.BOUNDARY | Flag.UNRESOLVED)) != 0).any(axis=1)
     often = np.bincount(number, at_zero) > AT_ZERO * np.bincount(number)
-    wanted = (unresolved | often)[number] | further[rows]
+    # a likelihood of each channel by itself takes what the channels of a sensor share for motion
+    shares = found.method == "maximum-likelihood" and usual > 1 and n_effective >= ENOUGH
+    wanted = (unresolved | often)[number] | further[rows] | shares
     if not wanted.any():
         return found
     if not wanted.all():

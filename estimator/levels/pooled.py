@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from estimator.levels.interval import moved, worth
+from estimator.levels.noise_matrices import axes_of, coupling, inverse, pairs, times, white
 
 if TYPE_CHECKING:
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
@@ -233,10 +234,10 @@ def _pool(
     largest = k * 2 ** np.log2(np.maximum(sizes // (k * LEAST_PARTS), 1)).astype(np.int64)
     # what the largest sub-blocks do not resolve, smaller ones do not either
     parts, mean = cut(at, largest)
-    at = at[_n_resolved(_white(mean, whitener[parts.block]), parts, q, sensor) > 0]
+    at = at[_n_resolved(white(mean, whitener[parts.block]), parts, q, sensor) > 0]
     while len(at):
         parts, mean = cut(at, k[at])
-        r = _n_resolved(_white(mean, whitener[at][parts.block]), parts, q[at], sensor)
+        r = _n_resolved(white(mean, whitener[at][parts.block]), parts, q[at], sensor)
         more = at[r > best[at]]
         if len(more):
             parts, mean = cut(more, k[more])
@@ -338,7 +339,7 @@ def _fitted(
     """
     p = mean.shape[1]
     own, N, whole = parts.block, parts.averages, parts.whole
-    a, b = _pairs(sensor)
+    a, b = pairs(sensor)
     column = np.arange(p)[::-1]  # eigenvalues ascend: the leading one is the last
     r, wanted = np.zeros(len(q), np.int64), q
     # noise at first: what the other sensors do not predict
@@ -346,7 +347,7 @@ def _fitted(
     alone *= (N / (N - p * (1 - 1 / (sensor[-1] + 1))))[:, None, None]
     whitener = np.linalg.inv(np.linalg.cholesky(parts.mean(alone)))
     for turn in range(ROUNDS):
-        X = _white(mean, whitener[own])
+        X = white(mean, whitener[own])
         P = np.broadcast_to(np.eye(p, dtype=np.complex128), X.shape)
         if resolve:
             r = _n_resolved(X, parts, wanted, sensor)
@@ -369,12 +370,12 @@ def _fitted(
             Q = P - PA @ np.linalg.solve(gram, PA.conj().swapaxes(1, 2))
         loss = 1 + weak / np.maximum(whole - q, 1.0)
         y = g[:, None] * (Q @ X @ Q)[:, a, b]
-        coupling = _coupling(Q, a, b)
-        noise = loss[:, None] * _times(_inverse(parts.mean(coupling)), parts.mean(y))
+        couples = coupling(Q, a, b)
+        noise = loss[:, None] * times(inverse(parts.mean(couples)), parts.mean(y))
         kept = parts.mean(np.einsum("bii->bi", Q).real)
         floor = 0.5 / np.maximum(kept, 1e-9) / np.sqrt(whole)[:, None]
         floor = np.maximum(floor, _FLOOR * np.einsum("bii->bi", parts.mean(X)).real)
-        size, axes = _axes(noise, floor, sensor)
+        size, axes = axes_of(noise, floor, sensor)
         step = np.clip(np.log(size), -_STEP, _STEP)
         if turn == ROUNDS - 1 or np.abs(step).max() < SETTLED:
             break
@@ -384,7 +385,7 @@ def _fitted(
     n_sensors = sensor[-1] + 1
     hidden = SHOWN * np.sqrt(2 * _degrees(sensor, q)) / ((1 - 1 / n_sensors) * p * n_sensors)
     unseen = 1 + UNSEEN * hidden * (1 - q / np.maximum(wanted, 1)) * (wanted > 0)
-    mean_noise = loss[:, None] * parts.mean(_times(_inverse(coupling), y))
+    mean_noise = loss[:, None] * parts.mean(times(inverse(couples), y))
     root: ComplexArray = np.asarray(np.linalg.inv(whitener), np.complex128)
     return _Fit(
         parts=parts,
@@ -394,44 +395,8 @@ def _fitted(
         left=n_effective * (1 - r[own] / N - weak[own] / whole[own]) / unseen[own],
         resolved=r,
         whitener=whitener,
-        level=_times(root[:, :, a] * root[:, :, b].conj(), mean_noise).real,
+        level=times(root[:, :, a] * root[:, :, b].conj(), mean_noise).real,
     )
-
-
-def _pairs(sensor: IntArray) -> tuple[IntArray, IntArray]:
-    """Return rows and columns of the elements of the noise matrices of all sensors."""
-    a, b = np.nonzero(sensor[:, None] == sensor)
-    return a, b
-
-
-def _coupling(Q: ComplexArray, a: IntArray, b: IntArray) -> ComplexArray:
-    """Return how elements of the noise appear beside the motion: ``Q_ac conj(Q_bd)``."""
-    return np.asarray(Q[:, a[:, None], a] * Q[:, b[:, None], b].conj())
-
-
-def _times(matrices: ComplexArray, vectors: ComplexArray) -> ComplexArray:
-    return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])
-
-
-def _axes(
-    noise: ComplexArray, floor: FloatArray, sensor: IntArray
-) -> tuple[FloatArray, ComplexArray]:
-    """Return sizes, at least the mean `floor` of a sensor, and axes of the noise of every block.
-
-    `noise` has the elements `_pairs` of whitened noise; the axes are columns, shape (n, p, p).
-    """
-    n, p = floor.shape
-    matrix = np.zeros((n, p, p), np.complex128)
-    a, b = _pairs(sensor)
-    matrix[:, a, b] = noise
-    size, axes = np.empty((n, p)), np.zeros((n, p, p), np.complex128)
-    for i in range(int(sensor[-1]) + 1):
-        of = np.flatnonzero(sensor == i)
-        block = matrix[:, of[:, None], of]
-        w, u = np.linalg.eigh((block + block.conj().swapaxes(1, 2)) / 2)
-        size[:, of] = np.maximum(w, floor[:, of].mean(axis=1, keepdims=True))
-        axes[:, of[:, None], of] = u
-    return size, axes
 
 
 def _read(
@@ -443,11 +408,11 @@ def _read(
 ) -> None:
     """Write noise and cumulants of the bins of some blocks: of all, or of the wanted ones."""
     parts, Q = fit.parts, fit.projector
-    a, b = _pairs(sensor)
+    a, b = pairs(sensor)
     at = np.repeat(np.arange(len(parts.count)), parts.count)
     root = np.linalg.inv(fit.whitener)[parts.block]
     # noise of a bin is linear in the projected matrix: the weights of its elements
-    weight = (root[:, :, a] * root[:, :, b].conj()) @ _inverse(_coupling(Q, a, b))
+    weight = (root[:, :, a] * root[:, :, b].conj()) @ inverse(coupling(Q, a, b))
     if len(parts.block) == len(parts.first):  # few: directions that all bins of a block share
         n, p = Q.shape[:2]
         G = Q @ fit.whitener[parts.block]
@@ -458,9 +423,9 @@ def _read(
         taken = per.conj().view(np.float64).swapaxes(1, 2)
         noise = np.concatenate([some @ by for some, by in zip(of, taken, strict=True)])
     else:
-        white = _white(matrix[parts.bins], fit.whitener[parts.block][at])
-        y = (Q[at] @ white @ Q[at])[:, a, b]
-        noise = fit.gain[at, None] * _times(weight[at], y).real
+        X = white(matrix[parts.bins], fit.whitener[parts.block][at])
+        y = (Q[at] @ X @ Q[at])[:, a, b]
+        noise = fit.gain[at, None] * times(weight[at], y).real
     traces = _traces(weight, Q @ fit.white @ Q * fit.gain[:, None, None], sensor)
     scaled = np.stack([traces[m] / fit.left[:, None] ** (m + 1) for m in range(3)])
     middle = np.add.reduceat(noise, parts.start) / parts.count[:, None]
@@ -468,10 +433,6 @@ def _read(
     use = np.ones(len(at), np.bool_) if wanted is None else wanted[parts.block][at]
     found.noise[parts.bins[use]] = noise[use]
     found.cumulants[:, parts.bins[use]] = cumulants[:, use]
-
-
-def _white(matrix: ComplexArray, whitener: ComplexArray) -> ComplexArray:
-    return np.asarray(whitener @ matrix @ whitener.conj().swapaxes(1, 2))
 
 
 def _n_resolved(X: ComplexArray, parts: _Parts, q: IntArray, sensor: IntArray) -> IntArray:
@@ -553,13 +514,6 @@ def _degrees(sensor: IntArray, q: IntArray) -> FloatArray:
     return np.asarray(np.maximum(left, 1.0))
 
 
-def _inverse(J: ComplexArray) -> ComplexArray:
-    """Invert information matrices, scaled to a unit diagonal."""
-    D = np.sqrt(np.maximum(np.einsum("bii->bi", J).real, 1e-30))
-    scaled = J / (D[:, :, None] * D[:, None, :]) + 1e-10 * np.eye(J.shape[1])
-    return np.asarray(np.linalg.inv(scaled) / (D[:, :, None] * D[:, None, :]))
-
-
 def _traces(weight: ComplexArray, projected: ComplexArray, sensor: IntArray) -> FloatArray:
     """Return ``tr((C_i Y)**k)``, k = 2, 3, 4, for every channel: shape (3, n, p).
 
@@ -577,7 +531,7 @@ def _traces(weight: ComplexArray, projected: ComplexArray, sensor: IntArray) -> 
 
 def _traces_of_some(weight: ComplexArray, projected: ComplexArray, sensor: IntArray) -> FloatArray:
     n, p = weight.shape[:2]
-    a, b = _pairs(sensor)
+    a, b = pairs(sensor)
     C = np.zeros((n, p, p, p), np.complex128)
     C[:, :, b, a] = weight
     B = (C + C.conj().swapaxes(2, 3)) / 2 @ projected[:, None]

@@ -216,11 +216,40 @@ def model_test(maximum: Maximum, *, n_effective: float) -> ModelTest:
     (about n SNR**2 < 100), the test is conservative. With a penalty, psi has
     ``tr J (J + penalty)^-1`` effective parameters instead of p, as in ridge regression.
     """
-    check_averages(n_effective)
     p = maximum.psi.shape[1]
-    q = maximum.n_factors
+    return likelihood_ratio(
+        maximum.discrepancy,
+        _estimated_parameters(maximum),
+        n_channels=p,
+        n_factors=maximum.n_factors,
+        n_effective=n_effective,
+    )
+
+
+def likelihood_ratio(
+    discrepancy: FloatArray,
+    estimated: FloatArray,
+    *,
+    n_channels: int,
+    n_factors: int,
+    n_effective: float,
+) -> ModelTest:
+    """Return the test of a model from its discrepancy, as `model_test`.
+
+    Parameters
+    ----------
+    discrepancy : float64, shape (n_freqs,)
+        At the maximum of the likelihood.
+    estimated : float64, shape (n_freqs,)
+        Real parameters of the noise: the channels or, with a matrix for each sensor, the sum of the
+        squares of their numbers of channels.
+    n_channels, n_factors : int
+    n_effective : float
+    """
+    check_averages(n_effective)
+    p, q = n_channels, n_factors
     order, averages = p - q, n_effective - q
-    if order**2 - p < 1:
+    if order**2 - estimated.max(initial=0.0) < 1:
         raise InsufficientDataError(
             f"{q} factors explain any covariance of {p} channels: the test has no freedom left"
         )
@@ -229,10 +258,9 @@ def model_test(maximum: Maximum, *, n_effective: float) -> ModelTest:
             f"{n_effective:.1f} averages of {p} channels: more averages than channels are needed"
         )
     logs = sum(digamma(averages - i) for i in range(order)) - order * np.log(averages)
-    estimated = _estimated_parameters(maximum)
     degrees = order**2 - estimated
     mean = -2 * averages * logs - estimated * (1 + 1 / (6 * averages))
-    statistic = 2 * averages * maximum.discrepancy * degrees / mean
+    statistic = 2 * averages * discrepancy * degrees / mean
     return ModelTest(statistic, degrees, p_values(degrees, statistic))
 
 

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from estimator.errors import InsufficientDataError, InvalidMatrixError
+from estimator.levels.noise_matrices import discrepancy
 from estimator.likelihood.dimension import bands, choose_dimension
+from estimator.likelihood.goodness_of_fit import likelihood_ratio
 from estimator.likelihood.maximum_likelihood import maximum_likelihood
 from estimator.likelihood.prior import expected_noise
 from estimator.self_noise.three_sensor import three_sensor
@@ -293,3 +295,66 @@ def test_invalid_arguments_are_refused() -> None:
     for frequency in ([2.0, 1.0], [1.0, np.nan]):
         with pytest.raises(InvalidMatrixError, match="ascending"):
             choose_dimension(twice, np.array(frequency), dims=THREE, n_effective=50)
+
+
+def _sharing(snr: float, n_sensors: int, rng: np.random.Generator) -> np.ndarray:
+    """Return a true matrix: triaxial sensors, of which the second has noise that it shares."""
+    axes = np.concatenate([rotation(rng, 3) for _ in range(n_sensors)])
+    csm = (snr * axes @ axes.T + np.eye(3 * n_sensors)).astype(np.complex128)
+    csm[3:6, 3:6] += np.outer([4, 2, 0], [4, 2, 0])
+    return np.asarray(csm)
+
+
+@pytest.mark.parametrize("snr", [0.05, 1.0, 1e3, 1e6])
+def test_the_ratio_with_a_matrix_for_each_sensor_is_chi_squared(snr: float) -> None:
+    """Degrees of freedom ``p**2 - sum d_i**2 - (2pq - q**2)``, whatever channels share."""
+    rng, draws = np.random.default_rng(3), 60
+    n = 189 if snr >= 1 else 20000  # it is conservative where motion is not resolved
+    sample = wishart(_sharing(snr, 4, rng), n, rng, n_draws=draws)
+    test = likelihood_ratio(
+        discrepancy(sample, 3, np.repeat(np.arange(4), 3)),
+        np.full(draws, 36.0),
+        n_channels=12,
+        n_factors=3,
+        n_effective=n,
+    )
+    assert test.degrees[0] == 12**2 - 4 * 9 - (2 * 12 * 3 - 9)
+    error = np.sqrt(2 * 45 / draws)
+    assert test.statistic.mean() == pytest.approx(45, abs=4 * error)
+
+
+@pytest.mark.parametrize("n_sensors", [4, 8])
+def test_what_a_sensor_s_channels_share_is_no_dimension_of_the_motion(n_sensors: int) -> None:
+    rng = np.random.default_rng(n_sensors)
+    csm = np.broadcast_to(_sharing(10.0, n_sensors, rng), (24, 3 * n_sensors, 3 * n_sensors))
+    n_factors, (choice,) = choose_dimension(
+        wishart(csm, 189, rng)[0],
+        np.linspace(1.0, 1.2, 24),
+        dims=(3,) * n_sensors,
+        n_effective=189,
+        neighbours=INDEPENDENT,
+        band=np.zeros(24, np.int64),
+    )
+    assert choice.accepted
+    assert n_factors.tolist() == [3] * 24
+    assert choice.tried[2].p_value < 1e-6  # nor is it less
+
+
+def test_a_level_for_all_bands_together() -> None:
+    """Clean recordings of four sensors: at 5 % for each band every second one had a bad band."""
+    rng, rejected = np.random.default_rng(12), 0
+    axes = np.concatenate([rotation(rng, 3) for _ in range(4)])
+    csm = (10.0 * axes @ axes.T + np.eye(12)).astype(np.complex128)
+    band = np.repeat(np.arange(10), 8)
+    for _ in range(6):
+        sample = wishart(np.broadcast_to(csm, (80, 12, 12)), 100, rng)[0]
+        _, choices = choose_dimension(
+            sample,
+            np.geomspace(1.0, 10.0, 80),
+            dims=(3,) * 4,
+            n_effective=100,
+            neighbours=INDEPENDENT,
+            band=band,
+        )
+        rejected += not all(choice.accepted for choice in choices)
+    assert rejected <= 1
