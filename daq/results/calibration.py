@@ -311,6 +311,8 @@ class _Work:
                 ),
                 Component("quantisation", "B", "rectangular", self._counting(column, inside)),
             ]
+            if drift := self._drift(column, found.reference):
+                components.append(Component("drift", "B", "normal", drift))
             absolute = bool(self._certificates) and channel is not None
             if self._of_reference:
                 source = "certificate" if self._certificates else "tolerance"
@@ -329,6 +331,18 @@ class _Work:
                 )
             )
         return budgets
+
+    def _drift(self, column: int, reference: int) -> float:
+        """Return the standard deviation of a gain over the recording, where responses change."""
+        found = self.snapshot.diagnostics.diagnosis
+        if found is None or found.stability is None:
+            return 0.0
+        of_reference = slice(
+            int(self._first[reference]),
+            int(self._first[reference]) + self.snapshot.dims[reference],
+        )
+        added = found.stability.added
+        return float(np.sqrt(added[column] + added[of_reference].max()))
 
     def _counting(self, column: int, inside: np.ndarray) -> float:
         """Return the relative uncertainty of a gain by the noise of whole counts."""

@@ -46,7 +46,7 @@ class Component:
     Attributes
     ----------
     source : str
-        "estimate", "variation", "quantisation", "certificate", "tolerance", or a cause of
+        "estimate", "variation", "quantisation", "certificate", "tolerance", "drift", or a cause of
         `estimator.levels.contributions.Source`.
     kind : str
         "A" (from the scatter of these data) or "B" (from elsewhere).

@@ -43,13 +43,16 @@ _SHORT = {
     "dimensions": "dim.",
     "axes": "axes",
     "faulty": "faulty",
+    "drift": "drift",
+    "changes": "changes",
 }
 LEGEND = (
     "Budgets are relative standard uncertainties. A: from the scatter of these data; B: from other "
     "sources. est.: finite averages. var.: scatter over the frequencies beyond that, by "
     "incoherence or by responses that vary. clocks: error of the alignment of the clocks. leak.: "
     "leakage by the width and the edges of segments. quant.: quantisation. cert.: certificate of "
-    "the reference; tol.: its tolerance, without one. sens.: twice the uncertainty of the "
+    "the reference; tol.: its tolerance, without one. drift: change of the response during the "
+    "recording; changes: motion that this leaves in the noise. sens.: twice the uncertainty of the "
     "sensitivity. temp.: temperature. edges, gaps: leakage at the "
     "edges of segments and by gaps. misfit: motion that the model does not explain. shared: noise "
     "that channels share. dim.: doubtful number of dimensions of the motion. axes: motion outside "

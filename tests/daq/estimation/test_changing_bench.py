@@ -9,6 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import huddle
+from daq.estimation.settings import Settings
+from daq.results.calibration import calibrate
 from estimator.checks.advice import NoiseChanges, ResponseChanges
 from tui.wording.findings import Names, alert
 
@@ -112,3 +114,18 @@ def test_steady_noise_of_more_than_4096_segments_scatters_as_all_of_them() -> No
     mean = float(scatter.statistic[known].sum()) / degrees
     assert mean == pytest.approx(1, abs=5 * np.sqrt(2 / degrees))
     assert diagnosis.stability.inflation == 1
+
+
+def test_a_gain_that_drifts_is_in_the_uncertainty_of_the_calibration() -> None:
+    """A ramp of 3 % has the standard deviation 3 % / sqrt(12)."""
+    snapshot = estimated("ramp", 1)
+    found = calibrate(snapshot, Settings(), None, reference="A")
+    by_sensor = {
+        budget.sensor: {each.source: each.relative for each in budget.components}
+        for budget in found.budgets
+        if budget.quantity == "sensitivity"
+    }
+    assert by_sensor["B"]["drift"] == pytest.approx(0.03 / np.sqrt(12), rel=0.05)
+    assert "drift" not in by_sensor["C"]
+    found = calibrate(snapshot, Settings(), None, reference="B")
+    assert all("drift" in {e.source for e in each.components} for each in found.budgets[:3])
