@@ -552,7 +552,7 @@ class ResponseChanges(Advice):
         Whether the sensor turns; its gains otherwise.
     size : float
         Change of the gain, as a fraction of the gain before; of a turn in radians.
-    error : float
+    size_error : float
         Standard error of the size.
     begin, end : float
         Seconds from the start, between which it changes; equal for a step.
@@ -565,7 +565,7 @@ class ResponseChanges(Advice):
     channel: int | None
     is_turn: bool
     size: float
-    error: float
+    size_error: float
     begin: float
     end: float
     variance: float

@@ -106,7 +106,7 @@ def changes(
             channel=change.channel,
             is_turn=change.is_turn,
             size=change.size,
-            error=change.error,
+            size_error=change.error,
             begin=change.begin,
             end=change.end,
             variance=float(stability.added[own].max()),

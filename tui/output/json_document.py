@@ -339,12 +339,13 @@ def facts_document(facts: Sequence[Known]) -> list[dict[str, Any]]:
 
 _IN_SECONDS = (
     *("segment", "longest", "missing", "overdue", "total", "error", "left"),
-    *("corrected", "uncorrected", "delay", "times"),
+    *("corrected", "uncorrected", "delay", "times", "begin", "end"),
 )
 _IN_HERTZ = ("below", "bands", "worst_band", "covers", "judged", "refresh", "polled")
 _SHARES = (
     *("lost", "leakage", "excess", "deviation", "expected", "unexplained", "largest_error"),
     *("added_by_one_degree", "three_sensor", "maximum_likelihood"),
+    *("size", "size_error", "variance"),
 )
 UNITS: Mapping[str, str] = (
     {name: f"{name}_s" for name in _IN_SECONDS}

@@ -677,7 +677,11 @@ def _responses_change(advice: ResponseChanges, names: Names) -> Explanation:
     own = names.list_sensors(advice.sensors)
     return Explanation(
         f"{_response_change(advice, names)} (standard error "
-        + (f"{math.degrees(advice.error):.1g}°" if advice.is_turn else f"{percent(advice.error)}")
+        + (
+            f"{math.degrees(advice.size_error):.1g}°"
+            if advice.is_turn
+            else f"{percent(advice.size_error)}"
+        )
         + f"). This leaves up to {percent(advice.variance)} of the motion's PSD in the noise of "
         f"{own}; the interval includes it.",
         f"{_remedy(advice).capitalize()} and record again, or estimate the time before or after "
