@@ -73,6 +73,13 @@ class Connections:
         self._held: dict[int, _Held] = {}
         """By descriptor, in the order in which they began to be idle."""
         self._n_of: Counter[str] = Counter()
+        self.n_open = 0
+        """Sockets that are not closed yet, those that were ended included."""
+
+    @property
+    def has_to_wait(self) -> bool:
+        """Whether sockets that were ended must be closed before there is room for another one."""
+        return self.n_open >= self._total and self.n_open > len(self._held)
 
     def __len__(self) -> int:
         return len(self._held)
@@ -220,7 +227,11 @@ class Listening(socket.socket):
         ------
         ConnectionAbortedError
             If it may not stay: an event loop goes on with the next one.
+        BlockingIOError
+            If others are to be closed first: an event loop does that, and comes again.
         """
+        if self._connections.has_to_wait:
+            raise BlockingIOError
         accepted, address = super().accept()
         counted = _Counted(self._connections, accepted.detach(), self.family)
         if not self._connections.admit(counted, str(address[0])):
@@ -235,10 +246,13 @@ class _Counted(socket.socket):
     def __init__(self, connections: Connections, descriptor: int, family: int) -> None:
         super().__init__(family, socket.SOCK_STREAM, fileno=descriptor)
         self._connections = connections
+        connections.n_open += 1
 
     def close(self) -> None:
         """Close the connection."""
-        self._connections.forget(self.fileno())
+        if self.fileno() >= 0:
+            self._connections.forget(self.fileno())
+            self._connections.n_open -= 1
         super().close()
 
 
