@@ -362,7 +362,7 @@ class Access:
             name, number = str(told["name"]), str(told["number"])
         except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
             return None
-        if right not in self._secrets or not _same(mac, self._mac(right, about)):
+        if right not in self._secrets or not same(mac, self._mac(right, about)):
             return None
         if ends < self._now() or number in self._ended:
             return None
@@ -409,6 +409,6 @@ def _right_of(given: str, known: Mapping[Right, str]) -> Right | None:
     return next((right for right, secret in known.items() if _fits(secret, given)), None)
 
 
-def _same(given: str, wanted: str) -> bool:
+def same(given: str, wanted: str) -> bool:
     """Compare in constant time; of two texts, only those in ASCII can be compared."""
     return hmac.compare_digest(given.encode("utf-8", "replace"), wanted.encode())

@@ -11,7 +11,6 @@ address leads past it. What no route has is denied to who may not look.
 from __future__ import annotations
 
 import asyncio
-import hmac
 import json
 import logging
 import re
@@ -54,6 +53,7 @@ from tui.web.access import (
     Visitor,
     check_private,
     network_of,
+    same,
     server_key,
     state_path,
 )
@@ -876,5 +876,5 @@ def _check_form(request: Request, form: Mapping[str, str]) -> None:
     visitor: Visitor | None = request.state.visitor
     wanted = "" if visitor is None else visitor.form_token
     is_token = "authorization" in request.headers
-    if not is_token and (not wanted or not hmac.compare_digest(form.get("token", ""), wanted)):
+    if not is_token and (not wanted or not same(form.get("token", ""), wanted)):
         raise HTTPException(HTTPStatus.FORBIDDEN, "Open the page again: this form is too old.")

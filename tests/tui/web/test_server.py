@@ -253,7 +253,7 @@ def test_forms_of_other_sites_do_nothing(closed: Server) -> None:
     visit = closed.visit()
     visit.log_in(STEERER)
     (token,) = set(re.findall(r'name="token" value="(\w+)"', visit.get("/start").text))
-    for form in ({}, {"token": ""}, {"token": token[:-1] + "x"}):
+    for form in ({}, {"token": ""}, {"token": token[:-1] + "x"}, {"token": "٣"}):
         assert visit.post("/mark", form | {"text": "x"}).status == 403
     wrong = visit.post("/mark", {"token": token, "text": "x"}, Origin="https://evil.example")
     assert wrong.status == 403
