@@ -169,6 +169,15 @@ class EstimateSettings:
             read=values.to_number,
         ),
     ] = 0.6
+    linearise: Annotated[
+        bool,
+        Option(
+            "Subtract what squares and cubes of a channel explain of its noise, where it is not"
+            " linear. Without, it widens the interval.",
+            check=values.yes_or_no,
+            flags=("--linearise/--no-linearise",),
+        ),
+    ] = False
     octaves: Annotated[
         bool,
         Option(

@@ -35,6 +35,8 @@ SECOND_ORDER = 2.5
 (docs/validation/gradients.md)."""
 MOST_SHARED = 0.99
 """Part of its noise that a channel shares at most."""
+UNCERTAIN = 0.3
+"""Share of what squares and cubes explain by which it is uncertain."""
 NOTHING_USEFUL = 1.0
 """Share of the noise by which a model that fails may be off, from which nothing is known."""
 
@@ -65,7 +67,7 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
         with np.errstate(invalid="ignore"):
             most = np.fmin(share * motion, unseen * psd)
         found.append(contribution(Source.AXES, shape, below=most, above=most))
-    found += _counts(snapshot, shape)
+    found += [*_counts(snapshot, shape), *_nonlinear(snapshot, shape)]
     if snapshot.rounding:
         most = snapshot.rounding * np.nan_to_num(snapshot.data_psd)
         found.append(contribution(Source.ROUNDING, shape, below=most, above=most))
@@ -121,6 +123,17 @@ def _changes(snapshot: Snapshot, psd: FloatArray) -> list[Contribution]:
     motion = np.maximum(np.nan_to_num(snapshot.data_psd) - psd, 0.0)
     below = np.minimum(steady.added * motion, psd)
     return [contribution(Source.CHANGES, psd.shape, below=below)]
+
+
+def _nonlinear(snapshot: Snapshot, shape: tuple[int, int]) -> Iterator[Contribution]:
+    """Yield what channels that are not linear add to their noise, or may add still."""
+    explained = np.zeros(shape)
+    for each in snapshot.nonlinear:
+        explained[:, each.column] = each.explained
+    if snapshot.nonlinear:
+        above = UNCERTAIN * explained
+        below = above if snapshot.linearised else (1 + UNCERTAIN) * explained
+        yield contribution(Source.LINEARITY, shape, below=below, above=above)
 
 
 def _sensitivities(snapshot: Snapshot, method: str, shape: tuple[int, int]) -> list[Contribution]:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from daq.bench.sensitivity import Sensitivities
     from daq.clocks.clock_model import ClockState
+    from daq.estimation.linearity import NonlinearChannel
     from daq.protocols.block import Event
     from daq.recording.interface import ReadableSensor
     from estimator.self_noise.result import SelfNoise
@@ -216,6 +217,11 @@ class Snapshot:
         finished estimate.
     rounded_alike : RoundedAlike or None
         What channels of several sensors share of it. Of a finished estimate.
+    nonlinear : tuple of NonlinearChannel
+        Channels that are not linear, the one with the largest evidence first. Of a finished
+        estimate.
+    linearised : bool
+        Whether what is not linear is taken off their noise.
     bridged : Bridged or None
         None where no segment with gaps counts.
     not_estimated : tuple of str
@@ -259,6 +265,8 @@ class Snapshot:
     no_segment: NoSegment | None = None
     quantisation_psd: FloatArray | None = None
     rounded_alike: RoundedAlike | None = None
+    nonlinear: tuple[NonlinearChannel, ...] = ()
+    linearised: bool = False
     bridged: Bridged | None = None
     not_estimated: tuple[str, ...] = ()
     across_axes: tuple[float, ...] = ()

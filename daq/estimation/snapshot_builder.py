@@ -28,6 +28,7 @@ from daq.estimation.diagnosis import (
 )
 from daq.estimation.equalisation import METHOD
 from daq.estimation.freed_memory import FREED_FROM, give_back
+from daq.estimation.linearity import linearised, nonlinear_channels
 from daq.estimation.noise_estimates import (
     Dimensions,
     Estimates,
@@ -285,6 +286,8 @@ class SnapshotBuilder:
         )
         left = _not_estimated(latest, channels)
         counting = _counting_rates(latest) if final else {}
+        nonlinear = nonlinear_channels(passes, frequency, channels, self._unit) if final else ()
+        taken_off = nonlinear if self._settings.linearise else ()
         if final and csm.nbytes > FREED_FROM:
             give_back()
         if final or (self._diagnoses.is_due and not left):
@@ -301,7 +304,7 @@ class SnapshotBuilder:
         snapshot = Snapshot(
             frequency=frequency,
             csm=csm,
-            results=estimates.results,
+            results=linearised(estimates.results, taken_off),
             refused=estimates.refused,
             channels=tuple(
                 ChannelLabel(sensor, channel.name, self._unit) for sensor, channel in channels
@@ -323,6 +326,8 @@ class SnapshotBuilder:
             shortened=_shortened(passes),
             diagnostics=diagnostics,
             no_segment=None if sets else _no_segment(passes, self._settings.segment),
+            nonlinear=nonlinear,
+            linearised=bool(taken_off),
             bridged=_bridged(passes, estimates.results),
             not_estimated=left,
             across_axes=self._axes,

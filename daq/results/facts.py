@@ -425,6 +425,25 @@ class RoundedAlike(Fact):
 
 
 @record
+class NotLinear(Fact):
+    """Channels of a sensor are not linear: squares and cubes of the motion add to their noise.
+
+    Attributes
+    ----------
+    shares : tuple of float
+        Of the noise of each of `channels`, that they explain: the mean over thirds of an octave.
+    evidence : float
+        That they are not linear, in standard deviations.
+    is_subtracted : bool
+    """
+
+    name: ClassVar[str] = "not-linear"
+    shares: tuple[float, ...]
+    evidence: float
+    is_subtracted: bool
+
+
+@record
 class ClocksFitted(Fact):
     """The times of samples come from clocks fitted to their arrivals.
 

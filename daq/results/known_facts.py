@@ -42,6 +42,7 @@ from daq.results.facts import (
     NoiseNotIdentified,
     NoSegmentUsable,
     NotInLiveEstimate,
+    NotLinear,
     OctaveSegments,
     Rank,
     RatesNominal,
@@ -97,6 +98,8 @@ LEAST_SHARE = 0.01
 """Share of the noise from which a contribution to an interval is a fact; of the time, too."""
 DELAYING_SHARE = 0.1
 """Share of the time of the estimate from which a sensor that shortens it delays the result."""
+MUCH_NONLINEAR = 0.05
+"""Share of the noise from which squares and cubes of the motion delay a result."""
 MUCH_ROUNDING = 0.1
 """Share of the noise from which rounding that channels share is a fact."""
 WITHOUT_ESTIMATE = (
@@ -133,6 +136,7 @@ def facts_of(
         *_segments(snapshot),
         *_channels(snapshot),
         *_rounded_alike(snapshot),
+        *_nonlinear(snapshot),
         *_clocks(snapshot),
         *_model(snapshot),
         *_methods(snapshot),
@@ -337,6 +341,35 @@ def _rounded_alike(snapshot: Snapshot) -> Iterator[RoundedAlike]:
                 if part > MUCH_ROUNDING / 3  # offsets raise a noise by three times that
             ),
             share=float(share.max()),
+        )
+
+
+def _nonlinear(snapshot: Snapshot) -> Iterator[NotLinear]:
+    """Yield the sensors that are not linear, the one with the largest evidence first."""
+    edges = third_octaves(snapshot.frequency, *known_range(snapshot))
+    if not snapshot.nonlinear or not snapshot.results or len(edges) < 2:
+        return
+    noise = next(iter(snapshot.results.values())).noise_psd
+    shares: dict[str, dict[str, float]] = {}
+    evidence: dict[str, float] = {}
+    for each in snapshot.nonlinear:
+        known = np.isfinite(noise[:, each.column])
+        both = (np.where(known, part, 0.0) for part in (each.explained, noise[:, each.column]))
+        part, whole = (np.add.reduceat(values[: edges[-1]], edges[:-1]) for values in both)
+        whole = np.maximum(np.abs(whole) + (part if snapshot.linearised else 0.0), part)
+        share = float(np.mean(part[whole > 0] / whole[whole > 0]))
+        label = snapshot.channels[each.column]
+        shares.setdefault(label.sensor, {})[label.name] = share
+        evidence.setdefault(label.sensor, each.evidence)
+    for sensor, of_channel in shares.items():
+        much = max(of_channel.values()) > MUCH_NONLINEAR and not snapshot.linearised
+        yield NotLinear(
+            rank=Rank.DELAYS if much else Rank.TO_KNOW,
+            sensors=(sensor,),
+            channels=tuple(of_channel),
+            shares=tuple(of_channel.values()),
+            evidence=evidence[sensor],
+            is_subtracted=snapshot.linearised,
         )
 
 

@@ -46,6 +46,7 @@ from daq.results.facts import (
     NoiseNotIdentified,
     NoSegmentUsable,
     NotInLiveEstimate,
+    NotLinear,
     OctaveSegments,
     Rank,
     RatesNominal,
@@ -544,6 +545,22 @@ def _drift(fact: StatedTimesDrift, names: Names) -> Wording:
         text += " too weak for so short segments, or times step."
     do = "Check whether the clocks were synchronised, or whether waves changed direction."
     return Wording(line, text, f"Choose longer segments. {do}" if fact.uncorrected else do)
+
+
+@word.register(NotLinear)
+def _not_linear(fact: NotLinear, names: Names) -> Wording:
+    del names
+    verb = "is" if len(fact.channels) == 1 else "are"
+    most = max(fact.shares)
+    text = f"{listed(fact.channels)} {verb} not linear"
+    done = "subtracted" if fact.is_subtracted else "in the intervals"
+    return Wording(
+        f"{text}: up to {most:.0%} of the noise, {done}; check {listed(fact.sensors)}",
+        f"{text}: squares and cubes of the motion are up to {most:.0%} of the noise"
+        f" ({fact.evidence:.0f} standard deviations). They are {done}.",
+        "Check the range and the supply of the sensor, or record with less motion."
+        + ("" if fact.is_subtracted else " --linearise subtracts them."),
+    )
 
 
 @word.register(RoundedAlike)

@@ -118,6 +118,7 @@ SOURCE_WORDS: Mapping[Source, str] = {
     Source.CHANGES: "a response that changed",
     Source.GAINS: "gains that may follow the loudness",
     Source.STEADY_MOTION: "motion that does not tell noise from motion",
+    Source.LINEARITY: "squares and cubes of the motion",
     Source.COUNTS: "rounding that channels share",
     Source.FAULTY: "a faulty channel",
     Source.SENSITIVITY: "sensitivity",

@@ -634,6 +634,15 @@ class Pass:
 
         return in_clipped_blocks(self._sensors, times)
 
+    def whole_segment(self, start: int) -> FloatArray | None:
+        """Return the segment that begins at a grid sample; None if it has gaps or is clipped."""
+        length = self.welch.segment_length
+        samples, valid = self.aligned.read(start, start + length)
+        if len(samples) < length or not valid.all():
+            return None
+        clipped = self._clipped(start, length)
+        return None if clipped is not None and clipped.any() else samples
+
     @property
     def awaited(self) -> int:
         """Segments with which delays could be measured first; 0 where they are, or need not be."""

@@ -59,6 +59,7 @@ VALUES: dict[str, Any] = {
     "equalise": "known",
     "reject": True,
     "bridge": 0.25,
+    "linearise": True,
     "octaves": True,
     "dimension": 2,
     "gains": {"B": 1.02, "C.Z": 0.1 + 0.2},
@@ -73,7 +74,8 @@ VALUES: dict[str, Any] = {
 ARGUMENTS = [
     "--method=maximum-likelihood,two-channel", "--segment=90.5", "--overlap=0.75",
     "--window=kaiser,8", "--detrend=linear", "--no-correction", "--clocks=arrivals",
-    "--equalise=known", "--reject", "--bridge=0.25", "--octaves", "--dimension=2", "--gain=B=1.02",
+    "--equalise=known", "--reject", "--bridge=0.25", "--linearise", "--octaves",
+    "--dimension=2", "--gain=B=1.02",
     f"--gain=C.Z={0.1 + 0.2}", "--axis-tolerance=0.5", "--axis-tolerance=B=0.25",
     "--gain-steadiness=0.02", "--lean=B=0.3,-0.1",
     "--unit=µg", f"--band={1 / 3}:20", "--target-cov=0.07",

@@ -88,7 +88,7 @@ DIMENSIONLESS = {
     *("cov", "target", "gains", "shares", "share", "statistic", "worst_statistic", "p_value"),
     *("snr", "condition", "ratio", "coherencies", "standard_errors", "share_of_frequencies"),
     *("n_dimensions", "n_effective", "share_of_partners", "share_without", "inflation"),
-    *("delay_samples", "ppm", "bits"),
+    *("delay_samples", "ppm", "bits", "evidence"),
 }
 """Numbers without a unit; samples, bits and ppm are their own."""
 

@@ -91,6 +91,14 @@ EXAMPLES: tuple[Fact, ...] = (
         left=3e-6,
         reference="C",
     ),
+    facts.NotLinear(
+        rank=Rank.DELAYS,
+        sensors=A,
+        channels=("A.X",),
+        shares=(0.6,),
+        evidence=22.0,
+        is_subtracted=False,
+    ),
     facts.RoundedAlike(rank=Rank.DELAYS, channels=("A.X", "B.X"), share=0.24),
     facts.StatedTimesUnchecked(rank=Rank.DELAYS, sensors=A),
     facts.SamplesUncounted(

@@ -1,0 +1,90 @@
+"""What is not linear in the channels of recordings, from some of their segments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.estimation.noise_estimates import responses
+from estimator.checks.linearity import MOST_SEGMENTS, SquaresAndCubes
+from estimator.self_noise.result import Flag, SelfNoise
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from daq.estimation.noise_estimates import Channels
+    from daq.estimation.segments.segment_pass import Pass
+    from estimator.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NonlinearChannel:
+    """A channel that is not linear.
+
+    Attributes
+    ----------
+    column : int
+    evidence : float
+        That it is not, in standard deviations.
+    explained : float64, shape (n_freqs,)
+        What squares and cubes of the channel add to its noise PSD, in unit**2/Hz.
+    """
+
+    column: int
+    evidence: float
+    explained: FloatArray
+
+
+def nonlinear_channels(
+    passes: Sequence[Pass], frequency: FloatArray, channels: Channels, unit: str
+) -> tuple[NonlinearChannel, ...]:
+    """Return the channels that are not linear, the one with the largest evidence first.
+
+    Parameters
+    ----------
+    passes : sequence of Pass
+    frequency : float64, shape (n_freqs,)
+        Of the estimate, in Hz.
+    channels : sequence of (str, Channel)
+    unit : str
+    """
+    welch = passes[0].welch
+    tested = SquaresAndCubes(welch, min(each.aligned.usable for each in passes))
+    if not len(tested.bins) or len(passes[0].aligned.dims) < 2:
+        return ()
+    total = sum(each.n_seen for each in passes)
+    for each in passes:
+        n_apart = max(0, (each.n_seen - 1) * welch.hop // welch.segment_length + 1)
+        wanted = min(n_apart, round(MOST_SEGMENTS * each.n_seen / max(total, 1)))
+        last = max(each.n_seen - 1, 0) * welch.hop
+        for start in np.linspace(0, last, wanted).astype(np.int64).tolist():
+            samples = each.whole_segment(start)
+            if samples is not None:
+                tested.add(samples)
+    sensor = np.repeat(np.arange(len(passes[0].aligned.dims)), passes[0].aligned.dims)
+    response = np.abs(responses(frequency, channels, unit)) ** 2
+    found = []
+    for one in tested.nonlinear(sensor):
+        psd = np.interp(frequency, tested.frequency, one.explained)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            psd = psd / response[:, one.channel]
+        psd = np.where(np.isfinite(psd), psd, 0.0)
+        found.append(NonlinearChannel(one.channel, one.evidence, psd))
+    return tuple(found)
+
+
+def linearised(
+    results: Mapping[str, SelfNoise], nonlinear: Sequence[NonlinearChannel]
+) -> dict[str, SelfNoise]:
+    """Return results without what squares and cubes explain."""
+    found = dict(results)
+    for name, noise in results.items():
+        psd = noise.noise_psd.copy()
+        for each in nonlinear:
+            psd[:, each.column] -= each.explained
+        negative = np.where(psd <= 0, int(Flag.NEGATIVE), 0)
+        flags = (noise.flags & ~Flag.NEGATIVE) | negative
+        found[name] = SelfNoise.of(name, psd, noise.cumulants, flags)
+    return found

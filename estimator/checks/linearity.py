@@ -1,0 +1,202 @@
+"""Whether sensors are linear: squares and cubes of a channel in what other sensors do not predict.
+
+Some segments, apart from each other, are transformed with their squares and cubes. Of a channel x,
+``x**2`` and ``x**3 - 3 s**2 x`` with s its standard deviation in that segment: the second has
+nothing in common with x itself, so that the channel's own noise is not taken for a cube. At every
+frequency the channels of the other sensors are regressed out of x, its square and its cube. What
+is left of x is its noise and what is not linear; what is left of the square and the cube explains
+the second. A block of neighbouring frequencies has one complex coefficient of each, which may be
+those of a filter after the nonlinear stage.
+
+Its evidence is Hotelling's: segments vary as they vary, whatever the correlation of neighbouring
+frequencies, and however loud the segments are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.levels.pooled import blocks_of
+from estimator.spectra.windows import get_window
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from estimator.spectra.welch import WelchSettings
+    from estimator.types import ComplexArray, FloatArray, IntArray
+
+MOST_SEGMENTS = 48
+MOST_BINS = 320
+MOST_PREDICTORS = 12
+LEAST_LEFT = 12
+"""Segments beyond the predictors without which nothing is tested."""
+PEAK = 6.0
+"""Standard deviations of a sample of a disturbed segment, which is left out."""
+LOUD = 50.0
+"""Power of a channel over what is left of it, from which it is tested: below, the fourth moment of
+its own noise looks like a cube."""
+CERTAIN = 5.0
+"""Standard deviations of the evidence from which a channel is not linear."""
+ROUNDS = 6
+_TERMS = 2  # square and cube
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Nonlinear:
+    """A channel that is not linear.
+
+    Attributes
+    ----------
+    channel : int
+    evidence : float
+        In standard deviations of a normal variable.
+    explained : float64, shape (n_kept,)
+        PSD that square and cube explain, in the channel's unit**2/Hz.
+    """
+
+    channel: int
+    evidence: float
+    explained: FloatArray
+
+
+class SquaresAndCubes:
+    """Spectra of some segments with their squares and cubes.
+
+    Parameters
+    ----------
+    welch : WelchSettings
+    highest : float
+        Frequency in Hz up to which averages are known.
+    """
+
+    def __init__(self, welch: WelchSettings, highest: float) -> None:
+        self._window = get_window(welch.window, welch.segment_length)
+        known = np.flatnonzero(
+            (welch.frequencies >= max(welch.lowest, welch.frequencies[1]))
+            & (welch.frequencies <= min(highest, 0.95 * welch.sampling_rate / 2))
+        )
+        wanted = np.geomspace(known[0], known[-1], MOST_BINS) if len(known) else np.empty(0)
+        self.bins: IntArray = np.array(sorted(set(np.round(wanted).astype(int).tolist())), np.int64)
+        self.frequency = welch.frequencies[self.bins]
+        self._density = 2 / (welch.sampling_rate * float(self._window @ self._window))
+        self._scale: FloatArray | None = None
+        self._spectra: list[NDArray[np.complex64]] = []
+
+    def add(self, samples: FloatArray) -> None:
+        """Add a segment, (segment_length, n_channels), unless it is disturbed."""
+        centred = samples - samples.mean(axis=0)
+        size = np.sqrt(np.mean(centred**2, axis=0))
+        if not np.all(size > 0) or np.any(np.abs(centred) > PEAK * size):
+            return
+        if self._scale is None:
+            self._scale = size
+        x = centred / self._scale
+        power = (self._window**2 @ x**2) / (self._window @ self._window)
+        terms = np.stack([x, x**2, x * (x**2 - 3 * power)], axis=-1)
+        spectra = np.fft.rfft(terms * self._window[:, None, None], axis=0)[self.bins]
+        self._spectra.append(spectra.astype(np.complex64))
+
+    def nonlinear(self, sensor: IntArray) -> list[Nonlinear]:
+        """Return the channels that are not linear, the one with the largest evidence first.
+
+        Parameters
+        ----------
+        sensor : int64, shape (n_channels,)
+            Sensor of each channel.
+
+        Notes
+        -----
+        What one channel explains is regressed out of the other sensors before these are tested.
+        """
+        found: list[Nonlinear] = []
+        if self._scale is None or len(self._spectra) < LEAST_LEFT or not len(self.bins):
+            return found
+        spectra = np.array(self._spectra)
+        block = blocks_of(self.frequency)
+        while len(found) < ROUNDS:
+            best: Nonlinear | None = None
+            for each in range(int(sensor.max()) + 1):
+                worst = _worst(spectra, sensor, each, block, [one.channel for one in found])
+                if worst is not None and (best is None or worst.evidence > best.evidence):
+                    best = worst
+            if best is None or best.evidence < CERTAIN:
+                break
+            scale = self._density * self._scale[best.channel] ** 2
+            found.append(Nonlinear(best.channel, best.evidence, scale * best.explained))
+        return found
+
+
+def _worst(
+    spectra: NDArray[np.complex64], sensor: IntArray, one: int, block: IntArray, known: list[int]
+) -> Nonlinear | None:
+    """Return the channel of a sensor with the largest evidence, besides those that are known."""
+    own = [c for c in np.flatnonzero(sensor == one).tolist() if c not in known]
+    others = np.flatnonzero(sensor != one)[:MOST_PREDICTORS]
+    further = [c for c in known if sensor[c] != one]
+    left = len(spectra) - len(others) - _TERMS * len(further)
+    if left < LEAST_LEFT or not own or not len(others):
+        return None
+    predictors = np.concatenate(
+        [spectra[:, :, others, 0], *(spectra[:, :, c, 1:] for c in further)], axis=2
+    ).transpose(1, 0, 2)
+    wanted = spectra[:, :, own].reshape(*spectra.shape[:2], -1).transpose(1, 0, 2)
+    rest = _without(predictors.astype(np.complex128), wanted.astype(np.complex128))
+    rest = rest.reshape(*rest.shape[:2], len(own), 1 + _TERMS)
+    found = []
+    for n, channel in enumerate(own):
+        evidence, explained = _explained(rest[:, :, n], block, left)
+        unexplained = np.sum(np.abs(rest[:, :, n, 0]) ** 2) / left - explained.sum()
+        power = np.sum(np.abs(spectra[:, :, channel, 0]) ** 2) / len(spectra)
+        if power > LOUD * unexplained:
+            found.append(Nonlinear(channel, evidence, explained))
+    return max(found, key=lambda each: each.evidence, default=None)
+
+
+def _without(predictors: ComplexArray, wanted: ComplexArray) -> ComplexArray:
+    """Return what predictors leave of spectra, both (n_freqs, n_segments, n)."""
+    basis, _ = np.linalg.qr(predictors)
+    return np.asarray(wanted - basis @ (basis.conj().swapaxes(1, 2) @ wanted))
+
+
+def _explained(rest: ComplexArray, block: IntArray, left: int) -> tuple[float, FloatArray]:
+    """Return the evidence of square and cube, and the power that they explain, (n_freqs,).
+
+    `rest` has the shape (n_freqs, n_segments, 3): what others leave of the channel and of both.
+    """
+    r, q = rest[:, :, 0], rest[:, :, 1:]
+    n = r.shape[1]
+    first = np.flatnonzero(np.diff(block, prepend=-1))
+    size = np.sqrt(np.add.reduceat(np.sum(np.abs(q) ** 2, axis=1), first))
+    q /= np.where(size > 0, size, 1.0)[block, None]
+    variance = np.sum(np.abs(r) ** 2, axis=1) / left
+    weight = 1 / np.maximum(variance, np.finfo(np.float64).tiny)
+    u = np.add.reduceat(q.conj() * r[:, :, None] * weight[:, None, None], first)
+    U, V = u.sum(axis=1), np.einsum("bki,bkj->bij", u, u.conj())
+    G = np.einsum("fki,fkj->fij", q.conj(), q)
+    A = np.add.reduceat(G * weight[:, None, None], first)
+    coefficient = np.linalg.solve(A, U[:, :, None])[:, :, 0]
+    share = np.einsum("bi,bi->b", U.conj(), np.linalg.solve(V, U[:, :, None])[:, :, 0]).real / n
+    share = np.clip(share * left / n, 0.0, 1 - 1e-9)
+    degrees = left - _TERMS
+    # P(Beta(2, degrees) > share); their logarithms add up (Fisher)
+    log_p = degrees * np.log1p(-share) + np.log1p(degrees * share)
+    half = len(first)  # degrees of freedom of -2 sum(log p), halved
+    evidence = _normal(-float(log_p.sum()) / half, half)
+    total = np.einsum("bi,bi->b", U.conj(), coefficient).real
+    chance = np.einsum("bii->b", np.linalg.solve(A, V)).real
+    true = np.maximum(1 - chance / np.maximum(total, 1e-300), 0.0)[block]
+    c = coefficient[block]
+    power = np.einsum("fi,fij,fj->f", c.conj(), G, c).real / left
+    return evidence, true * power
+
+
+def _normal(ratio: float, half: int) -> float:
+    """Return a chi-squared variable of 2 `half` degrees of freedom, over these, as a normal one.
+
+    By Wilson and Hilferty.
+    """
+    spread = 2 / (9 * 2 * half)
+    return float((np.cbrt(ratio) - (1 - spread)) / np.sqrt(spread))

@@ -1,0 +1,55 @@
+"""What is not linear is a fact, in the interval, and subtracted where that is asked for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.formats.arrays import recording_of_arrays
+from daq.results.band_summary import levels
+from daq.results.facts import NotLinear, Rank
+from daq.results.known_facts import facts_of
+
+RATE, N_SAMPLES = 100.0, 30_000
+EDGES = np.array([1.0, 5.0, 10.0, 20.0, 40.0])
+
+
+@pytest.mark.parametrize("linearise", [False, True])
+@pytest.mark.parametrize("scale", [1.0, 1e-6])
+def test_a_square_is_in_the_interval_or_subtracted(linearise: bool, scale: float) -> None:
+    rng = np.random.default_rng(47)
+    motion = 1e3 * rng.standard_normal((N_SAMPLES, 1))
+    curved = motion + 2e-3 * motion**2 / motion.std()
+    arrays = {
+        name: scale * (each + rng.standard_normal((N_SAMPLES, 1)))
+        for name, each in zip("ABC", (motion, curved, motion), strict=True)
+    }
+    settings = Settings(segment=5.0, linearise=linearise, axis_tolerance={"": 0.0})
+    snapshot = estimate([recording_of_arrays(arrays, sampling_rate=RATE)], settings)
+    (fact,) = (each for each in facts_of(snapshot, settings) if isinstance(each, NotLinear))
+    assert fact.channels == ("B.1",)
+    assert fact.shares[0] == pytest.approx(8 / 9, abs=0.1)  # (2e-3)**2 * 2 * 1e6 over 1
+    assert fact.rank is (Rank.TO_KNOW if linearise else Rank.DELAYS)
+    assert fact.is_subtracted is linearise
+    result = next(iter(snapshot.results.values()))
+    found = levels(result, snapshot, settings, np.searchsorted(snapshot.frequency, EDGES))
+    low, high = found.ends()
+    truth = 2 / RATE * scale**2
+    held = (low < truth) & (truth < high)
+    assert held[:, 1].all()
+    assert held.mean() > 0.85  # 12 intervals of 95 %
+    error = found.mean[:, 1] / truth - 1
+    assert np.abs(error).max() < 2.5 if linearise else error.min() > 6
+
+
+def test_a_linear_bench_has_no_such_fact_and_the_same_numbers() -> None:
+    rng = np.random.default_rng(48)
+    motion = 1e3 * rng.standard_normal((N_SAMPLES, 1))
+    arrays = {name: motion + rng.standard_normal((N_SAMPLES, 1)) for name in "ABC"}
+    recording = recording_of_arrays(arrays, sampling_rate=RATE)
+    one, other = (estimate([recording], Settings(linearise=each)) for each in (False, True))
+    assert not one.nonlinear
+    for name, noise in one.results.items():
+        np.testing.assert_array_equal(noise.noise_psd, other.results[name].noise_psd)
