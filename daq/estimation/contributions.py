@@ -20,6 +20,7 @@ from estimator.levels.contributions import (
     widened,
 )
 from estimator.levels.interval import NORMAL_95
+from estimator.levels.pooled import blocks_of
 from estimator.likelihood.dimension import most_testable
 from estimator.self_noise.result import Flag, SelfNoise
 
@@ -35,6 +36,10 @@ SECOND_ORDER = 2.5
 (docs/validation/gradients.md)."""
 MOST_SHARED = 0.99
 """Part of its noise that a channel shares at most."""
+MUCH_NONLINEAR = 0.05
+"""Share of the noise from which squares and cubes of the motion delay a result, and from which
+terms of other forms may be all of the rest."""
+_THREE = 3  # sensors
 UNCERTAIN = 0.3
 """Share of what squares and cubes explain by which it is uncertain."""
 NOTHING_USEFUL = 1.0
@@ -67,7 +72,7 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
         with np.errstate(invalid="ignore"):
             most = np.fmin(share * motion, unseen * psd)
         found.append(contribution(Source.AXES, shape, below=most, above=most))
-    found += [*_counts(snapshot, shape), *_nonlinear(snapshot, shape)]
+    found += [*_counts(snapshot, shape), *_nonlinear(snapshot, psd)]
     if snapshot.rounding:
         most = snapshot.rounding * np.nan_to_num(snapshot.data_psd)
         found.append(contribution(Source.ROUNDING, shape, below=most, above=most))
@@ -110,7 +115,8 @@ def _counts(snapshot: Snapshot, shape: tuple[int, int]) -> Iterator[Contribution
     """Yield what the rounding that like channels share does to their noise."""
     alike = snapshot.rounded_alike
     if alike is not None and alike.most.any():
-        below, above = (np.maximum(n * alike.lacking, 0.0) + MARGIN * alike.most for n in (-1, 1))
+        most = MARGIN * (2 if len(snapshot.dims) > _THREE else 1) * alike.most
+        below, above = (np.maximum(n * alike.lacking, 0.0) + most for n in (-1, 1))
         yield contribution(Source.COUNTS, shape, below=below, above=above)
 
 
@@ -125,15 +131,24 @@ def _changes(snapshot: Snapshot, psd: FloatArray) -> list[Contribution]:
     return [contribution(Source.CHANGES, psd.shape, below=below)]
 
 
-def _nonlinear(snapshot: Snapshot, shape: tuple[int, int]) -> Iterator[Contribution]:
-    """Yield what channels that are not linear add to their noise, or may add still."""
-    explained = np.zeros(shape)
+def _nonlinear(snapshot: Snapshot, psd: FloatArray) -> Iterator[Contribution]:
+    """Yield what channels that are not linear add to their noise, or may add still.
+
+    Where squares and cubes explain much, other terms may be there: the noise may be any smaller.
+    """
+    explained, below = np.zeros((2, *psd.shape))
+    block = blocks_of(snapshot.frequency)
+    first = np.flatnonzero(np.diff(block, prepend=-1))
     for each in snapshot.nonlinear:
         explained[:, each.column] = each.explained
+        before = psd[:, each.column] + (each.explained if snapshot.linearised else 0.0)
+        part, whole = (np.add.reduceat(values, first) for values in (each.explained, before))
+        much = (part > MUCH_NONLINEAR * whole)[block]
+        usual = (UNCERTAIN if snapshot.linearised else 1 + UNCERTAIN) * each.explained
+        below[:, each.column] = np.where(much, np.maximum(usual, psd[:, each.column]), usual)
     if snapshot.nonlinear:
         above = UNCERTAIN * explained
-        below = above if snapshot.linearised else (1 + UNCERTAIN) * explained
-        yield contribution(Source.LINEARITY, shape, below=below, above=above)
+        yield contribution(Source.LINEARITY, psd.shape, below=below, above=above)
 
 
 def _sensitivities(snapshot: Snapshot, method: str, shape: tuple[int, int]) -> list[Contribution]:

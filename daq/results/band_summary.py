@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 CONSTANT = frozenset({Source.SENSITIVITY})
 """What is the same in all tests of a sensor, and no part of the difference of two."""
+MUCH_SHARED = 0.01
+"""Share of its noise that a channel is rounded alike with others, from which they predict it."""
 _SHAPE_LENGTH = 512  # only the window's shape and overlap matter to the correlation of bins
 
 
@@ -195,6 +197,8 @@ class Spectrum:
         self._correlation = correlation_of(settings)
         self._contributions = contributions(snapshot, noise.method)
         self._shares = shared_parts(snapshot) > 0
+        if (alike := snapshot.rounded_alike) is not None:
+            self._shares |= alike.most > MUCH_SHARED * np.nan_to_num(np.abs(noise.noise_psd))
         known = np.isfinite(noise.noise_psd)
         self._weight = np.where(known, self._width[:, None], 0.0)
         self._bound: tuple[slice, FloatArray, FloatArray] = (slice(0, 0), np.empty(0), np.empty(0))

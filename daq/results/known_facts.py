@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.clocks.clock_model import ClockSource
+from daq.estimation.contributions import MUCH_NONLINEAR
 from daq.estimation.noise_estimates import BY_MOTION
 from daq.results.band_summary import band_of, channel_means, known_range
 from daq.results.clock_effect import reference
@@ -98,8 +99,6 @@ LEAST_SHARE = 0.01
 """Share of the noise from which a contribution to an interval is a fact; of the time, too."""
 DELAYING_SHARE = 0.1
 """Share of the time of the estimate from which a sensor that shortens it delays the result."""
-MUCH_NONLINEAR = 0.05
-"""Share of the noise from which squares and cubes of the motion delay a result."""
 MUCH_ROUNDING = 0.1
 """Share of the noise from which rounding that channels share is a fact."""
 WITHOUT_ESTIMATE = (

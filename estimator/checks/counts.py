@@ -24,8 +24,9 @@ if TYPE_CHECKING:
 
 NEAR = 1.0
 """Variance of the difference in counts**2 from which nothing is shared: 1e-9 of the rounding."""
-MARGIN = 0.25
-"""Share of the largest cross-spectrum by which the effect of all on a channel is uncertain."""
+MARGIN = 0.5
+"""Share of the largest cross-spectrum by which the effect of all on a channel is uncertain; twice
+as much of more than three sensors, of which the likelihood may take some for motion."""
 CERTAIN = 0.98
 """Share of a variance that is certain to be there: with less of it, more is shared."""
 _ORDERS = np.arange(1, 12)

@@ -14,7 +14,7 @@ frequencies, and however loud the segments are.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from estimator.types import ComplexArray, FloatArray, IntArray
 
 MOST_SEGMENTS = 48
-MOST_BINS = 320
+MOST_BINS = 200
 MOST_PREDICTORS = 12
 LEAST_LEFT = 12
 """Segments beyond the predictors without which nothing is tested."""
@@ -53,12 +53,15 @@ class Nonlinear:
     channel : int
     evidence : float
         In standard deviations of a normal variable.
+    share : float
+        Of the power of the channel that square and cube explain.
     explained : float64, shape (n_kept,)
         PSD that square and cube explain, in the channel's unit**2/Hz.
     """
 
     channel: int
     evidence: float
+    share: float
     explained: FloatArray
 
 
@@ -100,7 +103,7 @@ class SquaresAndCubes:
         self._spectra.append(spectra.astype(np.complex64))
 
     def nonlinear(self, sensor: IntArray) -> list[Nonlinear]:
-        """Return the channels that are not linear, the one with the largest evidence first.
+        """Return the channels that are not linear, the one with the largest share first.
 
         Parameters
         ----------
@@ -110,6 +113,8 @@ class SquaresAndCubes:
         Notes
         -----
         What one channel explains is regressed out of the other sensors before these are tested.
+        Among those with evidence, the channel with the largest share is the cause: what is not
+        linear is whole in what is left of it, and a part in what is left of the others.
         """
         found: list[Nonlinear] = []
         if self._scale is None or len(self._spectra) < LEAST_LEFT or not len(self.bins):
@@ -120,19 +125,19 @@ class SquaresAndCubes:
             best: Nonlinear | None = None
             for each in range(int(sensor.max()) + 1):
                 worst = _worst(spectra, sensor, each, block, [one.channel for one in found])
-                if worst is not None and (best is None or worst.evidence > best.evidence):
+                if worst is not None and (best is None or worst.share > best.share):
                     best = worst
-            if best is None or best.evidence < CERTAIN:
+            if best is None:
                 break
             scale = self._density * self._scale[best.channel] ** 2
-            found.append(Nonlinear(best.channel, best.evidence, scale * best.explained))
+            found.append(replace(best, explained=scale * best.explained))
         return found
 
 
 def _worst(
     spectra: NDArray[np.complex64], sensor: IntArray, one: int, block: IntArray, known: list[int]
 ) -> Nonlinear | None:
-    """Return the channel of a sensor with the largest evidence, besides those that are known."""
+    """Return the channel of a sensor with evidence and the largest share, besides `known`."""
     own = [c for c in np.flatnonzero(sensor == one).tolist() if c not in known]
     others = np.flatnonzero(sensor != one)[:MOST_PREDICTORS]
     further = [c for c in known if sensor[c] != one]
@@ -150,9 +155,10 @@ def _worst(
         evidence, explained = _explained(rest[:, :, n], block, left)
         unexplained = np.sum(np.abs(rest[:, :, n, 0]) ** 2) / left - explained.sum()
         power = np.sum(np.abs(spectra[:, :, channel, 0]) ** 2) / len(spectra)
-        if power > LOUD * unexplained:
-            found.append(Nonlinear(channel, evidence, explained))
-    return max(found, key=lambda each: each.evidence, default=None)
+        if power > LOUD * unexplained and evidence > CERTAIN:
+            share = float(explained.sum() / power)
+            found.append(Nonlinear(channel, evidence, share, explained))
+    return max(found, key=lambda each: each.share, default=None)
 
 
 def _without(predictors: ComplexArray, wanted: ComplexArray) -> ComplexArray:
