@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daq.estimation.noise_estimates import responses
+from daq.estimation.snapshot import NonlinearChannel
 from estimator.checks.linearity import MOST_SEGMENTS, SquaresAndCubes
 from estimator.self_noise.result import Flag, SelfNoise
 
@@ -17,24 +17,6 @@ if TYPE_CHECKING:
     from daq.estimation.noise_estimates import Channels
     from daq.estimation.segments.segment_pass import Pass
     from estimator.types import FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class NonlinearChannel:
-    """A channel that is not linear.
-
-    Attributes
-    ----------
-    column : int
-    evidence : float
-        That it is not, in standard deviations.
-    explained : float64, shape (n_freqs,)
-        What squares and cubes of the channel add to its noise PSD, in unit**2/Hz.
-    """
-
-    column: int
-    evidence: float
-    explained: FloatArray
 
 
 def nonlinear_channels(

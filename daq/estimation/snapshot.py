@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from daq.bench.sensitivity import Sensitivities
     from daq.clocks.clock_model import ClockState
-    from daq.estimation.linearity import NonlinearChannel
     from daq.protocols.block import Event
     from daq.recording.interface import ReadableSensor
     from estimator.self_noise.result import SelfNoise
@@ -171,6 +170,24 @@ class RoundedAlike:
 
     most: FloatArray
     lacking: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NonlinearChannel:
+    """A channel that is not linear.
+
+    Attributes
+    ----------
+    column : int
+    evidence : float
+        That it is not, in standard deviations.
+    explained : float64, shape (n_freqs,)
+        What squares and cubes of the channel add to its noise PSD, in unit**2/Hz.
+    """
+
+    column: int
+    evidence: float
+    explained: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -253,7 +253,7 @@ def _gusty(scene: Scene) -> None:
     response = np.abs(signal.freqz(*taps, worN=4001, fs=RATE)[1]) ** 2
     grid = np.linspace(0, RATE / 2, 4001)
     gusts = np.exp(scene.rng.standard_normal(N_SAMPLES // 1000)).repeat(1000)[:, None]
-    power = 4 * float(np.exp(2))  # of a log-normal size
+    power = 4 * float(np.mean(gusts**2))
     for n in range(scene.n_sensors):
         white = scene.rng.standard_normal((N_SAMPLES, scene.n_channels))
         scene.noise[n] += signal.lfilter(*taps, 2 * gusts * white, axis=0)
