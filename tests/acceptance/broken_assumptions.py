@@ -113,6 +113,15 @@ def _nothing(scene: Scene) -> None:
     """Break nothing."""
 
 
+def _weak(share: float) -> Callable[[Scene], None]:
+    """Leave motion of a share of the noise, whatever the ratio."""
+
+    def breaks(scene: Scene) -> None:
+        scene.felt *= np.sqrt(share) / scene.size
+
+    return breaks
+
+
 def _red(slope: float) -> Callable[[Scene], None]:
     def breaks(scene: Scene) -> None:
         motion = scene.size * scene.coloured(slope)
@@ -407,6 +416,10 @@ KINDS: Mapping[str, Kind] = {
     "nothing": Kind(_nothing),
     "nothing, red motion": Kind(_red(-0.5)),
     "nothing, very red motion": Kind(_red(-1.5)),
+    "no motion": Kind(_weak(0.0)),
+    "motion of 1 % of the noise": Kind(_weak(0.01)),
+    "motion of 5 % of the noise": Kind(_weak(0.05)),
+    "motion of 20 % of the noise": Kind(_weak(0.2)),
     "gain of a sensor rises by 3 %": Kind(_course(_ramp(0.03)), STEADY),
     "gain of a sensor rises by 0.3 %": Kind(_course(_ramp(0.003)), STEADY),
     "gain of a sensor falls by 5 % at once": Kind(_course(_step(0.05)), STEADY),
