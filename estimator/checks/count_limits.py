@@ -148,6 +148,7 @@ class CountLimits:
         columns : mapping of int to bool, shape (n_samples,)
             Channels to look at, with the rows to use of each.
         """
+        columns = {n: rows & np.isfinite(counts[:, n]) for n, rows in columns.items()}
         values = {column: counts[rows, column] for column, rows in columns.items() if rows.any()}
         wrapped = {n: found for n, own in values.items() if (found := wraps(own)) is not None}
         clipped = {n: share for n, own in values.items() if (share := share_at_ends(own))}
