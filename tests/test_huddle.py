@@ -120,14 +120,14 @@ def test_the_three_sensor_estimate_is_the_closed_form_of_scipys_spectra() -> Non
         ]
         for p in range(9)
     ]
-    csm = np.moveaxis(np.array(pairs), 2, 0)[1:-1]
+    csm = np.moveaxis(np.array(pairs), 2, 0)[2:-1]  # detrending bends the first bin
     a, b, c = slice(0, 3), slice(3, 6), slice(6, 9)
     for i, j, k in ((a, b, c), (b, c, a), (c, a, b)):
         motion = csm[:, i, k] @ np.linalg.inv(csm[:, j, k]) @ csm[:, j, i]
         closed = np.einsum("fcc->fc", csm[:, i, i] - motion).real
         # The noise is 1/SNR of the spectra that are subtracted, and so are 1/SNR of the digits.
         rounding = 1e3 * SNR * np.finfo(np.float64).eps
-        np.testing.assert_allclose(result.noise_psd[1:-1, i], closed, rtol=rounding)
+        np.testing.assert_allclose(result.noise_psd[2:-1, i], closed, rtol=rounding)
 
 
 def test_samples_that_are_not_numbers_cost_the_segments_they_touch() -> None:
@@ -137,7 +137,7 @@ def test_samples_that_are_not_numbers_cost_the_segments_they_touch() -> None:
     sensors["C"][9999:10_001] = np.nan  # within three
     found = huddle.self_noise(sensors, fs=RATE, segment="2s", overlap=0.5)
     assert whole.n_segments - found.n_segments == 5
-    assert np.isfinite(found.noise_psd[1:-1]).all()
+    assert np.isfinite(found.noise_psd[2:-1]).all()
 
 
 def test_a_unit_of_the_samples_is_turned_into_that_of_the_motion() -> None:
@@ -323,12 +323,17 @@ def test_too_few_sensors_are_refused_by_name() -> None:
     two = {name: sensors[name] for name in "AB"}
     with pytest.raises(ValueError, match=r"2 sensors \(A, B\): three-sensor takes at least 3; .*"
                        r"or method='two-channel'"):  # fmt: skip
-        huddle.self_noise(two, fs=RATE)
+        huddle.self_noise(two, fs=RATE, method="three-sensor")
     with pytest.raises(ValueError, match=r"1 sensor \(A\): two-channel takes at least 2"):
         huddle.self_noise({"A": sensors["A"]}, fs=RATE, method="two-channel")
-    for method in ("two-channel", "all"):
+    for method, used in (
+        ("two-channel", {"two-channel"}),
+        ("all", {"two-channel", "multi-part"}),
+        ("auto", {"multi-part"}),
+    ):
         found = huddle.self_noise(two, fs=RATE, method=method, segment="1s")
-        assert found.methods == ("two-channel",)
+        assert set(found.methods) == used
+    assert huddle.self_noise({"A": sensors["A"]}, fs=RATE, segment="1s").methods == ()
 
 
 def test_too_few_averages_are_refused_with_the_reason() -> None:
@@ -360,7 +365,7 @@ def result() -> huddle.Result:
 
 def test_a_result_shows_the_table_of_the_command(result: huddle.Result) -> None:
     lines = repr(result).splitlines()
-    assert lines[0].startswith("Self-noise, mean over 0.25 to 45 Hz, dB re 1 (counts)²/Hz")
+    assert lines[0].startswith("Self-noise, mean over 0.5 to 45 Hz, dB re 1 (counts)²/Hz")
     assert lines[1].startswith("99 segments")
     assert lines[2].split()[:4] == ["sensor", "channel", "data", "three-sensor"]
     assert [line.split()[:2] for line in lines[3:12]] == [[s, c] for s in "ABC" for c in "XYZ"]
@@ -379,7 +384,7 @@ def test_a_band_has_a_mean_with_its_interval(result: huddle.Result) -> None:
     assert np.all((band.noise_low < band.noise_psd) & (band.noise_psd < band.noise_high))
     assert "mean over 1 to 40 Hz" in repr(band)
     usual = result.band()
-    assert (usual.low_hz, usual.high_hz) == (0.25, 45.0)
+    assert (usual.low_hz, usual.high_hz) == (0.5, 45.0)
     with pytest.raises(BandError, match="no frequency between 60 and 70 Hz"):
         result.band(60, 70)
 
@@ -449,7 +454,7 @@ def test_a_dataset_has_the_matrix_and_what_made_motion_of_counts() -> None:
         sensors["A"][:, 0], sensors["B"][:, 0], RATE, "hann", 200, detrend="constant"
     )
     pair = dataset.coherence.sel(trace="A.X", other_trace="B.X")
-    np.testing.assert_allclose(pair[1:-1], expected[1:-1], rtol=1e-9)
+    np.testing.assert_allclose(pair[2:-1], expected[2:-1], rtol=1e-9)
     np.testing.assert_array_equal(dataset.response_amplitude, 1)
 
 

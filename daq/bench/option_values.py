@@ -13,7 +13,7 @@ METHODS = (
     *("auto", "two-channel", "three-channel", "three-sensor", "maximum-likelihood"),
     *("multi-part", "all"),
 )
-LEAST_SENSORS = {"auto": 1, "two-channel": 2, "multi-part": 2}
+LEAST_SENSORS = {"auto": 1, "two-channel": 2, "multi-part": 2, "all": 2}
 """By method; the others need three."""
 CLOCKS = ("refined", "arrivals", "nominal")
 EQUALISATIONS = ("auto", "known", "estimated", "off")

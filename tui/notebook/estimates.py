@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, Unpack
 
+from daq.bench.option_values import LEAST_SENSORS
 from daq.bench.units import is_motion
 from daq.errors import ArrayError, WrongSettingError
 from daq.estimation.estimation import Estimation
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 PathLike: TypeAlias = "str | os.PathLike[str]"
 Response: TypeAlias = "PathLike | Any"
 """A file or folder of responses, or an Inventory of ObsPy."""
-_MIN_SENSORS = {"two-channel": 2, "all": 2}
 """Sensors that a method takes; three if it is not named here."""
 
 
@@ -187,6 +187,8 @@ def estimate(
     axis_tolerance : float or mapping of str to float
         Angle in degrees, rms, by which axes of sensors with one or two channels may be off
         (default 1), of all or by sensor. Motion across an axis widens the intervals.
+    linearise : bool
+        Whether what squares and cubes of the motion explain is subtracted from the noise.
     gain_steadiness : float
         Change of a gain in percent, for motion of ten times the power, that the method multi-part
         allows for (default 0.1).
@@ -219,7 +221,7 @@ def estimate(
     >>> huddle.simulate("fig9", duration="2min").write("floor.h5")
     >>> result = huddle.estimate("floor.h5", method="all", segment="4s", start="20s")
     >>> result.methods
-    ('three-sensor', 'two-channel', 'three-channel', 'maximum-likelihood')
+    ('three-sensor', 'two-channel', 'three-channel', 'maximum-likelihood', 'multi-part')
     >>> result.unit
     'm/s²'
     """
@@ -314,7 +316,7 @@ def _check_sensors(sensors: Sequence[ReadableSensor], settings: Settings) -> Non
     ArrayError
         With the sensors, or the segment, that there are.
     """
-    least = min(_MIN_SENSORS.get(method, 3) for method in settings.methods)
+    least = min(LEAST_SENSORS.get(method, 3) for method in settings.methods)
     if len(sensors) < least:
         names = ", ".join(sensor.name for sensor in sensors)
         method = settings.for_sensors((1,) * len(sensors)).methods[0]

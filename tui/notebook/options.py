@@ -40,6 +40,7 @@ class EstimateOptions(TypedDict, total=False):
     gains: Mapping[str, float]
     axis_tolerance: float | Mapping[str, float]
     gain_steadiness: float
+    linearise: bool
     lean: Mapping[str, tuple[float, float]]
     unit: str
     band: tuple[float, float]

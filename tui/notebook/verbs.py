@@ -121,7 +121,7 @@ def export(
     >>> sensors = huddle.simulate("fig9", duration="1min")
     >>> result = huddle.self_noise(sensors, fs=sensors.fs, sample_unit="m/s²", segment="2s")
     >>> huddle.export(result, "noise.npz")
-    >>> bool((np.load("noise.npz")["data_psd"] == result.data_psd).all())
+    >>> np.array_equal(np.load("noise.npz")["data_psd"], result.data_psd, equal_nan=True)
     True
     """
     out = Path(path)
