@@ -23,6 +23,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from estimator.median import median
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -180,7 +182,7 @@ def share_at_ends(counts: NDArray[Any]) -> float:
         return 0.0
     hard = max((counts == end).sum() for end in (counts.min(), counts.max())) >= MIN_AT_END
     if hard:
-        values, times = np.unique(counts, return_counts=True)
+        values, times = _distinct(counts)
         if len(values) < DISTINCT:
             return 0.0
         ends = ((times[0], times[1:BESIDE].max()), (times[-1], times[-BESIDE:-1].max()))
@@ -189,6 +191,13 @@ def share_at_ends(counts: NDArray[Any]) -> float:
             return sum(cut) / len(counts)
     signal = counts.astype(np.float64)
     return sum(max(_at_soft_end(side, parts) for parts in WIDTHS) for side in (signal, -signal))
+
+
+def _distinct(values: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
+    """Return distinct values, ascending, with their numbers: ``np.unique`` loads numpy.ma."""
+    ordered = np.sort(values)
+    first = np.flatnonzero(np.diff(ordered, prepend=ordered[:1] - 1) != 0)
+    return ordered[first], np.diff(first, append=len(ordered))
 
 
 def _has_slopes(values: NDArray[Any], times: NDArray[np.int64], n_cut: int) -> bool:
@@ -201,9 +210,9 @@ def _has_slopes(values: NDArray[Any], times: NDArray[np.int64], n_cut: int) -> b
 
 def _at_soft_end(values: FloatArray, parts: int) -> float:
     """Return the share of values in the uppermost of ``parts`` of the range; 0 if not clipped."""
-    top, middle = values.max(), float(np.median(values))
+    top, middle = values.max(), float(median(values))
     width = (top - values.min()) / parts
-    unit = np.diff(np.unique(values)).min(initial=math.inf)
+    unit = np.diff(_distinct(values)[0]).min(initial=math.inf)
     if width < 2 * unit:
         return 0.0
     below = np.bincount(np.minimum((top - values) / width, parts - 1).astype(np.int64))
@@ -281,7 +290,7 @@ def codes(counts: NDArray[Any]) -> Codes | None:
     whole = _whole(counts)
     if whole is None or not len(whole):
         return None
-    values, times = np.unique(whole, return_counts=True)
+    values, times = _distinct(whole)
     if len(values) < DISTINCT_CODES:
         return None
     step = int(np.gcd.reduce(np.diff(values)))
@@ -299,8 +308,8 @@ def _stuck_bits(values: NDArray[np.int64], times: NDArray[np.int64], step: int) 
         return []
     span, bit, found = int(inner[-1] - inner[0]), step.bit_length(), []
     while (n_periods := span >> bit + 1) >= MIN_PERIODS[0]:
-        n_seen = len(np.unique(inner >> bit + 1))
-        is_constant = len(np.unique(inner >> bit & 1)) == 1
+        n_seen = len(set((inner >> bit + 1).tolist()))
+        is_constant = len(set((inner >> bit & 1).tolist())) == 1
         if is_constant and n_seen >= max(MIN_PERIODS[0], min(MIN_PERIODS[1], n_periods / 2)):
             found.append(bit)
         bit += 1

@@ -524,6 +524,7 @@ class _Scores:
         error = float(np.sqrt(2 / ((n_parts - 1) * self._n_channels)))
         level = levels.level / levels.level.mean(axis=0)
         square = (level**2).mean(axis=0)  # of like noise, the product
-        changed = square > 1 + SIGNIFICANCE * levels.expected**2
-        product = float(np.where(changed, square, 1.0).max())
+        # of which the scatter of the levels is a part, that alone exceeds twice itself at times
+        changed = square > 1 + 2 * SIGNIFICANCE * levels.expected**2
+        product = float(np.where(changed, square - levels.expected**2, 1.0).max())
         return max(ratio if ratio > 1 + SIGNIFICANCE * error else 1.0, product)

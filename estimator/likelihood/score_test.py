@@ -71,12 +71,13 @@ class Scores:
     n_frequencies: int
 
     def __add__(self, other: Scores) -> Scores:
-        """Return the combined scores of two bands."""
+        """Return the combined scores of two bands, each by its own averages."""
+        share = other.averages / self.averages
         return Scores(
             self.pairs,
-            self.score + other.score,
-            self.power + other.power,
-            lambda some: self.between(some) + other.between(some),
+            self.score + share * other.score,
+            self.power + share * other.power,
+            lambda some: self.between(some) + share * other.between(some),
             self.averages,
             self.n_frequencies + other.n_frequencies,
         )
