@@ -214,6 +214,20 @@ class EstimateSettings:
             repeated=True,
         ),
     ] = field(default_factory=dict)
+    sampling_rates: Annotated[
+        Mapping[str, float],
+        Option(
+            "Rate in Hz at which a sensor sampled (B=100.9), in place of the recorded one; may be"
+            " repeated.",
+            check=values.sampling_rates,
+            flags=("--sampling-rate",),
+            metavar="SENSOR=HZ",
+            read=values.to_gains,
+            show=dict,
+            text=lambda rates: [f"{name}={rate!r}" for name, rate in rates.items()],
+            repeated=True,
+        ),
+    ] = field(default_factory=dict)
     axis_tolerance: Annotated[
         Mapping[str, float],
         Option(

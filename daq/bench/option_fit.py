@@ -1,7 +1,7 @@
 """Whether the options of an estimate fit the sensors of a bench or recording."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -71,7 +71,8 @@ def misfits(settings: EstimateSettings, sensors: Sequence[_Sensor]) -> Iterator[
             yield Misfit("gains", f"{name}={gain:g}", str(error))
 
     names = [sensor.name for sensor in sensors]
-    for option, given in (("axis_tolerance", settings.axis_tolerance), ("lean", settings.lean)):
+    for option in ("axis_tolerance", "lean", "sampling_rates"):
+        given: Mapping[str, object] = getattr(settings, option)
         for name in filter(None, given):
             try:
                 one_of(name, names)

@@ -201,6 +201,13 @@ def gains(value: object) -> dict[str, float]:
     return {str(name): number(gain) for name, gain in value.items()}
 
 
+def sampling_rates(value: object) -> dict[str, float]:
+    """Return sampling rates in Hz by sensor."""
+    if not isinstance(value, Mapping) or not all(number(rate) > 0 for rate in value.values()):
+        raise ValueError("expected rates above 0 Hz by sensor, such as {B = 100.9}")
+    return {str(name): number(rate) for name, rate in value.items()}
+
+
 def to_gains(texts: Sequence[str]) -> dict[str, float]:
     """Return the gains in texts such as B=1.02."""
     found: dict[str, float] = {}

@@ -32,6 +32,9 @@ class ReadableBlocks(Protocol):
 class ReadableSensor(Protocol):
     """One sensor of a recording."""
 
+    sampling_rate: float
+    """In Hz, as reported by the device; otherwise nominal. Those who know better may set it."""
+
     @property
     def name(self) -> str:
         """Name of the sensor."""
@@ -39,10 +42,6 @@ class ReadableSensor(Protocol):
     @property
     def clock(self) -> str:
         """Name of the sampling clock; sensors with one clock share the name."""
-
-    @property
-    def sampling_rate(self) -> float:
-        """In Hz, as reported by the device; otherwise nominal."""
 
     @property
     def channels(self) -> tuple[Channel, ...]:

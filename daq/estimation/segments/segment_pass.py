@@ -184,6 +184,8 @@ class Pass:
         sensors: Collection[str] | None = None,
     ) -> None:
         self.recording = recording
+        for record in recording.sensors:
+            record.sampling_rate = settings.sampling_rates.get(record.name, record.sampling_rate)
         self.aligned = AlignedRecording(
             recording,
             sampling_rate=settings.sampling_rate,
