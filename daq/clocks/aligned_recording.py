@@ -32,6 +32,7 @@ from daq.clocks.grid import (
     late_by,
     start_of,
 )
+from daq.clocks.quantiles import median
 from daq.clocks.resampling import USABLE
 from daq.clocks.sensor_reader import SensorSource, main_columns
 from daq.clocks.slip_search import find_by_arrivals, find_by_motion
@@ -56,10 +57,13 @@ _OF_A_CLOCK = 2  # sensors that are compared: one may be broken
 
 
 def undoubted(sources: Sequence[SensorSource], reference: int | None) -> tuple[int, ...]:
-    """Return sensors whose stated UTC is not doubted, some of each clock; the reference first."""
+    """Return sensors whose stated UTC is not doubted, some of each clock; the reference first.
+
+    Then those whose clocks were not set.
+    """
     seen: dict[str, int] = {}
     found = [] if reference is None else [reference]
-    for number, source in enumerate(sources):
+    for number, source in sorted(enumerate(sources), key=lambda each: each[1].arrivals.stepped > 0):
         taken = seen.get(source.clock_name, 0)
         if source.device_utc and not source.doubted and taken < _OF_A_CLOCK:
             seen[source.clock_name] = taken + 1
@@ -84,16 +88,23 @@ def take_drift(sources: Sequence[SensorSource], drift: Mapping[int, float], refe
 
 
 def place_stated(sources: Sequence[SensorSource]) -> None:
-    """Shift devices' UTC to arrival times, if the computer's UTC, used by other sensors, is wrong.
+    """Shift devices' UTC to the right one of their times, where their clocks were set.
 
-    It is wrong if no device's blocks arrive at possible times. A block of all channels arrives with
-    its slowest channel: if channels are not synchronised, up to twice its duration after its end.
+    And to arrival times, if the computer's UTC, used by other sensors, is wrong. It is wrong if no
+    device's blocks arrive at possible times. A block of all channels arrives with its slowest
+    channel: if channels are not synchronised, up to twice its duration after its end.
     """
     stated = [source.arrivals for source in sources if source.device_utc]
+    usual = [each.latency for each in stated if not each.stepped]
+    for each in stated:
+        most = _LATEST + 2 * each.longest_block
+        each.moved = each.ahead(median(np.array(usual)) if usual else None, most=most)
     if 0 < len(stated) < len(sources):
-        wrong = all(not 0 <= each.latency < _LATEST + 2 * each.longest_block for each in stated)
-        for each in stated:
-            each.moved = min(other.latency for other in stated) if wrong else 0.0
+        latency = [each.latency - each.moved for each in stated]
+        most_of = [_LATEST + 2 * each.longest_block for each in stated]
+        if all(not 0 <= one < most for one, most in zip(latency, most_of, strict=True)):
+            for each in stated:
+                each.moved += min(latency)
 
 
 _GROWTH = 0.05  # fraction by which a recording grows before its clocks are set again
@@ -317,6 +328,10 @@ class AlignedRecording:
     def stated(self) -> tuple[int, ...]:
         """Indices of sensors that state UTC and are not doubted: the reference, two per clock."""
         return undoubted(self._sources, self.stated_reference)
+
+    def stepped(self, number: int) -> float:
+        """Return by how many s the clock of a sensor was set, in all."""
+        return self._sources[number].arrivals.stepped
 
     def compare_stated(self, drift: Mapping[int, float], reference: int) -> bool:
         """Take by how much stated UTC drifts, in s rms; return whether that of any sensor does.

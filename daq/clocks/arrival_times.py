@@ -24,7 +24,9 @@ Where the device itself states UTC (``BlockFlag.DEVICE_UTC``) there is nothing t
 statements are the clock, and a sensor whose statements agree with its nominal rate runs exactly at
 its nominal rate. If they drift against the motion, delays measured from it are the clock. Beside
 sensors without UTC the host's UTC must place them; where arrivals show that to be wrong, statements
-are moved to where arrivals put them. A step of one second is a leap second: UTC's.
+are moved to where arrivals put them. A step of one second is a leap second: UTC's. Where a device
+counted on while its clock was set, as a driver saw, the count is the clock; of the times before and
+after, those of the longest stretch are right that arrivals do not contradict.
 """
 
 from __future__ import annotations
@@ -114,12 +116,24 @@ class HostSleep:
         return restarts | early
 
 
+@dataclass(slots=True)
+class _Stated:
+    """A stretch of samples between steps of the clock that states their times."""
+
+    first_sample: int
+    ahead: float
+    """Seconds by which the clock is ahead of what it was at first."""
+    latency: float
+    """Seconds at least from the last sample of a block, as stated, to its arrival."""
+
+
 _NANO = 1e-9
 _NODE = 10.0  # seconds of arrival times that make one observation
 _MOST_NODES = 3000
 _FLOOR = 1e-7  # seconds; no delay is known better than the curve between nodes is
 _WELL_KNOWN = 0.02  # samples to which delays must be known to be of use
 _UTC_JUMP = 0.01  # samples
+_SET = 0.5  # samples by which a clock is set at least
 _DRIFT = 1e-4  # by which a sampling clock may run off its rate
 _LEAP = 1e-3  # seconds; how well a step must agree with a leap second
 _OSCILLATOR = 200.0  # ppm; no oscillator of an instrument is off by more
@@ -169,6 +183,7 @@ class ArrivalTimes:
     _polls: Polls = field(default_factory=Polls)
     _sleep: HostSleep = field(init=False)
     _leapt: float = 0.0
+    _stated: list[_Stated] = field(default_factory=list)
     _latency: FloatArray = field(default_factory=lambda: np.empty(0))  # least of each epoch
     _line: tuple[float, list[float]] | None = None  # what `_lines` found, until more arrives
     _unmeasured: Clock | None = None  # what `solve` found, until more arrives
@@ -204,15 +219,8 @@ class ArrivalTimes:
         if not self._device_utc:
             self._polls.add(index, late)
         if self._device_utc:
-            late -= self._leapt
-            step = np.diff(late, prepend=late[:1] if begins else self._late[-1:])
-            counted_on = first == np.append(self._end_sample, (first + length)[:-1])
-            leaps = np.where(counted_on & (np.abs(np.abs(step) - 1) < _LEAP), np.round(step), 0.0)
-            late -= np.cumsum(leaps)
-            step -= leaps
-            self._leapt += float(leaps.sum())
-            drift = _DRIFT * np.maximum(length, np.append(length[:1], length[:-1]))
-            breaks = np.abs(step) > (_UTC_JUMP + drift) / self.sampling_rate
+            latency = arrived - elapsed - length / self.sampling_rate
+            breaks = self._breaks_of_utc(first, length, late, flags=flags, latency=latency)
         else:
             breaks = self._sleep.breaks(index, late, (flags & int(_BREAKS)) != 0)
         breaks[0] |= begins
@@ -235,6 +243,75 @@ class ArrivalTimes:
         self._index = np.concatenate([self._index[:-1], index[kept]])
         self._late = np.concatenate([self._late[:-1], late[kept]])
         self._epoch = np.concatenate([self._epoch[:-1], epoch[kept]])
+
+    def _breaks_of_utc(
+        self,
+        first: IntArray,
+        length: IntArray,
+        late: FloatArray,
+        *,
+        flags: IntArray,
+        latency: FloatArray,
+    ) -> BoolArray:
+        """Return which blocks begin an epoch by the times stated.
+
+        Takes steps of the clock between samples that were counted on out of `late`.
+        """
+        begins = not self._epoch_starts
+        late -= self._leapt
+        step = np.diff(late, prepend=late[:1] if begins else self._late[-1:])
+        counted_on = first == np.append(self._end_sample, (first + length)[:-1])
+        was_set = counted_on & ((flags & int(_BREAKS)) == int(BlockFlag.CLOCK_RESTART))
+        was_set &= np.abs(step) > _SET / self.sampling_rate
+        leaps = np.where(counted_on & (np.abs(np.abs(step) - 1) < _LEAP), np.round(step), 0.0)
+        leaps = np.where(was_set, step, leaps)
+        self._take_stated(first, was_set, step, latency)
+        late -= np.cumsum(leaps)
+        step -= leaps
+        self._leapt += float(leaps.sum())
+        drift = _DRIFT * np.maximum(length, np.append(length[:1], length[:-1]))
+        return np.asarray(np.abs(step) > (_UTC_JUMP + drift) / self.sampling_rate)
+
+    def _take_stated(
+        self, first: IntArray, was_set: BoolArray, step: FloatArray, latency: FloatArray
+    ) -> None:
+        """Take how the clock was set, by the blocks before which it was."""
+        if not self._stated:
+            self._stated.append(_Stated(int(first[0]), 0.0, math.inf))
+        rows = [*np.flatnonzero(was_set).tolist(), len(first)]
+        for begin, end in itertools.pairwise([0, *rows]):
+            if begin in rows[:-1]:
+                ahead = self._stated[-1].ahead + float(step[begin])
+                self._stated.append(_Stated(int(first[begin]), ahead, math.inf))
+            last = self._stated[-1]
+            last.latency = min(last.latency, float(latency[begin:end].min(initial=math.inf)))
+
+    @property
+    def stepped(self) -> float:
+        """Seconds between the extremes of what the clock was ahead, where it was set."""
+        ahead = [each.ahead for each in self._stated]
+        return max(ahead, default=0.0) - min(ahead, default=0.0)
+
+    def ahead(self, usual: float | None, *, most: float) -> float:
+        """Return by how many s the right times are ahead of those at first.
+
+        Parameters
+        ----------
+        usual : float or None
+            Latency of sensors whose clocks were not set.
+        most : float
+            By which the latency of right times may differ, in s.
+        """
+        ends = [*(each.first_sample for each in self._stated[1:]), self._end_sample]
+        lengths = [end - each.first_sample for each, end in zip(self._stated, ends, strict=True)]
+
+        def rank(number: int) -> tuple[bool, int]:
+            latency = self._stated[number].latency
+            apart = latency if usual is None else latency - usual
+            likely = 0 <= apart < most if usual is None else abs(apart) < most
+            return likely, lengths[number]
+
+        return self._stated[max(range(len(lengths)), key=rank)].ahead
 
     @property
     def start(self) -> float:

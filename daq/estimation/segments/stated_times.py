@@ -122,7 +122,8 @@ def agree(
         Independent averages in all segments of the pass.
     """
     sensors = aligned.stated
-    if any(aligned.clocks[n].ppm or aligned.clocks[n].wander_ppm for n in sensors):
+    clocks = [aligned.clocks[n] for n in sensors]
+    if any(map(aligned.stepped, sensors)) or any(each.ppm or each.wander_ppm for each in clocks):
         return False
     edges = np.cumsum([0, *aligned.dims])
     first, last = aligned.common
@@ -210,6 +211,9 @@ def _drifts(
         drift[number] = drift_of(
             *mine, nominal=nominal, duration=duration, sampling_rate=welch.sampling_rate
         )
+        stepped = aligned.stepped(number)  # which of the times are right, the motion says
+        if stepped and not math.isinf(drift[number]):
+            drift[number] = float(np.fmax(drift[number], stepped))
         if is_reference[column]:
             drift[number] = 0.0
     return drift, sensors[int(np.argmax(is_reference))]
