@@ -425,7 +425,7 @@ class AlignedRecording:
             elif first is not source and not source.device_utc:
                 source.share(first, measured)
             elif together:
-                ppm, ppm_std = source.arrivals.rate()
+                ppm, ppm_std = source.heard.rate()
                 source.clock = nominal(
                     source.record.name,
                     ClockSource.SHARED_CLOCK,
@@ -468,6 +468,8 @@ class AlignedRecording:
             created = self._recording.created_at
             self._origin = (created.monotonic_ns, created.utc_ns)
             self._sources = [SensorSource.of(record, *self._origin) for record in self._records]
+            for source in self._sources:
+                source.span = self._limits
         for source in self._sources:
             source.refresh()
         n_samples = sum(source.end_sample for source in self._sources)

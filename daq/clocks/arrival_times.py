@@ -135,6 +135,7 @@ _WELL_KNOWN = 0.02  # samples to which delays must be known to be of use
 _UTC_JUMP = 0.01  # samples
 _SET = 0.5  # samples by which a clock is set at least
 _DRIFT = 1e-4  # by which a sampling clock may run off its rate
+_LEAST_SPAN = 60.0  # seconds of arrivals by which a rate is known
 _LEAP = 1e-3  # seconds; how well a step must agree with a leap second
 _OSCILLATOR = 200.0  # ppm; no oscillator of an instrument is off by more
 _CERTAIN = 3.0  # standard deviations
@@ -270,7 +271,8 @@ class ArrivalTimes:
         step -= leaps
         self._leapt += float(leaps.sum())
         drift = _DRIFT * np.maximum(length, np.append(length[:1], length[:-1]))
-        return np.asarray(np.abs(step) > (_UTC_JUMP + drift) / self.sampling_rate)
+        unsure = ~counted_on & ((flags & int(BlockFlag.MISSING_ESTIMATED)) != 0)
+        return np.asarray(unsure | (np.abs(step) > (_UTC_JUMP + drift) / self.sampling_rate))
 
     def _take_stated(
         self, first: IntArray, was_set: BoolArray, step: FloatArray, latency: FloatArray
@@ -387,21 +389,33 @@ class ArrivalTimes:
         """
         if not slips:
             return self
-        kept = ~slips.holds(self._index)
-        lost = np.setdiff1d(self._epoch, self._epoch[kept])  # an epoch keeps one arrival at least
-        kept |= np.isin(self._epoch, lost)
         ahead = slips.ahead(self._index)
         starts = np.array(self._epoch_starts)
-        return replace(
+        counted = replace(
             self,
-            _index=(self._index + ahead)[kept],
-            _late=(self._late - ahead / self.sampling_rate)[kept],
-            _epoch=self._epoch[kept],
+            _index=self._index + ahead,
+            _late=self._late - ahead / self.sampling_rate,
             _epoch_starts=(starts + slips.ahead(starts)).tolist(),
             _end_sample=self._end_sample + int(slips.ahead(np.array([self._end_sample]))[0]),
-            _line=None,
-            _unmeasured=None,
         )
+        return counted.only(~slips.holds(self._index))
+
+    def within(self, begin: float, end: float) -> ArrivalTimes:
+        """Return the arrivals between two times in s from the origin, by which a rate is known.
+
+        All of them where too few lie there.
+        """
+        seconds = self._index / self.sampling_rate + self._late
+        kept = (seconds >= begin) & (seconds <= end)
+        if kept.all() or not kept.any() or np.ptp(seconds[kept]) < _LEAST_SPAN:
+            return self
+        return self.only(kept)
+
+    def only(self, kept: BoolArray) -> ArrivalTimes:
+        """Return the same arrivals without some; an epoch keeps one at least."""
+        kept = kept | np.isin(self._epoch, np.setdiff1d(self._epoch, self._epoch[kept]))
+        index, late, epoch = self._index[kept], self._late[kept], self._epoch[kept]
+        return replace(self, _index=index, _late=late, _epoch=epoch, _line=None, _unmeasured=None)
 
     @property
     def hidden(self) -> float:

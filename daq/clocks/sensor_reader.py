@@ -115,6 +115,8 @@ class SensorSource:
     columns: list[int]
     sensitivity: FloatArray
     arrivals: ArrivalTimes
+    span: tuple[float, float] = (-math.inf, math.inf)
+    """Times in s from the origin between which its rate is wanted."""
     runs: list[_Run] = field(default_factory=list)
     n_blocks: int = 0
     device_utc: bool = False
@@ -133,10 +135,24 @@ class SensorSource:
     """Times of a polled sensor's samples that `by_instants` has read, in s."""
     _utc_rate: tuple[int, UtcRate] = (0, UtcRate())
     """How many blocks `utc_rate` has read, and what it found."""
+    _in_span: tuple[int, ArrivalTimes] = field(init=False)
+    """How many blocks there were, and `heard` then."""
     slips: Slips = field(default_factory=Slips)
     """Samples that it lost without counting them."""
     offset_in_doubt: bool = False
     """Whether the offset of its sample index to others of its clock is an estimate."""
+
+    def __post_init__(self) -> None:
+        self._in_span = 0, self.arrivals
+
+    @property
+    def heard(self) -> ArrivalTimes:
+        """Its arrivals in the span that is wanted."""
+        if self.span == (-math.inf, math.inf):
+            return self.arrivals
+        if self._in_span[0] != self.n_blocks:
+            self._in_span = self.n_blocks, self.arrivals.within(*self.span)
+        return self._in_span[1]
 
     @property
     def doubted(self) -> bool:
@@ -328,7 +344,7 @@ class SensorSource:
         if self.device_utc:
             return self._judged(self.arrivals.solve(name, measured))
         measured = None if measured is None else utc.by_computer(measured)
-        clock = utc.by_utc(self.arrivals.counting(self.slips).solve(name, measured))
+        clock = utc.by_utc(self.heard.counting(self.slips).solve(name, measured))
         clock = clock.without(self.slips)
         return replace(clock, state=replace(clock.state, slips=self._dated(clock)))
 
@@ -416,7 +432,7 @@ class SensorSource:
             return
         # Compare arrivals with arrivals: the other's clock may be the timeline itself.
         stated = first.device_utc or first.polled
-        heard = known if stated else first.arrivals.solve(name)
+        heard = known if stated else first.heard.solve(name)
         stretches, by_samples = [], measured is not None
         for begin, end, index, seconds in self.arrivals.earliest():
             apart = float((heard.position(seconds) - index).min())

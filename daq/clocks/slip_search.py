@@ -89,7 +89,7 @@ def find_by_arrivals(source: SensorSource) -> None:
     """
     if source.device_utc or source.polled:
         return
-    rate, counted = source.record.sampling_rate, source.arrivals.counting(source.slips)
+    rate, counted = source.record.sampling_rate, source.heard.counting(source.slips)
     node = max(_NODE, _BLOCKS * source.arrivals.longest_block)
     for _, _, index, seconds in counted.earliest():
         for step in arrive_otherwise((index / rate, seconds - index / rate), node=node):
@@ -132,7 +132,7 @@ def _together(one: Step, other: Step) -> bool:
 
 def _slipped(source: SensorSource, step: Step, before: float, after: float) -> bool:
     """Add a slip between two samples, if the step is one of this sensor."""
-    counted = source.arrivals.counting(source.slips)
+    counted = source.heard.counting(source.slips)
     n = lost_by_delays(
         replace(step, before=_count(source, before), after=_count(source, after)),
         source.record.sampling_rate,

@@ -1,0 +1,127 @@
+"""Stated times that step, and rates that only a part of a recording keeps, up to the noise.
+
+The digitizers are those of `tests.peers.digitizer`, which share no code with the drivers.
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.bench.channel import Channel
+from daq.devices.seedlink.decoder import SeedLinkDecoder, Selection
+from daq.errors import CannotAlignError
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.protocols.block import HostTime
+from daq.recorder.block_writer import BlockWriter
+from daq.recording.file_format import SensorLayout
+from daq.recording.writer import RecordingWriter
+from daq.results.band_summary import channel_means
+from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, create
+from tests.peers.digitizer import CODES, START, Digitizer, seedlink
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daq.protocols.block import Block, Event
+
+RATE, SECONDS, SNR = 100, 240.0, 1e3
+SETTINGS = Settings(segment=4.0, methods=("three-sensor",))
+CHANNELS = tuple(Channel(name=code, sensitivity=1.0) for code in CODES)
+
+
+def counts(n_sensors: int, n_samples: int) -> list[np.ndarray]:
+    rng = np.random.default_rng(11)
+    motion = 30_000 * rng.standard_normal((n_samples, 3))
+    noise = 30_000 / np.sqrt(SNR) * rng.standard_normal((n_sensors, n_samples, 3))
+    return [np.round(motion + each).astype(np.int32) for each in noise]
+
+
+def arrival(seconds: float) -> HostTime:
+    utc = round(START.timestamp() * 1e9) + round(seconds * 1e9)
+    return HostTime(5_000_000_000_000 + round(seconds * 1e9), utc)
+
+
+@pytest.mark.parametrize(
+    "steps",
+    [
+        {"B": ((100.0, -0.5),)},
+        pytest.param({"B": ((60.0, 3600.0),), "C": ((150.0, -20.0),)}, marks=pytest.mark.long),
+        pytest.param({"A": ((50.0, 0.02), (90.0, -2.0))}, marks=pytest.mark.long),
+        pytest.param({"C": ((180.0, -3600.0),)}, marks=pytest.mark.long),
+    ],
+)
+def test_noise_is_right_where_clocks_of_digitizers_are_set(
+    tmp_path: Path, steps: dict[str, tuple[tuple[float, float], ...]]
+) -> None:
+    path = tmp_path / "r.h5"
+    layouts = [SensorLayout(name, CHANNELS, RATE, np.dtype(np.int32)) for name in "ABC"]
+    file = RecordingWriter.create(path, sensors=layouts, created=arrival(0))
+    writer = BlockWriter(file, dict.fromkeys("ABC", float(RATE)))
+    items: list[Block | Event] = []
+    for name, samples in zip("ABC", counts(3, round(SECONDS * RATE)), strict=True):
+        digitizer = Digitizer(SECONDS, RATE, steps=steps.get(name, ()), seed=ord(name))
+        digitizer.samples = samples
+        chosen = Selection("XX", "STA", tuple(("*", code) for code in CODES), 3)
+        decoder = SeedLinkDecoder({name: chosen}, {name: np.dtype(np.int32)}, hold=10.0)
+        for sent in digitizer.records():
+            items += decoder.receive(seedlink(sent, RATE, sent.number), arrival(sent.arrival))
+    arrived: list[Block | Event] = sorted(items, key=lambda item: item.received.monotonic_ns)
+    writer.write(arrived)
+    writer.close(arrival(SECONDS + 1), "the end")
+    snapshot = estimate([path], SETTINGS)
+    means = channel_means(snapshot.results["three-sensor"], snapshot, SETTINGS, (1.0, 40.0))
+    true = 2 * (30_000**2 / SNR) / RATE
+    for mean in means:
+        assert 0.8 < mean.mean[0] / true < 1.25
+        assert mean.low[0] < 1.1 * true
+        assert mean.high[0] > true / 1.1
+        assert mean.high[0] / mean.low[0] < 1.5
+
+
+def lossy(path: Path, *, rate: float = float(RATE), lost: int = 0) -> None:
+    """Write sensors of which B loses samples in silence after 200 of 500 s, or samples oddly."""
+    made = {}
+    for name, samples in zip("ABC", counts(3, 50_000), strict=True):
+        made[name] = Sensor(samples, rate=rate if name == "B" else RATE, nominal=RATE)
+    writer = create(path, made)
+    for name, sensor in made.items():
+        for block in blocks(name, sensor):
+            late = lost / RATE if name == "B" and block.first_sample > 20_000 else 0.0
+            at = HostTime(
+                block.received.monotonic_ns + round(late * 1e9),
+                block.received.utc_ns + round(late * 1e9),
+            )
+            object.__setattr__(block, "received", at)
+            writer.append(block)
+    writer.close()
+
+
+def test_a_span_before_a_loss_is_estimated_by_its_own_rate(tmp_path: Path) -> None:
+    """A recorder of an older version lost 10 s in silence at the 200th second."""
+    lossy(tmp_path / "r.h5", lost=1000)
+    start = datetime.fromtimestamp(ORIGIN.utc_ns * 1e-9, UTC)
+    settings = Settings(
+        segment=4.0,
+        methods=("three-sensor",),
+        start=start,
+        end=start + timedelta(seconds=190),
+        clocks="arrivals",
+    )
+    snapshot = estimate([tmp_path / "r.h5"], settings)
+    assert abs(snapshot.clocks[1].ppm) < 50
+
+
+def test_a_finished_recording_can_be_given_its_rate(tmp_path: Path) -> None:
+    lossy(tmp_path / "r.h5", rate=101.0)
+    with pytest.raises(CannotAlignError, match="101"):
+        estimate([tmp_path / "r.h5"], SETTINGS)
+    settings = Settings(
+        segment=4.0, methods=("three-sensor",), sampling_rates={"B": 101.0}, clocks="arrivals"
+    )
+    snapshot = estimate([tmp_path / "r.h5"], settings)
+    assert abs(snapshot.clocks[1].ppm) < 10
