@@ -52,6 +52,8 @@ FREQUENCIES = 8
 """Number of frequencies per group of residuals."""
 DISTURBED = 8.0
 """Residuals of a group from which a segment is disturbed, in standard deviations by the median."""
+KNOWN = 0.5
+"""Standard error of the noise of a part, as a fraction, up to which its changes count."""
 MAX_DISTURBED = 0.2
 """Maximum share of disturbed segments; with more, the noise changes and no segment is excluded."""
 PAIR_BYTES = 1 << 24
@@ -524,7 +526,10 @@ class _Scores:
         error = float(np.sqrt(2 / ((n_parts - 1) * self._n_channels)))
         level = levels.level / levels.level.mean(axis=0)
         square = (level**2).mean(axis=0)  # of like noise, the product
-        # of which the scatter of the levels is a part, that alone exceeds twice itself at times
+        # of which the scatter of the levels is a part, that alone exceeds twice itself at times;
+        # a channel whose noise parts do not know is no sign of any change
         changed = square > 1 + 2 * SIGNIFICANCE * levels.expected**2
+        changed &= levels.expected < KNOWN
+        changed &= (levels.level > 0).all(axis=0)
         product = float(np.where(changed, square - levels.expected**2, 1.0).max())
         return max(ratio if ratio > 1 + SIGNIFICANCE * error else 1.0, product)

@@ -116,14 +116,20 @@ def count_of_inflated(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
     found: list[bytes] = []
     library: Any = packing.__dict__["deflate"]
 
-    def decompress(content: bytes, bits: int, n_bytes: int) -> bytes:
-        found.append(content)
-        inflated: bytes = library.decompress(content, bits, n_bytes)
-        return inflated
+    class Counted:
+        def __init__(self) -> None:
+            self._one = library.decompressobj()
 
-    counted = SimpleNamespace(
-        decompress=decompress, MAX_WBITS=library.MAX_WBITS, error=library.error
-    )
+        def decompress(self, content: bytes, n_bytes: int) -> bytes:
+            found.append(content)
+            inflated: bytes = self._one.decompress(content, n_bytes)
+            return inflated
+
+        @property
+        def eof(self) -> bool:
+            return bool(self._one.eof)
+
+    counted = SimpleNamespace(decompressobj=Counted, error=library.error)
     monkeypatch.setattr(packing, "deflate", counted)
     return found
 
