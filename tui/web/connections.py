@@ -201,6 +201,9 @@ class Connections:
                     )
                     for event in (head, h11.Data(data=msg.encode()), h11.EndOfMessage()):
                         self.transport.write(self.conn.send(event) or b"")
+                if self.cycle is not None:  # the request that is being answered ends here
+                    self.cycle.disconnected = True
+                    self.cycle.message_event.set()
                 self.transport.close()
 
         return Counted
