@@ -341,7 +341,7 @@ def _band(
             of_run = regression(joined_parts(csm, averages, by_run), at)
             of_runs.append(noise_levels(of_run, own))
     whole = Levels.joined(levels)
-    if np.median(whole.degrees) < LEAST_DEGREES:
+    if median(np.ravel(whole.degrees)) < LEAST_DEGREES:
         return None
     return _Band(
         whole,
