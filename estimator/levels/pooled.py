@@ -7,7 +7,8 @@ neighbouring bins, and its scatter would contain the cost. Project, then pool:
    neighbours that are worth `ENOUGH` averages.
 2. r of the q dimensions of the motion are *resolved*: their eigenvalues in the median sub-block
    stand out, whichever sensor is left out, and apart from the next ones. Their directions are taken
-   from each sub-block, so that a response may vary over the block however strong the motion is.
+   from each sub-block, so that a response may vary over the block however strong the motion is;
+   where a line of one sensor stands out like motion, from the nearest other sub-block.
 3. The other q - r directions are taken from the mean of the projected sub-blocks, one set for the
    block. A response that varies leaks little there: SNR times the square of its variation.
 4. With Q_b the projector off both in sub-block b, whitened by the noise, the noise of a bin is
@@ -33,6 +34,7 @@ import numpy as np
 
 from estimator.levels.interval import moved, worth
 from estimator.levels.noise_matrices import axes_of, coupling, inverse, pairs, times, white
+from estimator.median import median
 
 if TYPE_CHECKING:
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
@@ -56,6 +58,9 @@ LEAKS = 3.0
 differs from it, from which they are not used."""
 SHOWN = 2.0
 """Standard deviations by which sensors agree more than noise does, from which motion shows."""
+HIDES = 0.5
+"""Least share of a direction of a sensor's noise that a sub-block keeps, over the usual one of its
+block, below which a line of that sensor stands out there like motion."""
 UNSEEN = 0.67
 """Variance of the noise, over that of a PSD, by the square of the motion that does not show: so
 much that the interval holds the noise however much of this motion there is."""
@@ -349,11 +354,15 @@ def _fitted(
     for turn in range(ROUNDS):
         X = white(mean, whitener[own])
         P = np.broadcast_to(np.eye(p, dtype=np.complex128), X.shape)
+        g = np.ones(len(own))
         if resolve:
             r = _n_resolved(X, parts, wanted, sensor)
             V = np.linalg.eigh(X)[1] * (column < r[own, None])[:, None, :]
             P = P - V @ V.conj().swapaxes(1, 2)
-        g = N / (N - r[own])
+            source = _nearest(P, parts, sensor)
+            P = P[source]
+            # directions take noise of the samples they are from, and let motion of others pass
+            g = N / np.where(source == np.arange(len(own)), N - r[own], N + r[own])
         T = parts.mean(g[:, None, None] * (P @ X @ P)) if resolve else X
         A = np.linalg.eigh(T)[1]
         q = r + _shown(
@@ -435,6 +444,25 @@ def _read(
     found.cumulants[:, parts.bins[use]] = cumulants[:, use]
 
 
+def _nearest(P: ComplexArray, parts: _Parts, sensor: IntArray) -> IntArray:
+    """Return the sub-block of the same block from which each takes the directions of the motion.
+
+    Its own, unless its directions take noise of one sensor almost whole: a line of that sensor
+    stands out in one sub-block, not in the median one, and what is left would be magnified.
+    """
+    own = [np.flatnonzero(sensor == i) for i in range(int(sensor[-1]) + 1)]
+    kept = np.min([np.linalg.eigvalsh(P[:, c[:, None], c])[:, 0] for c in own], axis=0)
+    usual = np.array([median(each) for each in np.split(kept, parts.first[1:])])
+    seen = kept >= HIDES * usual[parts.block]
+    at, far = np.arange(len(seen)), 2 * len(seen)
+    last = np.append(parts.first[1:], len(seen))[parts.block] - 1
+    before = np.maximum.accumulate(np.where(seen, at, -1))
+    after = np.minimum.accumulate(np.where(seen, at, far)[::-1])[::-1]
+    back = np.where(before >= parts.first[parts.block], at - before, far)
+    ahead = np.where(after <= last, after - at, far)
+    return np.where(back <= ahead, before, after)
+
+
 def _n_resolved(X: ComplexArray, parts: _Parts, q: IntArray, sensor: IntArray) -> IntArray:
     """Return how many dimensions stand out in the median of up to `SAMPLED` sub-blocks."""
     number = np.diff(parts.first, append=len(parts.block))
@@ -460,7 +488,7 @@ def _stand_out(
             break
         keep = np.flatnonzero(sensor != i)
         w = np.linalg.eigvalsh(X[left][:, :, keep[:, None], keep])[:, :, ::-1]
-        w = np.median(w, axis=1)
+        w = median(w.swapaxes(0, 1))
         w = np.pad(w, ((0, 0), (0, max(0, most + 1 - w.shape[1]))), constant_values=1.0)
         edge = OUTSTANDING * (1 + np.sqrt(len(keep) / averages[left])) ** 2
         out = (w[:, :most] > edge[:, None]) & (number < q[left, None])

@@ -109,6 +109,35 @@ def test_what_the_channels_of_one_sensor_share_is_its_noise(sensors: int, snr: f
     np.testing.assert_allclose(np.mean(ratios, axis=0), 1.0, atol=0.02)
 
 
+def test_a_line_of_one_sensor_is_not_taken_for_motion() -> None:
+    """50 times its noise, in three of 61 bins, shared by two channels: it stands out in these."""
+    noise = np.ones((N_BINS, 9))
+    line = np.zeros((N_BINS, 9, 9))
+    line[30:33, 3:5, 3:5] = np.array([10.0, 50.0, 10.0])[:, None, None] * [[1.0, 0.5], [0.5, 0.25]]
+    noise += np.einsum("fcc->fc", line)
+    ratios, held, levels = [], [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        sample = drawn(rng, scene(rng, (10.0,) * 3, np.ones(9)) + line, 189)
+        found = pooled_noise(
+            sample,
+            np.zeros(N_BINS, np.int64),
+            np.full(N_BINS, 3),
+            dims=(3,) * 3,
+            n_effective=189,
+            correlation=ONE,
+        )
+        ratios.append((found.noise / noise)[30:33])
+        level = band_levels(found.noise, found.cumulants, EDGES, ONE)
+        low, high = level.interval()
+        held.append((low[0] <= noise.mean(axis=0)) & (noise.mean(axis=0) <= high[0]))
+        levels.append(level.mean[0] / noise.mean(axis=0))
+    # three bins of twelve draws of 189 averages: standard error 1.5 %; motion leaks a little
+    np.testing.assert_allclose(np.mean(ratios, axis=(0, 1)), 1.0, atol=0.1)
+    np.testing.assert_allclose(np.mean(levels, axis=0), 1.0, atol=0.02)
+    assert np.mean(held) > 0.95 - 4 * np.sqrt(0.05 * 0.95 / 108)
+
+
 @pytest.mark.parametrize("snr", [0.0, 0.02, 0.05])
 def test_motion_that_hardly_shows_is_in_the_interval(snr: float) -> None:
     bands, _, _ = coverage((snr,) * 3, np.ones(9), n=189, draws=8)
