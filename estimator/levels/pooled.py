@@ -487,8 +487,8 @@ def _stand_out(
         if not len(left):
             break
         keep = np.flatnonzero(sensor != i)
-        w = np.linalg.eigvalsh(X[left][:, :, keep[:, None], keep])[:, :, ::-1]
-        w = median(w.swapaxes(0, 1))
+        eigenvalues = np.linalg.eigvalsh(X[left][:, :, keep[:, None], keep])[:, :, ::-1]
+        w = median(np.asarray(eigenvalues.swapaxes(0, 1), np.float64))
         w = np.pad(w, ((0, 0), (0, max(0, most + 1 - w.shape[1]))), constant_values=1.0)
         edge = OUTSTANDING * (1 + np.sqrt(len(keep) / averages[left])) ** 2
         out = (w[:, :most] > edge[:, None]) & (number < q[left, None])

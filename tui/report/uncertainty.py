@@ -290,7 +290,7 @@ def _not_stated(snapshot: Snapshot) -> str:
     names = ", ".join(each.name for each in without_sensitivity(snapshot))
     return (
         f" Without certificate or tolerance, and taken as exact: sensitivities of {names}."
-        if (names)
+        if names
         else ""
     )
 
