@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from itertools import pairwise
+from math import isfinite, nan
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -27,6 +28,7 @@ from daq.formats.importer import import_files
 from daq.formats.response import Responses, is_response
 from daq.recording.reader import Recording
 from daq.results.band_summary import channel_means, data_means
+from estimator.self_noise.result import Flag
 from tui.output.console import check_places, for_people, notices, write_json
 from tui.output.extras import require
 from tui.studies.study import Curve, Panel, Study
@@ -130,9 +132,10 @@ def levels(test: str, snapshot: Snapshot, settings: Settings) -> Iterator[Level]
         rows = {BOUND: [*zip(mean, lower, upper, strict=True)]}
         for method, noise in snapshot.results.items():
             means = channel_means(noise, snapshot, settings, (low, high))
+            limits = ((noise.flags[inside] & Flag.UNIDENTIFIED) != 0).any(axis=0)  # no estimates
             rows[method] = [  # what the method itself says: huddle withdraws what is above a bound
-                (each.mean[0], each.scatter[0][0], each.scatter[1][0])
-                for each in means
+                (nan, nan, nan) if is_limit else (each.mean[0], *(end[0] for end in each.scatter))
+                for each, is_limit in zip(means, limits, strict=True)
                 if each.scatter is not None
             ]
         for method, row in rows.items():
@@ -287,7 +290,8 @@ def _print(found: Sequence[Level], json: str | None) -> None:
         for method in methods:
             own = [each for each in band if each.method == method]
             above = sum(each.contradicts for each in own)
-            text = f"{_median([each.noise for each in own]):.1f}"
+            level = _median([each.noise for each in own])
+            text = f"{level:.1f}" if isfinite(level) else "–"
             cells.append(f"{text} ({above} above)" if above else text)
         table.add_row(*cells)
     screen = for_people(json)
