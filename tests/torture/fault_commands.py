@@ -284,13 +284,16 @@ def _certified(disk: Path) -> dict[str, Any]:
 
 def _served(disk: Path) -> dict[str, Any]:
     """Return whether a service has done a run: recordings whole, and results those of them."""
+    store = next(disk.rglob("runs.sqlite"), None)
+    runs = RunStore(store.parent).runs() if store is not None else ()
+    parts = {name: run.parts for run in runs for name in run.parts}  # a restart begins another
     for path in sorted(disk.rglob("[!.]*.h5")):
         if _whole(path):
             with Recording.open(path) as recording:
                 stored = recording.results()
-            _check_results([path], stored)
-    store = next(disk.rglob("runs.sqlite"), None)
-    runs = RunStore(store.parent).runs() if store is not None else ()
+            _check_results(
+                [path.parent / each for each in parts.get(path.name, [path.name])], stored
+            )
     done = [run for run in runs if run.state == RunState.DONE]
     if store is not None and not all(_whole(store.parent / p) for run in done for p in run.parts):
         raise ValueError("a run is done, and its recordings are not whole")
