@@ -54,6 +54,7 @@ SAFE: Mapping[str, str] = {
     "#7bd88f": "#009e73",
     "#3f6d4b": "#004f3a",
     "#ff7b9c": "#ffffff",
+    "#8a4454": "#6b6b6b",
 }
 """Colours in place of the usual ones: after Okabe and Ito, red and yellow farther apart."""
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from daq.estimation.noise_estimates import ALL_METHODS
 from tests.tui.application.screen_text import screen_text
 from tests.tui.application.test_app import NARROW, running, shown
 from tests.tui.example_snapshot import ProgressCallback
@@ -56,6 +57,12 @@ def nearest(colours: list[str], seen: list[list[float]]) -> float:
         float(np.linalg.norm(lab(one, seen) - lab(other, seen)))
         for one, other in itertools.combinations(colours, 2)
     )
+
+
+def test_every_method_has_a_style_in_all_themes() -> None:
+    assert set(STYLES) == set(ALL_METHODS)
+    assert {colour for *colours, _ in STYLES.values() for colour in colours} <= set(SAFE)
+    assert len({marker for _, _, marker in STYLES.values()}) == len(STYLES)
 
 
 @pytest.mark.parametrize("eyes", SEEN)

@@ -41,6 +41,7 @@ STYLES = {
     "three-channel": ("#f4a261", "#8a5a34", "×"),
     "maximum-likelihood": ("#c297ff", "#5f4890", "◆"),
     "two-channel": ("#e9d86b", "#7f7638", "+"),
+    "multi-part": ("#ff7b9c", "#8a4454", "★"),
 }
 """Colours of each method, of its curve and of its 95 % band, and what marks the curve."""
 
