@@ -103,7 +103,6 @@ class MultiPart:
             np.where(outside, np.nan, cumulants),
             self.noise.flags[near],
         )
-        noise = replace(noise, cov=np.where(outside, np.nan, self.noise.cov[near]))
         return replace(self, noise=noise, lever=self.lever[near], frequency=frequency)
 
 
@@ -187,8 +186,7 @@ def multi_part(
             own = each.cumulants[m] * (course[:, None] ** (m + 2)) * apart ** (m + 1)
             cumulants[m, bins] = np.where(has, own, scatter[m, bins])
     result = SelfNoise.of("multi-part", noise, cumulants, flags)
-    precise = np.where(flags & Flag.UNIDENTIFIED, np.nan, result.cov)  # a bound is no level
-    return MultiPart(replace(result, cov=precise), lever, tuple(found), frequency, steadiness)
+    return MultiPart(result, lever, tuple(found), frequency, steadiness)
 
 
 def _merged(

@@ -77,7 +77,8 @@ class SelfNoise:
         One-sided PSD in unit**2/Hz. Not clipped, so it can be negative. NaN where there is no
         estimate; `flags` has the reason.
     cov : float64, shape (n_freqs, n_channels)
-        Coefficient of variation: predicted standard deviation over ``abs(noise_psd)``.
+        Coefficient of variation: predicted standard deviation over ``abs(noise_psd)``. NaN where
+        the value is no estimate, but a bound (UNIDENTIFIED).
     low, high : float64, shape (n_freqs, n_channels)
         95 % confidence interval, in unit**2/Hz.
     cumulants : float64, shape (3, n_freqs, n_channels)
@@ -101,7 +102,8 @@ class SelfNoise:
         """Return a result with the c.o.v. and the interval that follow from its cumulants."""
         with np.errstate(divide="ignore", invalid="ignore"):  # noise may be zero
             cov = np.sqrt(np.maximum(cumulants[0], 0.0)) / np.abs(noise_psd)
-            cov = np.where(noise_psd == 0, np.nan, cov)
+            nothing = (noise_psd == 0) | ((flags & Flag.UNIDENTIFIED) != 0)
+            cov = np.where(nothing, np.nan, cov)
             low, high = interval(noise_psd, cumulants)
         return cls(method, noise_psd, cov, low, high, flags, cumulants)
 
