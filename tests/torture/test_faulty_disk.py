@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING
 
 import pytest
@@ -10,6 +11,7 @@ from tests.torture.fault_commands import commands, device_commands, devices
 from tests.torture.faulty_disk import FAULTS, FaultyDisk, library, torture
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from tests.torture.faulty_disk import Command
@@ -42,11 +44,22 @@ def inputs(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.fixture
+def ends_zarr() -> Iterator[None]:
+    """End the thread that zarr keeps for later files."""
+    yield
+    with contextlib.suppress(ImportError):
+        from zarr.core.sync import cleanup_resources  # noqa: PLC0415 - takes long
+
+        cleanup_resources()
+
+
 def test_a_call_that_fails_once_gives_no_wrong_number(tmp_path: Path, inputs: Path) -> None:
     assert wrong(tmp_path, commands(inputs), SAMPLE, "EIO once") == []
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("ends_zarr")
 def test_no_fault_of_the_disk_gives_a_wrong_number(tmp_path: Path, inputs: Path) -> None:
     made = commands(inputs)
     assert wrong(tmp_path, made, dict.fromkeys(made, 3), *FAULTS) == []
