@@ -25,8 +25,6 @@ from estimator.checks.steadiness import (
     Regression,
     ResponseChange,
     ResponseScores,
-    grouped,
-    joined_parts,
     noise_levels,
     regression,
     response_change,
@@ -36,6 +34,7 @@ from estimator.likelihood import fisher
 from estimator.likelihood.goodness_of_fit import critical_value
 from estimator.likelihood.score_test import usable
 from estimator.median import median
+from estimator.spectra.parts import grouped, joined_parts
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence

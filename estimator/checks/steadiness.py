@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from estimator.likelihood.factor_analysis import Maximum
-    from estimator.types import ComplexArray, FloatArray, IntArray
+    from estimator.spectra.parts import Divided
+    from estimator.types import ComplexArray, FloatArray
 
 MIN_PARTS = 3
 MIN_DEGREES = 2.0
@@ -48,45 +49,6 @@ COST = 4.0
 """Of each parameter of a change, in terms of chi-squared: simple changes are named."""
 FALSE_ALARM = 2e-3
 """Probability that steady responses of any sensor are found to change."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Divided:
-    """Averages of parts of time at some frequencies, few enough that each part has averages.
-
-    Attributes
-    ----------
-    csm : complex128, shape (n_parts, n_bins, n_channels, n_channels)
-    averages : float64, shape (n_parts,)
-    """
-
-    csm: ComplexArray
-    averages: FloatArray
-
-
-def grouped(averages: FloatArray, least: float) -> list[IntArray]:
-    """Return neighbouring parts that are joined, so that each group has `least` averages."""
-    groups: list[list[int]] = [[]]
-    total = 0.0
-    for number, own in enumerate(averages.tolist()):
-        if total >= least:
-            groups.append([])
-            total = 0.0
-        groups[-1].append(number)
-        total += own
-    if total < least and len(groups) > 1:
-        groups[-2:] = [groups[-2] + groups[-1]]
-    return [np.array(each) for each in groups]
-
-
-def joined_parts(csm: ComplexArray, averages: FloatArray, groups: Sequence[IntArray]) -> Divided:
-    """Return the averages of groups of parts."""
-    sums = [averages[some].sum() for some in groups]
-    means = [
-        np.tensordot(averages[some] / total, csm[some], axes=1)
-        for some, total in zip(groups, sums, strict=True)
-    ]
-    return Divided(np.stack(means), np.array(sums))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

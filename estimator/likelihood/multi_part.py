@@ -19,6 +19,7 @@ from estimator.levels.interval import unpredicted, worth
 from estimator.levels.pooled import blocks_of
 from estimator.likelihood.changing_motion import STEADINESS, BandNoise, band_noise
 from estimator.self_noise.result import Flag, Refusal, SelfNoise
+from estimator.spectra.parts import grouped, joined_parts
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -142,7 +143,8 @@ def multi_part(
     -----
     Neighbouring parts are taken together until each has `LEAST` averages for each channel.
     """
-    csm, averages = _merged(csm, averages, LEAST * csm.shape[-1])
+    joined = joined_parts(csm, averages, grouped(averages, LEAST * csm.shape[-1]))
+    csm, averages = joined.csm, joined.averages
     total = float(averages.sum())
     mean = np.tensordot(averages / total, csm, axes=1)
     shape = mean.shape[:2]
@@ -187,22 +189,6 @@ def multi_part(
             cumulants[m, bins] = np.where(has, own, scatter[m, bins])
     result = SelfNoise.of("multi-part", noise, cumulants, flags)
     return MultiPart(result, lever, tuple(found), frequency, steadiness)
-
-
-def _merged(
-    csm: ComplexArray, averages: FloatArray, least: float
-) -> tuple[ComplexArray, FloatArray]:
-    """Return parts of so many averages at least: neighbours together."""
-    together = int(np.ceil(least / averages.mean()))
-    number = np.arange(len(averages)) // together
-    number = np.minimum(number, max(len(averages) // together - 1, 0))
-    starts = np.flatnonzero(np.diff(number, prepend=-1))
-    if len(starts) == len(averages):
-        return csm, averages
-    weighted = averages[:, None, None, None] * csm
-    total = np.add.reduceat(averages, starts)
-    means = np.add.reduceat(weighted, starts) / total[:, None, None, None]
-    return np.asarray(means, np.complex128), np.asarray(total, np.float64)
 
 
 def _course(bound: FloatArray, total: float) -> FloatArray:

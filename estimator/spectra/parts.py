@@ -194,3 +194,42 @@ class PartEnds:
         if len(found) > 1 and found[-1][0] - found[-2][0] < self.every / 2:
             del found[-2]
         return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Divided:
+    """Averages of parts of time at some frequencies, few enough that each part has averages.
+
+    Attributes
+    ----------
+    csm : complex128, shape (n_parts, n_bins, n_channels, n_channels)
+    averages : float64, shape (n_parts,)
+    """
+
+    csm: ComplexArray
+    averages: FloatArray
+
+
+def grouped(averages: FloatArray, least: float) -> list[IntArray]:
+    """Return neighbouring parts that are joined, so that each group has `least` averages."""
+    groups: list[list[int]] = [[]]
+    total = 0.0
+    for number, own in enumerate(averages.tolist()):
+        if total >= least:
+            groups.append([])
+            total = 0.0
+        groups[-1].append(number)
+        total += own
+    if total < least and len(groups) > 1:
+        groups[-2:] = [groups[-2] + groups[-1]]
+    return [np.array(each) for each in groups]
+
+
+def joined_parts(csm: ComplexArray, averages: FloatArray, groups: Sequence[IntArray]) -> Divided:
+    """Return the averages of groups of parts."""
+    sums = [averages[some].sum() for some in groups]
+    means = [
+        np.tensordot(averages[some] / total, csm[some], axes=1)
+        for some, total in zip(groups, sums, strict=True)
+    ]
+    return Divided(np.stack(means), np.array(sums))
