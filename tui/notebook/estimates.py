@@ -185,6 +185,8 @@ def estimate(
     gains : mapping of str to float
         Response of a sensor (``{"B": 1.02}``) or a channel (``{"B.X": 1.02}``) relative to the
         others, for the two-channel method.
+    sampling_rates : mapping of str to float
+        Rate in Hz at which a sensor sampled (``{"B": 100.9}``), in place of the recorded one.
     axis_tolerance : float or mapping of str to float
         Angle in degrees, rms, by which axes of sensors with one or two channels may be off
         (default 1), of all or by sensor. Motion across an axis widens the intervals.

@@ -38,6 +38,7 @@ class EstimateOptions(TypedDict, total=False):
     octaves: bool
     dimension: int | str
     gains: Mapping[str, float]
+    sampling_rates: Mapping[str, float]
     axis_tolerance: float | Mapping[str, float]
     gain_steadiness: float
     linearise: bool
