@@ -98,6 +98,14 @@ def remove(part: Path) -> None:
             part.unlink(missing_ok=True)
 
 
+def remove_parts(folder: Path, name: str, *, age: float = 0.0) -> None:
+    """Remove hidden files of killed processes, of this age in s, whose names begin with `name`."""
+    for leftover in folder.glob(f".{glob.escape(name)}.*{_SUFFIX}"):
+        with contextlib.suppress(OSError):
+            if time.time() - leftover.stat().st_mtime >= age:
+                remove(leftover)
+
+
 @contextlib.contextmanager
 def replaced(path: Path, *, free: bool = False) -> Iterator[Path]:
     """Yield a hidden name; the file or folder that is written there then takes the name `path`.
@@ -114,10 +122,7 @@ def replaced(path: Path, *, free: bool = False) -> Iterator[Path]:
     """
     path = path.resolve()
     part = hidden(path)
-    for leftover in path.parent.glob(f".{glob.escape(path.name)}.*{_SUFFIX}"):
-        with contextlib.suppress(OSError):
-            if time.time() - leftover.stat().st_mtime > _STALE_SECONDS:
-                remove(leftover)
+    remove_parts(path.parent, path.name, age=_STALE_SECONDS)
     try:
         yield part
         put_in_place(part, path, free=free)

@@ -58,9 +58,11 @@ if TYPE_CHECKING:
     from daq.protocols.block import Block, Event, HostTime, Reading
     from daq.recording.file_format import SensorLayout
 
-BROKEN: list[RecordingWriter] = []
-"""Writers whose file HDF5 could not close. Freeing their objects also fails, prints tracebacks, and
+BROKEN: list[RecordingWriter | h5py.File] = []
+"""What HDF5 could not write or close. Freeing their objects also fails, prints tracebacks, and
 may crash. The recorder therefore ends without freeing them."""
+
+IN_MEMORY = {"driver": "core", "backing_store": False, "libver": file_format.LIBVER}
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,16 +163,22 @@ class RecordingWriter:
             lock, file, writer = WriterLock(temporary), None, None
             disk = RememberingFile(temporary, "r+") if hidden else None
             try:
+                with h5py.File(str(temporary), "w", **IN_MEMORY) as new:
+                    write_attributes(
+                        new, bench, created, control, attributes or {}, sensors=sensors
+                    )
+                    make_datasets(new, sensors, chunk_seconds)
+                    new.flush()
+                    # HDF5 can crash when it frees objects that it could not write.
+                    temporary.write_bytes(new.id.get_file_image())
                 # A small cache suffices: chunks are written completely and not read again.
                 file = h5py.File(
                     disk or temporary,
-                    "w",
+                    "r+",
                     libver=file_format.LIBVER,
                     rdcc_nbytes=64 * 1024,
                     locking=False,
                 )
-                write_attributes(file, bench, created, control, attributes or {}, sensors=sensors)
-                make_datasets(file, sensors, chunk_seconds)
                 if not hidden:
                     file.swmr_mode = True
                 writer = cls(path, file, sensors, lock, disk=disk)
@@ -185,7 +193,9 @@ class RecordingWriter:
             except BaseException:
                 with contextlib.suppress(OSError, RuntimeError):
                     if file is not None:
+                        BROKEN.append(file)
                         file.close()
+                        BROKEN.remove(file)
                     if disk is not None:
                         disk.close()
                 lock.release()

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 from typing import TYPE_CHECKING
 
 import pytest
 
 from tests.torture.fault_commands import commands, device_commands, devices
-from tests.torture.faulty_disk import FAULTS, FaultyDisk, library, torture
+from tests.torture.faulty_disk import FAULTS, FOREVER, FaultyDisk, library, torture
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
     from pathlib import Path
 
     from tests.torture.faulty_disk import Command
@@ -60,16 +61,41 @@ def test_a_call_that_fails_once_gives_no_wrong_number(tmp_path: Path, inputs: Pa
 
 @pytest.mark.long
 @pytest.mark.usefixtures("ends_zarr")
-def test_no_fault_of_the_disk_gives_a_wrong_number(tmp_path: Path, inputs: Path) -> None:
+@pytest.mark.parametrize("fault", FAULTS)
+def test_no_fault_of_the_disk_gives_a_wrong_number(
+    tmp_path: Path, inputs: Path, fault: str
+) -> None:
     made = commands(inputs)
-    assert wrong(tmp_path, made, dict.fromkeys(made, 1), *FAULTS) == []
+    assert wrong(tmp_path, made, dict.fromkeys(made, 1), fault) == []
 
 
 @pytest.mark.long
-def test_no_fault_of_the_disk_loses_what_devices_sent(tmp_path: Path, inputs: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "faults"), [("record", FAULTS), ("run", FAULTS), ("serve", ["ENOSPC"])]
+)
+def test_no_fault_of_the_disk_loses_what_devices_sent(
+    tmp_path: Path, inputs: Path, name: str, faults: Iterable[str]
+) -> None:
     with devices(inputs) as bench:
-        made = device_commands(bench)
-        assert wrong(tmp_path, made, dict.fromkeys(made, 1), *FAULTS) == []
+        assert wrong(tmp_path, device_commands(bench), {name: 1}, *faults) == []
+
+
+@pytest.mark.long
+def test_a_recording_that_cannot_begin_ends_with_a_message(tmp_path: Path, inputs: Path) -> None:
+    """HDF5 crashed when it freed objects of a new file that the disk had no space for."""
+    built = library(tmp_path)
+    if built is None:
+        pytest.skip("no gcc, or not Linux: nothing can fail")
+    with devices(inputs) as bench, FaultyDisk(built, tmp_path) as disk:
+        command = device_commands(bench)["record"]
+        for place in range(1, 9):
+            disk.disk.mkdir()
+            arguments = command.arguments(disk.disk)
+            code, said = disk.run(arguments, first=place, last=FOREVER, error=errno.ENOSPC)
+            assert (code, said.count("\n")) == (3, 1), said
+            assert said.endswith("r.h5: cannot be written: No space left on device\n")
+            assert not list(disk.disk.iterdir())
+            disk.disk.rmdir()
 
 
 def test_a_file_is_on_the_disk_before_and_after_it_has_its_name(tmp_path: Path) -> None:

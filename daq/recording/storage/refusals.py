@@ -116,7 +116,7 @@ def check_length(found: h5py.Dataset) -> None:
 
 
 def _n_bytes(file: h5py.File) -> int:
-    if file.driver == "fileobj":
+    if file.driver in {"core", "fileobj"}:
         return int(file.id.get_filesize())
     return os.fstat(file.id.get_vfd_handle()).st_size  # the current size of a growing file
 

@@ -57,4 +57,4 @@ def report(error: BaseException) -> None:
 def reason_of(error: BaseException) -> str:
     """Return the system's message, which HDF5 hides among positions and addresses."""
     found = re.search(r"error message = '([^']+)'", str(error))
-    return found[1] if found else str(error)
+    return found[1] if found else str(getattr(error, "strerror", None) or error)

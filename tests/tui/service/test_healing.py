@@ -236,7 +236,11 @@ def test_what_is_finished_is_signed_and_known(tmp_path: Path) -> None:
     make_key(tmp_path / "key")
     path = place.bench.recording_directory / "r.h5"
     record(path, 12)
+    left = path.with_name(".r.json.0123.part"), path.with_name(".r2.json.0123.part")
+    for each in left:
+        each.write_bytes(b"{")  # by processes that were killed; r2 is of another recording
     outcome = finish(Request([str(path)], {"segment": "2s"}, key=str(tmp_path / "key")))
+    assert [each.exists() for each in left] == [False, True]
     assert outcome.notes == ()
     assert outcome.identities == (("r.h5", *identity(path)),)
     assert problem(path, *identity(path), public=tmp_path / "key.pub") == ""

@@ -30,6 +30,7 @@ from daq.recording.signing import identity, sign, signature_of
 from daq.results.decision.limits import judge
 from daq.results.sources import sources
 from daq.results.store import store_results
+from daq.whole_file import remove_parts
 from estimator.errors import EstimatorError
 from tui.output.console import finite, write_json
 from tui.output.json_document import document
@@ -143,6 +144,8 @@ def finish(request: Request, progress: Callable[[], object] = lambda: None) -> O
     HDF5 keeps busy for ever.
     """
     parts = with_continuations(map(Path, request.parts))
+    for part in parts:
+        remove_parts(part.parent, part.stem)  # of a process that was killed; only one runs
     try:
         outcome = _finished(replace(request, parts=[str(part) for part in parts]), progress)
     except (HuddleError, EstimatorError, OSError) as error:
