@@ -287,7 +287,7 @@ def diagnosis(
                     neighbours=neighbours(band),
                     vertical=vertical,
                     course=course if len(bands) == 1 else None,
-                    parts=band.parts,
+                    parts=band.parts if len(bands) == 1 else None,
                     maxima=maxima,
                 )
             except InsufficientDataError:

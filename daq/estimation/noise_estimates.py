@@ -17,7 +17,7 @@ from estimator.levels.pooled import blocks_of
 from estimator.likelihood.dimension import BandDimension, choose_dimension
 from estimator.likelihood.goodness_of_fit import neighbour_correlation
 from estimator.methods import METHODS, self_noise
-from estimator.self_noise.result import Flag, SelfNoise, combined
+from estimator.self_noise.result import Flag, SelfNoise, combined, joined
 from estimator.spectra.multiresolution import Band, MultiResolution
 from estimator.spectra.parts import Parts
 from estimator.spectra.welch import CrossSpectra, scale
@@ -124,10 +124,8 @@ def _parts(passes: Sequence[Pass]) -> Parts | None:
     known = [each for each in found if each is not None]
     if len(known) < len(found):
         return None
-    origin = passes[0].aligned.start_utc_ns
     parts = []
-    for run, (each, of_pass) in enumerate(zip(passes, known, strict=True)):
-        later = (each.aligned.start_utc_ns - origin) * 1e-9
+    for run, (later, of_pass) in enumerate(zip(_later(passes), known, strict=True)):
         parts += [
             replace(part, begin=part.begin + later, end=part.end + later, run=run)
             for part in of_pass.each
@@ -171,10 +169,16 @@ def _octaves(passes: Sequence[Pass]) -> MultiResolution | None:
     if passes[0].octaves is None:
         return None
     octaves = MultiResolution.like(passes[0].octaves)
-    for each in passes:
+    for run, (each, later) in enumerate(zip(passes, _later(passes), strict=True)):
         if each.octaves is not None:
-            octaves.merge(each.octaves)
+            octaves.merge(each.octaves, later=later, run=run)
     return octaves
+
+
+def _later(passes: Sequence[Pass]) -> list[float]:
+    """Return by how many seconds recordings begin after the first one."""
+    starts = [each.aligned.start_utc_ns for each in passes]
+    return [(each - starts[0]) * 1e-9 for each in starts]
 
 
 def _sets_of_octaves(
@@ -335,7 +339,8 @@ def in_units(
         return band
     parts = band.parts
     if parts is not None:
-        parts = replace(parts, response=response[parts.bins])
+        before = 1.0 if parts.response is None else parts.response
+        parts = replace(parts, response=response[parts.bins] * before)
     return replace(band, csm=scale(band.csm, response), parts=parts)
 
 
@@ -529,7 +534,7 @@ def noise_estimates(
                 if chosen and method == "maximum-likelihood" and "three-sensor" not in wanted:
                     wanted.append("three-sensor")  # it needs fewer averages; it is not judged by
             else:
-                results[method] = _joined(parts)
+                results[method] = joined(parts)
     return Estimates(results, refused, dimensions, changing)
 
 
@@ -541,28 +546,31 @@ def _by_changes(bands: Sequence[Band], settings: Settings, dims: tuple[int, ...]
     InsufficientDataError
         If sensors have different numbers of channels, or averages are not kept in parts.
     """
-    from estimator.likelihood.multi_part import multi_part  # noqa: PLC0415 - of two sensors
+    from estimator.likelihood.multi_part import MultiPart, multi_part  # noqa: PLC0415 - rarely used
 
-    parts = bands[0].parts
     if len(set(dims)) > 1:
         raise InsufficientDataError("the sensors have different numbers of channels")
-    if parts is None or len(bands) > 1:
-        raise InsufficientDataError(
-            "not with octaves, --reject or bridged gaps: averages are not kept in parts of time"
+    highest, found = USABLE * bands[-1].frequencies[-1], []
+    for band in bands:
+        parts = band.parts
+        if parts is None:
+            raise InsufficientDataError(
+                "not with bridged gaps: averages are not kept in parts of time"
+            )
+        frequency = band.frequencies[parts.bins]
+        known = np.isfinite(band.csm[parts.bins]).all(axis=(1, 2))
+        known &= ~band.settings.real(frequency) & (frequency <= highest)
+        of_band = multi_part(
+            parts.csm(),
+            parts.averages,
+            frequency,
+            dims=dims,
+            correlation=_power_correlation(band),
+            steadiness=settings.gain_steadiness / 100,
+            usable=known,
         )
-    frequency = bands[0].frequencies[parts.bins]
-    known = np.isfinite(bands[0].csm[parts.bins]).all(axis=(1, 2))
-    known &= ~bands[0].settings.real(frequency) & (frequency <= USABLE * bands[0].frequencies[-1])
-    found = multi_part(
-        parts.csm(),
-        parts.averages,
-        frequency,
-        dims=dims,
-        correlation=_power_correlation(bands[0]),
-        steadiness=settings.gain_steadiness / 100,
-        usable=known,
-    )
-    return found.at(bands[0].frequencies)
+        found.append(of_band.at(band.frequencies))
+    return MultiPart.joined(found)
 
 
 def _by_gradients(
@@ -626,14 +634,3 @@ def chosen_dimensions(
         maxima=maxima,
     )
     return Dimensions(n_factors, chosen, gradients)
-
-
-def _joined(parts: Sequence[SelfNoise]) -> SelfNoise:
-    if len(parts) == 1:
-        return parts[0]
-    return SelfNoise.of(
-        parts[0].method,
-        np.concatenate([part.noise_psd for part in parts]),
-        np.concatenate([part.cumulants for part in parts], axis=1),
-        np.concatenate([part.flags for part in parts]),
-    )

@@ -18,7 +18,7 @@ import numpy as np
 from estimator.levels.interval import unpredicted, worth
 from estimator.levels.pooled import blocks_of
 from estimator.likelihood.changing_motion import STEADINESS, BandNoise, band_noise
-from estimator.self_noise.result import Flag, Refusal, SelfNoise
+from estimator.self_noise.result import Flag, Refusal, SelfNoise, joined
 from estimator.spectra.parts import grouped, joined_parts
 
 if TYPE_CHECKING:
@@ -105,6 +105,17 @@ class MultiPart:
             self.noise.flags[near],
         )
         return replace(self, noise=noise, lever=self.lever[near], frequency=frequency)
+
+    @classmethod
+    def joined(cls, found: Sequence[MultiPart]) -> MultiPart:
+        """Return what neighbouring ranges of frequencies have, rising, as one."""
+        return cls(
+            joined([each.noise for each in found]),
+            np.concatenate([each.lever for each in found]),
+            tuple(block for each in found for block in each.blocks),
+            np.concatenate([each.frequency for each in found]),
+            found[0].steadiness,
+        )
 
 
 def multi_part(

@@ -108,6 +108,18 @@ class SelfNoise:
         return cls(method, noise_psd, cov, low, high, flags, cumulants)
 
 
+def joined(parts: Sequence[SelfNoise]) -> SelfNoise:
+    """Return the noise of neighbouring ranges of frequencies, rising, as one."""
+    if len(parts) == 1:
+        return parts[0]
+    return SelfNoise.of(
+        parts[0].method,
+        np.concatenate([part.noise_psd for part in parts]),
+        np.concatenate([part.cumulants for part in parts], axis=1),
+        np.concatenate([part.flags for part in parts]),
+    )
+
+
 def combined(parts: Sequence[SelfNoise], blocks: IntArray) -> SelfNoise:
     """Return the mean of independent estimates of the same noise, weighted by their precision.
 

@@ -24,11 +24,11 @@ import numpy as np
 
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.spectra.channel_sets import ChannelSets
+from estimator.spectra.parts import Part, PartEnds, Parts, by_part
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 
 if TYPE_CHECKING:
-    from estimator.spectra.parts import Parts
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
     Columns = tuple[int, ...]
@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 LOW, HIGH = 0.2, 0.4  # octave of a stage, as fractions of its rate
 TAPS = 89  # odd; stop-band from 0.3 of the rate above, 120 dB down
 KAISER_BETA = 12.3
+PART_BINS, PART_BINS_BELOW = 96, 32
+"""Frequencies of a stage that are kept in parts of time: from its octave on, and below it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,8 +146,10 @@ class MultiResolution:
         top = other._stages[0]
         return cls(top.settings, top.n_channels, n_stages=len(other._stages))
 
-    def merge(self, other: MultiResolution) -> None:
-        """Add the accepted segments of another recording.
+    def merge(self, other: MultiResolution, *, later: float = 0.0, run: int = 0) -> None:
+        """Add the accepted segments of another recording, which is number `run` of all.
+
+        It begins `later` than the first one by so many seconds.
 
         Raises
         ------
@@ -155,7 +159,7 @@ class MultiResolution:
         if len(other._stages) != len(self._stages):
             raise EstimatorError(f"{len(other._stages)} stages, expected {len(self._stages)}")
         for own, added in zip(self._stages, other._stages, strict=True):
-            own.merge(added)
+            own.merge(added, later=later, run=run)
 
     @property
     def sets(self) -> ChannelSets:
@@ -216,12 +220,11 @@ class MultiResolution:
                 inside &= frequencies <= HIGH * rate
             if level < depth - 1:
                 inside &= frequencies > LOW * rate
-            gain = np.prod(
-                [_response(frequencies[inside], above.settings) for above in self._stages[:level]],
-                axis=0,
-            )
+            gain = np.ones(int(inside.sum()))
+            for above in self._stages[:level]:
+                gain *= _response(frequencies[inside], above.settings)
             spectra = stage.total(columns)
-            csm = spectra.csm()[inside] / np.reshape(gain, (-1, 1, 1)) ** 2
+            csm = spectra.csm()[inside] / gain[:, None, None] ** 2
             bands.append(
                 Band(
                     stage.settings,
@@ -230,6 +233,7 @@ class MultiResolution:
                     spectra.n_segments,
                     spectra.n_effective,
                     stage.left_out,
+                    stage.parts(inside, gain) if columns is None else None,
                 )
             )
         return tuple(bands)
@@ -246,10 +250,15 @@ class _Stage:
         self.incomplete = 0
         self.judged = 0
         self._begun = False
-        self._spectra = CrossSpectra(settings, n_channels)
+        self._ends = PartEnds(_kept_in_parts(len(settings.frequencies)))
+        self._n_seen = 0
+        self._parts: tuple[Part, ...] = ()  # of other recordings
+        self._spectra = CrossSpectra(settings, n_channels, ends=self._ends)
         self._undisturbed: SelectedSpectra | None = None
         if rejection is not None:
-            self._undisturbed = SelectedSpectra(settings, n_channels, rejection=rejection)
+            self._undisturbed = SelectedSpectra(
+                settings, n_channels, rejection=rejection, ends=self._ends
+            )
         self.sets = ChannelSets(settings, short=0.0, rejection=rejection)
         self._total: CrossSpectra | None = None
         self._samples = np.zeros((0, n_channels))  # start of the next segment
@@ -285,10 +294,26 @@ class _Stage:
         transient = self.judged - self.total().n_segments + disturbed
         return Counter({Reason.GAP: self.incomplete - disturbed, Reason.TRANSIENT: transient})
 
-    def merge(self, other: _Stage) -> None:
+    def _own_parts(self) -> tuple[Part, ...]:
+        """Return the averages of the accepted segments in parts of time."""
+        return self._parts or self.total().parts(self._n_seen)
+
+    def parts(self, inside: BoolArray, gain: FloatArray) -> Parts:
+        """Return these at the frequencies `inside`, of which `gain` is taken out."""
+        kept = inside[self._ends.bins]
+        bins = (np.cumsum(inside) - 1)[self._ends.bins[kept]]
+        response = np.repeat(gain[bins][:, None], self.n_channels, axis=1).astype(np.complex128)
+        some = (part.at(kept) for part in self._own_parts())
+        return Parts(bins, tuple(some), response)
+
+    def merge(self, other: _Stage, *, later: float, run: int) -> None:
         """Add the segments of the same stage of another recording."""
         if self._undisturbed is not None:
             raise EstimatorError("segments of another recording cannot be judged by these")
+        self._parts += tuple(
+            replace(part, begin=part.begin + later, end=part.end + later, run=run)
+            for part in other._own_parts()
+        )
         self._spectra.merge(other.total())
         self.sets.merge(other.sets)
         disturbed = other.sets.n_disturbed
@@ -311,11 +336,11 @@ class _Stage:
             self._begun = first <= starts[-1]
         self.incomplete += n - int(whole.sum())
         self.judged += int(whole.sum())
-        if self._undisturbed is None:
-            self._spectra.add(self._samples, starts[whole])
-        else:
-            self._undisturbed.add(self._samples, starts[whole])
-            self._total = None
+        sums = self._spectra if self._undisturbed is None else self._undisturbed
+        for part in by_part(sums, self._n_seen + np.flatnonzero(whole)):
+            sums.add(self._samples, starts[whole][part])
+        self._n_seen += n
+        self._total = None
         if not whole.all():
             self.sets.take(self._samples, self._present, None, starts[~whole])
         self._samples = self._samples[n * self.settings.hop :]
@@ -333,6 +358,14 @@ class _Stage:
             return samples[:0], present[:0]
         filtered = upfirdn(_taps(), samples, down=2, axis=0)[TAPS // 2 : TAPS // 2 + n]
         return np.asarray(filtered), _whole(present, 2 * np.arange(n), TAPS)
+
+
+def _kept_in_parts(n_freqs: int) -> IntArray:
+    """Return the frequencies of a stage that are kept in parts."""
+    first = max(1, int(2 * LOW * (n_freqs - 1)))
+    octave = np.linspace(first, n_freqs - 1, min(PART_BINS, n_freqs - first))
+    below = np.geomspace(1, first, PART_BINS_BELOW)
+    return np.unique(np.concatenate([below, octave]).round().astype(np.int64))
 
 
 def _whole(present: BoolArray, starts: IntArray, length: int) -> BoolArray:

@@ -12,14 +12,14 @@ costs a pass no product. In float64 the difference is as exact as the sum.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
-    from estimator.types import ComplexArray, FloatArray, IntArray
+    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 MOST = 24
 """Parts at most; half as many after neighbours are merged."""
@@ -83,6 +83,11 @@ class Part:
     end: float
     n_segments: int = 0
     run: int = 0
+
+    def at(self, some: BoolArray) -> Part:
+        """Return the same at some of the kept frequencies."""
+        before = None if self.before is None else self.before[some]
+        return replace(self, before=before, after=self.after[some], scale=self.scale[some])
 
     def csm(self, some: slice | IntArray) -> ComplexArray:
         """Return the averages at some of the kept frequencies."""
@@ -194,6 +199,29 @@ class PartEnds:
         if len(found) > 1 and found[-1][0] - found[-2][0] < self.every / 2:
             del found[-2]
         return found
+
+
+class _Sums(Protocol):
+    """Sums of segments that are kept in parts."""
+
+    @property
+    def ends(self) -> PartEnds | None: ...
+
+    def end_part(self, place: int) -> None: ...
+
+
+def by_part(sums: _Sums, places: IntArray) -> Iterator[slice]:
+    """Yield the segments at `places` by part; the sums so far end a part before the next one."""
+    ends, done = sums.ends, 0
+    if ends is None:
+        yield slice(None)
+        return
+    while done < len(places):
+        while ends.upcoming <= places[done]:
+            sums.end_part(ends.upcoming)
+        stop = int(np.searchsorted(places, ends.upcoming))
+        yield slice(done, stop)
+        done = stop
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -33,6 +33,7 @@ from estimator.spectra.windows import get_window
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from estimator.spectra.parts import PartEnds
     from estimator.types import BoolArray, FloatArray, IntArray
 
 FIRST_BAND = 8  # frequencies in the lowest band; every other band is an octave
@@ -119,6 +120,8 @@ class SelectedSpectra:
     rejection : RejectionSettings, optional
     full_scale : float64, shape (n_channels,), optional
         A segment with a sample of this magnitude or more is clipped.
+    ends : PartEnds, optional
+        As of `CrossSpectra`. Segments of a start-up set are in the part in which it ends.
 
     Attributes
     ----------
@@ -137,6 +140,7 @@ class SelectedSpectra:
         *,
         rejection: RejectionSettings | None = None,
         full_scale: FloatArray | None = None,
+        ends: PartEnds | None = None,
     ) -> None:
         self.settings = settings
         self.rejection = RejectionSettings() if rejection is None else rejection
@@ -147,7 +151,7 @@ class SelectedSpectra:
         if self._full_scale.shape != (n_channels,):
             raise EstimatorError(f"full scale of {self._full_scale.shape}, expected {n_channels}")
         self._limited = bool(np.isfinite(self._full_scale).any())
-        self._accepted = CrossSpectra(settings, n_channels)
+        self._accepted = CrossSpectra(settings, n_channels, ends=ends)
         self._window = get_window(settings.window, settings.segment_length)[:, None]
         n_freqs = settings.segment_length // 2 + 1
         octaves = int(np.log2(max(1, n_freqs // FIRST_BAND)))
@@ -200,11 +204,20 @@ class SelectedSpectra:
 
         Includes the segments held back that agree with each other.
         """
-        total = CrossSpectra(self.settings, self._accepted.n_channels)
+        total = CrossSpectra(self.settings, self._accepted.n_channels, ends=self.ends)
         total.merge(self._accepted)
         for held in self._agreeing(self._held)[0]:
             total.add(held.samples, np.zeros(1, dtype=np.int64))
         return total
+
+    @property
+    def ends(self) -> PartEnds | None:
+        """Sums at the ends of parts of time."""
+        return self._accepted.ends
+
+    def end_part(self, place: int) -> None:
+        """End a part of time before this place of the segments."""
+        self._accepted.end_part(place)
 
     def drain(self) -> CrossSpectra:
         """Return the spectra of segments accepted since the last call, and keep all criteria.

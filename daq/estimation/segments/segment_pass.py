@@ -21,7 +21,7 @@ from daq.estimation.segments.own_spectra import OwnSpectra, need_samples_of_grid
 from daq.estimation.segments.stated_times import agree, compare
 from estimator.spectra.channel_sets import ChannelSets
 from estimator.spectra.multiresolution import MultiResolution
-from estimator.spectra.parts import MOST, PartEnds, Parts, part_bins
+from estimator.spectra.parts import MOST, PartEnds, Parts, by_part, part_bins
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
 from estimator.spectra.welch import CrossSpectra, SegmentSpectra, WelchSettings, kept_bins
 from estimator.spectra.windows import Leakage, gap_window, get_window, without_trend
@@ -224,15 +224,13 @@ class Pass:
                 n_stages=OCTAVES,
                 rejection=rejection,
             )
-        elif wanted.reject:
-            self._undisturbed = SelectedSpectra(self.welch, self.n_channels)
+        bins = part_bins(len(self.welch.frequencies), self.n_channels)
+        self._ends = None if wanted.octaves else PartEnds(bins)
+        if wanted.reject and not wanted.octaves:
+            self._undisturbed = SelectedSpectra(self.welch, self.n_channels, ends=self._ends)
         single = SegmentSpectra(kept_bins(len(self.welch.frequencies)), self.n_channels)
         self.single = None if wanted.octaves or wanted.reject else single
         self._kept_at = GrowingRows(np.int64)
-        self._ends: PartEnds | None = None
-        if not (wanted.octaves or wanted.reject):
-            bins = part_bins(len(self.welch.frequencies), self.n_channels)
-            self._ends = PartEnds(bins)
         self._all = CrossSpectra(
             self.welch, self.n_channels, threads=1, segments=self.single, ends=self._ends
         )
@@ -270,7 +268,7 @@ class Pass:
         """Averages in parts of time; None where they are not kept, or do not hold all segments."""
         if self._ends is None or self.n_bridged:
             return None
-        return Parts(self._ends.bins, self._all.parts(self.n_seen))
+        return Parts(self._ends.bins, self.spectra.parts(self.n_seen))
 
     @property
     def _at_once(self) -> int:
@@ -282,9 +280,9 @@ class Pass:
 
         Segments held back for judgement are among the next ones, unless these are the last.
         """
+        self._ends = None  # the sums begin again: no parts of time are kept of them
         if self._undisturbed is None:
             spectra, self._all = self._all, CrossSpectra(self.welch, self.n_channels, threads=1)
-            self._ends = None  # the sums begin again: no parts of time are kept of them
             return spectra
         self._selected = None
         return self._undisturbed.spectra() if last else self._undisturbed.drain()
@@ -525,34 +523,17 @@ class Pass:
 
         `first` is the grid sample of row 0.
         """
-        if self._undisturbed is None:
-            begins = first + starts
-            for some in self._by_part(begins - self.reach):
-                self._all.add(samples, starts[some])
-            self._kept_at.add(begins)
-        else:
-            self._undisturbed.add(samples, starts)
-            self._selected = None
+        sums = self._all if self._undisturbed is None else self._undisturbed
+        for some in by_part(sums, (first + starts - self.reach) // self.welch.hop):
+            sums.add(samples, starts[some])
+        self._kept_at.add(first + starts)
+        self._selected = None
 
     def _take_whole(self, spectra: ComplexArray, begins: NDArray[np.int64]) -> None:
         """Add segments by their spectra; they begin at grid samples `begins`."""
-        for some in self._by_part(begins):
+        for some in by_part(self._all, begins // self.welch.hop):
             self._all.add_spectra(spectra[some])
         self._kept_at.add(begins)
-
-    def _by_part(self, begins: NDArray[np.int64]) -> Iterator[slice]:
-        """Yield the segments of each part of time; the sum so far ends a part before the next."""
-        ends = self._ends
-        if ends is None:
-            yield slice(None)
-            return
-        places, done = begins // self.welch.hop, 0
-        while done < len(places):
-            while ends.upcoming <= places[done]:
-                self._all.end_part(ends.upcoming)
-            stop = int(np.searchsorted(places, ends.upcoming))
-            yield slice(done, stop)
-            done = stop
 
     def _take_samples(self, part: _Samples, first: int, count: int, *, together: bool) -> None:
         """Add segments from samples on the grid; `first` is the number of the first of them."""

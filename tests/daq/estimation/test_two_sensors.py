@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,18 +51,27 @@ def estimated(sensors: dict[str, np.ndarray], settings: Settings = SETTINGS) -> 
     return estimate([recording_of_arrays(sensors, RATE)], settings)
 
 
-@pytest.mark.parametrize("d", [1, 3])
-def test_two_sensors_have_a_noise_where_the_motion_changes(d: int) -> None:
+@pytest.mark.parametrize(
+    ("d", "settings"),
+    [
+        (1, SETTINGS),
+        (3, SETTINGS),
+        (3, replace(SETTINGS, reject=True)),
+        (3, replace(SETTINGS, octaves=True)),
+        (1, replace(SETTINGS, octaves=True, reject=True)),
+    ],
+)
+def test_two_sensors_have_a_noise_where_the_motion_changes(d: int, settings: Settings) -> None:
     held, errors = [], []
     for seed in range(4):
         rng = np.random.default_rng([d, seed])
-        snapshot = estimated(samples(rng, change=6.0, d=d))
+        snapshot = estimated(samples(rng, change=6.0, d=d), settings)
         noise = snapshot.results["multi-part"]
-        means = channel_means(noise, snapshot, SETTINGS, BAND)
+        means = channel_means(noise, snapshot, settings, BAND)
         truth = 2 / RATE * np.repeat(NOISE, d)
         held += [m.low[0] <= t <= m.high[0] for m, t in zip(means, truth, strict=True)]
         errors += [m.mean[0] / t - 1 for m, t in zip(means, truth, strict=True)]
-        kinds = {type(fact) for fact in facts_of(snapshot, SETTINGS)}
+        kinds = {type(fact) for fact in facts_of(snapshot, settings)}
         assert SteadyGainsAssumed in kinds
     assert np.mean(held) >= 0.8  # 8 or 24 intervals of 95 %
     assert abs(np.mean(errors)) < 0.1

@@ -52,6 +52,30 @@ def test_white_noise_is_flat_and_keeps_its_phase_relations() -> None:
         np.testing.assert_allclose(phase, 2 * np.pi * band.frequencies[1:-1] / 100, atol=0.02)
 
 
+@pytest.mark.parametrize("rejection", [None, RejectionSettings()])
+def test_parts_of_time_hold_every_accepted_segment(rejection: RejectionSettings | None) -> None:
+    samples = noise(60_000, seed=4)
+    samples[40_000:40_100] *= 100  # a knock
+    both = MultiResolution(SETTINGS, 2, n_stages=3)
+    for run, half in enumerate((samples[:35_000], samples[35_000:])):
+        spectra = MultiResolution(SETTINGS, 2, n_stages=3, rejection=rejection)
+        for piece in np.array_split(half, 7):
+            spectra.add(piece)
+        both.merge(spectra, later=350.0 * run, run=run)
+    for band in both.bands():
+        parts = band.parts
+        assert parts is not None
+        counts = np.array([part.n_segments for part in parts.each])
+        assert counts.sum() == band.n_segments
+        mean = np.tensordot(counts / counts.sum(), parts.csm(), axes=1)
+        kept = ~band.settings.real(band.frequencies[parts.bins])
+        np.testing.assert_allclose(mean[kept], band.csm[parts.bins][kept], rtol=1e-9)
+        begins = [part.begin for part in parts.each]
+        assert begins == sorted(begins)
+        assert {part.run for part in parts.each} == {0, 1}
+        assert parts.each[-1].end == pytest.approx(600, abs=10)
+
+
 def test_a_strong_high_frequency_does_not_alias() -> None:
     t = np.arange(400_000) / 100
     for frequency in (30.1, 44.7, 16.3, 8.9):
