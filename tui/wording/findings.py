@@ -348,9 +348,11 @@ def _dimensions(n: int) -> str:
     return f"{n} dimension{'s' if n > 1 else ''}"
 
 
+ANY_AXES = "three-sensor, maximum likelihood or multi-part"
+"""Methods for sensors in any orientation, of any gain and polarity."""
 EFFECT_OF_ROTATION = (
-    "no bias in the three-sensor or maximum likelihood estimate, but motion leaks into a "
-    "three-channel or two-channel estimate"
+    f"no bias in a {ANY_AXES} estimate, but motion leaks into a three-channel or two-channel "
+    "estimate"
 )
 EFFECT_OF_SKEW = "no bias, but the noise estimate scatters more as they come closer to parallel"
 EFFECT_OF_DELAY = "their segments differ at the ends"
@@ -359,9 +361,9 @@ EFFECT_OF_DELAY = "their segments differ at the ends"
 @explain.register(SwappedChannels)
 def _swapped(advice: SwappedChannels, names: Names) -> Explanation:
     return Explanation(
-        f"Channels are swapped: {listed(followers(advice, names))}. The three-sensor and maximum "
-        "likelihood estimates are unbiased but carry the wrong channel names, and other methods "
-        "compare channels that do not correspond.",
+        f"Channels are swapped: {listed(followers(advice, names))}. A {ANY_AXES} estimate is "
+        "unbiased but carries the wrong channel names, and other methods compare channels that do "
+        "not correspond.",
         "Check the order of the channels in the bench file, and the cables.",
     )
 
@@ -396,8 +398,8 @@ def _not_orthogonal(advice: NotOrthogonal, names: Names) -> Explanation:
 @explain.register(ReversedPolarity)
 def _reversed(advice: ReversedPolarity, names: Names) -> Explanation:
     return Explanation(
-        f"{opposite(advice, names)}: no bias in the three-sensor or maximum likelihood estimate, "
-        "but its sensitivity has the wrong sign.",
+        f"{opposite(advice, names)}: no bias in a {ANY_AXES} estimate, but its sensitivity has the "
+        "wrong sign.",
         "Change the sign of the sensitivity in the bench file, or swap the channel's wires.",
     )
 
@@ -908,18 +910,15 @@ def _several_skewed(*found: NotOrthogonal, names: Names) -> str:
 @_together.register(ReversedPolarity)
 def _several_reversed(*found: ReversedPolarity, names: Names) -> str:
     pairs = ", ".join(opposite(advice, names) for advice in found)
-    return (
-        f"{pairs}: no bias in the three-sensor or maximum likelihood estimate, but a sensitivity "
-        "has the wrong sign."
-    )
+    return f"{pairs}: no bias in a {ANY_AXES} estimate, but a sensitivity has the wrong sign."
 
 
 @_together.register(SwappedChannels)
 def _several_swapped(*found: SwappedChannels, names: Names) -> str:
     pairs = "; ".join(", ".join(followers(advice, names)) for advice in found)
     return (
-        f"Channels are swapped ({pairs}): the three-sensor and maximum likelihood estimates are "
-        "unbiased but carry the wrong channel names."
+        f"Channels are swapped ({pairs}): a {ANY_AXES} estimate is unbiased but carries the wrong "
+        "channel names."
     )
 
 

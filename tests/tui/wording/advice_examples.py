@@ -301,7 +301,7 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
         ROTATED,
         (
             "Sensors a and b are rotated against each other by 4.1° (−2.50° in the horizontal",
-            "no bias in the three-sensor",
+            "no bias in a three-sensor, maximum likelihood or multi-part estimate",
             "improve the precision",
         ),
     ),
