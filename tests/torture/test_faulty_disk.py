@@ -1,8 +1,10 @@
-"""A part of the torture by faults at every call of a command that changes a file."""
+"""A part of the torture by faults at every call of a command that changes a file.
+
+`make torture` has all commands, faults and places.
+"""
 
 from __future__ import annotations
 
-import contextlib
 import errno
 from typing import TYPE_CHECKING
 
@@ -12,7 +14,6 @@ from tests.torture.fault_commands import commands, device_commands, devices
 from tests.torture.faulty_disk import FAULTS, FOREVER, FaultyDisk, library, torture
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
     from pathlib import Path
 
     from tests.torture.faulty_disk import Command
@@ -45,39 +46,15 @@ def inputs(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.fixture
-def ends_zarr() -> Iterator[None]:
-    """End the thread that zarr keeps for later files."""
-    yield
-    with contextlib.suppress(ImportError):
-        from zarr.core.sync import cleanup_resources  # noqa: PLC0415 - takes long
-
-        cleanup_resources()
-
-
 def test_a_call_that_fails_once_gives_no_wrong_number(tmp_path: Path, inputs: Path) -> None:
     assert wrong(tmp_path, commands(inputs), SAMPLE, "EIO once") == []
 
 
 @pytest.mark.long
-@pytest.mark.usefixtures("ends_zarr")
-@pytest.mark.parametrize("fault", FAULTS)
-def test_no_fault_of_the_disk_gives_a_wrong_number(
-    tmp_path: Path, inputs: Path, fault: str
-) -> None:
-    made = commands(inputs)
-    assert wrong(tmp_path, made, dict.fromkeys(made, 1), fault) == []
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("name", "faults"), [("record", FAULTS), ("run", FAULTS), ("serve", ["ENOSPC"])]
-)
-def test_no_fault_of_the_disk_loses_what_devices_sent(
-    tmp_path: Path, inputs: Path, name: str, faults: Iterable[str]
-) -> None:
+def test_no_fault_of_the_disk_loses_what_devices_sent(tmp_path: Path, inputs: Path) -> None:
     with devices(inputs) as bench:
-        assert wrong(tmp_path, device_commands(bench), {name: 1}, *faults) == []
+        places = {"record": 1, "run": 1}
+        assert wrong(tmp_path, device_commands(bench), places, *FAULTS) == []
 
 
 @pytest.mark.long
