@@ -6,11 +6,11 @@ PEER := tests/peers/async_labjack_peer
 PEER_CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/huddle-tests/async_labjack
 SOURCES := huddle.py daq estimator sim_devices tui tests benchmarks docs examples
 
-.PHONY: demo test test-long peers check bench studies docs session torture mutants clean
+.PHONY: demo test test-long peers check check-all bench studies docs session torture mutants clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[fast,formats,report]'
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e .
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
@@ -39,6 +39,10 @@ check: $(VENV)/.installed-dev  ## formatting, rules, types, who may import whom
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+check-all:  ## the same with every Python that is supported and present, in .venv-3.11, .venv-3.12, ...
+	set -e; for version in 3.11 3.12 3.13; do if python$$version -c "" 2>/dev/null; then \
+	    $(MAKE) check PYTHON=python$$version VENV=.venv-$$version; fi; done
 
 bench: $(VENV)/.installed-dev  ## speed and memory, as ratios within one run
 	$(BIN)/python -m benchmarks

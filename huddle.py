@@ -107,7 +107,7 @@ if not TYPE_CHECKING:  # type checkers see the imports above
 
 
 def _check_packages() -> None:
-    """Refuse packages of a user's that hide ours.
+    """Refuse other packages of these names, which hide ours or were installed over them.
 
     Raises
     ------
@@ -125,6 +125,31 @@ def _check_packages() -> None:
                 " folder of the script off sys.path, or rename the file or folder",
                 name=name,
             )
+        try:
+            import_module(name)  # ours imports nothing
+        except Exception as error:
+            from importlib.metadata import packages_distributions  # noqa: PLC0415 - seldom needed
+
+            others = {*packages_distributions().get(name, ())} - {"huddle-bench"}
+            culprit = " ".join(sorted(others)) or "PACKAGE"
+            raise ImportError(
+                f"{found}: replaced by another package that is called {name!r} ({error}); run:"
+                f" python -m pip uninstall {culprit}, then install huddle again, in an"
+                " environment of its own if you need both",
+                name=name,
+            ) from error
+
+
+def main() -> None:
+    """Run the command ``huddle``."""
+    try:
+        _check_packages()
+    except ImportError as error:
+        print(f"huddle: {error}", file=sys.stderr)
+        sys.exit(2)
+    from tui.commands.main import main as run  # noqa: PLC0415 - a script needs no command
+
+    run()
 
 
 if __name__ == "__main__":
@@ -133,7 +158,4 @@ if __name__ == "__main__":
     if not sys.flags.safe_path:
         del sys.path[0]
     sys.argv[0] = "huddle"  # as help and messages call the command
-    _check_packages()
-    from tui.commands.main import main
-
     main()

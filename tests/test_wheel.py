@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
+import tomllib
 import venv
 import zipfile
 from pathlib import Path
@@ -72,6 +74,64 @@ def test_it_works_in_a_folder_of_the_users_own_modules(site: Path, crowded: Path
     )
     assert run(site, crowded, "-c", call).split() == [str(site / "huddle.py"), "11"]
     assert run(site, crowded, "-m", "huddle", "--version").startswith("huddle ")
+
+
+def test_a_package_that_was_installed_over_ours_is_named(site: Path, tmp_path: Path) -> None:
+    shutil.copytree(site, tmp_path / "site")
+    (tmp_path / "site" / "daq" / "__init__.py").write_text("import nowhere_to_be_found")
+    info = tmp_path / "site" / "daq-0.4.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: daq\nVersion: 0.4\n")
+    (info / "top_level.txt").write_text("daq\n")
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "huddle", "estimate", "a.h5"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(tmp_path / "site")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    (said,) = done.stderr.splitlines()
+    assert f"daq{os.sep}__init__.py: replaced by another package that is called 'daq'" in said
+    assert "run: python -m pip uninstall daq, then install huddle again" in said
+
+
+def test_the_command_is_the_front_door(site: Path) -> None:
+    """A package that hides ours is named by the command, too."""
+    (entries,) = site.glob("huddle_bench-*.dist-info/entry_points.txt")
+    assert "\nhuddle = huddle:main\n" in entries.read_text(encoding="utf-8")
+
+
+SERVICE = ("fast", "metrics", "miniseed", "report", "signing", "web")
+PLATFORMS = {
+    "aarch64": (("manylinux2014_aarch64", "manylinux_2_28_aarch64"), SERVICE),
+    # cryptography has no wheels for Intel Macs any more: recordings are not signed there.
+    "x86_64 of Apple": (("macosx_10_12_x86_64", "macosx_14_0_x86_64"), SERVICE[:4] + SERVICE[5:]),
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", PLATFORMS)
+def test_wheels_of_all_that_a_service_needs_are_there(name: str, tmp_path: Path) -> None:
+    platforms, extras = PLATFORMS[name]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    needed = [*project["dependencies"]]
+    for extra in extras:
+        needed += [e for e in project["optional-dependencies"][extra] if "huddle-bench" not in e]
+    done = subprocess.run(
+        [sys.executable, "-m", "pip", "install", "--dry-run", "--only-binary=:all:", "--quiet"]
+        + ["--disable-pip-version-check", "--target", str(tmp_path), "--python-version", "3.11"]
+        + ["--constraint", str(ROOT / "constraints.txt")]
+        + [f"--platform={each}" for each in platforms]
+        + needed,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if "connection broken" in done.stderr:
+        pytest.skip("no network")
+    assert done.returncode == 0, done.stderr
 
 
 def test_everything_that_is_not_code_is_in_it(site: Path) -> None:

@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from daq.errors import BenchFileError, FileFault, NotConnectedError, toml_value
+from daq.python_process import install_command
 from daq.transport.address import check_serial, host_and_port
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ def package(name: str, extra: str, label: str, further: str = "") -> Any:  # noq
     try:
         return import_module(name)
     except (ImportError, OSError) as error:  # OSError: a library that the package loads
-        how = f"pip install 'huddle-bench[{extra}]'{further}"
+        how = f"{install_command(extra)}{further}"
         raise NotConnectedError(f"{label}: {error}; {how}") from error
 
 

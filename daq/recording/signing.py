@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daq.errors import HuddleError
+from daq.python_process import install_command
 from daq.recording.chunks.manifest import root_sha256
 from daq.recording.reader import Recording
 from daq.recording.storage.opening import open_file
@@ -266,5 +267,5 @@ def _library(name: str) -> Any:  # noqa: ANN401 - a module
         return import_module(f"cryptography.hazmat.primitives.{name}")
     except ImportError:
         raise SigningError(
-            "signatures need the package cryptography: pip install 'huddle-bench[signing]'"
+            f"signatures need the package cryptography; run: {install_command('signing')}"
         ) from None

@@ -403,7 +403,7 @@ def self_signed(folder: Path) -> tuple[ssl.SSLContext, str]:
         from cryptography.hazmat.primitives import hashes, serialization  # noqa: PLC0415
         from cryptography.hazmat.primitives.asymmetric import ec  # noqa: PLC0415
     except ImportError as error:
-        raise ServeError(f"tls needs a certificate: {error}; huddle-bench[signing]") from error
+        raise ServeError(f"tls needs cryptography: {error}") from error
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "simulated device")])
     names = [x509.IPAddress(ip_address("127.0.0.1")), x509.DNSName("localhost")]

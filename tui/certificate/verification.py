@@ -22,6 +22,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from daq.errors import HuddleError
+from daq.python_process import install_command
 from daq.recording.reader import Recording
 from daq.recording.repair import verify as verify_recording
 from daq.recording.signing import problem, signature_of
@@ -311,7 +312,7 @@ def _signatures(content: bytes, entry: Entry, wanted: str) -> tuple[list[str], l
             said += ", and its ledger, of an earlier version, does not say whether it was signed"
         return [said], wrong
     if find_spec("pyhanko") is None:
-        line = "signature not checked: pip install 'huddle-bench[sign]'"
+        line = f"signature not checked; run: {install_command('sign')}"
         return [line], [line] if wanted else []
     from tui.certificate.signing import signatures  # noqa: PLC0415 - an extra
 
@@ -344,7 +345,7 @@ def _head(ledger: Ledger, entry: Entry, wanted: str) -> tuple[list[str], list[st
     if entry.signer is None:
         return ["ledger not signed as far as this certificate: of an earlier version"], []
     if find_spec("cryptography") is None:
-        return ["signature of the ledger not checked: pip install 'huddle-bench[sign]'"], []
+        return [f"signature of the ledger not checked; run: {install_command('sign')}"], []
     rows = ledger.signed_rows()
     key_id = wanted or entry.signer or ""
     if rows.get(key_id, 0) < entry.row:

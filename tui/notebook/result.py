@@ -393,7 +393,7 @@ class Result:
     ) -> Figure:
         """Draw PSD of samples and noise, with its interval, against frequency.
 
-        Needs matplotlib: ``pip install 'huddle-bench[report]'``.
+        Needs matplotlib (extra ``report``).
 
         Parameters
         ----------
@@ -425,8 +425,8 @@ class Result:
         coordinates too. ``csm_real`` and ``csm_imag`` are the cross-spectral matrix, with
         ``coherence``; ``response_amplitude`` and ``response_phase`` what the samples were divided
         by to be motion. Attributes say by which program, with which settings and from which span
-        of time, and what each flag means. Units are those of the CF conventions. Needs xarray:
-        ``pip install 'huddle-bench[notebook]'``.
+        of time, and what each flag means. Units are those of the CF conventions. Needs xarray
+        (extra ``notebook``).
         """
         from tui.notebook.tables import to_xarray  # noqa: PLC0415 - loads xarray
         from tui.output.json_document import provenance  # noqa: PLC0415 - seldom needed
@@ -438,8 +438,8 @@ class Result:
         """Write what `to_xarray` returns as netCDF, or as Zarr if the name ends in ``.zarr``.
 
         The attributes of the file have the SHA-256 of the recordings, too. A file that was there is
-        replaced when the new one is complete. `huddle.load` reads it. Needs h5netcdf (``pip install
-        'huddle-bench[notebook]'``) or zarr (``'huddle-bench[zarr]'``).
+        replaced when the new one is complete. `huddle.load` reads it. Needs h5netcdf (extra
+        ``notebook``) or zarr (extra ``zarr``).
         """
         from daq.results.sources import sources  # noqa: PLC0415 - seldom needed
         from tui.notebook.curve_files import write_dataset  # noqa: PLC0415
@@ -451,7 +451,7 @@ class Result:
     def to_frame(self) -> pd.DataFrame:
         """Return the spectra as a tidy table: a row a method, channel and frequency.
 
-        Needs pandas: ``pip install 'huddle-bench[notebook]'``.
+        Needs pandas (extra ``notebook``).
         """
         from tui.notebook.tables import to_frame  # noqa: PLC0415 - loads pandas
 

@@ -7,6 +7,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from daq.errors import HuddleError
+from daq.python_process import install_command
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -67,5 +68,5 @@ def require(*packages: str) -> None:
 
 def _missing(package: str) -> MissingPackageError:
     return MissingPackageError(
-        f"{package} is not installed; run: pip install 'huddle-bench[{_EXTRA[package]}]'"
+        f"{package} is not installed; run: {install_command(_EXTRA[package])}"
     )

@@ -10,12 +10,13 @@ import numpy as np
 
 from daq.devices.seedlink.packets import RECORD_SIZE
 from daq.protocols.errors import RemoteProtocolError
+from daq.python_process import install_command
 
 try:
     from pymseed import MiniSEEDError, MS3Record, nslc2sourceid, sourceid2nslc
 except ImportError as error:  # an optional dependency
     raise ImportError(
-        "SeedLink needs pymseed, which is not installed; run: pip install 'huddle-bench[seedlink]'"
+        f"SeedLink needs pymseed, which is not installed; run: {install_command('seedlink')}"
     ) from error
 
 if TYPE_CHECKING:

@@ -55,7 +55,7 @@ class MiniSeedPart:
 
     def load(self) -> Sequence[Trace]:
         """Return the traces in these records; text, such as a log, is left out."""
-        pymseed = load("pymseed", reads="miniSEED is", extra="formats")
+        pymseed = load("pymseed", reads="miniSEED is", extra="miniseed")
         try:
             with self.path.open("rb") as file:
                 file.seek(self.offset)
@@ -79,7 +79,7 @@ class MiniSeedPart:
         """Whether a record has samples between two instants, by headers; a damaged part may."""
         if start_ns is None and end_ns is None:
             return True
-        pymseed = load("pymseed", reads="miniSEED is", extra="formats")
+        pymseed = load("pymseed", reads="miniSEED is", extra="miniseed")
         try:
             with self.path.open("rb") as file:
                 file.seek(self.offset)
@@ -130,7 +130,7 @@ def contents(path: Path) -> list[tuple[str, str, int, int]]:
     ImportFormatError
         pymseed is not installed, or the file cannot be read.
     """
-    pymseed = load("pymseed", reads="miniSEED is", extra="formats")
+    pymseed = load("pymseed", reads="miniSEED is", extra="miniseed")
     try:
         return [
             (
@@ -171,7 +171,7 @@ def miniseed_parts(path: Path) -> Iterator[MiniSeedPart]:
     ImportFormatError
         pymseed is not installed, or the file begins with no record.
     """
-    pymseed = load("pymseed", reads="miniSEED is", extra="formats")
+    pymseed = load("pymseed", reads="miniSEED is", extra="miniseed")
     size = path.stat().st_size
     with path.open("rb") as file:
         try:

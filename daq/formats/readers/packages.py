@@ -8,6 +8,7 @@ import warnings
 from typing import Any
 
 from daq.errors import ImportFormatError
+from daq.python_process import install_command
 
 
 def load(package: str, *, reads: str, extra: str) -> Any:  # noqa: ANN401 - they have no types
@@ -26,6 +27,5 @@ def load(package: str, *, reads: str, extra: str) -> Any:  # noqa: ANN401 - they
             return importlib.import_module(package.lower())
     except ImportError as error:
         raise ImportFormatError(
-            f"{reads} read by {package}, which is not installed; run: pip install"
-            f" 'huddle-bench[{extra}]'"
+            f"{reads} read by {package}, which is not installed; run: {install_command(extra)}"
         ) from error

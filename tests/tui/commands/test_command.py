@@ -228,7 +228,7 @@ def test_a_report_without_matplotlib_names_the_extra_before_anything_is_estimate
         assert ended.value.code == 2
     said = " ".join(stderr.getvalue().split())
     assert said.count("matplotlib is not installed") == len(arguments)
-    assert "run: pip install 'huddle-bench[report]'" in said
+    assert f"run: {sys.executable} -m pip install 'fpdf2>=2.8' 'jinja2>=3.1' 'matplotlib" in said
 
 
 # ----------------------------------------------------------------------------- names

@@ -93,4 +93,4 @@ def test_a_driver_without_its_library_says_so(monkeypatch: pytest.MonkeyPatch) -
     result = CliRunner().invoke(app, ["devices"])
     assert result.exit_code == 0
     assert "not listed: sound" in result.stdout
-    assert "huddle-bench[audio]" in " ".join(result.stdout.split())
+    assert "pip install 'sounddevice>=0.5'" in " ".join(result.stdout.split())
