@@ -94,6 +94,11 @@ def in_acceleration(unit: str) -> float | None:
     return si if derivatives == 2 else None
 
 
+def order_of(unit: str) -> int:
+    """Return which time derivative of displacement a unit is of; other units count as of 2."""
+    return _MOTION.get(canonical(unit), (2, 1.0))[0]
+
+
 def in_si(unit: str) -> tuple[float, str] | None:
     """Return how many SI units one of a unit of motion is, and which; None of other units."""
     derivatives, si = _MOTION.get(canonical(unit), (-1, 1.0))

@@ -20,6 +20,7 @@ from daq.bench.model import (
 )
 from daq.bench.option_fit import misfits, shortest_duration
 from daq.bench.option_values import LEAST_SENSORS
+from daq.bench.units import in_si, is_motion
 from daq.errors import BenchFileError, FileFault, WrongSettingError
 
 if TYPE_CHECKING:
@@ -63,6 +64,7 @@ def cross_faults(
     yield from _simulation_faults(table)
     if estimate is not None:
         yield from _set_faults(sensors, len(entries), estimate)
+        yield from _unit_faults(sensors, estimate)
         yield from _method_faults(estimate)
         if sensors and len(sensors) == len(entries):
             yield from _option_faults(estimate, sensors)
@@ -166,6 +168,33 @@ def _set_faults(
                     f"{sensor.n_main_channels} channels",
                     sensor.name,
                 )
+
+
+def _unit_faults(sensors: Sequence[Sensor], estimate: EstimateSettings) -> Iterator[FileFault]:
+    """Yield channels of another quantity than most have; `estimate.unit` converts those of motion.
+
+    A unit of velocity with the sensitivity for acceleration is a mistake that is easily made.
+    """
+    channels = [(s.name, c.name, c.unit) for s in sensors for c in s.channels if not c.auxiliary]
+    quantities = [
+        "motion" if estimate.unit and is_motion(unit) else (in_si(unit) or (1.0, unit))[1]
+        for _, _, unit in channels
+    ]
+    if len(set(quantities)) < 2:
+        return
+    usual = Counter(quantities).most_common(1)[0][0]
+    example = channels[quantities.index(usual)][2]
+    for (sensor, name, unit), quantity in zip(channels, quantities, strict=True):
+        if quantity != usual:
+            yield FileFault(
+                f'channels["{name}"].unit',
+                (
+                    f"expected a unit of the quantity of most channels, such as {example};"
+                    " if the sensor measures another motion, set the unit of [estimate]"
+                ),
+                unit,
+                sensor,
+            )
 
 
 def _method_faults(estimate: EstimateSettings) -> Iterator[FileFault]:

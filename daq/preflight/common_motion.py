@@ -1,7 +1,7 @@
 """The motion that sensors share in some seconds of samples: gains and directions between them.
 
-From cross-spectra of segments of one second. Clocks do not matter: samples are shifted by the
-delays that the motion shows, and what is left of them is a phase.
+From cross-spectra of segments of one second, in m/s². Clocks do not matter: samples are shifted by
+the delays that the motion shows, and what is left of them is a phase.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.bench.units import conversion, is_motion
 from estimator.checks.relative_response import relative_response
 from estimator.errors import EstimatorError
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from daq.bench.model import Sensor
     from daq.preflight.preview import SensorPreview
     from estimator.checks.relative_response import RelativeResponse
     from estimator.types import ComplexArray, FloatArray
@@ -112,12 +114,13 @@ def _response(
     others = [n for n in range(len(sensors)) if n not in (first, second)]
     others.sort(key=lambda n: abs(counts[n] - d))
     chosen = [first, second, *others[: max(1, 3 - d)]]
-    rates = [sensors[n].sensor.sampling_rate for n in chosen]
     dims = tuple(counts[n] for n in chosen)
     delays = [0.0] * len(chosen)
     found = None
     for is_last in (False, True):
-        csm, frequency = _averages([series[n] for n in chosen], rates, delays)
+        csm, frequency = _averages(
+            [sensors[n].sensor for n in chosen], [series[n] for n in chosen], delays
+        )
         for place in range(1, 2 if is_last else len(chosen)):
             if dims[place] != d:
                 continue
@@ -132,13 +135,25 @@ def _response(
     return None if found is None else replace(found, first=first, second=second)
 
 
+def to_acceleration(sensor: Sensor, frequency: FloatArray) -> ComplexArray:
+    """Return what spectra of the channels that take part are multiplied by to be in m/s².
+
+    Shape (n_freqs, n_channels). Spectra that are of no motion stay in their unit.
+    """
+    units = [channel.unit for channel in sensor.channels if not channel.auxiliary]
+    return np.stack(
+        [conversion(unit, "m/s²" if is_motion(unit) else unit, frequency) for unit in units], axis=1
+    )
+
+
 def _averages(
-    series: Sequence[NDArray[np.float64]], rates: Sequence[float], delays: Sequence[float]
+    sensors: Sequence[Sensor], series: Sequence[NDArray[np.float64]], delays: Sequence[float]
 ) -> tuple[ComplexArray, FloatArray]:
     """Return the cross-spectral matrix of segments that end together, and its frequencies in Hz.
 
     `delays` are how many seconds each sensor lags behind the first.
     """
+    rates = [sensor.sampling_rate for sensor in sensors]
     latest = max(delays)
     ends = [
         len(samples) - round((latest - delay) * rate)
@@ -147,8 +162,9 @@ def _averages(
     step = SEGMENT / 2
     n_segments = int(min(end / rate for end, rate in zip(ends, rates, strict=True)) / step) - 1
     n_freqs = int(min(rates) * SEGMENT / 2)
+    frequency = np.arange(n_freqs) / SEGMENT
     spectra = []
-    for samples, rate, end in zip(series, rates, ends, strict=True):
+    for sensor, samples, rate, end in zip(sensors, series, rates, ends, strict=True):
         length = round(rate * SEGMENT)
         starts = [round(end - length - n * step * rate) for n in range(max(n_segments, 0))]
         segments = np.array([samples[start : start + length] for start in starts if start >= 0])
@@ -157,11 +173,12 @@ def _averages(
         segments = segments - _line(segments)
         window = np.hanning(length)
         spectra_of = np.fft.rfft(segments * window[:, None], axis=1)[:, :n_freqs]
-        spectra.append(spectra_of * math.sqrt(2 / (rate * float(window @ window))))
+        spectra_of *= math.sqrt(2 / (rate * float(window @ window)))
+        spectra.append(spectra_of * to_acceleration(sensor, np.maximum(frequency, 1 / SEGMENT)))
     together = min(map(len, spectra))
     whole = np.concatenate([each[:together] for each in spectra], axis=2)
     csm = np.einsum("sfi,sfj->fij", whole, whole.conj()) / together
-    return csm, np.arange(n_freqs) / SEGMENT
+    return csm, frequency
 
 
 def _line(segments: NDArray[np.float64]) -> NDArray[np.float64]:

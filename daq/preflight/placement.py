@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.bench.units import STANDARD_GRAVITY, in_acceleration
+from daq.bench.units import STANDARD_GRAVITY, in_acceleration, order_of
 from daq.preflight.findings import Finding, Problem
 
 if TYPE_CHECKING:
@@ -155,7 +155,8 @@ def _what_is_reflected(each: SensorPreview, seen: Sequence[NDArray[np.float64]])
 def _slow(each: SensorPreview, end_ns: int) -> NDArray[np.float64]:
     """Return the motion below `SLOW` of a sensor's live channels, at 2 `SLOW` rows a second.
 
-    The last row is at `end_ns`: rows of all sensors are of the same moments.
+    It is the change of acceleration. The last row is at `end_ns`: rows of all sensors are of the
+    same moments.
     """
     rate = each.sensor.sampling_rate
     late = max(0, round((each.last_ns - end_ns) * 1e-9 * rate))
@@ -168,4 +169,7 @@ def _slow(each: SensorPreview, end_ns: int) -> NDArray[np.float64]:
     step = max(1, round(rate / (2 * SLOW)))
     n_rows = len(values) // step
     rows = values[len(values) - n_rows * step :].reshape(n_rows, step, len(main)).mean(axis=1)
+    for column, channel in enumerate(main):
+        for _ in range(2 - order_of(each.sensor.channels[channel].unit)):
+            rows[:, column] = np.gradient(rows[:, column])
     return np.asarray(np.diff(rows, axis=0))

@@ -11,7 +11,7 @@ import numpy as np
 
 from daq.bench.units import in_acceleration
 from daq.errors import WrongDeviceError
-from daq.preflight.common_motion import MIN_RATE, CommonMotion, main_samples
+from daq.preflight.common_motion import MIN_RATE, CommonMotion, main_samples, to_acceleration
 from daq.preflight.findings import Check, CheckRow, Finding, Problem
 from daq.preflight.placement import alone, gravity, wrong_polarity
 from daq.recorder.device_identity import check_identity
@@ -276,7 +276,10 @@ def _hum(able: Sequence[SensorPreview]) -> Iterator[Finding]:
 
 
 def _at_mains(each: SensorPreview, mains: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the power of each channel near a frequency, and its share of that above 1 Hz."""
+    """Return the power of each channel near a frequency, and its share of that above 1 Hz.
+
+    The power is that of acceleration, in (m/s²)².
+    """
     values, rate = main_samples(each), each.sensor.sampling_rate
     window = np.hanning(len(values))[:, None]
     power = np.abs(np.fft.rfft((values - values.mean(axis=0)) * window, axis=0)) ** 2
@@ -285,7 +288,8 @@ def _at_mains(each: SensorPreview, mains: float) -> tuple[NDArray[np.float64], N
     near = power[np.abs(frequency - mains) <= 1.0].sum(axis=0)
     whole = power[frequency > 1.0].sum(axis=0)
     share = np.divide(near, whole, out=np.zeros_like(near), where=whole > 0)
-    return near * (rate / len(values)), share
+    factor = np.abs(to_acceleration(each.sensor, np.array([mains]))[0]) ** 2
+    return near * factor * (rate / len(values)), share
 
 
 def _sensitivities(motion: CommonMotion) -> Iterator[Finding]:

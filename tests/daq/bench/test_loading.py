@@ -286,6 +286,21 @@ def test_too_few_sensors_are_refused() -> None:
     assert len(read(HEAD + sensor_text("a")).sensors) == 1
 
 
+def test_channels_of_another_quantity_are_refused_without_a_unit_for_all() -> None:
+    velocity = THREE.replace('name = "x"', 'name = "x"\nunit = "mm/s"', 1)
+    assert faults(HEAD + velocity) == [
+        (
+            'bench.toml: sensors["a"].channels["x"].unit = "mm/s": expected a unit of the quantity of'
+            " most channels, such as m/s²; if the sensor measures another motion, set the unit of"
+            " [estimate]"
+        )
+    ]
+    assert len(read(HEAD + velocity + '[estimate]\nunit = "m/s²"\n').sensors) == 3
+    assert len(read(HEAD + velocity.replace("mm/s", "mg")).sensors) == 3
+    volts = HEAD + THREE.replace('name = "x"', 'name = "x"\nunit = "V"', 1)
+    assert len(faults(volts + '[estimate]\nunit = "m/s²"\n')) == 1
+
+
 def test_all_errors_are_reported_together() -> None:
     text = """
 sampling_rate = -1

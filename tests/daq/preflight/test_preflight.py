@@ -70,6 +70,30 @@ def test_a_sound_bench_passes_every_check(seed: int, turned: bool) -> None:
     assert check_list(BENCH, previews(turned=turned, seed=seed)) == tuple(map(CheckRow, Check))
 
 
+def in_unit(each: SensorPreview, unit: str, samples: FloatArray | None = None) -> SensorPreview:
+    """Return a sensor whose channels have another unit."""
+    channels = tuple(replace(c, unit=unit) for c in each.sensor.channels)
+    sheet = DataSheet(full_scale=100.0, unit="m/s²")
+    sensor = each.sensor.model_copy(update={"channels": channels, "data_sheet": sheet})
+    return replace(each, sensor=sensor, samples=each.samples if samples is None else samples)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_sound_bench_of_several_units_passes_every_check(turned: bool) -> None:
+    a, b, c = previews(turned=turned)
+    velocity = np.cumsum(c.samples, axis=0) / RATE
+    sensors = [in_unit(a, "g", a.samples / 9.80665), b, in_unit(c, "m/s", velocity)]
+    assert check_list(BENCH, sensors) == tuple(map(CheckRow, Check))
+
+
+@pytest.mark.parametrize(("unit", "cause"), [("g", Cause.GRAVITY), ("mm/s²", Cause.GAIN_SWITCH)])
+def test_a_sensitivity_of_another_unit_is_named(unit: str, cause: Cause) -> None:
+    a, b, c = previews()
+    assert failures([in_unit(a, unit), b, c]) == [(Problem.SENSITIVITY, "A", "")]
+    found = [each for each in findings([in_unit(a, unit), b, c]) if each.cause is not None]
+    assert [each.cause for each in found] == [cause]
+
+
 def test_enough_samples_are_awaited() -> None:
     assert is_complete(previews())
     assert not is_complete(previews(2.0))
