@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -33,7 +33,7 @@ class ReadableSensor(Protocol):
     """One sensor of a recording."""
 
     sampling_rate: float
-    """In Hz, as reported by the device; otherwise nominal. Those who know better may set it."""
+    """In Hz, as reported by the device; otherwise nominal."""
 
     @property
     def name(self) -> str:
@@ -135,3 +135,25 @@ class ReadableRecording(Protocol):
 
     def close(self) -> None:
         """Close the file, if there is one."""
+
+
+class _With:
+    """An object with some attributes of its own."""
+
+    def __init__(self, of: object, **own: object) -> None:
+        self.__dict__.update(own)
+        self._of = of
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - as the object has it
+        return getattr(self._of, name)
+
+
+def at_rates(recording: ReadableRecording, rates: Mapping[str, float]) -> ReadableRecording:
+    """Return a recording some of whose sensors have other sampling rates, in Hz, by name."""
+    if not rates:
+        return recording
+    sensors = tuple(
+        _With(each, sampling_rate=rates.get(each.name, each.sampling_rate))
+        for each in recording.sensors
+    )
+    return cast("ReadableRecording", _With(recording, sensors=sensors))

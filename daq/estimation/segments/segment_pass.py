@@ -19,6 +19,7 @@ from daq.estimation.segments.delay_measurement import DelayMeasurement
 from daq.estimation.segments.flatline import FlatlineDetector, stands_still
 from daq.estimation.segments.own_spectra import OwnSpectra, need_samples_of_grid
 from daq.estimation.segments.stated_times import agree, compare
+from daq.recording.interface import at_rates
 from estimator.spectra.channel_sets import ChannelSets
 from estimator.spectra.multiresolution import MultiResolution
 from estimator.spectra.parts import MOST, PartEnds, Parts, by_part, part_bins
@@ -183,9 +184,8 @@ class Pass:
         settings: Settings,
         sensors: Collection[str] | None = None,
     ) -> None:
+        recording = at_rates(recording, settings.sampling_rates)
         self.recording = recording
-        for record in recording.sensors:
-            record.sampling_rate = settings.sampling_rates.get(record.name, record.sampling_rate)
         self.aligned = AlignedRecording(
             recording,
             sampling_rate=settings.sampling_rate,

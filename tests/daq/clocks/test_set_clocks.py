@@ -19,6 +19,7 @@ from daq.estimation.settings import Settings
 from daq.protocols.block import HostTime
 from daq.recorder.block_writer import BlockWriter
 from daq.recording.file_format import SensorLayout
+from daq.recording.reader import Recording
 from daq.recording.writer import RecordingWriter
 from daq.results.band_summary import channel_means
 from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, create
@@ -123,5 +124,8 @@ def test_a_finished_recording_can_be_given_its_rate(tmp_path: Path) -> None:
     settings = Settings(
         segment=4.0, methods=("three-sensor",), sampling_rates={"B": 101.0}, clocks="arrivals"
     )
-    snapshot = estimate([tmp_path / "r.h5"], settings)
+    with Recording.open(tmp_path / "r.h5") as recording:
+        rates = [sensor.sampling_rate for sensor in recording.sensors]
+        snapshot = estimate([recording], settings)
+        assert [sensor.sampling_rate for sensor in recording.sensors] == rates != [100.0, 101.0]
     assert abs(snapshot.clocks[1].ppm) < 10
