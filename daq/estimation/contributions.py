@@ -36,6 +36,8 @@ SECOND_ORDER = 2.5
 (docs/validation/gradients.md)."""
 MOST_SHARED = 0.99
 """Part of its noise that a channel shares at most."""
+MUCH_CHANGED = 0.1
+"""Share of the noise that changes of responses may be, from which all of it may be."""
 MUCH_NONLINEAR = 0.05
 """Share of the noise from which squares and cubes of the motion delay a result, and from which
 terms of other forms may be all of the rest."""
@@ -127,7 +129,11 @@ def _changes(snapshot: Snapshot, psd: FloatArray) -> list[Contribution]:
     if steady is None or not steady.changes:
         return []
     motion = np.maximum(np.nan_to_num(snapshot.data_psd) - psd, 0.0)
-    below = np.minimum(steady.added * motion, psd)
+    if (within := steady.steadied) is not None:
+        below, above = (part * motion for part in (within.below, within.above))
+        return [contribution(Source.CHANGES, psd.shape, below=np.minimum(below, psd), above=above)]
+    below = steady.added * motion
+    below = np.where(below > MUCH_CHANGED * psd, psd, below)
     return [contribution(Source.CHANGES, psd.shape, below=below)]
 
 

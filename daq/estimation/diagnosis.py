@@ -19,10 +19,20 @@ from daq.estimation.snapshot_diagnostics import (
     SnapshotDiagnostics,
     Synchronisation,
 )
-from estimator.checks.advice import Advice, Delay, Gain, Level, ModelMisfit, SharedNoise, Untested
+from estimator.checks.advice import (
+    Advice,
+    Delay,
+    Gain,
+    Level,
+    ModelMisfit,
+    ResponseChanges,
+    SharedNoise,
+    Untested,
+)
 from estimator.checks.count_limits import CountLimits
 from estimator.checks.diagnose import Diagnostics, diagnose
 from estimator.errors import InsufficientDataError
+from estimator.median import median
 from estimator.responses.equalisation import leakage_advice
 
 if TYPE_CHECKING:
@@ -34,8 +44,9 @@ if TYPE_CHECKING:
     from daq.clocks.clock_model import ClockState
     from daq.estimation.noise_estimates import Dimensions
     from daq.estimation.segments.segment_pass import Pass
+    from daq.estimation.snapshot import NonlinearChannel
     from estimator.checks.band import BandDiagnosis
-    from estimator.checks.stability import SegmentCourse
+    from estimator.checks.stability import SegmentCourse, Stability
     from estimator.likelihood.factor_analysis import Maxima
     from estimator.self_noise.result import SelfNoise
     from estimator.spectra.multiresolution import Band
@@ -91,6 +102,41 @@ class Findings:
             advice = sorted([*rest, *leaks], key=lambda each: order.index(each.level))
             whole = replace(whole, advice=tuple(advice))
         return cls(counts, stood_still, whole, untested, edges)
+
+    @property
+    def stability(self) -> Stability | None:
+        """What parts of time show, where the test is diagnosed."""
+        return None if self.diagnosis is None else self.diagnosis.stability
+
+    def linear_first(
+        self, nonlinear: Sequence[NonlinearChannel], psd: FloatArray, dims: tuple[int, ...]
+    ) -> Findings:
+        """Return findings without changes of responses that add less than squares and cubes do.
+
+        What is not linear follows the loudness of the motion, as a response that changes would.
+        `psd` is that of the channels, shape (n_freqs, n_channels).
+        """
+        whole, steady = self.diagnosis, self.stability
+        if not nonlinear or whole is None or steady is None or not steady.changes:
+            return self
+        with np.errstate(invalid="ignore", divide="ignore"):
+            shares = [each.explained / psd[:, each.column] for each in nonlinear]
+        explained = max(float(median(each[each > 0])) for each in shares)
+        most = np.maximum.reduceat(steady.added, np.cumsum([0, *dims[:-1]]))
+        changes = tuple(each for each in steady.changes if most[each.sensor] > explained)
+        left = {each.sensor for each in changes}
+        steady = replace(
+            steady,
+            changes=changes,
+            added=np.where(np.repeat([n in left for n in range(len(dims))], dims), steady.added, 0),
+            steadied=steady.steadied if changes else None,
+        )
+        advice = (
+            each
+            for each in whole.advice
+            if not isinstance(each, ResponseChanges) or left.issuperset(each.sensors)
+        )
+        return replace(self, diagnosis=replace(whole, advice=tuple(advice), stability=steady))
 
     def fits(self, frequency: FloatArray) -> bool:
         """Whether it is about these frequencies: with octaves, there are more as time goes by."""

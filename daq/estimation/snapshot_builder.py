@@ -47,7 +47,15 @@ from daq.estimation.noise_estimates import (
 from daq.estimation.recording_set import is_complete
 from daq.estimation.segments.clipping import limits_by_column
 from daq.estimation.segments.segment_pass import still_for_a_while
-from daq.estimation.snapshot import Bridged, ChannelLabel, NoSegment, Octave, SensorTotals, Snapshot
+from daq.estimation.snapshot import (
+    Bridged,
+    ChannelLabel,
+    NonlinearChannel,
+    NoSegment,
+    Octave,
+    SensorTotals,
+    Snapshot,
+)
 from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics
 from daq.estimation.throttle import Throttle
 from daq.protocols.block import Quantity
@@ -126,6 +134,8 @@ def segment_course(
     )
 
 
+ROUNDS = 2
+"""Times that averages within parts are estimated and diagnosed, where responses change."""
 _RECHOICE = 2.0  # growth after which the dimension is chosen again: 5 s with 15 channels
 _SEGMENTS_MISSED = 3  # complete, and none that counts: a reason is given
 DIAGNOSIS_SHARE = 0.01
@@ -271,7 +281,7 @@ class SnapshotBuilder:
             n_segments = bands[-1].n_segments
         n_effective = bands[-1].n_effective if bands else 0.0
         n_partial = sum(each.n_segments for each in sets) - (0 if raw else n_segments)
-        latest = recordings[-1]
+        latest = last.recording
         events = latest.events
         diagnostics = SnapshotDiagnostics(
             synchronisation=bias_of_clocks(
@@ -290,13 +300,20 @@ class SnapshotBuilder:
         taken_off = nonlinear if self._settings.linearise else ()
         if final and csm.nbytes > FREED_FROM:
             give_back()
+        psd = np.diagonal(csm, axis1=1, axis2=2).real
         if final or (self._diagnoses.is_due and not left):
             with self._diagnoses:
                 bands_of_all = bands if raw else ()
                 self._findings = self._diagnose(
                     recordings, passes, raw, bands_of_all, estimates, maxima=maxima
-                )
+                ).linear_first(nonlinear, psd, dims)
             self._occasional_cost += self._diagnoses.cost
+        if final and raw and not sets:
+            bands, estimates = self._within_parts(
+                recordings, passes, raw, bands, estimates, nonlinear=nonlinear
+            )
+            csm = csm if len(bands) > 1 else bands[0].csm
+            n_effective = bands[-1].n_effective
         if self._findings.fits(frequency):
             diagnostics = self._findings.added_to(diagnostics)
         if sets and not raw:
@@ -343,6 +360,43 @@ class SnapshotBuilder:
             ),
         )
         return with_contributions(snapshot)
+
+    def _within_parts(
+        self,
+        recordings: Sequence[ReadableRecording],
+        passes: Sequence[Pass],
+        raw: tuple[Band, ...],
+        bands: tuple[Band, ...],
+        estimates: Estimates,
+        *,
+        nonlinear: Sequence[NonlinearChannel],
+    ) -> tuple[tuple[Band, ...], Estimates]:
+        """Return averages and estimates within parts of time, if responses change between them.
+
+        Twice: noise in which motion is left is no scale by which changes are told.
+        """
+        first, dims = self._findings, passes[0].aligned.dims
+        psd = np.diagonal(bands[0].csm, axis1=1, axis2=2).real
+        for _ in range(ROUNDS):
+            steady = self._findings.stability
+            if steady is None or steady.steadied is None:
+                break
+            found = steady.steadied
+            band = replace(bands[0], csm=found.csm, n_effective=found.n_effective)
+            maxima, n = Maxima(), band.n_segments
+            again = self._estimates(
+                (band,), raw, recordings[0], passes[0], n, maxima=maxima, final=True
+            )
+            self._findings = self._diagnose(
+                recordings, passes, raw, (band,), again, maxima=maxima
+            ).linear_first(nonlinear, psd, dims)
+            after = self._findings.stability
+            if after is None or not after.changes:
+                self._findings = first
+                return bands, estimates
+        else:
+            return (band,), again
+        return bands, estimates
 
     def _sets(self, passes: Sequence[Pass], raw: tuple[Band, ...]) -> tuple[ChannelSet, ...]:
         """Return averages of segments in which channels have no samples, in physical units."""

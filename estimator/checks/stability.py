@@ -7,6 +7,7 @@ more, by one factor a band. Single segments show disturbances.
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 import operator
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimator.checks.steadied import Steadied, steadied
 from estimator.checks.steadiness import (
     BINS_AT_ONCE,
     FALSE_ALARM,
@@ -59,6 +61,15 @@ PAIR_BYTES = 1 << 24
 """Bytes of products of pairs of channels with all others that exist together: 16 MB."""
 SIGNIFICANCE = 3.0
 """Standard errors by which scatter must exceed its expectation to be significant."""
+SECOND_ORDER = 4.0
+"""Times the variance of a response between parts, a change is at most, squared. Scores are linear
+in changes: the share of its statistic that may look like changes of other sensors."""
+STRONG = 100.0
+"""Motion over noise from which changes of responses are suspected without a noise that is known."""
+LEAST_SHARE = 0.01
+"""Share of a channel beside the motion, from which what is left of it within parts counts."""
+WITHIN_PARTS = 0.75
+"""Share of a channel's noise within parts, below which its responses, or others', may change."""
 LEAST_DEGREES = 8.0
 """Degrees of freedom of the noise of a part from which a band is tested."""
 
@@ -158,6 +169,8 @@ class Stability:
         Noise added by these segments, as a fraction, for the worst band and channel.
     channel : int
         That channel.
+    steadied : Steadied or None
+        Averages without the changes of responses; None where nothing tells of any.
     """
 
     low: FloatArray
@@ -171,6 +184,7 @@ class Stability:
     disturbed: IntArray
     excess: float
     channel: int
+    steadied: Steadied | None = None
 
     @property
     def inflation(self) -> float:
@@ -193,6 +207,7 @@ class Stability:
             runs=None if self.runs is None else self.runs.among(channels, n_channels),
             channel=channels[self.channel],
             added=added,
+            steadied=self.steadied if len(channels) == n_channels else None,
             changes=tuple(
                 replace(
                     each,
@@ -240,10 +255,13 @@ def stability(
     Stability or None
         None with too few parts or frequencies.
     """
-    good = usable(maximum, n_effective)
-    places = np.flatnonzero(parts.bins < len(frequency))
+    good, places = usable(maximum, n_effective), np.flatnonzero(parts.bins < len(frequency))
+    doubtful = good[parts.bins[places]].sum() < FREQUENCIES
+    if doubtful:  # the noise of a sensor may seem to be zero where all others change
+        good = maximum.converged & ~maximum.singular
+        good &= maximum.eigenvalues[:, maximum.n_factors - 1] > STRONG
     places = places[good[parts.bins[places]]]
-    averages = parts.averages * (n_effective / parts.averages.sum())
+    averages = parts.averages
     q = maximum.n_factors
     groups = grouped(averages, q + max(MIN_DEGREES, maximum.psi.shape[1]))
     if len(groups) < MIN_PARTS or len(places) < FREQUENCIES:
@@ -270,10 +288,22 @@ def stability(
                 dims=dims,
             )
         )
-    if not any(band is not None for band in bands):
-        return None
+    found = [band for band in bands if band is not None]
+    if doubtful:
+        bands = [None if band is None else replace(band, levels=None) for band in bands]
+    suspect = any(band.share.min() < WITHIN_PARTS for band in found)
     levels = [None if band is None else band.levels for band in bands]
     changes, added = _changed(bands, dims, begin, end)
+    without = None
+    if changes or suspect:
+        sensors = [each.sensor for each in changes]
+        without = steadied(parts, maximum, dims=dims, good=good, changed=sensors)
+        kept = np.array([not np.isin(some, without.left_out).any() for some in groups])
+        if kept.sum() >= MIN_PARTS:
+            bands = [None if band is None else band.of_parts(kept) for band in bands]
+            levels = [None if band is None else band.levels for band in bands]
+    elif all(each is None for each in levels):
+        return None
     out, excess = np.zeros(0, np.bool_), np.zeros((1, n_channels))
     if course is not None and len(course.spectra) >= MIN_SEGMENTS * MIN_PARTS:
         out, excess = _disturbed_segments(course, maximum, good)
@@ -293,17 +323,35 @@ def stability(
         disturbed=np.flatnonzero(out),
         excess=float(excess.max()),
         channel=int(excess.max(axis=0).argmax()),
+        steadied=without,
     )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Band:
-    """What the parts show of one band."""
+    """What the parts show of one band.
 
-    levels: Levels
+    `levels` are None where they are too uncertain. `share`, shape (n_channels,), is that of the
+    residuals of all segments which is left within parts.
+    """
+
+    share: FloatArray
+    levels: Levels | None
     of_runs: Levels | None
-    inflation: float
+    scores: _Scores
     responses: ResponseScores
+
+    @property
+    def inflation(self) -> float:
+        """Variance of the scores of pairs over that for steady noise; 1 where it is not known."""
+        return 1.0 if self.levels is None else self.scores.inflation(self.levels)
+
+    def of_parts(self, some: BoolArray) -> _Band:
+        """Return what some parts show of the noise."""
+        if self.levels is None:
+            return self
+        levels = Levels(self.levels.level[some], self.levels.degrees[some])
+        return replace(self, levels=levels, scores=self.scores.of_parts(some))
 
 
 def _band(
@@ -323,6 +371,7 @@ def _band(
     n_pieces = -(-len(places) // BINS_AT_ONCE)
     levels, of_runs, responses = [], [], []
     scores = _Scores(len(groups), sum(dims))
+    within, whole_band = np.zeros((2, sum(dims)))
     for some in np.array_split(places, n_pieces):
         bins = parts.bins[some]
         lags = np.minimum(np.abs(bins[:, None] - bins), len(correlation) - 1)
@@ -330,6 +379,9 @@ def _band(
         if not np.isfinite(csm).all():
             return None
         found = regression(joined_parts(csm, averages, groups), at)
+        weight = found.averages / found.averages.sum()
+        within += np.einsum("k,kfpp->p", weight, found.covariance)
+        whole_band += np.einsum("fpp->p", found.projector).real
         piece = noise_levels(found, own)
         levels.append(piece)
         scores.add(found, own)
@@ -340,12 +392,13 @@ def _band(
             of_run = regression(joined_parts(csm, averages, by_run), at)
             of_runs.append(noise_levels(of_run, own))
     whole = Levels.joined(levels)
-    if median(np.ravel(whole.degrees)) < LEAST_DEGREES:
-        return None
+    known = median(np.ravel(whole.degrees)) >= LEAST_DEGREES
+    beside = whole_band > LEAST_SHARE * len(places)
     return _Band(
-        whole,
-        Levels.joined(of_runs) if of_runs else None,
-        scores.inflation(whole),
+        np.where(beside, within / np.where(beside, whole_band, 1.0), 1.0),
+        whole if known else None,
+        Levels.joined(of_runs) if of_runs and known else None,
+        scores,
         functools.reduce(operator.add, responses),
     )
 
@@ -365,17 +418,21 @@ def _changed(
     """
     n_parts = len(begin)
     total = ResponseScores(dims, n_parts)
-    for band in (each for each in bands if each is not None):
+    for band in bands:
+        if band is None or band.levels is None:
+            continue
         unsteady = band.levels.statistic > critical_value(n_parts - 1, FALSE_ALARM)
         level = np.ones(n_parts)
         if unsteady.any():
             level = np.maximum(1.0, band.levels.level[:, unsteady].max(axis=1))
         total = total + band.responses.weighted(level)
+    total = total.centred()
     added = np.zeros(sum(dims))
     first = np.cumsum([0, *dims])
     changes = []
     left = list(range(len(dims)))
     taken: list[int] = []
+    second_order = 0.0
     while len(left) > 1:
         tests = {number: total.test(number, taken) for number in left}
         strength = {
@@ -383,12 +440,13 @@ def _changed(
         }
         sensor = max(strength, key=lambda each: strength[each])
         chi, df = tests[sensor]
-        if not (df > 0 and chi > critical_value(df, FALSE_ALARM / len(dims))):
+        if not (df > 0 and chi > critical_value(df, FALSE_ALARM / len(dims)) + second_order):
             break
         own = total.without(taken)
         change = response_change(own, sensor, begin, end, int(first[sensor]))
         changes.append(change)
         added[first[sensor] : first[sensor + 1]] = variance_of_changes(own, sensor)
+        second_order += SECOND_ORDER * chi * float(added[first[sensor] : first[sensor + 1]].max())
         left.remove(sensor)
         taken.append(sensor)
     return tuple(changes), added
@@ -483,7 +541,7 @@ class _Scores:
         self._i, self._j = np.array(list(combinations(range(n_channels), 2))).T
         self._n_channels = n_channels
         n_pairs = len(self._i)
-        self._score = np.zeros((n_parts, n_pairs))
+        self.score = np.zeros((n_parts, n_pairs))
         self._theory, self._own = np.zeros(n_pairs), np.zeros(n_pairs)
 
     def add(self, found: Regression, correlation: FloatArray) -> None:
@@ -493,20 +551,27 @@ class _Scores:
         averages = 1 / np.mean(1 / found.averages)
         own = np.einsum("fpp->fp", found.projector).real
         inverse = fisher.covariance(np.abs(found.projector) ** 2)
-        noise = np.einsum("fpq,bfq->bfp", inverse, np.einsum("bfpp->bfp", found.covariance) - own)
+        covariance = found.covariance
+        noise = np.einsum("fpq,bfq->bfp", inverse, np.einsum("bfpp->bfp", covariance) - own)
         for low in range(0, len(self._i), at_once):
             some = slice(low, low + at_once)
             i, j = self._i[some], self._j[some]
             projector = found.projector
             with_noise = 2 * (projector[:, :, i].conj() * projector[:, :, j]).real
-            score = 2 * found.covariance[:, :, i, j]
+            score = 2 * covariance[:, :, i, j]
             score -= np.einsum("bfp,fpa->bfa", noise, with_noise)
             known = 2 * (projector[:, i, j] ** 2 + projector[:, i, i] * projector[:, j, j]).real
             known -= np.einsum("fpa,fpq,fqa->fa", with_noise, inverse, with_noise)
             root = np.sqrt(np.clip(known, 0.0, None))
-            self._score[:, some] += score.sum(axis=1)
+            self.score[:, some] += score.sum(axis=1)
             self._theory[some] += np.einsum("fa,fg,ga->a", root, correlation, root) / averages
             self._own[some] += known.sum(axis=0)
+
+    def of_parts(self, some: BoolArray) -> _Scores:
+        """Return those of some parts."""
+        found = copy.copy(self)
+        found.score = self.score[some]
+        return found
 
     def inflation(self, levels: Levels) -> float:
         """Return the variance of the scores of pairs over that for steady noise.
@@ -516,10 +581,10 @@ class _Scores:
         means.
         """
         significant = self._own > 0.1 * max(self._own.max(), np.finfo(np.float64).tiny)
-        n_parts = len(self._score)
+        n_parts = len(self.score)
         ratio = 1.0
         if significant.any():
-            found = self._score.var(axis=0, ddof=1)
+            found = self.score.var(axis=0, ddof=1)
             ratio = float(np.mean(found[significant] / self._theory[significant]))
         # The number of independent scores is about the number of channels.
         error = float(np.sqrt(2 / ((n_parts - 1) * self._n_channels)))

@@ -57,8 +57,8 @@ class Regression:
 
     Attributes
     ----------
-    covariance : float64, shape (n_parts, n_bins, n_channels, n_channels)
-        Real part, whose expectation is the projector if the noise is steady.
+    left : complex128, shape (n_parts, n_bins, n_channels, n_channels)
+        Averages of what the regression leaves.
     coefficients : complex128, shape (n_parts, n_bins, n_channels, n_factors)
         ``D_k``.
     motion : complex128, shape (n_parts, n_bins, n_factors, n_factors)
@@ -72,13 +72,19 @@ class Regression:
         From units to whitened channels.
     """
 
-    covariance: FloatArray
+    left: ComplexArray
     coefficients: ComplexArray
     motion: ComplexArray
     directions: ComplexArray
     projector: ComplexArray
     averages: FloatArray
     scale: FloatArray
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Real part of the noise's: its expectation is the projector if the noise is steady."""
+        n = self.averages[:, None, None, None]
+        return np.asarray(self.left.real * ((n + self.directions.shape[2]) / n))
 
 
 def regression(parts: Divided, at: Maximum) -> Regression:
@@ -97,10 +103,8 @@ def regression(parts: Divided, at: Maximum) -> Regression:
     beside = at.projector
     PSU = beside @ SU
     D = np.linalg.solve(across.swapaxes(2, 3), PSU.swapaxes(2, 3)).swapaxes(2, 3)
-    left = (beside @ S @ beside - D @ PSU.conj().swapaxes(2, 3)).real
-    free = (n - q) / n
     return Regression(
-        covariance=left / free[:, None, None, None],
+        left=beside @ S @ beside - D @ PSU.conj().swapaxes(2, 3),
         coefficients=D,
         motion=n[:, None, None, None] * across,
         directions=U,
@@ -220,6 +224,15 @@ class ResponseScores:
     def weighted(self, level: FloatArray) -> ResponseScores:
         """Return the scores where the noise has `level` in each part, shape (n_parts,)."""
         return self._like(self.score / level[:, None], self.information / level[:, None, None])
+
+    def centred(self) -> ResponseScores:
+        """Return the scores beside the mean of responses over all parts, which is that of the fit.
+
+        The fit is of other averages where parts were left out.
+        """
+        inverse = np.linalg.pinv(self.information.sum(axis=0), rcond=1e-9, hermitian=True)
+        mean = inverse @ self.score.sum(axis=0)
+        return self._like(self.score - self.information @ mean, self.information)
 
     def without(self, sensors: Sequence[int]) -> ResponseScores:
         """Return what is left of the scores after the changes of some sensors are fitted."""

@@ -684,8 +684,9 @@ def _responses_change(advice: ResponseChanges, names: Names) -> Explanation:
             if advice.is_turn
             else f"{percent(advice.size_error)}"
         )
-        + f"). This leaves up to {percent(advice.variance)} of the motion's PSD in the noise of "
-        f"{own}; the interval includes it.",
+        + f"). Over all segments, this leaves up to {percent(advice.variance)} of the motion's PSD "
+        f"in the noise of {own}. Noise is estimated within parts of time where these have enough "
+        "averages; intervals include what is left.",
         f"{_remedy(advice).capitalize()} and record again, or estimate the time before or after "
         "(--start, --end).",
     )

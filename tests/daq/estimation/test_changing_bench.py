@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import huddle
 from daq.estimation.settings import Settings
+from daq.results.band_summary import levels
 from daq.results.calibration import calibrate
 from estimator.checks.advice import NoiseChanges, ResponseChanges
 from tui.wording.findings import Names, alert
@@ -80,6 +81,20 @@ def test_a_response_that_changes_is_named_sized_and_dated(
     own = slice(3, 6)
     low, high = noise.low[inside, own], noise.high[inside, own]
     assert np.mean((low <= NOISE) & (high >= NOISE)) > 0.93
+
+
+@pytest.mark.parametrize(("kind", "most"), [("step", 1.0), ("ramp", 2.5), ("settles", 1.0)])
+def test_levels_within_parts_are_those_of_a_steady_bench(kind: str, most: float) -> None:
+    """Over all parts, motion 60 dB above the noise leaves up to 28 dB in it."""
+    snapshot = estimated(kind, 3, ratio=1e6)
+    found = levels(
+        snapshot.results["three-sensor"], snapshot, Settings(), np.array([5, 20, 45, 90])
+    )
+    assert np.abs(10 * np.log10(found.mean / NOISE)).max() < most
+    noise = snapshot.results["three-sensor"]
+    inside = slice(5, 90)
+    assert np.mean((noise.low[inside] <= NOISE) & (noise.high[inside] >= NOISE)) > 0.93
+    assert snapshot.n_effective < 420  # of 455: every part has spent three
 
 
 def test_gains_that_follow_one_temperature_are_found() -> None:

@@ -11,6 +11,7 @@ from daq.formats.arrays import recording_of_arrays
 from daq.results.band_summary import levels
 from daq.results.facts import NotLinear, Rank
 from daq.results.known_facts import facts_of
+from estimator.checks.advice import ResponseChanges
 
 RATE, N_SAMPLES = 100.0, 30_000
 EDGES = np.array([1.0, 5.0, 10.0, 20.0, 40.0])
@@ -53,3 +54,18 @@ def test_a_linear_bench_has_no_such_fact_and_the_same_numbers() -> None:
     assert not one.nonlinear
     for name, noise in one.results.items():
         np.testing.assert_array_equal(noise.noise_psd, other.results[name].noise_psd)
+
+
+def test_a_square_is_no_change_of_a_gain() -> None:
+    """It follows the loudness of the motion, as a gain that changes would."""
+    rng = np.random.default_rng([47, 1])
+    motion = 1e3 * rng.standard_normal((N_SAMPLES, 3))
+    arrays = {}
+    for name in "ABC":
+        felt = motion @ np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        if name == "A":
+            felt[:, 0] += 2e-2 * felt[:, 0] ** 2 / felt[:, 0].std()
+        arrays[name] = felt + rng.standard_normal((N_SAMPLES, 3))
+    snapshot = estimate([recording_of_arrays(arrays, sampling_rate=RATE)], Settings(segment=2.5))
+    assert snapshot.nonlinear[0].column == 0
+    assert not [e for e in snapshot.diagnostics.advice if isinstance(e, ResponseChanges)]
