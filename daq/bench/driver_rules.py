@@ -44,3 +44,12 @@ class Checking(Protocol):
             Naming the sensor, its key, the value and what was expected.
         """
         ...
+
+
+@runtime_checkable
+class Ranged(Protocol):
+    """A driver that knows the full scale of a sensor before the port is opened."""
+
+    def full_scale(self, sensor: Sensor) -> float | None:
+        """Return the largest count of the sensor's channels; None if unknown."""
+        ...

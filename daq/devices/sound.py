@@ -132,6 +132,10 @@ class SoundDriver:
         del sensor
         return np.dtype(np.int32)
 
+    def full_scale(self, sensor: Sensor) -> float | None:  # noqa: ARG002 -- interface
+        """See :meth:`daq.bench.driver_rules.Ranged.full_scale`."""
+        return FULL_SCALE
+
     def check(self, sensors: Sequence[Sensor]) -> None:
         """See :meth:`daq.devices.interface.Checking.check`."""
         _inputs(sensors)

@@ -93,6 +93,8 @@ class Problem(enum.StrEnum):
     """The device states neither a counter nor times: missing samples would not be seen."""
     UNEVEN = "uneven"
     """Samples arrive too unevenly for the rate to be known well."""
+    LEFT_OUT = "left-out"
+    """It sends nothing: the other checks leave it out, and those that `text` names are moot."""
     TOO_FEW_SAMPLES = "too-few-samples"
     """It has not sent enough samples."""
     TOO_SLOW = "too-slow"
@@ -123,7 +125,7 @@ class Finding:
     wanted : float
         Rate of the bench file in Hz, or bytes that the recording takes; NaN where there is none.
     text : str
-        Of the error that was raised.
+        Of the error that was raised, or the checks that are moot.
     against : tuple of str
         Sensors that agree with each other, and not with this one.
     cause : Cause or None

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.bench.driver_rules import Ranged
 from daq.bench.units import in_acceleration
+from daq.devices.registry import driver_type
 from daq.errors import WrongDeviceError
 from daq.preflight.common_motion import MIN_RATE, CommonMotion, main_samples, to_acceleration
 from daq.preflight.findings import Check, CheckRow, Finding, Problem
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daq.bench.model import Bench
+    from daq.bench.model import Bench, Sensor
     from daq.preflight.preview import SensorPreview
 
 MIN_SECONDS = 4.0
@@ -53,6 +55,8 @@ OF_CHANNELS = {
     Problem.SENSITIVITY,
 }
 """Problems that all channels of a sensor have for one cause."""
+MOOT = {Problem.TOO_FEW_SENSORS}
+"""Problems that a sensor which sends nothing causes in checks of the others."""
 ALIKE = 1.05
 """Largest over smallest value of the channels of a sensor up to which they have one cause."""
 BYTES_PER_VALUE = 4
@@ -80,18 +84,19 @@ def check_list(
     duration : float, optional
         Of the recording in s; default: that of the bench file.
     """
-    able = [each for each in sensors if not each.trouble and _has_enough(each)]
+    heard = [each for each in sensors if not each.trouble and len(each.samples)]
+    able = [each for each in heard if _has_enough(each)]
     fast = [each for each in able if each.sensor.sampling_rate >= MIN_RATE]
     motion = CommonMotion.of(
         [each for each in fast if (np.ptp(main_samples(each), axis=0) > 0).all()]
     )
-    waiting = [_of(Problem.TOO_FEW_SAMPLES, each) for each in sensors if each not in able]
+    waiting = [_of(Problem.TOO_FEW_SAMPLES, each) for each in heard if each not in able]
     slow = [_of(Problem.TOO_SLOW, each) for each in able if each not in fast]
     at_rest = [one for each in able for one in gravity(each)]
     found: dict[Check, list[Finding]] = {
         Check.PORTS: [one for each in sensors for one in _port(each)],
         Check.IDENTITY: [one for each in sensors for one in _identity(each)],
-        Check.RATES: [one for each in sensors for one in _rate(each)],
+        Check.RATES: [one for each in heard for one in _rate(each)],
         Check.CHANNELS: [
             *(one for each in able for one in (*_dead(each), *_repeats(each))),
             *waiting,
@@ -106,7 +111,7 @@ def check_list(
             *slow,
         ],
         Check.POLARITY: [*wrong_polarity(motion), *waiting, *slow],
-        Check.CLOCKS: [one for each in sensors for one in _clock(each)],
+        Check.CLOCKS: [one for each in heard for one in _clock(each)],
         Check.DISK: list(_disk(bench, duration)),
     }
     polarity = found[Check.POLARITY]
@@ -115,6 +120,19 @@ def check_list(
         for one in at_rest
         if one.problem is Problem.SWAPPED and one.sensor not in {known.sensor for known in polarity}
     ]
+    if len(heard) < len(sensors):
+        moot = [
+            check
+            for check, several in found.items()
+            if check not in {Check.PORTS, Check.DISK}
+            and (not (heard or several) or any(one.problem in MOOT for one in several))
+        ]
+        found = {check: several for check, several in found.items() if check not in moot}
+        found[Check.PORTS] += [
+            Finding(Problem.LEFT_OUT, each.sensor.name, text=", ".join(moot))
+            for each in sensors
+            if each not in heard
+        ]
     return tuple(
         row
         for check, several in found.items()
@@ -179,8 +197,8 @@ def _port(each: SensorPreview) -> Iterator[Finding]:
 
 def _identity(each: SensorPreview) -> Iterator[Finding]:
     if each.information is None:
-        yield _of(Problem.TOO_FEW_SAMPLES, each)
-    elif _is_wrong_device(each):
+        return  # a problem of the port
+    if _is_wrong_device(each):
         yield Finding(Problem.WRONG_DEVICE, each.sensor.name, text=each.trouble)
     elif not each.information.serial_number:
         yield _of(Problem.NO_SERIAL_NUMBER, each)
@@ -190,9 +208,6 @@ def _identity(each: SensorPreview) -> Iterator[Finding]:
 
 def _rate(each: SensorPreview) -> Iterator[Finding]:
     rate, n_samples = each.sensor.sampling_rate, len(each.samples)
-    if each.trouble or not n_samples:
-        yield _of(Problem.TOO_FEW_SAMPLES, each)
-        return
     if each.measured_rate is None:
         yield _of(Problem.UNEVEN, each, each.arrival_scatter)
     elif abs(each.measured_rate / rate - 1) > max(RATE_ERROR, SIGNIFICANCE * each.rate_error):
@@ -206,9 +221,6 @@ def _rate(each: SensorPreview) -> Iterator[Finding]:
 
 
 def _clock(each: SensorPreview) -> Iterator[Finding]:
-    if each.trouble or not len(each.samples):
-        yield _of(Problem.TOO_FEW_SAMPLES, each)
-        return
     if each.measured_rate is None or each.arrival_scatter > UNEVEN:
         yield _of(Problem.UNEVEN, each, each.arrival_scatter)
         return
@@ -243,18 +255,33 @@ def _levels(each: SensorPreview) -> Iterator[Finding]:
     if each.is_clipping:
         yield _of(Problem.CLIPPING, each)
         return
-    sheet = each.sensor.data_sheet
-    if sheet is None or sheet.full_scale is None:
+    sheet, counts = each.sensor.data_sheet, _full_scale(each.sensor)
+    if counts is None and (sheet is None or sheet.full_scale is None):
         yield _of(Problem.NO_FULL_SCALE, each)
         return
     for channel, values in zip(each.sensor.channels, each.samples.T, strict=True):
-        if channel.auxiliary or (sheet.channels and channel.name not in sheet.channels):
+        if channel.auxiliary:
             continue
-        own, of_sheet = in_acceleration(channel.unit), in_acceleration(sheet.unit or channel.unit)
-        scale = 1.0 if own is None or of_sheet is None else own / of_sheet
-        share = float(np.abs(values).max()) * scale / sheet.full_scale
+        most = float(np.abs(values).max())
+        share = most * abs(channel.sensitivity) / (counts or math.inf)
+        has_sheet = sheet is not None and (not sheet.channels or channel.name in sheet.channels)
+        if sheet is not None and has_sheet and sheet.full_scale:
+            own, of_sheet = (
+                in_acceleration(channel.unit),
+                in_acceleration(sheet.unit or channel.unit),
+            )
+            scale = 1.0 if own is None or of_sheet is None else own / of_sheet
+            share = max(share, most * scale / sheet.full_scale)
         if share > NEAR:
             yield Finding(Problem.NEAR_FULL_SCALE, each.sensor.name, channel.name, value=share)
+
+
+def _full_scale(sensor: Sensor) -> float | None:
+    """Return the largest count, if the driver or the type of the counts states one."""
+    driver = driver_type(sensor.driver)
+    if isinstance(driver, Ranged):
+        return driver.full_scale(sensor)
+    return float(np.iinfo(np.int16).max) if driver.counts_dtype(sensor) == np.int16 else None
 
 
 def _hum(able: Sequence[SensorPreview]) -> Iterator[Finding]:

@@ -70,11 +70,12 @@ SENTENCES: Mapping[Problem, str] = {
     Problem.NO_SERIAL_NUMBER: "not checked, because {sensor} states no serial number",
     Problem.NOT_IN_FILE: "not checked, because the bench file has no serial number of {sensor}:"
     " huddle check --write adds it",
-    Problem.NO_FULL_SCALE: "not checked, because the bench file has no full scale of {sensor}: give"
-    " full_scale in its data_sheet",
+    Problem.NO_FULL_SCALE: "not checked, because the full scale of {sensor} is not known: give"
+    " full_scale in the data_sheet of the bench file",
     Problem.UNCOUNTED: "rates as in the bench file; not checked whether samples are missing,"
     " because {sensor} sends no counter and no times",
     Problem.UNEVEN: "not checked, because the samples of {sensor} arrive unevenly",
+    Problem.LEFT_OUT: "the other checks leave out {sensor}{moot}",
     Problem.TOO_FEW_SAMPLES: "not checked, because {sensor} has not sent enough samples",
     Problem.TOO_SLOW: "not checked, because {sensor} is sampled too slowly",
     Problem.TOO_FEW_SENSORS: "not checked, because fewer than three sensors can be compared",
@@ -85,7 +86,8 @@ SENTENCES: Mapping[Problem, str] = {
 MERGED = frozenset(
     {
         Problem.NO_SERIAL_NUMBER, Problem.NOT_IN_FILE, Problem.NO_FULL_SCALE, Problem.UNEVEN,
-        Problem.UNCOUNTED, Problem.TOO_FEW_SAMPLES, Problem.TOO_SLOW, Problem.NOT_COMPARABLE,
+        Problem.UNCOUNTED, Problem.LEFT_OUT, Problem.TOO_FEW_SAMPLES, Problem.TOO_SLOW,
+        Problem.NOT_COMPARABLE,
     }
 )  # fmt: skip
 """Problems of several sensors that are one line."""
@@ -106,6 +108,7 @@ def sentence(finding: Finding, sensors: Sequence[str] = ()) -> str:
         value=finding.value,
         wanted=finding.wanted,
         text=finding.text,
+        moot=f"; not made: {finding.text}" if finding.text else "",
         free=_size(finding.value),
         needed=_size(finding.wanted),
     )

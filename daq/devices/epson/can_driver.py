@@ -305,6 +305,10 @@ class EpsonCanDriver:
         del sensor
         return np.dtype(np.int32)
 
+    def full_scale(self, sensor: Sensor) -> float | None:
+        """See :meth:`daq.bench.driver_rules.Ranged.full_scale`."""
+        return EpsonCanSettings.model_validate(sensor.settings).full_scale * COUNTS_PER_G
+
     def check(self, sensors: Sequence[Sensor]) -> None:
         """See :meth:`daq.devices.interface.Checking.check`."""
         _settings(sensors)

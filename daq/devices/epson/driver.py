@@ -205,6 +205,11 @@ class EpsonDriver:
         """Return int32, for all fields including temperature."""
         return np.dtype(np.int32)
 
+    def full_scale(self, sensor: Sensor) -> float | None:
+        """See :meth:`daq.bench.driver_rules.Ranged.full_scale`."""
+        settings = EpsonSettings.model_validate(sensor.settings)
+        return None if settings.tilt else settings.full_scale * commands.COUNTS_PER_G
+
     def check(self, sensors: Sequence[Sensor]) -> None:
         """See :meth:`daq.devices.interface.Checking.check`."""
         _configured(sensors)

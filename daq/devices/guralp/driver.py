@@ -26,6 +26,7 @@ import numpy as np
 
 from daq.devices.guralp.gcf import component, serial_number
 from daq.devices.guralp.links import GuralpSettings, open_link
+from daq.devices.guralp.streams import FULL_SCALE_COUNTS
 from daq.devices.interface import DeviceInformation
 from daq.devices.port_rules import port_label, require_address, require_alike
 from daq.errors import (
@@ -119,6 +120,10 @@ class GuralpDriver:
     def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:  # noqa: ARG002 -- interface
         """Return int32."""
         return np.dtype(np.int32)
+
+    def full_scale(self, sensor: Sensor) -> float | None:  # noqa: ARG002 -- interface
+        """See :meth:`daq.bench.driver_rules.Ranged.full_scale`."""
+        return FULL_SCALE_COUNTS
 
     def check(self, sensors: Sequence[Sensor]) -> None:
         """See :meth:`daq.devices.interface.Checking.check`."""

@@ -290,9 +290,9 @@ def test_channels_of_another_quantity_are_refused_without_a_unit_for_all() -> No
     velocity = THREE.replace('name = "x"', 'name = "x"\nunit = "mm/s"', 1)
     assert faults(HEAD + velocity) == [
         (
-            'bench.toml: sensors["a"].channels["x"].unit = "mm/s": expected a unit of the quantity of'
-            " most channels, such as m/s²; if the sensor measures another motion, set the unit of"
-            " [estimate]"
+            'bench.toml: sensors["a"].channels["x"].unit = "mm/s": expected a unit of the quantity'
+            " of most channels, such as m/s²; if the sensor measures another motion, set the unit"
+            " of [estimate]"
         )
     ]
     assert len(read(HEAD + velocity + '[estimate]\nunit = "m/s²"\n').sensors) == 3

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -122,11 +122,13 @@ def test_each_fault_is_found_where_it_is() -> None:
         (Problem.CLIPPING, "B", ""),
         (Problem.HUM, "B", "Z"),
     ]
-    # Two sensors without a third say nothing of each other.
-    unknown = {
-        row.check for row in check_list(BENCH, sensors) if row.outcome is Outcome.NOT_CHECKED
+    # Two sensors without a third say nothing of each other: one line, whatever is moot.
+    rows = check_list(BENCH, sensors)
+    (left_out,) = (row.finding for row in rows if row.outcome is Outcome.NOT_CHECKED)
+    assert left_out == Finding(Problem.LEFT_OUT, "C", text="motion, sensitivities, polarity")
+    assert {row.check for row in rows} == set(Check) - {
+        *(Check.MOTION, Check.SENSITIVITIES, Check.POLARITY),
     }
-    assert unknown >= {Check.SENSITIVITIES, Check.POLARITY, Check.MOTION, Check.IDENTITY}
     silent = replace(a, samples=a.samples[:0])
     assert failures([silent, b, c])[0] == (Problem.NO_SAMPLES, "A", "")
 
@@ -178,22 +180,40 @@ def test_identities_are_compared_and_unknown_ones_are_no_success() -> None:
         Problem.WRONG_DEVICE,
         Problem.NO_SERIAL_NUMBER,
     ]
-    assert [row for row in rows if row.check is Check.PORTS] == [CheckRow(Check.PORTS)]
+    (left_out,) = [row.finding for row in rows if row.check is Check.PORTS]
+    assert (left_out and left_out.problem, left_out and left_out.sensor) == (Problem.LEFT_OUT, "A")
+
+
+def test_nothing_passes_where_nothing_is_sent() -> None:
+    trouble = "no answer"
+    silent = [
+        replace(each, trouble=trouble, information=None, samples=each.samples[:0])
+        for each in previews()
+    ]
+    rows = check_list(BENCH, silent)
+    assert {row.check for row in rows if row.outcome is Outcome.PASSED} == {Check.DISK}
+    assert [row.outcome for row in rows].count(Outcome.FAILED) == 3
 
 
 def test_levels_near_full_scale_and_unknown_ones() -> None:
     a, b, c = previews()
+    no_sheet: dict[str, Any] = {"data_sheet": None}
     found = findings(
         [
             replace(a, samples=a.samples + np.array([0, 95.0, 0])),
-            replace(b, sensor=b.sensor.model_copy(update={"data_sheet": None})),
-            c,
+            replace(b, sensor=b.sensor.model_copy(update=no_sheet | {"driver": "nidaqmx"})),
+            replace(c, sensor=c.sensor.model_copy(update=no_sheet)),  # its driver knows
         ]
     )
     assert found[0].problem is Problem.NEAR_FULL_SCALE
     assert (found[0].sensor, found[0].channel) == ("A", "Y")
     assert found[0].value == pytest.approx(0.95, abs=0.01)
-    assert (Problem.NO_FULL_SCALE, "B") in {(each.problem, each.sensor) for each in found}
+    assert [e.sensor for e in found if e.problem is Problem.NO_FULL_SCALE] == ["B"]
+    beyond = replace(c, samples=c.samples + np.array([0, 0, 14.0 * 9.80665]))
+    beyond = replace(beyond, sensor=c.sensor.model_copy(update=no_sheet))
+    (near,) = (e for e in findings([a, b, beyond]) if e.problem is Problem.NEAR_FULL_SCALE)
+    assert (near.sensor, near.channel) == ("C", "Z")
+    assert near.value == pytest.approx(14 / 15, abs=0.01)
 
 
 def test_mains_of_all_sensors_may_be_motion() -> None:
