@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.results.band_summary import channel_means
+from daq.results.result import Result
 from estimator.levels.bands import band_edges
 from tui.studies.study import Panel, Point, Series, Study
 
@@ -123,7 +123,7 @@ def _coverage(
     band: tuple[float, float],
 ) -> float:
     """Return the share of channels whose interval holds the true mean over a band."""
-    means = channel_means(snapshot.results[method], snapshot, settings, band)
+    means = Result(snapshot, settings).means(method, band)
     here = slice(*band_edges(snapshot.frequency, band))
     width = np.gradient(snapshot.frequency)[here]
     truth = np.average(noise_psd[here], axis=0, weights=width)

@@ -17,8 +17,7 @@ from daq.devices.bench_file import parse
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
-from daq.results.band_summary import channel_means
-from daq.results.decision.limits import judge
+from daq.results.result import Result
 from estimator.decision.verdict import Verdict
 
 RATE, SECONDS = 100.0, 600.0
@@ -66,7 +65,7 @@ def random_benches(n_benches: int, seed: int) -> None:
         held += [
             float(mean.low[0]) <= TRUTH <= float(mean.high[0])
             for band in BANDS
-            for mean in channel_means(noise, snapshot, SETTINGS, band)
+            for mean in Result(snapshot, SETTINGS).means(noise.method, band)
         ]
         factors = 2.0 ** rng.choice([-1, 1], len(snapshot.channels))
         limits = tuple(
@@ -79,7 +78,7 @@ def random_benches(n_benches: int, seed: int) -> None:
             )
             for label, factor in zip(snapshot.channels, factors.tolist(), strict=True)
         )
-        found = judge(BENCH.model_copy(update={"limits": limits}), snapshot, SETTINGS)
+        found = Result(snapshot, SETTINGS, BENCH.model_copy(update={"limits": limits})).verdict
         assert found is not None
         for result, factor in zip(found.limits, factors.tolist(), strict=True):
             right = Verdict.PASS if factor > 1 else Verdict.FAIL
@@ -104,7 +103,7 @@ def plumb() -> None:
             snapshot = estimate([recording_of_arrays(samples, RATE)], SETTINGS)
             ((method, noise),) = snapshot.results.items()
             for band in BANDS:
-                for mean in channel_means(noise, snapshot, SETTINGS, band):
+                for mean in Result(snapshot, SETTINGS).means(noise.method, band):
                     held.append(float(mean.low[0]) <= TRUTH <= float(mean.high[0]))
                     low, high = max(float(mean.low[0]), 0.0), float(mean.high[0])
                     ends.append(10 * np.log10(high / TRUTH))

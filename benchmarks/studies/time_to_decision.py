@@ -20,7 +20,7 @@ from benchmarks.studies.leaning import BENCH
 from daq.bench.model import Bench, Limit
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import ChannelLabel, Snapshot
-from daq.results.decision.limits import judge
+from daq.results.result import Result
 from estimator.methods import self_noise
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import effective_averages, get_window
@@ -127,7 +127,7 @@ def test_of(rng: np.random.Generator) -> Ended | None:
             drift=np.empty((0, 1 + len(DIMS))),
             closed=False,
         )
-        verdict = judge(bench, snapshot, SETTINGS)
+        verdict = Result(snapshot, SETTINGS, bench).verdict
         if verdict is None:
             raise ValueError("the bench has no limits")
         if verdict.is_sure:

@@ -16,7 +16,7 @@ from daq.bench.channel import Channel
 from daq.bench.model import Bench, Limit, Sensor
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import ChannelLabel, Snapshot
-from daq.results.decision.limits import judge
+from daq.results.result import Result
 from estimator.decision.verdict import Verdict
 from estimator.errors import InsufficientDataError
 from estimator.methods import self_noise
@@ -123,7 +123,7 @@ class SimulatedTest:
 
     def verdict(self, limit_psd: float) -> TestVerdict:
         """Return the verdict so far."""
-        found = judge(_bench(limit_psd), self._snapshot(), self.settings)
+        found = Result(self._snapshot(), self.settings, _bench(limit_psd)).verdict
         if found is None:
             raise ValueError("the bench has no limits")
         return found

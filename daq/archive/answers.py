@@ -31,6 +31,7 @@ from daq.results.facts import (
     SpectraUnreadable,
     StretchesLeftOut,
 )
+from daq.results.result import Result
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -71,11 +72,10 @@ class Answer:
 
     Attributes
     ----------
-    pooled : Snapshot
+    result : Result
         The estimate from all recordings together.
-    settings : Settings
     method : str
-        That of all but `pooled`.
+        That of all but `result`.
     bands : tuple of (float, float)
         In Hz: the band of the estimate, then octaves, unless a band was asked for.
     days_utc_ns : int64, shape (n_days,)
@@ -101,8 +101,7 @@ class Answer:
         Segments that other channels have and a channel lacks, by its name: they are not used.
     """
 
-    pooled: Snapshot
-    settings: Settings
+    result: Result
     method: str
     bands: tuple[tuple[float, float], ...]
     days_utc_ns: IntArray
@@ -117,6 +116,11 @@ class Answer:
     problems: tuple[str, ...]
     doubted: tuple[Described, ...]
     lacking: Mapping[str, int]
+
+    @property
+    def pooled(self) -> Snapshot:
+        """The snapshot of `result`."""
+        return self.result.snapshot
 
 
 @one_blas_thread()
@@ -194,8 +198,7 @@ def answer(
     mean, spread = (each.reshape(-1, n_series) for each in (levels.mean, levels.spread))
     parts = {day: (n, total.reshape(3, n_series)) for day, (n, total) in tally.local.items()}
     return Answer(
-        pooled=snapshot,
-        settings=settings,
+        result=Result(snapshot, settings),
         method=judged_method(snapshot, plan.noise_settings(settings)),
         bands=tally.bands,
         days_utc_ns=days,

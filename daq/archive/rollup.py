@@ -21,7 +21,7 @@ import numpy as np
 from daq.archive.averages import Average, Estimator
 from daq.archive.density import counted
 from daq.archive.spectra_file import DAY_NS, Summary
-from daq.results.band_summary import Levels, band_within, correlation_of, levels
+from daq.results.band_summary import Levels, Spectrum, band_within, correlation_of
 from estimator.errors import BandError
 from estimator.levels.bands import BandLevels, band_edges
 from estimator.levels.contributions import Contribution, Source
@@ -328,7 +328,7 @@ class _Making:
         row[RECORDED] = grid.mean(snapshot.data_psd)
         result = next(iter(snapshot.results.values()), None)
         if result is not None:
-            found = levels(result, snapshot, self._estimator.settings, grid.edges)
+            found = Spectrum(result, snapshot, self._estimator.settings).levels(grid.edges)
             t2, t3, t4 = found.of_scatter.cumulants
             with np.errstate(invalid="ignore", divide="ignore"):
                 row[DEVIATION] = np.sqrt(np.maximum(t2, 0.0))

@@ -7,7 +7,9 @@ are named here, too.
 from __future__ import annotations
 
 import enum
+import math
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,9 +17,11 @@ import numpy as np
 from daq.estimation.contributions import contributions, shared_parts
 from daq.estimation.noise_estimates import ALL_METHODS
 from estimator.checks.advice import NoSharedMotion
-from estimator.levels.bands import band_edges, band_levels, bin_correlation
+from estimator.levels.bands import band_edges, band_levels, bin_correlation, third_octaves
 from estimator.levels.contributions import Source, by_chance, deviation, widened
 from estimator.levels.interval import NORMAL_95, interval, unpredicted
+from estimator.median import median_of_columns
+from estimator.self_noise.result import Flag
 from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:
@@ -235,26 +239,175 @@ class Spectrum:
         return inside.start, rest, scatter
 
 
-def levels(
-    noise: SelfNoise, snapshot: Snapshot, settings: Settings, edges: NDArray[np.int64]
-) -> Levels:
-    """Return the noise of every channel in bands: `Spectrum.levels`."""
-    return Spectrum(noise, snapshot, settings).levels(edges)
+@dataclass(frozen=True, slots=True)
+class Precision:
+    """Scatter of the noise, beside the scatter that is wanted.
+
+    Attributes
+    ----------
+    cov : float
+        In the worst third of an octave of the band, of the worst channel that has an estimate; NaN
+        where there is none. See `Estimate.covs_of`.
+    target : float or None
+    seconds_left : float or None
+        Until the target is reached, at the pace so far; None without a target or an estimate.
+    total : float or None
+        Length of the recording that reaches the target, in seconds.
+    """
+
+    cov: float
+    target: float | None
+    seconds_left: float | None
+    total: float | None
+
+    @property
+    def is_reached(self) -> bool:
+        """Whether there is a target, and it is reached."""
+        return self.target is not None and self.cov <= self.target
 
 
-def channel_means(
-    noise: SelfNoise,
-    snapshot: Snapshot,
-    settings: Settings,
-    band: tuple[float, float],
-    *,
-    quantile: float = NORMAL_95,
-    without: Collection[Source] = (),
-) -> tuple[BandMeans, ...]:
-    """Return the mean noise of every channel in a band, each with its interval: `levels` of one."""
-    found = levels(noise, snapshot, settings, band_edges(snapshot.frequency, band))
-    columns = range(len(snapshot.channels))
-    return tuple(found.of_channel(column, quantile, without=without) for column in columns)
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """A snapshot with its settings, and what follows from both: each derived once, when wanted.
+
+    Attributes
+    ----------
+    snapshot : Snapshot
+    settings : Settings
+    """
+
+    snapshot: Snapshot
+    settings: Settings
+    _spectra: dict[str, Spectrum] = field(default_factory=dict, init=False, repr=False)
+    _means: dict[tuple[str, tuple[float, float], frozenset[Source]], tuple[BandMeans, ...]] = field(
+        default_factory=dict, init=False, repr=False
+    )
+
+    @cached_property
+    def band(self) -> tuple[float, float]:
+        """The band of the tables, in Hz: `band_of`."""
+        return band_of(self.settings, self.snapshot)
+
+    @cached_property
+    def method(self) -> str:
+        """The method that judges, also where it gives no result: `judged_method`."""
+        return judged_method(self.snapshot, self.settings)
+
+    @property
+    def noise(self) -> SelfNoise | None:
+        """The noise by the method that judges; None where it gives no result."""
+        return self.snapshot.results.get(self.method)
+
+    @cached_property
+    def data(self) -> FloatArray:
+        """Mean PSD of what each channel recorded in the band, shape (n_channels,)."""
+        return data_means(self.snapshot, self.band)
+
+    @cached_property
+    def alone(self) -> dict[int, WithoutPartner]:
+        """Channels, by column, whose noise cannot be told from motion in the band."""
+        return without_partners(self.snapshot, self.band)
+
+    def spectrum(self, method: str) -> Spectrum:
+        """Return the noise by a method, from which levels of any bands are made."""
+        if method not in self._spectra:
+            noise = self.snapshot.results[method]
+            self._spectra[method] = Spectrum(noise, self.snapshot, self.settings)
+        return self._spectra[method]
+
+    def means(
+        self,
+        method: str,
+        band: tuple[float, float] | None = None,
+        *,
+        without: frozenset[Source] = frozenset(),
+    ) -> tuple[BandMeans, ...]:
+        """Return the mean noise of every channel by a method in a band, with its interval.
+
+        Parameters
+        ----------
+        method : str
+            One of the snapshot's results.
+        band : (float, float), optional
+            In Hz; default: that of the tables.
+        without : frozenset of Source
+            Contributions that do not count.
+
+        Raises
+        ------
+        BandError
+            If no frequency lies in the band.
+        """
+        key = method, self.band if band is None else band, without
+        if key not in self._means:
+            found = self.levels(method, key[1])
+            columns = range(len(self.snapshot.channels))
+            self._means[key] = tuple(found.of_channel(n, without=without) for n in columns)
+        return self._means[key]
+
+    @cached_property
+    def covs(self) -> list[float]:
+        """The c.o.v. of every channel by the method that judges: `covs_of`."""
+        return self.covs_of(self.method)
+
+    def covs_of(self, method: str) -> list[float]:
+        """Return the c.o.v. of every channel in the worst third of an octave of the band.
+
+        With `Settings.target_cov_bin` it is that of single frequencies, median in the band. NaN
+        where there is none, or a bound.
+        """
+        snapshot, settings = self.snapshot, self.settings
+        noise = snapshot.results.get(method)
+        edges = third_octaves(snapshot.frequency, *self.band)
+        if noise is None or edges.size < 2:
+            return [math.nan] * len(snapshot.channels)
+        if settings.target_cov_bin is not None:
+            cov = noise.cov[edges[0] : edges[-1]]
+            medians = median_of_columns(np.where(np.isfinite(cov), cov, np.nan))
+            return [float(median) for median in medians]
+        width, correlation = np.gradient(snapshot.frequency), correlation_of(settings)
+        found = band_levels(noise.noise_psd, noise.cumulants, edges, correlation, weights=width)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            cov = np.where(np.isfinite(found.mean), found.spread / np.abs(found.mean), -np.inf)
+        bounds = (noise.flags[edges[0] : edges[-1]] & Flag.UNIDENTIFIED) != 0
+        worst = np.where(bounds.any(axis=0), -np.inf, cov.max(axis=0))  # no precision of a bound
+        return [math.nan if each < 0 else each for each in worst.tolist()]
+
+    def precision(self, target: float | None = None) -> Precision:
+        """Return the c.o.v. of the method that judges, and when it reaches its target.
+
+        Without `target` that of the settings. The c.o.v. falls with the root of the averages, and
+        averages come at a steady pace. It is unknown where sensors are left out of a live estimate.
+        """
+        snapshot, settings = self.snapshot, self.settings
+        known = [cov for cov in self.covs if math.isfinite(cov)]
+        if snapshot.not_estimated:
+            known = []
+        cov = max(known, default=math.nan)
+        target = target or settings.target_cov_bin or settings.target_cov
+        left = total = None
+        if target is not None and known:
+            hop = settings.segment * (1 - settings.overlap)
+            taken = (snapshot.n_segments + snapshot.n_dropped) * hop
+            left = taken * max(0.0, (cov / target) ** 2 - 1)
+            total = snapshot.elapsed + left
+        return Precision(cov=cov, target=target, seconds_left=left, total=total)
+
+    def levels(self, method: str, band: tuple[float, float]) -> Levels:
+        """Return the noise of every channel by a method in one band: `Spectrum.levels`."""
+        return self.spectrum(method).levels(band_edges(self.snapshot.frequency, band))
+
+
+def data_interval(estimate: Estimate) -> tuple[FloatArray, FloatArray]:
+    """Return the 95 % interval of `Estimate.data`, two arrays of shape (n_channels,)."""
+    snapshot = estimate.snapshot
+    psd = snapshot.data_psd
+    averages = averages_at(snapshot, snapshot.frequency)[:, None]
+    cumulants = np.stack([psd**k / averages ** (k - 1) for k in (2, 3, 4)])
+    edges, width = band_edges(snapshot.frequency, estimate.band), np.gradient(snapshot.frequency)
+    correlation = correlation_of(estimate.settings)
+    low, high = band_levels(psd, cumulants, edges, correlation, weights=width).interval()
+    return low[0], high[0]
 
 
 def data_means(snapshot: Snapshot, band: tuple[float, float]) -> FloatArray:
@@ -262,19 +415,6 @@ def data_means(snapshot: Snapshot, band: tuple[float, float]) -> FloatArray:
     inside = slice(*band_edges(snapshot.frequency, band))
     width = np.gradient(snapshot.frequency)[inside]
     return np.asarray(np.average(snapshot.data_psd[inside], axis=0, weights=width))
-
-
-def data_interval(
-    snapshot: Snapshot, settings: Settings, band: tuple[float, float]
-) -> tuple[FloatArray, FloatArray]:
-    """Return the 95 % interval of `data_means`, two arrays of shape (n_channels,)."""
-    psd = snapshot.data_psd
-    averages = averages_at(snapshot, snapshot.frequency)[:, None]
-    cumulants = np.stack([psd**k / averages ** (k - 1) for k in (2, 3, 4)])
-    edges, width = band_edges(snapshot.frequency, band), np.gradient(snapshot.frequency)
-    found = band_levels(psd, cumulants, edges, correlation_of(settings), weights=width)
-    low, high = found.interval()
-    return low[0], high[0]
 
 
 def judged_method(snapshot: Snapshot, settings: Settings) -> str:

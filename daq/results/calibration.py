@@ -10,7 +10,7 @@ import numpy as np
 
 from daq.clocks.clock_model import RelativeTime
 from daq.errors import WrongSettingError
-from daq.results.band_summary import band_of, correlation_of
+from daq.results.band_summary import correlation_of
 from daq.results.clock_effect import relative_time
 from daq.results.uncertainty_budget import Budget, Component, calibrated_budgets, known
 from estimator.errors import InsufficientDataError
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
     from daq.bench.channel import Certificate, Channel
     from daq.bench.model import Bench
-    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import ChannelLabel, Snapshot
+    from daq.results.band_summary import Estimate
     from estimator.responses.calibration import ResponseCurve, SensorCalibration
     from estimator.types import ComplexArray, FloatArray
 
@@ -76,8 +76,7 @@ class Calibration:
 
 
 def calibrate(
-    snapshot: Snapshot,
-    settings: Settings,
+    estimate: Estimate,
     bench: Bench | None,
     *,
     reference: str | None = None,
@@ -87,9 +86,8 @@ def calibrate(
 
     Parameters
     ----------
-    snapshot : Snapshot
-        A finished estimate.
-    settings : Settings
+    estimate : Estimate
+        A finished one.
     bench : Bench or None
         With the certificates of the reference, if it has any.
     reference : str, optional
@@ -104,6 +102,7 @@ def calibrate(
     InsufficientDataError
         If no sensor can be compared with the reference.
     """
+    snapshot = estimate.snapshot
     if not 0 < confidence < 1:
         raise WrongSettingError(f"confidence {confidence:g}: expected a fraction such as 0.95")
     names = snapshot.sensor_names
@@ -114,8 +113,7 @@ def calibrate(
     chosen = chosen if reference is None else names.index(reference)
     certificates = certified[chosen]
     work = _Work(
-        snapshot,
-        settings,
+        estimate,
         bench,
         reference=chosen,
         certificates=certificates,
@@ -166,20 +164,20 @@ class _Work:
 
     def __init__(
         self,
-        snapshot: Snapshot,
-        settings: Settings,
+        estimate: Estimate,
         bench: Bench | None,
         *,
         reference: int,
         certificates: Sequence[Certificate],
         confidence: float,
     ) -> None:
-        self.snapshot, self._settings, self._bench = snapshot, settings, bench
+        snapshot = estimate.snapshot
+        self.snapshot, self._estimate, self._bench = snapshot, estimate, bench
         self._reference, self._confidence = reference, confidence
         name = snapshot.sensor_names[reference]
         self._certificates = certificates
-        self.band = band_of(settings, snapshot)
-        self._correlation = correlation_of(settings)
+        self.band = estimate.band
+        self._correlation = correlation_of(estimate.settings)
         self._first = np.cumsum([0, *snapshot.dims])
         scale = np.ones(len(snapshot.channels))
         own = [label for label in snapshot.channels if label.sensor == name]
@@ -254,8 +252,8 @@ class _Work:
         ``factor / 2 (D'' / D + 2 D' / D conj(K' / K))``.
         """
         f, dims, reference = self.snapshot.frequency, self.snapshot.dims, self._reference
-        window = get_window(self._settings.window, 512)
-        factor = slope_factor(window, 512 / self._settings.segment)
+        window = get_window(self._estimate.settings.window, 512)
+        factor = slope_factor(window, 512 / self._estimate.settings.segment)
         found = channel_responses(self._csm, f, dims=dims)
         ratio, slopes = found.ratio[:, :, reference], found.slopes()[:, :, reference]
         width = np.gradient(f)[1:-1, None]
@@ -374,8 +372,7 @@ class _Work:
                 label = labels[column]
                 calibrated[column] = (gain, combined[label.sensor, label.channel])
         return calibrated_budgets(
-            self.snapshot,
-            self._settings,
+            self._estimate,
             self.band,
             calibrated,
             confidence=self._confidence,

@@ -8,27 +8,27 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from daq.clocks.clock_model import RelativeTime
-from daq.results.band_summary import band_of, judged_method
 
 if TYPE_CHECKING:
-    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from daq.results.band_summary import Estimate
     from estimator.types import FloatArray
 
 NO_EFFECT, NEGLIGIBLE_EFFECT, SMALL_EFFECT = 0.001, 0.01, 0.05
 """Share of the noise that comes from the clocks: below it nothing, negligible, small."""
 
 
-def effect(snapshot: Snapshot, settings: Settings) -> FloatArray:
+def effect(estimate: Estimate) -> FloatArray:
     """Return which share of each channel's noise in the band is expected to come from clocks.
 
     Shape (n_channels,); NaN where it is not known (yet).
     """
+    snapshot = estimate.snapshot
     share = snapshot.diagnostics.synchronisation.noise_bias
-    found = snapshot.results.get(judged_method(snapshot, settings))
+    found = estimate.noise
     if share is None or found is None:
         return np.full(len(snapshot.channels), np.nan)
-    low, high = band_of(settings, snapshot)
+    low, high = estimate.band
     inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
     noise = found.noise_psd[inside]
     known = np.isfinite(share[inside] * noise)
@@ -38,10 +38,10 @@ def effect(snapshot: Snapshot, settings: Settings) -> FloatArray:
         return np.asarray(np.where(total > 0, np.maximum(added.sum(axis=0), 0.0) / total, np.nan))
 
 
-def effect_by_sensor(snapshot: Snapshot, settings: Settings) -> dict[str, float]:
+def effect_by_sensor(estimate: Estimate) -> dict[str, float]:
     """Return `effect` of each sensor's worst channel; NaN where it is not known (yet)."""
-    worst = dict.fromkeys((label.sensor for label in snapshot.channels), math.nan)
-    for label, share in zip(snapshot.channels, effect(snapshot, settings), strict=True):
+    worst = dict.fromkeys((label.sensor for label in estimate.snapshot.channels), math.nan)
+    for label, share in zip(estimate.snapshot.channels, effect(estimate), strict=True):
         worst[label.sensor] = float(np.fmax(worst[label.sensor], share))
     return worst
 

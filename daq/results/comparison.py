@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from daq.bench.units import decibels
-from daq.results.band_summary import CONSTANT, band_of, channel_means
+from daq.results.band_summary import CONSTANT
 
 if TYPE_CHECKING:
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
-    from daq.results.band_summary import BandMeans
+    from daq.results.band_summary import BandMeans, Estimate
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +38,7 @@ class Difference:
         return self.low_db > 0 or self.high_db < 0
 
 
-def compare(
-    snapshot: Snapshot, settings: Settings, earlier: Snapshot, earlier_settings: Settings
-) -> dict[tuple[str, str], Difference]:
+def compare(one: Estimate, earlier: Estimate) -> dict[tuple[str, str], Difference]:
     """Return the differences of the channels that both tests have, by sensor and channel.
 
     What is known of their sensitivities is the same in both, and no part of it.
@@ -51,29 +47,19 @@ def compare(
     compared, and the result is empty, where units differ, or bands or methods have nothing in
     common.
     """
-    methods = [name for name in snapshot.results if name in earlier.results]
-    mine, theirs = band_of(settings, snapshot), band_of(earlier_settings, earlier)
-    band = max(mine[0], theirs[0]), min(mine[1], theirs[1])
-    if not methods or snapshot.unit != earlier.unit or band[0] >= band[1]:
+    snapshot, before = one.snapshot, earlier.snapshot
+    methods = [name for name in snapshot.results if name in before.results]
+    band = max(one.band[0], earlier.band[0]), min(one.band[1], earlier.band[1])
+    if not methods or snapshot.unit != before.unit or band[0] >= band[1]:
         return {}
-    method = methods[0]
-    now = channel_means(snapshot.results[method], snapshot, settings, band, without=CONSTANT)
-    before = {
-        (label.sensor, label.channel): mean
-        for label, mean in zip(
-            earlier.channels,
-            channel_means(
-                earlier.results[method], earlier, earlier_settings, band, without=CONSTANT
-            ),
-            strict=True,
-        )
-    }
+    now, old = (each.means(methods[0], band, without=CONSTANT) for each in (one, earlier))
+    means = dict(zip(((e.sensor, e.channel) for e in before.channels), old, strict=True))
     return {
         (label.sensor, label.channel): difference(
-            label.sensor, label.channel, mean, before[label.sensor, label.channel]
+            label.sensor, label.channel, mean, means[label.sensor, label.channel]
         )
         for label, mean in zip(snapshot.channels, now, strict=True)
-        if (label.sensor, label.channel) in before
+        if (label.sensor, label.channel) in means
     }
 
 

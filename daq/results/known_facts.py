@@ -10,7 +10,7 @@ import numpy as np
 from daq.clocks.clock_model import ClockSource
 from daq.estimation.contributions import MUCH_NONLINEAR
 from daq.estimation.noise_estimates import BY_MOTION
-from daq.results.band_summary import band_of, channel_means, known_range
+from daq.results.band_summary import known_range
 from daq.results.clock_effect import reference
 from daq.results.facts import (
     RANK_OF_LEVEL,
@@ -66,7 +66,6 @@ from daq.results.facts import (
     ValuesBelowZero,
     WithoutEstimate,
 )
-from daq.results.precision import precision
 from estimator.checks.advice import (
     Copies,
     Delay,
@@ -86,11 +85,12 @@ from estimator.self_noise.result import Flag, Refusal
 from estimator.spectra.segment_rejection import Reason
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import SensorTotals, Snapshot
     from daq.recording.monitor import RecordingStatus
+    from daq.results.band_summary import Estimate
     from daq.results.decision.verdict import TestVerdict
     from estimator.checks.advice import Advice
     from estimator.levels.contributions import Source
@@ -116,19 +116,9 @@ _LIKE_A_CLOCK = Delay | Gain | ModelMisfit | NoSharedMotion
 _TURN = 0.3  # rad at the highest frequency: 9 % of the motion is taken for noise there
 
 
-def facts_of(
-    snapshot: Snapshot, settings: Settings | None = None, verdict: TestVerdict | None = None
-) -> tuple[Fact, ...]:
-    """Return all facts of an estimate, the worst rank first.
-
-    Parameters
-    ----------
-    snapshot : Snapshot
-    settings : Settings or None
-        The snapshot was made with. Without, facts that depend on a band or a target are left out.
-    verdict : TestVerdict or None
-        On its limits, where facts of the verdict are wanted, too.
-    """
+def facts_of(estimate: Estimate) -> tuple[Fact, ...]:
+    """Return all facts of an estimate, the worst rank first; not those of its verdict."""
+    snapshot = estimate.snapshot
     found = [
         *_findings(snapshot),
         *_recording(snapshot),
@@ -139,13 +129,15 @@ def facts_of(
         *_clocks(snapshot),
         *_model(snapshot),
         *_methods(snapshot),
+        *_precision(estimate),
     ]
-    if settings is not None:
-        found += _precision(snapshot, settings)
-    if verdict is not None:
-        found += facts_of_verdict(verdict)
+    return ranked(found)
+
+
+def ranked(facts: Iterable[Fact]) -> tuple[Fact, ...]:
+    """Return facts by their rank, the worst first."""
     ranks = list(Rank)
-    return tuple(sorted(found, key=lambda fact: ranks.index(fact.rank)))
+    return tuple(sorted(facts, key=lambda fact: ranks.index(fact.rank)))
 
 
 def _findings(snapshot: Snapshot) -> Iterator[Fact]:
@@ -579,16 +571,17 @@ def without_estimate(
             )
 
 
-def _precision(snapshot: Snapshot, settings: Settings) -> Iterator[Fact]:
+def _precision(estimate: Estimate) -> Iterator[Fact]:
     """Yield what widens the intervals of the table, and whether the wanted precision is reached."""
-    for method in snapshot.results:
-        if shares := widening(snapshot, settings, method):
+    for method in estimate.snapshot.results:
+        if shares := widening(estimate, method):
             rank = Rank.TO_KNOW
             yield IntervalsWidened(rank=rank, method=method, shares=shares)
-    if not snapshot.closed or (settings.target_cov is None and settings.target_cov_bin is None):
+    settings = estimate.settings
+    if not estimate.snapshot.closed or (settings.target_cov or settings.target_cov_bin) is None:
         return
     try:
-        reached = precision(snapshot, settings)
+        reached = estimate.precision()
     except BandError:
         return
     if reached.target is not None and math.isfinite(reached.cov) and not reached.is_reached:
@@ -597,17 +590,17 @@ def _precision(snapshot: Snapshot, settings: Settings) -> Iterator[Fact]:
         )
 
 
-def widening(snapshot: Snapshot, settings: Settings, method: str) -> dict[Source, float]:
+def widening(estimate: Estimate, method: str) -> dict[Source, float]:
     """Return what intervals of a method include beside scatter, as shares of the noise.
 
     The largest share of a channel, from `LEAST_SHARE` on.
     """
     try:
-        band = band_of(settings, snapshot)
+        means = estimate.means(method)
     except BandError:
         return {}
     most: dict[Source, float] = {}
-    for mean in channel_means(snapshot.results[method], snapshot, settings, band):
+    for mean in means:
         level = abs(float(mean.mean[0]))
         for source, (below, above) in mean.parts.items():
             share = max(float(below[0]), float(above[0])) / level if level else math.nan

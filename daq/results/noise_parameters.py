@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.bench.units import canonical, conversion
-from daq.results.band_summary import Spectrum, band_of, correlation_of, judged_method
+from daq.results.band_summary import band_of, correlation_of
 from estimator.errors import InsufficientDataError
 from estimator.levels.bands import band_edges
 from estimator.levels.contributions import by_chance
@@ -18,8 +18,8 @@ from estimator.levels.interval import NORMAL_95
 
 if TYPE_CHECKING:
     from daq.bench.model import Bench, DataSheet
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import ChannelLabel, Snapshot
+    from daq.estimation.snapshot import ChannelLabel
+    from daq.results.band_summary import Estimate, Spectrum
     from estimator.noise_parameters.allan import AllanDeviation
     from estimator.noise_parameters.fit import NoiseParameters
     from estimator.types import FloatArray
@@ -109,26 +109,25 @@ class ChannelNoise:
     comparisons: tuple[Comparison, ...]
 
 
-def noise_parameters(
-    snapshot: Snapshot, settings: Settings, bench: Bench | None = None
-) -> tuple[ChannelNoise, ...]:
+def noise_parameters(estimate: Estimate, bench: Bench | None = None) -> tuple[ChannelNoise, ...]:
     """Return the noise of every channel as parameters, by the method that judges.
 
     They are fitted to the whole usable spectrum: slopes show over decades, not in a band. None of
     a snapshot in which that method has no result.
     """
+    snapshot = estimate.snapshot
     # every estimate asks for the shares of quantisation below, few for these
     from estimator.noise_parameters.allan import allan_deviation  # noqa: PLC0415
     from estimator.noise_parameters.fit import fit  # noqa: PLC0415
 
-    noise = snapshot.results.get(judged_method(snapshot, settings))
+    noise = estimate.noise
     if noise is None:
         return ()
-    frequency, correlation = snapshot.frequency, correlation_of(settings)
-    band = band_of(replace(settings, band=None), snapshot)
-    spectrum = Spectrum(noise, snapshot, settings)
+    frequency, correlation = snapshot.frequency, correlation_of(estimate.settings)
+    band = band_of(replace(estimate.settings, band=None), snapshot)
+    spectrum = estimate.spectrum(estimate.method)
     factors = spectrum.levels(band_edges(frequency, band)).deviation
-    shares = quantisation_shares(snapshot, settings)
+    shares = quantisation_shares(estimate)
     found = []
     for column, label in enumerate(snapshot.channels):
         psd, cov = noise.noise_psd[:, column], noise.cov[:, column]
@@ -158,12 +157,13 @@ def noise_parameters(
     return tuple(found)
 
 
-def quantisation_shares(snapshot: Snapshot, settings: Settings) -> list[tuple[float, float]]:
+def quantisation_shares(estimate: Estimate) -> list[tuple[float, float]]:
     """Return each channel's mean quantisation noise in the band, and its share of the noise."""
-    noise = snapshot.results.get(judged_method(snapshot, settings))
+    snapshot = estimate.snapshot
+    noise = estimate.noise
     if noise is None or snapshot.quantisation_psd is None:
         return [(math.nan, math.nan)] * len(snapshot.channels)
-    inside = slice(*band_edges(snapshot.frequency, band_of(settings, snapshot)))
+    inside = slice(*band_edges(snapshot.frequency, estimate.band))
     width = np.gradient(snapshot.frequency)[inside]
     shares = []
     for column in range(len(snapshot.channels)):

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.bench.sensitivity import KnownSensitivity
-from daq.results.band_summary import band_of, judged_method, levels
+from daq.results.band_summary import Estimate
 from estimator.levels.bands import band_edges, third_octaves
 from estimator.levels.interval import NORMAL_95
 
@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import ChannelLabel, Snapshot
+    from daq.estimation.snapshot import ChannelLabel
     from daq.results.band_summary import Levels
     from estimator.types import FloatArray
 
@@ -225,12 +224,12 @@ _RECTANGULAR = math.sqrt(12.0)
 """Width of a rectangular distribution over its standard deviation (JCGM 100:2008, 4.3.8)."""
 
 
-def band_budgets(snapshot: Snapshot, settings: Settings) -> list[Budget]:
+def band_budgets(estimate: Estimate) -> list[Budget]:
     """Return the budget of every channel over the band of the tables; none without a result."""
-    return [found[0] for found in _budgets(snapshot, settings, band_edges)]
+    return [found[0] for found in _budgets(estimate, band_edges)]
 
 
-def third_octave_budgets(snapshot: Snapshot, settings: Settings) -> list[list[Budget]]:
+def third_octave_budgets(estimate: Estimate) -> list[list[Budget]]:
     """Return the budgets of every channel in thirds of an octave of the band of the tables.
 
     Those whose interval has both ends.
@@ -238,22 +237,21 @@ def third_octave_budgets(snapshot: Snapshot, settings: Settings) -> list[list[Bu
     return [
         [each for each in of_channel if all(map(math.isfinite, (each.value, *each.interval)))]
         for of_channel in _budgets(
-            snapshot, settings, lambda frequency, band: third_octaves(frequency, *band)
+            estimate, lambda frequency, band: third_octaves(frequency, *band)
         )
     ]
 
 
 def _budgets(
-    snapshot: Snapshot,
-    settings: Settings,
+    estimate: Estimate,
     divided: Callable[[FloatArray, tuple[float, float]], NDArray[np.int64]],
 ) -> list[list[Budget]]:
     """Return the budgets of the bands of every channel, by the method that judges."""
-    noise = snapshot.results.get(judged_method(snapshot, settings))
-    if noise is None:
+    snapshot = estimate.snapshot
+    if estimate.noise is None:
         return []
-    edges = divided(snapshot.frequency, band_of(settings, snapshot))
-    found, frequency = levels(noise, snapshot, settings, edges), snapshot.frequency
+    edges = divided(snapshot.frequency, estimate.band)
+    found, frequency = estimate.spectrum(estimate.method).levels(edges), snapshot.frequency
     bands = [
         (float(frequency[first]), float(frequency[last - 1]))
         for first, last in itertools.pairwise(edges)
@@ -265,8 +263,7 @@ def _budgets(
 
 
 def calibrated_budgets(
-    snapshot: Snapshot,
-    settings: Settings,
+    estimate: Estimate,
     band: tuple[float, float],
     calibrated: Mapping[int, tuple[float, float]],
     *,
@@ -279,8 +276,7 @@ def calibrated_budgets(
 
     Parameters
     ----------
-    snapshot : Snapshot
-    settings : Settings
+    estimate : Estimate
     band : (float, float)
         Hz.
     calibrated : mapping of int to (float, float)
@@ -296,16 +292,16 @@ def calibrated_budgets(
     unknown : list of ChannelLabel
         Calibrated channels whose mean noise is not positive.
     """
-    noise = snapshot.results.get(judged_method(snapshot, settings))
-    if noise is None:
+    snapshot = estimate.snapshot
+    if estimate.noise is None:
         return [], []
     sensitivities = {
         (label.sensor, label.channel): KnownSensitivity(own=calibrated[column][1])
         for column, label in enumerate(snapshot.channels)
         if column in calibrated
     }
-    snapshot = replace(snapshot, sensitivities=sensitivities)
-    whole = levels(noise, snapshot, settings, band_edges(snapshot.frequency, band))
+    stated = replace(snapshot, sensitivities=sensitivities)
+    whole = Estimate(stated, estimate.settings).levels(estimate.method, band)
     budgets: list[Budget] = []
     unknown: list[ChannelLabel] = []
     for column, (ratio, _) in sorted(calibrated.items()):

@@ -31,7 +31,7 @@ from daq.estimation.settings import Settings
 from daq.formats.importer import import_files
 from daq.python_process import python_command
 from daq.recording.reader import Recording
-from daq.results.band_summary import levels
+from daq.results.result import Result
 from daq.results.sources import sources
 from estimator.levels.bands import log_edges
 from tui.application.app import HuddleApp
@@ -145,7 +145,9 @@ def real_recording(folder: Path) -> None:
         axis.plot(centre, 10 * np.log10(data / np.diff(edges)), color="0.6", label="data")
         for method, colour in zip(METHODS, ("#0a7ea4", "#e07b39"), strict=True):
             noise = snapshot.results[method]
-            mean = levels(noise, snapshot, settings, edges).of_channel(column)
+            mean = (
+                Result(snapshot, settings).spectrum(noise.method).levels(edges).of_channel(column)
+            )
             with np.errstate(invalid="ignore", divide="ignore"):
                 level, low, high = (10 * np.log10(v) for v in (mean.mean, mean.low, mean.high))
             axis.fill_between(centre, low, high, color=colour, alpha=0.25, lw=0)
@@ -166,7 +168,14 @@ def report(folder: Path) -> None:
     command = python_command("tui", "simulate", str(bench), "--duration", "20min")
     subprocess.run([*command, "--out", str(recording)], check=True)
     settings = Settings(segment=2.0, band=(2.0, 20.0))
-    contents = report_of(estimate([recording], settings), settings, sources([recording]))
+    contents = report_of(
+        Result(
+            estimate([recording], settings),
+            settings,
+            sources([recording])[0].bench,
+            examined=tuple(sources([recording])),
+        )
+    )
     paper = folder / "report.pdf"
     with paper.open("wb") as file:
         write_paper(contents, file)

@@ -32,9 +32,8 @@ from daq.errors import HuddleError
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
-from daq.results.band_summary import levels
 from daq.results.facts import Finding, Rank
-from daq.results.known_facts import facts_of
+from daq.results.result import Result
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -506,7 +505,7 @@ PAIRS = (
 def said(snapshot: Snapshot, settings: Settings) -> list[tuple[str, set[str]]]:
     """Return the names of facts and findings that delay the result or worse, and their sensors."""
     found: list[tuple[str, set[str]]] = []
-    for fact in facts_of(snapshot, settings):
+    for fact in Result(snapshot, settings).facts:
         if fact.rank is Rank.TO_KNOW:
             continue
         sensors = {*fact.sensors, *(name.split(".")[0] for name in fact.channels)}
@@ -550,7 +549,7 @@ def one(kinds: Sequence[str], ratio: int, n_sensors: int, seed: int) -> Outcome:
         return Outcome(tuple(kinds), ratio, n_sensors, 0, 0, True, 0, 0, 0.0, why)
     edges = np.searchsorted(snapshot.frequency, EDGES)
     result = next(iter(snapshot.results.values()))
-    found = levels(result, snapshot, settings, edges)
+    found = Result(snapshot, settings).spectrum(result.method).levels(edges)
     low, high = found.ends()
     truth = scene.truth(snapshot.frequency, edges)
     if scene.step:

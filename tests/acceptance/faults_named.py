@@ -18,10 +18,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.estimation.estimation import Estimation
+from daq.estimation.settings import Settings
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, HostTime
 from daq.recording.monitor import RecordingMonitor
 from daq.recording.reader import Recording
+from daq.results.result import Result
 from sim_devices.world.world import World
 from tests.tui.example_snapshot import demo_bench, growing
 from tui.application.following import CURVE_GROWTH
@@ -110,12 +112,14 @@ def seconds_to_name(case: Case, seed: int) -> tuple[float, str]:
                 recording.refresh()
                 estimation.update()
                 status = monitor.status_with_stuck_channels()
-                lines = [line.plain for line in alerts(status, estimation.settings)]
+                lines = [line.plain for line in alerts(status, None)]
                 if estimation.n_seen >= wanted:
                     wanted = max(estimation.n_seen + 1, estimation.n_seen * (1 + CURVE_GROWTH))
                     snapshot = estimation.snapshot()
                     snapshot = with_advice(snapshot, recent.strangers(snapshot))
-                    found = [line.plain for line in findings(snapshot, width=200)]
+                    found = [
+                        line.plain for line in findings(Result(snapshot, Settings()), width=200)
+                    ]
                 for line in lines + found:
                     if case.words in line and second >= case.at:
                         return second + 1 - case.at + COMMITTED, line

@@ -21,6 +21,7 @@ from daq.devices.bench_file import load
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
+from daq.results.result import Result
 from tests.acceptance import fault_script
 from tests.acceptance.run_bench import command, served
 from tests.acceptance.sample_accounting import Account, Log, accounts
@@ -89,7 +90,7 @@ def _estimate(screen: Console, bench: Bench, out: Path) -> int:
     )
     for name in ("method", "channel", "true", "estimate", "95 % interval", "covers"):
         table.add_column(name, justify="right")
-    compared = compare(snapshot, settings, scenario_of(bench))
+    compared = compare(Result(snapshot, settings), scenario_of(bench))
     for one in compared:
         table.add_row(
             one.method,

@@ -20,7 +20,7 @@ import numpy as np
 
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
-from daq.results.band_summary import levels
+from daq.results.result import Result
 from tests.known_clocks import NOISE, Motion, Oscillator, Scene, record
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def one(job: tuple[str, Scene]) -> tuple[str, np.ndarray, np.ndarray, list[float
         truth = record(path, scene)
         snapshot = estimate([path], settings)
     edges = np.searchsorted(snapshot.frequency, min(scene.rates) * EDGES)
-    found = levels(snapshot.results["three-sensor"], snapshot, settings, edges)
+    found = Result(snapshot, settings).spectrum("three-sensor").levels(edges)
     low, high = found.ends()
     with np.errstate(invalid="ignore", divide="ignore"):
         error = 10 * np.log10(found.mean / NOISE)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from daq.estimation.settings import Settings
 from daq.results.facts import (
     ClockNotUnderstood,
     RatesNominal,
@@ -11,7 +12,7 @@ from daq.results.facts import (
     StatedTimesDrift,
     StatedTimesUnchecked,
 )
-from daq.results.known_facts import facts_of
+from daq.results.result import Result
 
 if TYPE_CHECKING:
     from typing import Any
@@ -25,4 +26,4 @@ _WRONG = (
 
 def clock_facts(snapshot: Snapshot) -> list[Any]:
     """Return the facts on times, the worst first; each test knows which kind it expects."""
-    return [fact for fact in facts_of(snapshot) if isinstance(fact, _WRONG)]
+    return [fact for fact in Result(snapshot, Settings()).facts if isinstance(fact, _WRONG)]

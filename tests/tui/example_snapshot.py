@@ -30,6 +30,7 @@ from daq.recording.monitor import RecordingStatus, SensorStatus
 from daq.recording.sensor_state import SensorState
 from daq.recording.storage.names import CONTINUES
 from daq.recording.writer import RecordingWriter
+from daq.results.result import Result
 from estimator.checks.advice import Level, NoSharedMotion
 from estimator.checks.diagnose import Diagnostics, diagnose
 from estimator.methods import self_noise
@@ -351,30 +352,25 @@ class ProgressCallback:
         self.told.append(f"about {path.name} {dict(changes)}")
         return replace(SETTINGS, **changes), self.bench  # type: ignore[arg-type]
 
-    def keep(self, path: Path, snapshot: Snapshot, verdict: TestVerdict | None) -> None:
+    def keep(self, path: Path, result: Result) -> None:
         """Note it."""
-        assert verdict is None
-        self.told.append(f"keep {path.name} {', '.join(snapshot.results)}")
+        assert result.verdict is None
+        self.told.append(f"keep {path.name} {', '.join(result.snapshot.results)}")
 
-    def noted(
-        self, path: Path, snapshot: Snapshot, settings: Settings, verdict: TestVerdict | None
-    ) -> Sequence[str]:
+    def noted(self, path: Path, result: Result) -> Sequence[str]:
         """Return what was prepared."""
-        del path, snapshot, settings, verdict
+        del path, result
         return self.since
 
-    def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
+    def report(self, path: Path, result: Result) -> Path:
         """Note it."""
-        assert snapshot.closed
-        self.told.append(f"report {path.name} {settings.segment:g}")
+        assert result.snapshot.closed
+        self.told.append(f"report {path.name} {result.settings.segment:g}")
         return path.with_suffix(".html")
 
-    def certify(
-        self, path: Path, snapshot: Snapshot, settings: Settings, wanted: Mapping[str, str]
-    ) -> Path:
+    def certify(self, path: Path, result: Result, wanted: Mapping[str, str]) -> Path:
         """Note it."""
-        assert snapshot.closed
-        del settings
+        assert result.snapshot.closed
         if wanted["by"] == "Nobody":
             raise HuddleError(f"{path}: sensors were simulated\nnot given: a name")
         self.told.append(f"certify {path.name} {dict(wanted)}")
@@ -392,15 +388,18 @@ class ProgressCallback:
         """Note it."""
         self.told.append(f"mark {path.name} {text}")
 
-    def save(
-        self, path: Path, snapshot: Snapshot, settings: Settings, verdict: TestVerdict | None
-    ) -> tuple[Path, ...]:
+    def save(self, path: Path, result: Result) -> tuple[Path, ...]:
         """Note it."""
-        del settings, verdict
-        self.told.append(f"save {path.name} {len(snapshot.channels)}")
+        self.told.append(f"save {path.name} {len(result.snapshot.channels)}")
         return (path.with_suffix(".csv"), path.with_suffix(".json"))
+
+
+def judged(result: Result, verdict: TestVerdict) -> Result:
+    """Return a result whose verdict was derived already."""
+    vars(result)["verdict"] = verdict
+    return result
 
 
 def said(snapshot: Snapshot, settings: Settings | None = None) -> list[str]:
     """Return the sentences on all facts of a snapshot."""
-    return [str(each) for each in known(snapshot, settings)]
+    return [str(each) for each in known(Result(snapshot, settings or Settings()))]

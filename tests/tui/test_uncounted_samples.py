@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import huddle
 from daq.recording.monitor import RecordingMonitor
 from daq.recording.reader import Recording
+from daq.results.result import Result
 from daq.results.sources import sources
 from tests.known_clocks import Scene, record, seconds_of
 from tui.application.test_view.details import details
@@ -30,12 +31,19 @@ def test_samples_that_are_not_counted_are_events_of_the_result(tmp_path: Path) -
         assert "check the buffers" in event.text
     made = result.to_dict()["diagnostics"]
     assert [each["text"] for each in made["events"]] == [each.text for each in result.events]
-    report = report_of(result.snapshot, result.settings, sources([path]))
+    report = report_of(
+        Result(
+            result.snapshot,
+            result.settings,
+            sources([path])[0].bench,
+            recordings=(path,),
+        )
+    )
     (happened,) = (each for each in report.sections if each.title == "What happened")
     rows = [row for part in happened.parts if isinstance(part, Table) for row in part.rows]
     assert [(row[1], row[3]) for row in rows] == [("B", each.text) for each in result.events]
     now = RecordingMonitor(Recording.open(path)).status()
     screen = console()
     with screen.capture() as shown:
-        screen.print(details(now, result.snapshot, result.settings, trouble=""), width=200)
+        screen.print(details(now, result.result, trouble=""), width=200)
     assert shown.get().count("uncounted") == 2

@@ -31,8 +31,7 @@ if TYPE_CHECKING:
 
     from daq.bench.masks.mask import Mask
     from daq.bench.model import Bench
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
+    from daq.results.result import Result
     from tui.application.controls import Controls
 
 HINTS = {
@@ -269,18 +268,16 @@ class HuddleApp(FollowingApp):
         self._write_report(is_opened=True)
 
     def _write_report(self, *, is_opened: bool) -> None:
-        path, snapshot, settings = self.path, self.snapshot, self.state.settings
-        if path is None or snapshot is None or settings is None or not snapshot.closed:
+        path, result = self.path, self.state.result
+        if path is None or result is None or not result.snapshot.closed:
             return
         self.notify("writing the report …", timeout=3)
-        self._report(path, snapshot, settings, is_opened=is_opened)
+        self._report(path, result, is_opened=is_opened)
 
     @work(thread=True, group="control")
-    def _report(
-        self, path: Path, snapshot: Snapshot, settings: Settings, *, is_opened: bool
-    ) -> None:
+    def _report(self, path: Path, result: Result, *, is_opened: bool) -> None:
         with self._reading:
-            report = self._try(lambda: self._controls.report(path, snapshot, settings))
+            report = self._try(lambda: self._controls.report(path, result))
         if report is None:
             return
         notify = partial(self.call_from_thread, self.notify, f"{report}", timeout=15, markup=False)
@@ -293,24 +290,22 @@ class HuddleApp(FollowingApp):
 
     def action_issue(self) -> None:
         """Ask who authorises a certificate, and issue it; without anybody, make a specimen."""
-        path, snapshot, settings = self.path, self.snapshot, self.state.settings
-        if path is None or snapshot is None or settings is None or not snapshot.closed:
+        path, result = self.path, self.state.result
+        if path is None or result is None or not result.snapshot.closed:
             return
 
         def issue(wanted: Mapping[str, str] | None) -> None:
             if wanted is not None:
                 self.notify("verifying the recording, making the certificate …", timeout=5)
-                self._issue(path, snapshot, settings, wanted)
+                self._issue(path, result, wanted)
 
         self.push_screen(IssueForm(path.name), issue)
 
     @work(thread=True, group="control")
-    def _issue(
-        self, path: Path, snapshot: Snapshot, settings: Settings, wanted: Mapping[str, str]
-    ) -> None:
+    def _issue(self, path: Path, result: Result, wanted: Mapping[str, str]) -> None:
         try:
             with self._reading:
-                made = self._controls.certify(path, snapshot, settings, wanted)
+                made = self._controls.certify(path, result, wanted)
         except (HuddleError, OSError) as error:
             self.call_from_thread(self._refused, wanted, f"{error}")
             return
@@ -324,9 +319,9 @@ class HuddleApp(FollowingApp):
             return
 
         def make(really: bool | None) -> None:
-            path, snapshot, settings = self.path, self.snapshot, self.state.settings
-            if really and path and snapshot and settings:
-                self._issue(path, snapshot, settings, {**wanted, "by": ""})
+            path, result = self.path, self.state.result
+            if really and path and result:
+                self._issue(path, result, {**wanted, "by": ""})
 
         text = f"{why}\n\nMake a specimen instead?"
         question = QuestionScreen("no certificate", text, does="makes a specimen")
@@ -334,19 +329,13 @@ class HuddleApp(FollowingApp):
 
     def action_save(self) -> None:
         """Write the estimate as CSV and JSON, and the screen as a picture (SVG)."""
-        path, snapshot, settings = self.path, self.snapshot, self.state.settings
-        if path is None or snapshot is None or settings is None:
-            return
-        picture = self.export_screenshot(title=path.name)
-        self._save(path, picture)
+        if self.path is not None and self.state.result is not None:
+            picture = self.export_screenshot(title=self.path.name)
+            self._save(self.path, picture, self.state.result)
 
     @work(thread=True, group="control")
-    def _save(self, path: Path, picture: str) -> None:
-        state = self.state
-        snapshot, settings = state.snapshot, state.settings
-        if snapshot is None or settings is None:
-            return
-        files = self._try(partial(self._controls.save, path, snapshot, settings, state.verdict))
+    def _save(self, path: Path, picture: str, result: Result) -> None:
+        files = self._try(partial(self._controls.save, path, result))
         if files is None:
             return
         drawn = files[0].with_suffix(".svg")

@@ -11,10 +11,9 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
     from daq.preflight.device_check import DiscoveredDevice
     from daq.preflight.preview import SensorPreview
-    from daq.results.decision.verdict import TestVerdict
+    from daq.results.result import Result
     from tui.application.plan import TestPlan
 
 
@@ -143,28 +142,24 @@ class Controls(Protocol):
         """
         ...
 
-    def keep(self, path: Path, snapshot: Snapshot, verdict: TestVerdict | None) -> None:
+    def keep(self, path: Path, result: Result) -> None:
         """Write the result into a recording whose end has been seen here. Blocks."""
         ...
 
-    def noted(
-        self, path: Path, snapshot: Snapshot, settings: Settings, verdict: TestVerdict | None
-    ) -> Sequence[str]:
+    def noted(self, path: Path, result: Result) -> Sequence[str]:
         """Write a test into the ledger of sensors; return how they have changed. Blocks."""
         ...
 
-    def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
+    def report(self, path: Path, result: Result) -> Path:
         """Write the report of a recording; returns its file. Blocks."""
         ...
 
-    def certify(
-        self, path: Path, snapshot: Snapshot, settings: Settings, wanted: Mapping[str, str]
-    ) -> Path:
+    def certify(self, path: Path, result: Result, wanted: Mapping[str, str]) -> Path:
         """Issue a certificate, or make a specimen; returns its file. Blocks.
 
         Parameters
         ----------
-        path, snapshot, settings
+        path, result
             The recording and its estimate.
         wanted : mapping of str to str
             ``by`` (empty: a specimen), ``reason`` and ``despite``.
@@ -176,8 +171,6 @@ class Controls(Protocol):
         """
         ...
 
-    def save(
-        self, path: Path, snapshot: Snapshot, settings: Settings, verdict: TestVerdict | None
-    ) -> tuple[Path, ...]:
+    def save(self, path: Path, result: Result) -> tuple[Path, ...]:
         """Write the estimate as CSV and JSON beside its recording; returns the files. Blocks."""
         ...

@@ -13,7 +13,6 @@ from textual.reactive import var
 
 from daq.errors import HuddleError
 from daq.estimation.follow import follow
-from daq.results.decision.limits import judge
 from estimator.errors import EstimatorError
 from tui.application.bench_view.view import BenchView
 from tui.application.dialogs import StopScreen
@@ -170,12 +169,12 @@ class FollowingApp(ThemedApp[None]):
     def _follow(
         self, path: Path, settings: Settings | None, ended: threading.Event, *, is_kept: bool
     ) -> None:
-        messenger, bench = Messenger(self, ended), self._bench
+        messenger = Messenger(self, ended, path, self._bench)
         with self._reading:
             if ended.is_set():  # another one was opened meanwhile
                 return
             try:
-                result = follow(
+                followed = follow(
                     path,
                     settings,
                     messenger,
@@ -187,11 +186,10 @@ class FollowingApp(ThemedApp[None]):
                 messenger.error(error)
                 return
             is_kept = is_kept or messenger.was_open
-            if is_kept and result is not None and messenger.settings is not None:
-                verdict = judge(bench, result, messenger.settings)
-                self._try(partial(self._controls.keep, path, result, verdict))
-                of_test = path, result, messenger.settings, verdict
-                lines = self._try(partial(self._controls.noted, *of_test))
+            result = messenger.result
+            if is_kept and followed is not None and result is not None:
+                self._try(partial(self._controls.keep, path, result))
+                lines = self._try(partial(self._controls.noted, path, result))
                 if lines and not ended.is_set():
                     self.post_message(SensorsNoted(path, tuple(lines)))
 
@@ -214,22 +212,16 @@ class FollowingApp(ThemedApp[None]):
 
     @on(SnapshotReady)
     async def _on_fresh(self, message: SnapshotReady) -> None:
-        snapshot, before = message.snapshot, self.snapshot
+        result, before = message.result, self.snapshot
+        snapshot = result.snapshot
         moved = () if snapshot.closed else self._recent.strangers(snapshot)
         if moved and not self._is_moved:
             self.announce("trouble", alert(moved[0], Names.of(snapshot)))
         self._is_moved = bool(moved)
-        snapshot = with_advice(snapshot, moved)
-        self.state = replace(
-            self.state,
-            snapshot=snapshot,
-            settings=message.settings,
-            judged_by=self._bench,
-            verdict=judge(self._bench, snapshot, message.settings),
-            note="",
-        )
+        result = replace(result, snapshot=with_advice(snapshot, moved), bench=self._bench)
+        self.state = replace(self.state, result=result, note="")
         if snapshot.closed and before is not None and not before.closed:
-            word = "" if self.state.verdict is None else WORDS[self.state.verdict.verdict]
+            word = "" if result.verdict is None else WORDS[result.verdict.verdict]
             self.announce("ended", word)
             await self._show_result()
 
@@ -275,7 +267,8 @@ class FollowingApp(ThemedApp[None]):
             self.state = replace(self.state, reference=None)
             return
         self.notify(f"estimating {message.path.name} to compare with …", timeout=5, markup=False)
-        self._estimate_reference(message.path, self.state.settings)
+        result = self.state.result
+        self._estimate_reference(message.path, None if result is None else result.settings)
 
     @work(thread=True, group="reference", exclusive=True)
     def _estimate_reference(self, path: Path, settings: Settings | None) -> None:

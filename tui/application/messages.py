@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from textual.message import Message
 
+from daq.results.result import Result
 from tui.application.state import TEST
 
 if TYPE_CHECKING:
@@ -115,10 +116,9 @@ class StatusUpdated(Message):
 
 @dataclass
 class SnapshotReady(Message):
-    """A new snapshot, with its settings."""
+    """A new estimate."""
 
-    snapshot: Snapshot
-    settings: Settings
+    result: Result
 
 
 @dataclass
@@ -147,19 +147,25 @@ class Messenger:
         Receives the messages.
     ended : threading.Event
         Set when the recording is no longer followed.
+    path : Path
+        The recording.
+    bench : Bench or None
+        With the limits.
 
     Attributes
     ----------
     was_open : bool
         Whether the recording was growing when it was opened.
-    settings : Settings or None
-        Of the latest snapshot.
+    result : Result or None
+        The latest estimate.
     """
 
-    def __init__(self, app: App[None], ended: threading.Event) -> None:
-        self._app, self._ended = app, ended
+    def __init__(
+        self, app: App[None], ended: threading.Event, path: Path, bench: Bench | None
+    ) -> None:
+        self._app, self._ended, self._path, self._bench = app, ended, path, bench
         self.was_open = False
-        self.settings: Settings | None = None
+        self.result: Result | None = None
 
     def status(self, status: RecordingStatus) -> None:
         """Tell how the sensors are doing."""
@@ -168,8 +174,9 @@ class Messenger:
 
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
         """Show an estimate."""
-        self.settings = settings
-        self._post(SnapshotReady(snapshot, settings))
+        recordings = (self._path,) if snapshot.closed else ()
+        self.result = Result(snapshot, settings, self._bench, recordings)
+        self._post(SnapshotReady(self.result))
 
     def segments(self, n_segments: int, elapsed: float) -> None:
         """Tell nothing: the estimate that follows says it."""

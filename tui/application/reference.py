@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from daq.errors import HuddleError
 from daq.estimation.estimation import estimate
 from daq.recording.reader import Recording
+from daq.results.result import Result
 from tui.application.state import Reference
 
 if TYPE_CHECKING:
@@ -59,7 +60,8 @@ def reference_of(
     try:
         with Recording.open(path) as recording:
             numbers = {each.name: each.serial_number for each in recording.sensors}
-        return Reference(path, estimate([path], settings, progress=progress), settings, numbers)
+        result = Result(estimate([path], settings, progress=progress), settings)
+        return Reference(path, result, numbers)
     except _CancelledError:
         return None
 

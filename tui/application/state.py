@@ -13,10 +13,9 @@ if TYPE_CHECKING:
 
     from daq.bench.masks.mask import Mask
     from daq.bench.model import Bench
-    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
-    from daq.results.decision.verdict import TestVerdict
+    from daq.results.result import Result
 
 BENCH, TEST, RESULT, RECORDINGS = VIEWS = ("bench", "test", "result", "recordings")
 TITLES: Final = {BENCH: "Bench", TEST: "Test", RESULT: "Result", RECORDINGS: "Recordings"}
@@ -30,8 +29,7 @@ class Reference:
     """
 
     path: Path
-    snapshot: Snapshot
-    settings: Settings
+    result: Result
     serial_numbers: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -50,12 +48,10 @@ class State:
         Whether a recording can be started from here.
     path : Path or None
         The recording.
-    now, snapshot, settings : RecordingStatus, Snapshot and Settings, or None
-        What is known of it.
-    judged_by : Bench or None
-        Whose limits are for the recording: the bench that it was recorded with.
-    verdict : TestVerdict or None
-        On these limits, of `snapshot`.
+    now : RecordingStatus or None
+        How it is doing.
+    result : Result or None
+        Its latest estimate, judged by the limits of the bench that it was recorded with.
     trouble : str
         Why the recording is no longer followed.
     failure : str
@@ -78,10 +74,7 @@ class State:
     can_start: bool = False
     path: Path | None = None
     now: RecordingStatus | None = None
-    snapshot: Snapshot | None = None
-    settings: Settings | None = None
-    judged_by: Bench | None = None
-    verdict: TestVerdict | None = None
+    result: Result | None = None
     trouble: str = ""
     failure: str = ""
     note: str = ""
@@ -89,6 +82,11 @@ class State:
     reference: Reference | None = None
     models: tuple[Mask, ...] = ()
     sensors_since: tuple[str, ...] = ()
+
+    @property
+    def snapshot(self) -> Snapshot | None:
+        """The latest estimate, without what follows from it."""
+        return None if self.result is None else self.result.snapshot
 
     @property
     def is_simulated(self) -> bool:

@@ -144,13 +144,14 @@ class View(Screen[None]):
 def status_line(state: State, view: str, *, width: int) -> Text:
     """Return the line at the top: views, bench, what the recording does, verdict, file."""
     now, path = state.now, state.path
+    verdict = None if state.result is None else state.result.verdict
     doing = _doing(state)
     if now is not None:
         doing.append(f"  {clock_time(now.elapsed)}")
-    if state.verdict is not None:
+    if verdict is not None:
         if width < ALL_TABS:  # its sign says the same as its word
             doing = Text.assemble(doing[:1], doing[doing.plain.find("  ") + 1 :])
-        doing.append(f"  {WORDS[state.verdict.verdict]}", STYLES[state.verdict.verdict])
+        doing.append(f"  {WORDS[verdict.verdict]}", STYLES[verdict.verdict])
     simulated = Text(" SIMULATED ", f"{BAD} reverse") if state.is_simulated else Text()
     line = _tabs(view, has_titles=width >= ALL_TABS)
     if line.cell_len + simulated.cell_len + doing.cell_len > width - 4 >= ALL_TABS - 4:

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 from daq.bench.tables.certificate import CertificateTable, Customer, Laboratory
 from daq.bench.units import in_si
 from daq.protocols.block import Quantity
-from daq.results.band_summary import band_of, judged_method
 from daq.results.decision.conformity import Statement, conformity, with_rule
 from daq.results.sources import conditions
 from daq.results.uncertainty_budget import band_budgets, third_octave_budgets
@@ -34,9 +33,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from daq.bench.model import Bench
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
     from daq.results.decision.conformity import Conformity
+    from daq.results.result import Result
     from daq.results.sources import Condition, Source
     from daq.results.uncertainty_budget import Budget
     from tui.report.certificate import Issue
@@ -63,9 +61,7 @@ _UNITS = {
 
 
 def dcc(
-    snapshot: Snapshot,
-    settings: Settings,
-    found: Sequence[Source],
+    result: Result,
     *,
     issue: Issue | None = None,
     about: Bench | None = None,
@@ -74,12 +70,8 @@ def dcc(
 
     Parameters
     ----------
-    snapshot : Snapshot
-        A finished estimate.
-    settings : Settings
-        It was made with.
-    found : sequence of Source
-        The recordings it was made from.
+    result : Result
+        A finished estimate of recordings.
     issue : Issue, optional
         Number and revision.
     about : Bench, optional
@@ -87,10 +79,11 @@ def dcc(
     """
     for prefix, name in (("dcc", DCC), ("si", SI)):
         ET.register_namespace(prefix, name)
+    found = result.sources
     about = found[0].bench if about is None else about
     root = ET.Element(_dcc("digitalCalibrationCertificate"), schemaVersion=SCHEMA_VERSION)
     _administrative(root, found, about, issue)
-    _results(root, snapshot, settings, found, about)
+    _results(root, result, about)
     ET.indent(root)
     content: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
     return content + b"\n"
@@ -197,21 +190,20 @@ def _persons(persons: ET.Element, responsible: str, operator: str) -> None:
 
 def _results(
     root: ET.Element,
-    snapshot: Snapshot,
-    settings: Settings,
-    found: Sequence[Source],
+    result: Result,
     about: Bench | None,
 ) -> None:
+    found, settings = result.sources, result.settings
     table = CertificateTable() if about is None else about.certificate
     one = _add(_add(root, "measurementResults"), "measurementResult")
     _text(one, "name", "Self-noise")
     methods = _add(one, "usedMethods")
     method = _add(methods, "usedMethod")
-    _text(method, "name", f"Huddle test, {judged_method(snapshot, settings)} method")
+    _text(method, "name", f"Huddle test, {result.method} method")
     _content(_add(method, "description"), PROCEDURE)
     if table.procedure:
         _add(method, "reference", table.procedure)
-    stated = conformity(with_rule(found[0].bench, about), snapshot, settings)
+    stated = conformity(with_rule(found[0].bench, about), result)
     if stated:
         method = _add(methods, "usedMethod")
         _text(method, "name", "Decision rule")
@@ -221,19 +213,19 @@ def _results(
     found_conditions = conditions(found, about, start=settings.start, end=settings.end)
     _conditions(_add(_add(one, "influenceConditions"), "influenceCondition"), found_conditions)
     results = _add(one, "results")
-    whole = band_budgets(snapshot, settings)
-    spectra = third_octave_budgets(snapshot, settings)
+    whole = band_budgets(result)
+    spectra = third_octave_budgets(result)
     if not whole:
-        result = _add(results, "result")
-        _text(result, "name", "Self-noise")
-        _content(_add(_add(result, "data"), "text"), "Nothing can be said of the noise.")
+        element = _add(results, "result")
+        _text(element, "name", "Self-noise")
+        _content(_add(_add(element, "data"), "text"), "Nothing can be said of the noise.")
         return
-    name = f"Mean PSD over {span(*band_of(settings, snapshot))}"
-    factor, unit = _in_si(snapshot.unit)
-    for label, total, spectrum in zip(snapshot.channels, whole, spectra, strict=True):
-        result = _add(results, "result")
-        _text(result, "name", f"Self-noise of {label.sensor}.{label.channel}")
-        data = _add(result, "data")
+    name = f"Mean PSD over {span(*result.band)}"
+    factor, unit = _in_si(result.snapshot.unit)
+    for label, total, spectrum in zip(result.snapshot.channels, whole, spectra, strict=True):
+        element = _add(results, "result")
+        _text(element, "name", f"Self-noise of {label.sensor}.{label.channel}")
+        data = _add(element, "data")
         _mean(data, total, name, factor, unit)
         if spectrum:
             _spectrum(data, spectrum, factor, unit)

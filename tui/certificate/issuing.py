@@ -14,9 +14,8 @@ from daq.errors import HuddleError
 from daq.estimation.contributions import with_sensitivities
 from daq.estimation.snapshot_builder import sensitivities_at
 from daq.recording.signing import identity
-from daq.results.band_summary import judged_method
 from daq.results.decision.conformity import conformity, with_rule
-from daq.results.decision.limits import judge
+from daq.results.result import Result
 from daq.results.sources import sources
 from tui.certificate.dcc import NAME as DCC_NAME
 from tui.certificate.dcc import dcc
@@ -37,8 +36,6 @@ if TYPE_CHECKING:
 
     from daq.bench.masks.mask import Mask
     from daq.bench.model import Bench
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
     from daq.results.sources import Source
     from tui.certificate.ledger import Entry, Ledger
     from tui.report.parts import Report
@@ -209,29 +206,26 @@ def examine(
     return Examined(found, order, about, tuple(objections))
 
 
-def settings_table(settings: Settings, snapshot: Snapshot) -> dict[str, Any]:
+def settings_table(result: Result) -> dict[str, Any]:
     """Return the settings of an estimate as the ledger keeps them."""
+    settings = result.settings
     span = {
         key: None if value is None else value.isoformat()
         for key, value in (("start", settings.start), ("end", settings.end))
     }
-    table = to_table(settings) | span | {"method": list(snapshot.results)}
+    table = to_table(settings) | span | {"method": list(result.snapshot.results)}
     table = {key: value for key, value in table.items() if value is not None}
     plain: dict[str, Any] = json.loads(json.dumps(table, default=str))
     return plain
 
 
-def issue(
-    snapshot: Snapshot, settings: Settings, examined: Examined, ledger: Ledger
-) -> tuple[Entry, Path]:
+def issue(result: Result, examined: Examined, ledger: Ledger) -> tuple[Entry, Path]:
     """Issue a certificate: number, file, and both in the ledger.
 
     Parameters
     ----------
-    snapshot : Snapshot
+    result : Result
         A finished estimate of the examined recordings.
-    settings : Settings
-        It was made with.
     examined : Examined
     ledger : Ledger
 
@@ -247,13 +241,13 @@ def issue(
         raise NotIssuedError("\n".join(map(str, examined.objections)))
     if not order.by:
         raise NotIssuedError("nobody authorises the certificate; expected --by NAME")
-    if judged_method(snapshot, settings) == "multi-part":
+    if result.method == "multi-part":
         raise NotIssuedError(
             "the noise of two sensors assumes steady gains: no certificate is issued of it;"
             " --specimen makes a specimen"
         )
-    snapshot = with_stated(snapshot, examined)
-    invalid = invalidating(known_facts(snapshot, settings))
+    result = with_stated(result, examined)
+    invalid = invalidating(known_facts(result))
     if invalid and not order.despite:
         lines = "\n".join(f"  {each.text}" for each in invalid)
         raise NotIssuedError(
@@ -266,7 +260,7 @@ def issue(
     prefix = "HT" if about is None else about.certificate.prefix
     runs = [(source.path.name, source.run_id, source.sha256) for source in found]
     roots = dict(identity(source.path) for source in found)
-    table = settings_table(settings, snapshot)
+    table = settings_table(result)
     if about is not None and about.certificate.guard_band != 1.0:
         table["guard_band"] = about.certificate.guard_band
     if about is not None:
@@ -304,7 +298,7 @@ def issue(
                 incomplete=bool(missing(about, found[0], by=order.by)),
                 despite=order.despite if invalid else "",
             )
-            content = _content(snapshot, settings, examined, made, roots)
+            content = _content(result, examined, made, roots)
             if signer is not None:
                 content = signer(content)
             path = ledger.publish(entry, ".pdf", content, signer)
@@ -314,12 +308,12 @@ def issue(
     return entry, path
 
 
-def specimen(snapshot: Snapshot, settings: Settings, examined: Examined, folder: Path) -> Path:
+def specimen(result: Result, examined: Examined, folder: Path) -> Path:
     """Make a specimen: what a certificate would be, watermarked, without number and ledger.
 
     Parameters
     ----------
-    snapshot, settings, examined
+    result, examined
         As `issue` takes them, of any recordings.
     folder : Path
         Where it is written; an earlier specimen of the recording is replaced.
@@ -337,49 +331,44 @@ def specimen(snapshot: Snapshot, settings: Settings, examined: Examined, folder:
         despite=examined.order.despite,
         objections=tuple(each.line for each in examined.objections),
     )
-    snapshot = with_stated(snapshot, examined)
-    content = _content(snapshot, settings, examined, made, {})
+    content = _content(with_stated(result, examined), examined, made, {})
     name = f"{examined.found[0].path.stem}-specimen.pdf"
     return write_content(folder / name, content, "replace")
 
 
 def _content(
-    snapshot: Snapshot,
-    settings: Settings,
+    result: Result,
     examined: Examined,
     made: Issue,
     roots: Mapping[str, str],
 ) -> bytes:
     """Return the PDF, with its machine-readable forms inside."""
-    found, about, models = examined.found, examined.about, examined.order.models
-    report = report_of(snapshot, settings, found, models, issue=made, about=about)
-    xml = dcc(snapshot, settings, found, issue=made, about=about)
-    return _pdf(report, _result(snapshot, settings, examined, made, roots), xml, made.at)
+    about = examined.about
+    report = report_of(result, examined.order.models, issue=made, about=about)
+    xml = dcc(result, issue=made, about=about)
+    return _pdf(report, _result(result, examined, made, roots), xml, made.at)
 
 
-def with_stated(snapshot: Snapshot, examined: Examined) -> Snapshot:
-    """Return a snapshot with what the bench file of the order states of sensitivities."""
-    about = examined.order.about
+def with_stated(result: Result, examined: Examined) -> Result:
+    """Return a result with what the bench file of the order states of sensitivities."""
+    about, snapshot = examined.order.about, result.snapshot
     outline = None if about is None else BenchOutline.of_text(about.text)
-    if outline is None:
-        return snapshot
-    readings = (each for source in examined.found for each in source.readings)
-    return with_sensitivities(snapshot, sensitivities_at(outline.sensitivities, readings))
+    if outline is not None:
+        readings = (each for source in examined.found for each in source.readings)
+        stated = sensitivities_at(outline.sensitivities, readings)
+        snapshot = with_sensitivities(snapshot, stated)
+    return Result(snapshot, result.settings, examined.found[0].bench, examined=examined.found)
 
 
 def _result(
-    snapshot: Snapshot,
-    settings: Settings,
+    result: Result,
     examined: Examined,
     made: Issue,
     roots: Mapping[str, str],
 ) -> bytes:
     """Return the result as JSON, with the certificate it is of."""
-    found = examined.found
-    rule = with_rule(found[0].bench, examined.about)
-    verdict = judge(rule, snapshot, settings)
-    result = document(snapshot, settings, sources=found, verdict=verdict)
-    result["certificate"] = {
+    rule, text = with_rule(result.bench, examined.about), document(result)
+    text["certificate"] = {
         "number": made.number,
         "revision": made.revision,
         "issued": made.at.isoformat(),
@@ -388,9 +377,9 @@ def _result(
         "roots": dict(roots),
         "despite": made.despite or None,
     }
-    stated = conformity(rule, snapshot, settings)
+    stated = conformity(rule, result)
     if rule is not None and stated:
-        result["certificate"] |= {
+        text["certificate"] |= {
             "decision_rule": rule.certificate.decision_rule,
             "guard_band": rule.certificate.guard_band,
             "conformity": [
@@ -407,7 +396,7 @@ def _result(
                 for each in stated
             ],
         }
-    return json.dumps(finite(result), ensure_ascii=False, allow_nan=False).encode()
+    return json.dumps(finite(text), ensure_ascii=False, allow_nan=False).encode()
 
 
 def _pdf(report: Report, result: bytes, xml: bytes, at: datetime) -> bytes:

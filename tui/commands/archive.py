@@ -334,7 +334,7 @@ def _show_one(asked: _Asked, archive: Store, failures: Sequence[str]) -> None:
     wrong = [*failures, *bad]
     found = _answered(archive, entries, settings, zone=asked.zone, false_alarm=asked.false_alarm)
     screen = for_people(asked.json, asked.csv)
-    _show(screen, found, settings, str(asked.zone))
+    _show(screen, found, str(asked.zone))
     if asked.json is not None:
         write_text(asked.json, archive_json(found, archive, len(entries), wrong) + "\n")
     if asked.csv is not None:
@@ -395,16 +395,16 @@ def _counting(what: str, of: str) -> Iterator[Callable[[int, int], None]]:
         yield lambda done, total: bar.update(task, completed=done, total=total, visible=True)
 
 
-def _show(screen: Console, found: Answer, settings: Settings, time_zone: str) -> None:
+def _show(screen: Console, found: Answer, time_zone: str) -> None:
     """Print the tables of an archive."""
     from tui.output.archive.tables import course_table, course_title, remarks
     from tui.output.results import averages_line, result_table, result_title
     from tui.wording.facts import known
 
-    screen.print(result_title(found.pooled, settings))
-    screen.print(result_table(found.pooled, settings))
+    screen.print(result_title(found.result))
+    screen.print(result_table(found.result))
     screen.print(averages_line(found.pooled))
-    for each in known(found.pooled, settings):
+    for each in known(found.result):
         screen.print(each.line)
     screen.print(course_title(found))
     screen.print(course_table(found))

@@ -84,8 +84,9 @@ def calibrate(
     from tui.wording.facts import known
 
     check_places(json)
-    snapshot, settings, first = estimated(files, start=start, end=end, **wanted)
-    found = calibrate(snapshot, settings, first.bench, reference=reference, confidence=confidence)
+    result = estimated(files, start=start, end=end, whole=True, **wanted)
+    snapshot = result.snapshot
+    found = calibrate(result, result.bench, reference=reference, confidence=confidence)
     screen = for_people(json)
     screen.print(Text(title(found, snapshot), "bold"))
     _show(screen, "", sensitivity_table(found, snapshot))
@@ -98,7 +99,7 @@ def calibrate(
         _show(screen, "Budget of the noise PSD, relative", budget_table(noise))
     for line in (LEGEND, *remarks(found, snapshot)):
         screen.print(line)
-    for each in known(snapshot):
+    for each in known(result):
         if each.needs_action:
             screen.print(str(each))
     write_json(json, calibration_document(found, snapshot))

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from daq.results.result import Result
     from sim_devices.world.scenario import Scenario
 
 _LOGGER = logging.getLogger(__name__)
@@ -84,7 +85,7 @@ def demo(
     from daq.devices.bench_file import parse
     from daq.estimation.estimation import estimate
     from daq.estimation.settings import Settings
-    from daq.results.band_summary import band_of
+    from daq.results.result import Result
     from tui.output.console import check_places, for_people, write_json
     from tui.simulation.devices import scenario_of, simulated
 
@@ -111,14 +112,14 @@ def demo(
                 interrupted = _record(path, out, settings, bench.recording.duration or 60.0, speed)
         if out is None or not out.exists():
             return
-        snapshot = estimate([out], settings)
+        result = Result(estimate([out], settings), settings)
         if keep is not None:
             shutil.copyfile(out, keep)
             _LOGGER.info("recording kept as %s", keep, extra={"recording": str(keep)})
     scenario = scenario_of(bench)
-    compared = compare(snapshot, settings, scenario)
+    compared = compare(result, scenario)
     screen = for_people(json)
-    low, high = band_of(settings, snapshot)
+    snapshot, (low, high) = result.snapshot, result.band
     added = max(entry.clocks / entry.true_psd for entry in compared)
     screen.print(
         Text.assemble(
@@ -130,7 +131,7 @@ def demo(
             else "",
         )
     )
-    screen.print(comparison_table(compared, snapshot, settings))
+    screen.print(comparison_table(compared, result))
     for line in verdict(compared):
         screen.print(line)
     write_json(json, _document(compared, snapshot))
@@ -192,18 +193,15 @@ def _record(path: Path, out: Path, settings: Settings, duration: float, speed: f
     return interruption.pressed
 
 
-def compare(snapshot: Snapshot, settings: Settings, scenario: Scenario) -> list[NoiseComparison]:
+def compare(result: Result, scenario: Scenario) -> list[NoiseComparison]:
     """Return the noise of every channel in the band by each method, with the truth."""
-    from daq.results.band_summary import band_of, levels
     from estimator.levels.bands import band_edges
     from estimator.levels.contributions import Source
 
-    band = band_of(settings, snapshot)
-    edges = band_edges(snapshot.frequency, band)
-    inside = snapshot.frequency[slice(*edges)]
-    compared = []
-    for method, noise in snapshot.results.items():
-        found = levels(noise, snapshot, settings, edges)
+    snapshot, compared = result.snapshot, []
+    inside = snapshot.frequency[slice(*band_edges(snapshot.frequency, result.band))]
+    for method in snapshot.results:
+        found = result.levels(method, result.band)
         clocks = [each.below[0] for each in found.contributions if each.source is Source.CLOCKS]
         means = [found.of_channel(n, SIMULTANEOUS_95) for n in range(len(snapshot.channels))]
         places: dict[str, int] = {}
@@ -233,30 +231,25 @@ def _percent(share: float) -> str:
     )
 
 
-def comparison_table(
-    compared: list[NoiseComparison], snapshot: Snapshot, settings: Settings
-) -> Table:
+def comparison_table(compared: list[NoiseComparison], result: Result) -> Table:
     """Return a row per channel: truth, each method's estimate, and whether that covers it."""
     from rich.table import Table
     from rich.text import Text
 
-    from daq.results.band_summary import band_of, data_means
     from tui.wording.formatting import level, level_with_error
 
-    band = band_of(settings, snapshot)
-    data = data_means(snapshot, band)
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for name in ("channel", "data", "true noise"):
         table.add_column(name, justify="left" if name == "channel" else "right")
     for method in METHODS:
         table.add_column(method, justify="right")
-    for column, label in enumerate(snapshot.channels):
+    for column, label in enumerate(result.snapshot.channels):
         found = {
             entry.method: entry
             for entry in compared
             if (entry.sensor, entry.channel) == (label.sensor, label.channel)
         }
-        row = [Text(label.name), Text(level(float(data[column])))]
+        row = [Text(label.name), Text(level(float(result.data[column])))]
         row.append(Text(level(found[METHODS[0]].true_psd)))
         for method in METHODS:
             entry = found[method]

@@ -27,13 +27,10 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from daq.bench.model import Bench
     from daq.estimation.estimation import Progress
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
-    from daq.recording.reader import Recording
     from daq.results.decision.verdict import TestVerdict
     from daq.results.noise_parameters import ChannelNoise
+    from daq.results.result import Result
 
 
 @examples(
@@ -69,27 +66,15 @@ def estimate(
     from tui.output.console import check_places, hint
 
     check_places(json, csv)
-    snapshot, settings, first = estimated(files, start=start, end=end, **wanted)
-    outline = first.outline
-    judged = noise_parameters or (outline is not None and outline.has_limits)
-    bench = first.bench if judged else None  # all of it takes as long to read as to estimate
+    result = estimated(files, start=start, end=end, whole=noise_parameters, **wanted)
     parameters = None
     if noise_parameters:
         from daq.results.noise_parameters import noise_parameters as parameters_of
 
-        parameters = parameters_of(snapshot, settings, bench)
-    found = show_result(
-        snapshot,
-        settings,
-        recordings=files,
-        json=json,
-        csv=csv,
-        bench=bench,
-        diagnostics=diagnostics,
-        parameters=parameters,
-    )
+        parameters = parameters_of(result, result.bench)
+    show_result(result, json=json, csv=csv, diagnostics=diagnostics, parameters=parameters)
     hint(f"For a report: huddle report {files[0]}")
-    exit_with(found)
+    exit_with(result.verdict)
 
 
 def exit_with(found: TestVerdict | None) -> None:
@@ -115,11 +100,16 @@ def estimated(
     *,
     start: str | None,
     end: str | None,
+    whole: bool = False,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
-) -> tuple[Snapshot, Settings, Recording]:
-    """Estimate recordings, showing the progress; return also settings and the first, closed."""
+) -> Result:
+    """Estimate recordings, showing the progress.
+
+    The whole bench takes as long to read as to estimate: without limits only where it is wanted.
+    """
     from daq.estimation.estimation import estimate
     from daq.recording.reader import Recording
+    from daq.results.result import Result
     from tui.runs.estimate_settings import settings_of
 
     with (
@@ -128,7 +118,9 @@ def estimated(
     ):
         settings = settings_of(first, start=start, end=end, **wanted)
         snapshot = estimate([first, *files[1:]], settings, progress=count)
-    return snapshot, settings, first
+    outline = first.outline
+    bench = first.bench if whole or (outline is not None and outline.has_limits) else None
+    return Result(snapshot, settings, bench, tuple(files))
 
 
 @contextmanager
@@ -156,23 +148,14 @@ def _counted_segments() -> Iterator[Progress | None]:
 
 
 def show_result(
-    snapshot: Snapshot,
-    settings: Settings,
+    result: Result,
     *,
-    recordings: Sequence[Path],
     json: str | None,
     csv: str | None,
-    bench: Bench | None,
     diagnostics: bool = False,
     parameters: Sequence[ChannelNoise] | None = None,
-) -> TestVerdict | None:
-    """Print the table, and write JSON and CSV if requested.
-
-    Returns
-    -------
-    TestVerdict or None
-        None where the bench file has no limits.
-    """
+) -> None:
+    """Print the table, and write JSON and CSV if requested."""
     from daq.results.noise_parameters import quantisation_shares
     from tui.output.console import STANDARD_OUTPUT, for_people, write_json, write_text
     from tui.output.diagnosis import details
@@ -180,41 +163,31 @@ def show_result(
     from tui.output.results import averages_line, curves_csv, result_table, result_title
     from tui.wording.facts import brief, known
 
-    screen = for_people(json, csv)
-    table = result_table(snapshot, settings)  # refuses a band without frequencies
-    screen.print(result_title(snapshot, settings))
+    snapshot, screen = result.snapshot, for_people(json, csv)
+    table = result_table(result)  # refuses a band without frequencies
+    screen.print(result_title(result))
     screen.print(averages_line(snapshot))
     screen.print(table)
-    for line in quantisation_notes(snapshot.channels, quantisation_shares(snapshot, settings)):
+    for line in quantisation_notes(snapshot.channels, quantisation_shares(result)):
         screen.print(line)
     if parameters is not None:
         _show_parameters(screen, parameters, snapshot.unit)
-    facts = known(snapshot, settings)
+    facts = known(result)
     for part in details(snapshot, facts) if diagnostics else brief(facts):
         screen.print(part)
-    found = None
-    if bench is not None and bench.limits:
-        from daq.results.decision.limits import judge
+    if json is not None:
+        from tui.output.json_document import document
 
-        found = judge(bench, snapshot, settings)
-    if json is not None or csv is not None:
-        from daq.results.sources import sources
-        from tui.output.csv_text import write_metadata
-        from tui.output.json_document import document, provenance
+        write_json(json, document(result, parameters))
+    if csv is not None:
+        write_text(csv, curves_csv(snapshot))
+        if csv != STANDARD_OUTPUT:
+            from tui.output.csv_text import write_metadata
+            from tui.output.json_document import provenance
 
-        about = sources(recordings)
-        if json is not None:
-            result = document(
-                snapshot, settings, sources=about, verdict=found, noise_parameters=parameters
-            )
-            write_json(json, result)
-        if csv is not None:
-            write_text(csv, curves_csv(snapshot))
-            if csv != STANDARD_OUTPUT:
-                write_metadata(Path(csv), provenance(snapshot, settings, about))
-    if found is not None:
-        _show_verdict(screen, found)
-    return found
+            write_metadata(Path(csv), provenance(result))
+    if result.verdict is not None:
+        _show_verdict(screen, result.verdict)
 
 
 def _show_verdict(screen: Console, found: TestVerdict) -> None:

@@ -61,7 +61,6 @@ def export(
 
     uff58: a function of type 9 (PSD) for each curve.
     """
-    from daq.results.sources import sources
     from tui.notebook.curve_files import MINISEED, WRITERS, write_curves
     from tui.output.console import for_people, write_json
     from tui.output.json_document import provenance
@@ -80,8 +79,9 @@ def export(
         known = ", ".join((MINISEED, *WRITERS))
         raise typer.BadParameter(f"--format {kind}: expected one of {known}")
     path = out or files[0].with_suffix(WRITERS[kind][0])
-    snapshot, settings, _ = estimated(files, start=start, end=end, **wanted)
-    write_curves(snapshot, kind, path, provenance(snapshot, settings, sources(files)))
+    result = estimated(files, start=start, end=end, **wanted)
+    snapshot = result.snapshot
+    write_curves(snapshot, kind, path, provenance(result))
     n_curves = len(snapshot.results) * len(snapshot.channels)
     for_people(json).print(f"{path} written: {several(n_curves, 'noise curve')}")
     write_json(json, {"file": str(path), "format": kind, "methods": list(snapshot.results)})

@@ -117,7 +117,6 @@ def issue(
     """
     from daq.bench.masks.mask_file import masks_named
     from daq.devices.bench_file import load
-    from daq.results.decision.limits import judge
     from tui.output.console import console, notices
 
     require("matplotlib", "jinja2", "fpdf", *(["pyhanko"] if sign is not None else []))
@@ -148,14 +147,14 @@ def issue(
         )
     if not is_specimen:
         examined.check()
-    snapshot, settings, recorded = estimated(files, start=start, end=end, **wanted)
+    result = estimated(files, start=start, end=end, whole=True, **wanted)
     with notices().status("making the certificate"):
         if is_specimen:
             place = files[0].absolute().parent if folder is None else folder
-            said = f"specimen: {specimen(snapshot, settings, examined, place)}"
+            said = f"specimen: {specimen(result, examined, place)}"
         else:
             ledger = ledger_of(files[0], examined.about) if folder is None else Ledger(folder)
-            entry, path = issue(snapshot, settings, examined, ledger)
+            entry, path = issue(result, examined, ledger)
             said = f"certificate {entry.name}: {path}"
             if signer is not None:
                 said += f"\nsigned with key {signer.key_id}"
@@ -165,7 +164,7 @@ def issue(
                     f"\nhuddle verify --certificates {ledger.folder} compares recordings with it"
                 )
     console().print(said, soft_wrap=True)
-    exit_with(judge(recorded.bench, with_stated(snapshot, examined), settings))
+    exit_with(with_stated(result, examined).verdict)
 
 
 @examples("huddle issues certificates", "huddle issues night.h5 --json -")

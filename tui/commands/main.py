@@ -103,10 +103,12 @@ def messages(error: BaseException) -> Iterator[str]:
         yield from (str(error) or type(error).__name__).splitlines()
         loaded = sys.modules.get("daq.estimation.snapshot")
         if loaded is not None and isinstance(error, loaded.NoResultError):
-            from tui.wording.facts import known  # noqa: PLC0415 - seldom needed
+            from daq.estimation.settings import Settings  # noqa: PLC0415 - seldom needed
+            from daq.results.result import Result  # noqa: PLC0415
+            from tui.wording.facts import known  # noqa: PLC0415
 
             refused = error.snapshot.refused  # in the message already
-            for each in known(error.snapshot):
+            for each in known(Result(error.snapshot, Settings())):
                 if each.needs_action and each.fact.method not in refused:
                     yield str(each)
 

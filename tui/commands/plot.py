@@ -65,9 +65,9 @@ def plot(
         raise typer.BadParameter(f"{out}: expected a file name that ends in .svg, .png or .pdf")
     check_places(str(out))
     masks = masks_named(models)
-    snapshot, settings, first = estimated(files, start=start, end=end, **wanted)
+    result = estimated(files, start=start, end=end, whole=True, **wanted)
     from tui.report.figures.curves import write_figure
 
     with notices().status("drawing"):
-        write_figure(snapshot, settings, first.bench, out, models=masks, width=width / 25.4)
+        write_figure(result, out, models=masks, width=width / 25.4)
     console().print(f"{out} written", soft_wrap=True)

@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from daq.bench.masks.mask import Mask
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
+    from daq.results.result import Result
     from tui.report.writing import Taken
 
 SUFFIXES = (".html", ".htm", ".pdf", ".xml")
@@ -73,22 +72,14 @@ def report(
     The exit code is 1 if a limit is not met, and 4 if that is not decided.
     """
     from daq.bench.masks.mask_file import masks_named
-    from daq.results.decision.limits import judge
     from tui.output.console import console
 
     masks = masks_named(models)
     out = checked(files[0].with_suffix(".html") if out is None else out)
-    snapshot, settings, first = estimated(files, start=start, end=end, **wanted)
-    write_report(
-        snapshot,
-        out,
-        recordings=files,
-        settings=settings,
-        models=masks,
-        taken="replace" if force else "refuse",
-        screen=console(),
-    )
-    exit_with(judge(first.bench, snapshot, settings))
+    result = estimated(files, start=start, end=end, whole=True, **wanted)
+    taken: Taken = "replace" if force else "refuse"
+    write_report(result, out, models=masks, taken=taken, screen=console())
+    exit_with(result.verdict)
 
 
 def checked(out: Path) -> Path:
@@ -111,11 +102,9 @@ def checked(out: Path) -> Path:
 
 
 def write_report(
-    snapshot: Snapshot,
+    result: Result,
     out: Path,
     *,
-    recordings: Sequence[Path],
-    settings: Settings,
     models: Sequence[Mask] = (),
     taken: Taken = "beside",
     screen: Console,
@@ -127,7 +116,6 @@ def write_report(
     ReportError
         If the file cannot be written.
     """
-    from daq.results.sources import sources
     from tui.output.console import notices
     from tui.report.writing import write
 
@@ -135,17 +123,10 @@ def write_report(
         from tui.certificate.dcc import dcc
         from tui.report.writing import write_content
 
-        out = write_content(out, dcc(snapshot, settings, sources(recordings)), taken)
+        out = write_content(out, dcc(result), taken)
         screen.print(f"{out} written", soft_wrap=True)
         return
     with notices().status("writing the report"):
-        report, out = write(
-            snapshot,
-            out,
-            recordings=recordings,
-            settings=settings,
-            models=models,
-            taken=taken,
-        )
+        report, out = write(result, out, models=models, taken=taken)
     screen.print(report.verdict.text, style=_COLOURS.get(report.verdict.tone))
     screen.print(f"{out} written", soft_wrap=True)

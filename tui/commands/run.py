@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
-    from daq.results.decision.verdict import TestVerdict
+    from daq.results.result import Result
     from tui.runs.recorder_process import RecorderProcess
 
 _LOGGER = logging.getLogger(__name__)
@@ -106,7 +106,7 @@ def run(
     from daq.devices.bench_file import load
     from daq.estimation.settings import Settings
     from daq.host_clock import SystemClock
-    from daq.results.decision.limits import judge
+    from daq.results.result import Result
     from tui.output.console import check_places, for_people, hint
     from tui.runs.estimate_settings import check_fit, chosen
     from tui.runs.recorder_process import RecorderProcess, defer_interrupt
@@ -133,29 +133,16 @@ def run(
         hint("Ctrl-C stops the recording and shows the result")
         with defer_interrupt(recorder.request_stop) as interruption:
             snapshot = result_of(recorder, settings, end=end, bench=bench)
+            result = Result(snapshot, settings, bench, (out,))
             # First into the recording, whatever becomes of screens and other files.
-            stored = _Stored(out, snapshot, judge(bench, snapshot, settings))
-            found = show_result(
-                snapshot,
-                settings,
-                recordings=[out],
-                json=json,
-                csv=csv,
-                bench=bench,
-                diagnostics=diagnostics,
-            )
+            stored = _Stored(out, result)
+            show_result(result, json=json, csv=csv, diagnostics=diagnostics)
             recorder.check()  # its error says more than one that follows from it
-            for line in noted(out, snapshot, settings, found):
+            for line in noted(out, result):
                 for_people(json, csv).print(line, soft_wrap=True)
             stored.check()
             if report is not None:
-                write_report(
-                    snapshot,
-                    report,
-                    recordings=[out],
-                    settings=settings,
-                    screen=for_people(json, csv),
-                )
+                write_report(result, report, screen=for_people(json, csv))
     except BaseException:
         recorder.request_stop()
         raise
@@ -165,18 +152,18 @@ def run(
         hint(f"For a report: huddle report {out}")
     if interruption.pressed:
         raise typer.Exit(ExitCode.INTERRUPTED)
-    exit_with(found)
+    exit_with(result.verdict)
 
 
 class _Stored:
     """Writes the results into the recording, and raises later what kept it from that."""
 
-    def __init__(self, out: Path, snapshot: Snapshot, found: TestVerdict | None) -> None:
+    def __init__(self, out: Path, result: Result) -> None:
         from daq.results.store import store_results
 
         self._error: RecordingError | None = None
         try:
-            store_results(out, snapshot, found)
+            store_results(out, result.snapshot, result.verdict)
         except RecordingError as error:
             self._error = error
 
@@ -207,8 +194,8 @@ def result_of(
     from daq.estimation.follow import RecordingLeftOpenError, follow
     from daq.recording.repair import repair
 
-    with _progress(end.duration, bench) as bar:
-        observer = _Run(bar)
+    with _progress(end.duration) as bar:
+        observer = _Run(bar, bench)
         try:
             snapshot = follow(
                 recorder.out,
@@ -258,8 +245,8 @@ def _estimate_at_end(recorder: RecorderProcess, settings: Settings) -> Snapshot 
 class _Run:
     """Shows the progress of a run."""
 
-    def __init__(self, bar: _Bar) -> None:
-        self._bar = bar
+    def __init__(self, bar: _Bar, bench: Bench | None) -> None:
+        self._bar, self._bench = bar, bench
         self._says_why = False
         self._now: RecordingStatus | None = None
 
@@ -269,12 +256,14 @@ class _Run:
 
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
         """Show the progress of the run."""
+        from daq.results.result import Result
         from tui.wording.facts import why_no_estimate
 
         if snapshot.closed:
             return
-        self._bar.estimated(snapshot, settings, self._now)
-        reason = why_no_estimate(snapshot)
+        result = Result(snapshot, settings, self._bench)
+        self._bar.estimated(result, self._now)
+        reason = why_no_estimate(result)
         if reason and not self._says_why:
             self._says_why = True
             _LOGGER.warning("%s", reason)
@@ -313,26 +302,20 @@ def refuse_hopeless(bench: Bench, settings: Settings, end: EndCondition) -> None
 class _Bar:
     """Progress line of a run: time, segments, c.o.v., how long it takes."""
 
-    def __init__(self, bar: Progress, duration: float | None, bench: Bench | None) -> None:
-        self._bar, self._bench = bar, bench
+    def __init__(self, bar: Progress, duration: float | None) -> None:
+        self._bar = bar
         self._task = bar.add_task("0:00", total=None, state="")
         self._end = duration
         self._cov = math.nan
         self._left = ""
 
-    def estimated(
-        self, snapshot: Snapshot, settings: Settings, now: RecordingStatus | None
-    ) -> None:
+    def estimated(self, result: Result, now: RecordingStatus | None) -> None:
         """Show the progress of the recording with the precision of its estimate."""
-        from daq.results.decision.end import remaining
-        from daq.results.decision.limits import judge
-        from daq.results.precision import precision
         from tui.wording.verdict_text import how_long
 
-        self._cov = precision(snapshot, settings).cov
+        snapshot, self._cov = result.snapshot, result.precision().cov
         if now is not None and not self._bar.disable:
-            verdict = judge(self._bench, snapshot, settings)
-            left = remaining(now.until, verdict, snapshot, settings, elapsed=now.elapsed)
+            left = result.remaining(now.until, now.elapsed)
             self._end = None if left.seconds is None else snapshot.elapsed + left.seconds
             self._left = how_long(left, now.in_local_time(left.seconds))
         self.recording(snapshot.n_segments, snapshot.elapsed)
@@ -365,7 +348,7 @@ class _Bar:
 
 
 @contextmanager
-def _progress(duration: float | None, bench: Bench | None) -> Iterator[_Bar]:
+def _progress(duration: float | None) -> Iterator[_Bar]:
     from rich.progress import BarColumn, TextColumn
 
     from tui.output.console import progress
@@ -376,4 +359,4 @@ def _progress(duration: float | None, bench: Bench | None) -> Iterator[_Bar]:
         TextColumn("{task.fields[state]}"),
         per_second=1,
     ) as bar:
-        yield _Bar(bar, duration, bench)
+        yield _Bar(bar, duration)

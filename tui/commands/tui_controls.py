@@ -26,7 +26,6 @@ from daq.preflight.preview import preview
 from daq.recording.control import ask
 from daq.recording.reader import Recording
 from daq.recording.storage.names import continuations, continued_name, recording_path
-from daq.results.sources import sources
 from daq.results.store import store_results
 from daq.whole_file import write_whole
 from tui.certificate.ledger import ledger_of
@@ -52,10 +51,9 @@ if TYPE_CHECKING:
     from daq.bench.masks.mask import Mask
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
     from daq.preflight.device_check import DiscoveredDevice
     from daq.preflight.preview import SensorPreview
-    from daq.results.decision.verdict import TestVerdict
+    from daq.results.result import Result
     from tui.application.controls import Preview
     from tui.application.plan import TestPlan
 
@@ -147,20 +145,16 @@ class _Controls:
         """Start the command that the user gave for events."""
         announce(self.on_event, event, text, path)
 
-    def noted(
-        self, path: Path, snapshot: Snapshot, settings: Settings, verdict: TestVerdict | None
-    ) -> list[str]:
+    def noted(self, path: Path, result: Result) -> list[str]:
         """Write a test into the ledger of sensors; return how they have changed."""
-        return noted(path, snapshot, settings, verdict)
+        return noted(path, result)
 
     def described(self, path: Path) -> Bench | None:
         """Return the bench that describes the parties of a certificate; None: the recorded one."""
         del path
         return None
 
-    def certify(
-        self, path: Path, snapshot: Snapshot, settings: Settings, wanted: Mapping[str, str]
-    ) -> Path:
+    def certify(self, path: Path, result: Result, wanted: Mapping[str, str]) -> Path:
         """Issue a certificate beside a recording, or make a specimen.
 
         Raises
@@ -181,8 +175,8 @@ class _Controls:
         if order.by and examined.objections:
             raise HuddleError("\n".join(each.line for each in examined.objections))
         if not order.by:
-            return issuing.specimen(snapshot, settings, examined, path.parent)
-        return issuing.issue(snapshot, settings, examined, ledger_of(path, examined.about))[1]
+            return issuing.specimen(result, examined, path.parent)
+        return issuing.issue(result, examined, ledger_of(path, examined.about))[1]
 
     def about(self, path: Path, changes: Mapping[str, Any]) -> tuple[Settings, Bench | None]:
         """Return the settings for a recording, with changes and methods for comparison; its bench.
@@ -326,26 +320,24 @@ class BenchControls(_Controls):
         with self.ports:
             return asyncio.run(discover(port, SystemClock()))
 
-    def keep(self, path: Path, snapshot: Snapshot, verdict: TestVerdict | None) -> None:
+    def keep(self, path: Path, result: Result) -> None:
         """Write the result into the recording, unless it holds one."""
         with Recording.open(path) as recording:
             if recording.results():
                 return
-        store_results(path, snapshot, verdict)
+        store_results(path, result.snapshot, result.verdict)
 
     def described(self, path: Path) -> Bench | None:
         """Return the bench as it is now, if the recording is of its sensors."""
         return self.bench if is_of(path, self.bench) else None
 
-    def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
+    def report(self, path: Path, result: Result) -> Path:
         """Write the report."""
-        return _report(path, snapshot, settings, folder=self.reports, models=self.models)
+        return _report(path, result, folder=self.reports, models=self.models)
 
-    def save(
-        self, path: Path, snapshot: Snapshot, settings: Settings, verdict: TestVerdict | None
-    ) -> tuple[Path, ...]:
+    def save(self, path: Path, result: Result) -> tuple[Path, ...]:
         """Write CSV and JSON beside the recording, or with the reports."""
-        return save_result(path, snapshot, settings, verdict, folder=self.reports or path.parent)
+        return save_result(path, result, folder=self.reports or path.parent)
 
     def release(self) -> None:
         """Release the recorders, which continue."""
@@ -449,18 +441,16 @@ class RecordingControls(_Controls):
         del port
         return ()
 
-    def keep(self, path: Path, snapshot: Snapshot, verdict: TestVerdict | None) -> None:
+    def keep(self, path: Path, result: Result) -> None:
         """Do nothing: the process that records writes the result."""
 
-    def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
+    def report(self, path: Path, result: Result) -> Path:
         """Write the report beside the recording."""
-        return _report(path, snapshot, settings, models=self.models)
+        return _report(path, result, models=self.models)
 
-    def save(
-        self, path: Path, snapshot: Snapshot, settings: Settings, verdict: TestVerdict | None
-    ) -> tuple[Path, ...]:
+    def save(self, path: Path, result: Result) -> tuple[Path, ...]:
         """Write CSV and JSON beside the recording."""
-        return save_result(path, snapshot, settings, verdict, folder=path.parent)
+        return save_result(path, result, folder=path.parent)
 
 
 def pin(source: Path, path: Path) -> str:
@@ -532,14 +522,7 @@ def announce(command: str, event: str, text: str, path: Path | None) -> None:
         raise HuddleError(f"--on-event {command}: {message}")
 
 
-def save_result(
-    path: Path,
-    snapshot: Snapshot,
-    settings: Settings,
-    verdict: TestVerdict | None,
-    *,
-    folder: Path,
-) -> tuple[Path, ...]:
+def save_result(path: Path, result: Result, *, folder: Path) -> tuple[Path, ...]:
     """Write an estimate as CSV and JSON; that of a growing recording has no entry for its file.
 
     Raises
@@ -548,18 +531,15 @@ def save_result(
         If a file cannot be written.
     """
     csv, json = (folder / f"{path.stem}{suffix}" for suffix in (".csv", ".json"))
-    write_whole(csv, curves_csv(snapshot).encode())
-    about = sources([path]) if snapshot.closed else ()
-    write_metadata(csv, provenance(snapshot, settings, about))
-    result = document(snapshot, settings, sources=about, verdict=verdict)
-    write_json(str(json), result)
+    write_whole(csv, curves_csv(result.snapshot).encode())
+    write_metadata(csv, provenance(result))
+    write_json(str(json), document(result))
     return csv, json
 
 
 def _report(
     path: Path,
-    snapshot: Snapshot,
-    settings: Settings,
+    result: Result,
     *,
     folder: Path | None = None,
     models: tuple[Mask, ...] = (),
@@ -568,10 +548,7 @@ def _report(
     from tui.report.writing import write  # noqa: PLC0415 - loads matplotlib
 
     out = (folder or path.parent) / f"{path.stem}.html"
-    _, out = write(
-        snapshot, out, recordings=[path], settings=settings, models=models, taken="beside"
-    )
-    return out
+    return write(result, out, models=models, taken="beside")[1]
 
 
 def without_comparison(settings: Settings) -> Settings:

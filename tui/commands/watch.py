@@ -21,10 +21,13 @@ from tui.commands.options import (
 )
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
+    from daq.results.result import Result
 
 
 @examples("huddle watch night.h5", "huddle watch night.h5 --json -   (one line of JSON per update)")
@@ -40,7 +43,6 @@ def watch(
 ) -> None:
     """Show the live estimate of a recording that another process writes."""
     from daq.estimation.follow import follow
-    from daq.results.decision.limits import judge
     from tui.runs.estimate_settings import settings_for
 
     if json is None and sys.stdout.isatty() and sys.stdin.isatty():
@@ -49,24 +51,24 @@ def watch(
         open_recording(file, start=start, end=end, **wanted)
         return
     settings, bench = settings_for(file, start=start, end=end, **wanted)
-    lines = _Lines(json, bench)
+    lines = _Lines(file, json, bench)
     try:
         follow(file, settings, lines)
     finally:
-        if lines.last is not None and lines.last.results and json is None:
-            show_result(lines.last, settings, recordings=[file], json=None, csv=None, bench=bench)
+        if lines.last is not None and lines.last.snapshot.results and json is None:
+            show_result(lines.last, json=None, csv=None)
     if lines.last is not None:
-        exit_with(judge(bench, lines.last, settings))
+        exit_with(lines.last.verdict)
 
 
 class _Lines:
     """Writes a line for each new segment and event, as text or as JSON."""
 
-    def __init__(self, json: str | None, bench: Bench | None) -> None:
-        self._json, self._bench = json, bench
+    def __init__(self, file: Path, json: str | None, bench: Bench | None) -> None:
+        self._file, self._json, self._bench = file, json, bench
         self._now: RecordingStatus | None = None
         self._n_events = 0
-        self.last: Snapshot | None = None
+        self.last: Result | None = None
         self._says_why = False
 
     def status(self, status: RecordingStatus) -> None:
@@ -96,25 +98,31 @@ class _Lines:
                 self._write({"event": document})
 
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
+        from daq.results.result import Result
         from tui.output.console import console
         from tui.output.json_values import plain
         from tui.wording.facts import why_no_estimate
         from tui.wording.formatting import clock_time
 
-        before, self.last = self.last, snapshot
-        reason = why_no_estimate(snapshot)
+        result = Result(snapshot, settings, self._bench, (self._file,))
+        before, self.last = self.last, result
+        reason = why_no_estimate(result)
         if reason and not self._says_why:
             self._says_why = True
             if self._json is None:
                 console().print(f"{clock_time(snapshot.elapsed)}  {reason}", soft_wrap=True)
             else:
                 self._write({"no_segment": plain(snapshot.no_segment), "text": reason})
-        if before is not None and not snapshot.closed and snapshot.n_segments == before.n_segments:
+        if (
+            before is not None
+            and not snapshot.closed
+            and snapshot.n_segments == before.snapshot.n_segments
+        ):
             return
         if self._json is None:
-            console().print(_line(snapshot, settings, self._now, self._bench), soft_wrap=True)
+            console().print(_line(result, self._now), soft_wrap=True)
         else:
-            self._write(_update(snapshot, settings, self._now, self._bench))
+            self._write(_update(result, self._now))
 
     def segments(self, n_segments: int, elapsed: float) -> None:
         pass
@@ -130,47 +138,33 @@ class _Lines:
             write_text(self._json, line, append=True)
 
 
-def _line(
-    snapshot: Snapshot, settings: Settings, now: RecordingStatus | None, bench: Bench | None
-) -> str:
-    from daq.bench.end_condition import NEVER
-    from daq.results.decision.end import remaining
-    from daq.results.decision.limits import judge
-    from daq.results.precision import precision
+def _line(result: Result, now: RecordingStatus | None) -> str:
     from tui.wording.formatting import clock_time
     from tui.wording.verdict_text import how_long
 
-    until = NEVER if now is None else now.until
-    reached = precision(snapshot, settings, target=until.cov)
-    state = "ended"
+    snapshot, state = result.snapshot, "ended"
     if not snapshot.closed and now is not None:
-        verdict = judge(bench, snapshot, settings)
-        left = remaining(until, verdict, snapshot, settings, elapsed=now.elapsed)
+        left = result.remaining(now.until, now.elapsed)
         state = how_long(left, now.in_local_time(left.seconds))
-    known = "" if math.isnan(reached.cov) else f"c.o.v. {reached.cov:.3f}  "
+    cov = result.precision().cov
+    known = "" if math.isnan(cov) else f"c.o.v. {cov:.3f}  "
     return f"{clock_time(snapshot.elapsed)}  {snapshot.n_segments} segments  {known}{state}"
 
 
-def _update(
-    snapshot: Snapshot, settings: Settings, now: RecordingStatus | None, bench: Bench | None
-) -> dict[str, Any]:
+def _update(result: Result, now: RecordingStatus | None) -> dict[str, Any]:
     """Return the update for programs: states, noise in the band, verdict."""
     from daq.bench.end_condition import NEVER
-    from daq.results.band_summary import band_of, channel_means
-    from daq.results.decision.end import remaining
-    from daq.results.decision.limits import judge
-    from daq.results.precision import precision
     from tui.output.json_document import verdict_document
     from tui.output.json_values import plain
 
-    until, verdict = NEVER if now is None else now.until, judge(bench, snapshot, settings)
+    snapshot, until = result.snapshot, NEVER if now is None else now.until
     elapsed = snapshot.elapsed if now is None else now.elapsed
-    left = remaining(until, verdict, snapshot, settings, elapsed=elapsed)
+    left = result.remaining(until, elapsed)
     document: dict[str, Any] = {
         "elapsed": snapshot.elapsed,
         "segments": snapshot.n_segments,
         "effective_averages": snapshot.n_effective,
-        "cov": precision(snapshot, settings).cov,
+        "cov": result.precision().cov,
         "time_left": left.seconds,
         "time_left_for": left.goal,
         "ends_too_early_for": left.short_of,
@@ -188,11 +182,10 @@ def _update(
             for sensor in (() if now is None else now.sensors)
         },
         "left_out": plain(snapshot.left_out),
-        **plain(verdict_document(verdict)),
+        **plain(verdict_document(result.verdict)),
     }
     if snapshot.results:
-        band = band_of(settings, snapshot)
-        document["band_hz"] = band
+        document["band_hz"] = result.band
         document["noise"] = {
             method: {
                 label.name: {
@@ -202,10 +195,10 @@ def _update(
                 }
                 for label, mean in zip(
                     snapshot.channels,
-                    channel_means(noise, snapshot, settings, band),
+                    result.means(method),
                     strict=True,
                 )
             }
-            for method, noise in snapshot.results.items()
+            for method in snapshot.results
         }
     return document

@@ -11,7 +11,7 @@ import numpy as np
 from daq.bench.masks.mask_file import masks_named
 from daq.bench.units import levels_db
 from daq.errors import WrongSettingError
-from daq.results.band_summary import band_of, levels
+from daq.results import result as results
 from daq.results.sources import uncounted_events
 from estimator.levels.bands import band_edges
 from tui.notebook import text
@@ -42,21 +42,14 @@ if TYPE_CHECKING:
     from tui.wording.facts import Known
 
 
-def figure(
-    snapshot: Snapshot,
-    settings: Settings,
-    bench: Bench | None,
-    *,
-    models: Sequence[Mask],
-    width: float,
-) -> Figure:
+def figure(result: results.Result, *, models: Sequence[Mask], width: float) -> Figure:
     """Return a figure with an axis for each channel, sensors below each other."""
     pyplot = load("matplotlib.pyplot")
     from tui.report.figures.curves import noise_plots  # noqa: PLC0415 - loads matplotlib
     from tui.report.figures.drawing import look, stack, stack_height  # noqa: PLC0415
 
     with look():
-        plots = noise_plots(snapshot, settings, bench, models)
+        plots = noise_plots(result, models)
         drawn: Figure = pyplot.figure(figsize=(width, stack_height(plots)), facecolor="white")
         stack(plots, drawn, margin=0.1)
     return drawn
@@ -156,10 +149,8 @@ class Result:
 
     Attributes
     ----------
-    snapshot : Snapshot
-        The complete result: clocks, gaps, octaves, diagnostics.
-    settings : Settings
-        Options of the estimate.
+    result : daq.results.result.Result
+        What follows from the estimate: band, means, precision, verdict, facts.
     """
 
     def __init__(
@@ -170,11 +161,18 @@ class Result:
         recordings: Sequence[Path] = (),
         recorded: Mapping[str, Channel] | None = None,
     ) -> None:
-        self.snapshot = snapshot
-        self.settings = settings
-        self._bench = bench
-        self._recordings = tuple(recordings)
+        self.result = results.Result(snapshot, settings, bench, tuple(recordings))
         self._recorded = recorded
+
+    @property
+    def snapshot(self) -> Snapshot:
+        """The complete result: clocks, gaps, octaves, diagnostics."""
+        return self.result.snapshot
+
+    @property
+    def settings(self) -> Settings:
+        """Options of the estimate."""
+        return self.result.settings
 
     @property
     def method(self) -> str:
@@ -265,7 +263,7 @@ class Result:
 
         Each has its typed ``fact`` with numbers, and its ``words``; ``str()`` gives sentences.
         """
-        return known(self.snapshot, self.settings)
+        return known(self.result)
 
     @property
     def advice(self) -> tuple[str, ...]:
@@ -283,22 +281,22 @@ class Result:
     @property
     def bench(self) -> Bench | None:
         """The bench in the recording, if it was one."""
-        return self._bench
+        return self.result.bench
 
     @property
     def recordings(self) -> tuple[Path, ...]:
         """The recordings that were estimated; none for arrays."""
-        return self._recordings
+        return self.result.recordings
 
     @property
     def _noise(self) -> SelfNoise:
         return self.snapshot.results[self.method]
 
     def __repr__(self) -> str:
-        return text.result(self.snapshot, self.settings)
+        return text.text(self.result)
 
     def _repr_html_(self) -> str:
-        return text.html(self.snapshot, self.settings)
+        return text.html(self.result)
 
     def __getitem__(self, label: tuple[str, str]) -> ChannelNoise:
         """Return one channel, by sensor and channel: ``result["A", "X"]``."""
@@ -333,7 +331,7 @@ class Result:
             )
         results = {method: self.snapshot.results[method]} | self.snapshot.results
         snapshot = replace(self.snapshot, results=results)
-        return Result(snapshot, self.settings, self._bench, self._recordings, self._recorded)
+        return Result(snapshot, self.settings, self.bench, self.recordings, self._recorded)
 
     def interval(self, confidence: float = 0.95) -> tuple[FloatArray, FloatArray]:
         """Return the ends of the interval of the noise at every frequency, at any confidence.
@@ -351,7 +349,7 @@ class Result:
         """
         quantile = _quantile(confidence)
         edges = np.arange(len(self.frequency) + 1)
-        return levels(self._noise, self.snapshot, self.settings, edges).ends(quantile)
+        return self.result.spectrum(self.method).levels(edges).ends(quantile)
 
     def band(
         self, low: float | None = None, high: float | None = None, *, confidence: float = 0.95
@@ -370,10 +368,10 @@ class Result:
         BandError
             If no frequency lies in the band.
         """
-        usual = band_of(self.settings, self.snapshot)
+        usual = self.result.band
         band = (usual[0] if low is None else low, usual[1] if high is None else high)
         edges = band_edges(self.frequency, band)
-        found = levels(self._noise, self.snapshot, self.settings, edges)
+        found = self.result.spectrum(self.method).levels(edges)
         noise_low, noise_high = found.ends(_quantile(confidence))
         inside = slice(*edges)
         width = np.gradient(self.frequency)[inside]
@@ -410,8 +408,7 @@ class Result:
         for mask in masks:
             mask.check_unit(self.unit)
         if ax is None:
-            bench, settings = self._bench, self.settings
-            return figure(self.snapshot, settings, bench, models=masks, width=width)
+            return figure(self.result, models=masks, width=width)
         draw(ax, self.snapshot, masks)
         drawn = ax.get_figure(root=True)
         if drawn is None:
@@ -431,7 +428,7 @@ class Result:
         from tui.notebook.tables import to_xarray  # noqa: PLC0415 - loads xarray
         from tui.output.json_document import provenance  # noqa: PLC0415 - seldom needed
 
-        said = provenance(self.snapshot, self.settings)
+        said = provenance(self.result, with_recordings=False)
         return to_xarray(self.snapshot, said, self._recorded, matrix=True)
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -441,11 +438,10 @@ class Result:
         replaced when the new one is complete. `huddle.load` reads it. Needs h5netcdf (extra
         ``notebook``) or zarr (extra ``zarr``).
         """
-        from daq.results.sources import sources  # noqa: PLC0415 - seldom needed
-        from tui.notebook.curve_files import write_dataset  # noqa: PLC0415
+        from tui.notebook.curve_files import write_dataset  # noqa: PLC0415 - seldom needed
         from tui.output.json_document import provenance  # noqa: PLC0415
 
-        said = provenance(self.snapshot, self.settings, sources(self._recordings))
+        said = provenance(self.result)
         write_dataset(self.to_xarray().assign_attrs(said), path)
 
     def to_frame(self) -> pd.DataFrame:
@@ -465,16 +461,9 @@ class Result:
         RecordingError
             If a recording cannot be read any more.
         """
-        from daq.results.decision.limits import judge  # noqa: PLC0415 - seldom needed
-        from daq.results.sources import sources  # noqa: PLC0415
-        from tui.output.json_document import document  # noqa: PLC0415
+        from tui.output.json_document import document  # noqa: PLC0415 - seldom needed
 
-        return document(
-            self.snapshot,
-            self.settings,
-            sources=sources(self._recordings),
-            verdict=judge(self._bench, self.snapshot, self.settings),
-        )
+        return document(self.result)
 
 
 def _quantile(confidence: float) -> float:

@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from estimator.errors import BandError
-from tui.output import results
+from tui.output.results import averages_line, result_table, result_title
 from tui.wording.facts import brief, known
 from tui.wording.formatting import level, level_with_error
 
@@ -21,33 +21,33 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import ChannelLabel, Snapshot
+    from daq.estimation.snapshot import ChannelLabel
+    from daq.results.result import Result
     from estimator.types import FloatArray
 
 _WIDTH = 100
 
 
-def result(snapshot: Snapshot, settings: Settings) -> str:
+def text(result: Result) -> str:
     """Return the table that ``huddle estimate`` prints, and where the advice is."""
     try:
         parts: list[RenderableType] = [
-            results.result_title(snapshot, settings),
-            Text(results.averages_line(snapshot)),
-            results.result_table(snapshot, settings),
+            result_title(result),
+            Text(averages_line(result.snapshot)),
+            result_table(result),
         ]
     except BandError as error:
-        return rendered([Text(f"Self-noise: {error}"), Text(results.averages_line(snapshot))])
-    parts += map(Text, brief(known(snapshot, settings), "print(*result.facts, sep='\\n')"))
+        return rendered([Text(f"Self-noise: {error}"), Text(averages_line(result.snapshot))])
+    parts += map(Text, brief(known(result), "print(*result.facts, sep='\\n')"))
     return rendered(parts)
 
 
-def html(snapshot: Snapshot, settings: Settings) -> str:
+def html(result: Result) -> str:
     """Return the table that ``huddle estimate`` prints, as HTML."""
     try:
         title, table = (
-            results.result_title(snapshot, settings),
-            results.result_table(snapshot, settings),
+            result_title(result),
+            result_table(result),
         )
     except BandError as error:
         return f"<p>Self-noise: {escape(str(error))}</p>"
@@ -57,7 +57,7 @@ def html(snapshot: Snapshot, settings: Settings) -> str:
         for tag, row in zip(chain(["th"], repeat("td")), zip(*columns, strict=True), strict=False)
     ]
     body = "".join(f"<tr>{row}</tr>" for row in rows)
-    lines = (results.averages_line(snapshot), *(each.line for each in known(snapshot, settings)))
+    lines = (averages_line(result.snapshot), *(each.line for each in known(result)))
     below = "".join(f"<p>{escape(line)}</p>" for line in lines)
     return (
         f"<table><caption>{escape(title.plain)}</caption><thead><tr>{header}</tr></thead>"

@@ -16,7 +16,6 @@ from daq.bench.masks.mask_file import masks_named
 from daq.errors import WrongSettingError
 from daq.results.calibration import CONFIDENCE
 from daq.results.calibration import calibrate as calibrated
-from daq.results.sources import sources
 from tui.notebook.curve_files import MINISEED, WRITERS, write_curves, write_samples
 from tui.notebook.estimates import PathLike, estimate
 from tui.notebook.result import Result
@@ -84,9 +83,7 @@ def calibrate(
         If no sensor can be compared with the reference.
     """
     found = _result(result, options)
-    return calibrated(
-        found.snapshot, found.settings, found.bench, reference=reference, confidence=confidence
-    )
+    return calibrated(found.result, found.bench, reference=reference, confidence=confidence)
 
 
 def export(
@@ -144,8 +141,7 @@ def export(
             f" {', '.join((*WRITERS, MINISEED))}"
         )
     found = _result(result, options)
-    said = provenance(found.snapshot, found.settings, sources(found.recordings))
-    write_curves(found.snapshot, kind, out, said)
+    write_curves(found.snapshot, kind, out, provenance(found.result))
 
 
 def report(
@@ -186,7 +182,7 @@ def report(
     from tui.report.writing import write  # noqa: PLC0415 - loads matplotlib
 
     masks = masks_named(models if isinstance(models, str) else ",".join(models))
-    write(found.snapshot, out, recordings=found.recordings, settings=found.settings, models=masks)
+    write(found.result, out, models=masks)
 
 
 def noise_model(name: str, frequency: ArrayLike, *, unit: str = "m/s²") -> FloatArray:

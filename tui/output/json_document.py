@@ -12,13 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 from daq.bench.estimate_settings import table_keys
 from daq.protocols.block import Quantity
-from daq.results.band_summary import band_of, data_means, levels
 from daq.results.clock_effect import relative_time
 from daq.results.facts import Fact, Finding
 from daq.results.sources import conditions
 from daq.results.uncertainty_budget import level_budget
 from estimator.checks.advice import Advice
-from estimator.levels.bands import band_edges
 from estimator.self_noise.result import Flag
 from tui import __version__
 from tui.output.calibration import channels_of
@@ -30,11 +28,11 @@ from tui.wording.facts import known
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.results.calibration import Calibration
     from daq.results.decision.verdict import TestVerdict
     from daq.results.noise_parameters import ChannelNoise
+    from daq.results.result import Result
     from daq.results.sources import Source
     from estimator.responses.calibration import SensorCalibration
     from estimator.responses.derived_quantities import Value
@@ -72,62 +70,45 @@ def result_document(snapshot: Snapshot, method: str) -> dict[str, Any]:
 
 
 def document(
-    snapshot: Snapshot,
-    settings: Settings,
-    *,
-    sources: Sequence[Source] = (),
-    verdict: TestVerdict | None = None,
-    noise_parameters: Sequence[ChannelNoise] | None = None,
+    result: Result, noise_parameters: Sequence[ChannelNoise] | None = None
 ) -> dict[str, Any]:
     """Return the JSON of a result: of its one method, or of all of them under ``results``.
 
     Parameters
     ----------
-    snapshot : Snapshot
+    result : Result
         A finished estimate.
-    settings : Settings
-        It was made with.
-    sources : sequence of Source
-        The recordings it was made from; none for arrays.
-    verdict : TestVerdict or None
-        On the limits of the bench file.
     noise_parameters : sequence of ChannelNoise or None
         Of every channel, where they were asked for.
     """
+    snapshot, sources = result.snapshot, result.sources
     documents = [result_document(snapshot, method) for method in snapshot.results]
     whole = {
         "schema_version": SCHEMA_VERSION,
         "software": {"name": "huddle-bench", "version": __version__},
         "run_id": sources[-1].run_id if sources else None,
         "recordings": [_recording(source) for source in sources],
-        "settings": _settings(settings, snapshot),
+        "settings": _settings(result),
     }
     whole |= documents[0] if len(documents) == 1 else {"results": documents}
-    whole |= verdict_document(verdict)
-    whole["facts"] = facts_document(known(snapshot, settings, verdict))
-    whole["band_means"] = _band_means(snapshot, settings)
+    whole |= verdict_document(result.verdict)
+    whole["facts"] = facts_document(known(result, with_verdict=True))
+    whole["band_means"] = _band_means(result)
     if noise_parameters is not None:
         whole["noise_parameters"] = plain(noise_parameters_document(noise_parameters))
     return whole
 
 
-def provenance(
-    snapshot: Snapshot, settings: Settings, sources: Sequence[Source] = ()
-) -> dict[str, str]:
+def provenance(result: Result, *, with_recordings: bool = True) -> dict[str, str]:
     """Return what made an estimate, as texts that files of other programs can hold.
 
-    Parameters
-    ----------
-    snapshot : Snapshot
-    settings : Settings
-        It was made with.
-    sources : sequence of Source
-        The recordings it was made from; none for arrays.
+    Checksums of recordings take as long as reading them.
     """
+    snapshot = result.snapshot
     start_ns = snapshot.start_utc_ns
     recordings = [
         {"file": each.path.name, "run_id": each.run_id, "sha256": each.sha256 or None}
-        for each in sources
+        for each in (result.sources if with_recordings else ())
     ]
     return {
         "title": "Self-noise of sensors, from a huddle test",
@@ -137,7 +118,7 @@ def provenance(
         "confidence_of_intervals": "0.95",
         "simulated": str(snapshot.simulated).lower(),
         "flags": json.dumps({str(flag.name).lower(): int(flag) for flag in Flag}),
-        "settings": json.dumps(_settings(settings, snapshot), ensure_ascii=False),
+        "settings": json.dumps(_settings(result), ensure_ascii=False),
         "recordings": json.dumps(recordings, ensure_ascii=False),
     }
 
@@ -198,16 +179,17 @@ def _recording(source: Source) -> dict[str, Any]:
     }
 
 
-def _settings(settings: Settings, snapshot: Snapshot) -> dict[str, Any]:
+def _settings(result: Result) -> dict[str, Any]:
     """Return the options of the estimate under their names in the bench file."""
+    snapshot = result.snapshot
 
     def value_of(name: str) -> object:
-        value = getattr(settings, name)
+        value = getattr(result.settings, name)
         return value.isoformat() if isinstance(value, datetime) else plain(value)
 
     return {
         **{key: value_of(name) for key, name in table_keys().items()},
-        "method": list(snapshot.results) or list(settings.methods),
+        "method": list(snapshot.results) or list(result.settings.methods),
         "unit": snapshot.unit,
         "start": value_of("start"),
         "end": value_of("end"),
@@ -215,18 +197,17 @@ def _settings(settings: Settings, snapshot: Snapshot) -> dict[str, Any]:
     }
 
 
-def _band_means(snapshot: Snapshot, settings: Settings) -> list[dict[str, Any]]:
+def _band_means(result: Result) -> list[dict[str, Any]]:
     """Return the mean noise of every channel in the band of the tables, by every method."""
+    snapshot = result.snapshot
     if not snapshot.results:
         return []
-    band = band_of(settings, snapshot)
-    data = data_means(snapshot, band).tolist()
-    edges = band_edges(snapshot.frequency, band)
+    band, data = result.band, result.data.tolist()
     documents = []
-    for method, noise in snapshot.results.items():
-        found = levels(noise, snapshot, settings, edges)
+    for method in snapshot.results:
+        found, means = result.levels(method, band), result.means(method)
         for column, label in enumerate(snapshot.channels):
-            mean, total = found.of_channel(column), level_budget(found, column, label, band)
+            mean, total = means[column], level_budget(found, column, label, band)
             documents.append(
                 {
                     "sensor": label.sensor,

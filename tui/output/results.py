@@ -9,13 +9,7 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from daq.results.band_summary import (
-    band_of,
-    channel_means,
-    data_interval,
-    data_means,
-    without_partners,
-)
+from daq.results.band_summary import data_interval
 from estimator.self_noise.result import Flag
 from tui.wording.formatting import (
     clock_time,
@@ -30,35 +24,34 @@ from tui.wording.vocabulary import (
 )
 
 if TYPE_CHECKING:
-    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from daq.results.result import Result
 
 
-def result_title(snapshot: Snapshot, settings: Settings) -> Text:
+def result_title(result: Result) -> Text:
     """Return the title of the table of results."""
-    low, high = band_of(settings, snapshot)
-    wanted = high if settings.band is None else settings.band[1]
+    low, high = result.band
+    wanted = high if result.settings.band is None else result.settings.band[1]
     asked = f" ({wanted:.3g} requested)" if wanted > high else ""
-    what = "Self-noise" if snapshot.results else "PSD of the recorded signals"
+    what = "Self-noise" if result.snapshot.results else "PSD of the recorded signals"
     return Text.assemble(
         (f"{what}, mean over {low:.3g} to {high:.3g} Hz", "bold"),
-        f"{asked}, dB re 1 ({snapshot.unit})²/Hz, with its 95 % interval",
+        f"{asked}, dB re 1 ({result.snapshot.unit})²/Hz, with its 95 % interval",
     )
 
 
-def result_table(snapshot: Snapshot, settings: Settings) -> Table:
+def result_table(result: Result) -> Table:
     """Return the noise of every channel in the band, by each method."""
-    band = band_of(settings, snapshot)
+    snapshot = result.snapshot
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("sensor")
     table.add_column("channel")
     table.add_column("data", justify="right")
-    columns = []
-    for method, noise in snapshot.results.items():
+    for method in snapshot.results:
         table.add_column(method, justify="right")
-        columns.append(channel_means(noise, snapshot, settings, band))
-    data, alone = data_means(snapshot, band), without_partners(snapshot, band)
-    ends = None if columns else data_interval(snapshot, settings, band)
+    columns = [result.means(method) for method in snapshot.results]
+    data, alone = result.data, result.alone
+    ends = None if columns else data_interval(result)
     for number, label in enumerate(snapshot.channels):
         power = float(data[number])
         no_signal = FLAG_WORDS[Flag.DEAD_CHANNEL].short

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Bench
     from daq.estimation.snapshot import Snapshot
+    from daq.results.result import Result
     from daq.results.sources import Condition, Source
     from tui.report.parts import Part
 
@@ -243,12 +244,12 @@ def _value(key: str, table: dict[str, object]) -> str:
 
 def notices(
     found: Sequence[Source],
-    snapshot: Snapshot,
-    settings: Settings,
+    result: Result,
     bench: Bench | None,
     issue: Issue | None,
 ) -> tuple[Paragraph, ...]:
     """Return what must be read before the numbers."""
+    settings = result.settings
     lines: list[Paragraph] = []
     if any(source.simulated for source in found):
         text = "SIMULATED SENSORS: the noise is that of a model. No instrument was measured."
@@ -271,7 +272,7 @@ def notices(
     if issue is not None and issue.despite:
         text = f"Issued despite facts that invalidate the result. Reason: {issue.despite}."
         lines.append(Paragraph(text, "bad"))
-    lines += [Paragraph(text, "bad") for text in without_samples(found[-1], snapshot)]
+    lines += [Paragraph(text, "bad") for text in without_samples(found[-1], result.snapshot)]
     stated = conditions(found, bench, start=settings.start, end=settings.end)
     lines += [Paragraph(text, "bad") for text in outside_range(stated)]
     lines.append(settings_line(settings, bench))

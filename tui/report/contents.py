@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING
 
 from daq.bench.durations import format_duration
 from daq.bench.estimate_settings import OPTIONS, table_keys
-from daq.results.band_summary import band_of
 from daq.results.calibration import calibrate
 from daq.results.decision.conformity import conformity, with_rule
-from daq.results.decision.limits import judge
 from estimator.errors import InsufficientDataError
 from tui.output.calibration import (
     LEGEND,
@@ -53,19 +51,18 @@ if TYPE_CHECKING:
     from daq.bench.masks.mask import Mask
     from daq.bench.model import Bench
     from daq.clocks.clock_model import ClockState
-    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.results.calibration import Calibration
+    from daq.results.result import Result
     from daq.results.sources import RecordedSensor, Source
     from tui.report.parts import Part
 
 
-def calibration_section(
-    snapshot: Snapshot, settings: Settings, bench: Bench | None
-) -> Section | None:
+def calibration_section(result: Result) -> Section | None:
     """Return the calibration against the reference; None where no sensors can be compared."""
+    snapshot = result.snapshot
     try:
-        found = calibrate(snapshot, settings, bench)
+        found = calibrate(result, result.bench)
     except InsufficientDataError:
         return None
     sensitivities = tuple(each for each in found.budgets if each.quantity != "noise")
@@ -114,9 +111,7 @@ _STATES = {
 
 
 def report_of(
-    snapshot: Snapshot,
-    settings: Settings,
-    found: Sequence[Source],
+    result: Result,
     models: Sequence[Mask] = (),
     *,
     issue: Issue | None = None,
@@ -126,12 +121,8 @@ def report_of(
 
     Parameters
     ----------
-    snapshot : Snapshot
-        A finished estimate, with its diagnostics.
-    settings : Settings
-        It was made with.
-    found : sequence of Source
-        The recordings it was made from.
+    result : Result
+        A finished estimate of recordings.
     models : sequence of Mask
         Noise models to show beside the noise.
     issue : Issue, optional
@@ -139,8 +130,8 @@ def report_of(
     about : Bench, optional
         Where laboratory, customer and sensors are described; default: the recorded bench.
     """
+    snapshot, found, judged = result.snapshot, result.sources, result.verdict
     bench = found[0].bench
-    judged = judge(bench, snapshot, settings)
     sentence = verdict(judged)
     states = {source.state for source in found}
     if "growing" in states or (not snapshot.closed and states == {"closed"}):
@@ -152,28 +143,28 @@ def report_of(
         sentence = Paragraph(text, "bad" if sentence.tone == "bad" else "doubtful")
     about = bench if about is None else about
     by_rule = with_rule(bench, about)
-    facts = known(snapshot, settings)
+    facts = known(result)
     sections = [
         parties_section(found, about, issue),
         _test_section(found),
         facts_section(facts),
         _sensors_section(snapshot, found, about),
-        conditions_section(found, about, settings),
+        conditions_section(found, about, result.settings),
         limits_section(
             snapshot,
             judged,
-            conformity(by_rule, snapshot, settings),
+            conformity(by_rule, result),
             None if by_rule is None else by_rule.certificate,
         ),
-        noise_section(snapshot, settings, bench, models),
-        uncertainty_section(snapshot, settings, about),
-        parameters_section(snapshot, settings, bench),
-        calibration_section(snapshot, settings, bench),
-        model_test_section(snapshot, settings),
+        noise_section(result, models),
+        uncertainty_section(result, about),
+        parameters_section(result),
+        calibration_section(result),
+        model_test_section(result),
         alignment_section(snapshot),
-        clocks_section(snapshot, settings),
+        clocks_section(result),
         events_section(snapshot, found),
-        _settings_section(snapshot, settings),
+        _settings_section(result),
         Section(
             "Signed off",
             (Signatures(("Name", "Date", "Signature")), Signatures(("Remarks",))),
@@ -186,7 +177,7 @@ def report_of(
         subtitle=f"Huddle test {name}" + (f", {utc_time(start)}" if is_known(start) else ""),
         verdict=sentence,
         sections=tuple(section for section in sections if section is not None),
-        notices=(*notices(found, snapshot, settings, about, issue), *invalidating(facts)),
+        notices=(*notices(found, result, about, issue), *invalidating(facts)),
         watermark=watermark(found, issue),
         number="" if issue is None else issue.name,
     )
@@ -280,16 +271,17 @@ def _response(channel: Channel) -> str:
     return f"{response.described}; sensitivity at {response.frequency:g} Hz"
 
 
-def _settings_section(snapshot: Snapshot, settings: Settings) -> Section:
+def _settings_section(result: Result) -> Section:
     """Return every option of the estimate, and what follows from them."""
+    snapshot, settings = result.snapshot, result.settings
     rate = 2 * float(snapshot.frequency[-1])
     rows = [
         ("Methods", ", ".join(snapshot.results) or ", ".join(settings.methods)),
-        ("Time used", _time_used(snapshot, settings)),
+        ("Time used", _time_used(result)),
         ("Common grid", f"{rate:.10g} Hz"),
         ("Frequency resolution", f"{1 / settings.segment:.4g} Hz between frequencies"),
         ("Segments used", f"{snapshot.n_segments}, n = {snapshot.n_effective:.1f} effective"),
-        ("Band of the tables", span(*band_of(settings, snapshot))),
+        ("Band of the tables", span(*result.band)),
         ("Unit", f"{snapshot.unit}; PSD one-sided, in ({snapshot.unit})²/Hz"),
     ]
     rows += [
@@ -316,8 +308,9 @@ def _settings_section(snapshot: Snapshot, settings: Settings) -> Section:
     return Section("Settings of the estimate", tuple(parts))
 
 
-def _time_used(snapshot: Snapshot, settings: Settings) -> str:
-    text = format_duration(round(snapshot.elapsed))
+def _time_used(result: Result) -> str:
+    settings = result.settings
+    text = format_duration(round(result.snapshot.elapsed))
     if settings.start is not None:
         text += f", from {utc_time(settings.start)}"
     if settings.end is not None:

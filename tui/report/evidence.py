@@ -10,8 +10,7 @@ import numpy as np
 
 from daq.bench.units import decibels
 from daq.protocols.block import EventKind
-from daq.results.band_summary import band_of
-from daq.results.clock_effect import effect_by_sensor, grade, reference, residuals
+from daq.results.clock_effect import grade, reference, residuals
 from daq.results.facts import Rank
 from daq.results.sources import uncounted_events, with_uncounted
 from estimator.checks.advice import NoSharedMotion
@@ -36,8 +35,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from daq.clocks.clock_model import ClockState
-    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from daq.results.result import Result
     from daq.results.sources import LoggedEvent, Source
     from estimator.checks.band import BandDiagnosis
     from estimator.checks.relative_response import RelativeResponse
@@ -54,11 +53,11 @@ TONES: Mapping[Rank, Tone] = {
 _USUAL = {EventKind.STARTED, EventKind.CONNECTED, EventKind.STOPPED, EventKind.MARK}
 
 
-def model_test_section(snapshot: Snapshot, settings: Settings) -> Section:
+def model_test_section(result: Result) -> Section:
     """Return where one common motion explains the sensors, and where not."""
     title = "Model test: do the sensors share one motion?"
-    found = snapshot.diagnostics.diagnosis
-    if found is None or snapshot.diagnostics.untested is not None:
+    found = result.snapshot.diagnostics.diagnosis
+    if found is None or result.snapshot.diagnostics.untested is not None:
         return Section(title, (Paragraph("Not tested: see the facts.", "doubtful"),))
     tested = [band for band in found.bands if math.isfinite(band.test.p_value)]
     rejected = rejected_below(band.test for band in tested)
@@ -95,7 +94,7 @@ def model_test_section(snapshot: Snapshot, settings: Settings) -> Section:
                 "One common motion explains what the sensors have in common, in all bands.", "good"
             )
         )
-    plot = model_test_plot(snapshot, settings)
+    plot = model_test_plot(result)
     if plot is not None:
         parts += [
             Paragraph(
@@ -188,13 +187,14 @@ def alignment_section(snapshot: Snapshot) -> Section:
     return Section(title, tuple(parts))
 
 
-def clocks_section(snapshot: Snapshot, settings: Settings) -> Section:
+def clocks_section(result: Result) -> Section:
     """Return what is known of each clock, and what it does to the noise."""
-    effects = effect_by_sensor(snapshot, settings)
+    snapshot = result.snapshot
+    effects = result.clock_effects
     worst = max((effect for effect in effects.values() if math.isfinite(effect)), default=math.nan)
     parts: list[Part] = []
     if math.isfinite(worst):
-        band = span(*band_of(settings, snapshot))
+        band = span(*result.band)
         tone = grade(worst)
         text = f"Errors of the clocks make up {share(worst)} of the noise within {band}"
         text += " at most: they do not matter here." if tone == "good" else " in the worst channel."

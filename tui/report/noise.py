@@ -8,15 +8,8 @@ from typing import TYPE_CHECKING
 from daq.bench.masks.mask import SOURCES
 from daq.bench.tables.certificate import Rule
 from daq.bench.units import decibels
-from daq.results.band_summary import (
-    band_of,
-    channel_means,
-    data_means,
-    known_range,
-    without_partners,
-)
+from daq.results.band_summary import known_range
 from daq.results.decision.conformity import Statement
-from daq.results.precision import channel_covs
 from estimator.decision.verdict import Verdict
 from estimator.self_noise.result import Flag
 from tui.report.figures.curves import noise_plots
@@ -37,13 +30,12 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from daq.bench.masks.mask import Mask
-    from daq.bench.model import Bench
     from daq.bench.tables.certificate import CertificateTable
-    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.results.band_summary import BandMeans
     from daq.results.decision.conformity import Conformity
     from daq.results.decision.verdict import TestVerdict
+    from daq.results.result import Result
     from tui.report.parts import Tone
 
 STATEMENTS: Mapping[Statement, str] = {
@@ -171,13 +163,12 @@ def _risk(risk: float) -> str:
     return "> 99.99 %" if risk > 0.9999 else f"{100 * risk:.2g} %"
 
 
-def noise_section(
-    snapshot: Snapshot, settings: Settings, bench: Bench | None, models: Sequence[Mask] = ()
-) -> Section:
+def noise_section(result: Result, models: Sequence[Mask] = ()) -> Section:
     """Return tables and plots of the noise of every channel."""
+    snapshot = result.snapshot
     if not snapshot.results:
         return Section("Self-noise", (Paragraph("Nothing can be said yet.", "doubtful"),))
-    parts: list[Part] = [_band_table(snapshot, settings)]
+    parts: list[Part] = [_band_table(result)]
     parts += [
         Paragraph(
             "The 95 % interval is that of the mean over the band, with all that widens it (see "
@@ -186,11 +177,11 @@ def noise_section(
             "quiet",
         )
     ]
-    octaves = _octave_table(snapshot, settings)
+    octaves = _octave_table(result)
     if octaves is not None:
         parts.append(octaves)
     if len(snapshot.results) > 1:
-        parts.append(_methods_table(snapshot, settings))
+        parts.append(_methods_table(result))
     parts.append(
         Paragraph(
             f"Below: one-sided power spectral density in dB re 1 ({snapshot.unit})²/Hz (left) and "
@@ -201,7 +192,7 @@ def noise_section(
             "quiet",
         )
     )
-    parts += noise_plots(snapshot, settings, bench, models)
+    parts += noise_plots(result, models)
     return Section("Self-noise", tuple(parts))
 
 
@@ -211,14 +202,13 @@ def _about_models(models: Sequence[Mask]) -> str:
     return f" Noise models: {'; '.join(found)}." if found else ""
 
 
-def _band_table(snapshot: Snapshot, settings: Settings) -> Table:
-    band = band_of(settings, snapshot)
-    method, noise = next(iter(snapshot.results.items()))
-    means = channel_means(noise, snapshot, settings, band)
-    data, covs = data_means(snapshot, band), channel_covs(snapshot, settings, method)
+def _band_table(result: Result) -> Table:
+    snapshot, band = result.snapshot, result.band
+    method = next(iter(snapshot.results))
+    means, data, alone = result.means(method), result.data, result.alone
+    covs = result.covs_of(method)
     no_signal = FLAG_WORDS[Flag.DEAD_CHANNEL].short
     rows = []
-    alone = without_partners(snapshot, band)
     for number, label in enumerate(snapshot.channels):
         name, recorded = f"{label.sensor}.{label.channel}", level(float(data[number]), 1)
         if number in alone:
@@ -266,13 +256,14 @@ def _snr(data: float, noise: float) -> str:
     return plain_number(decibels(data - noise) - decibels(noise), ".1f") if data > noise else "< 0"
 
 
-def _octave_table(snapshot: Snapshot, settings: Settings) -> Table | None:
+def _octave_table(result: Result) -> Table | None:
     """Return the mean noise in bands of an octave or more, by the first method."""
+    snapshot = result.snapshot
     bands = list(_octaves(known_range(snapshot)[0], float(snapshot.frequency[-2])))
     if len(bands) < 2:
         return None
-    noise = next(iter(snapshot.results.values()))
-    columns = [channel_means(noise, snapshot, settings, band) for band in bands]
+    method = next(iter(snapshot.results))
+    columns = [result.means(method, band) for band in bands]
     rows = []
     for number, label in enumerate(snapshot.channels):
         row = [f"{label.sensor}.{label.channel}"]
@@ -300,11 +291,9 @@ def _in_the_band(means: BandMeans) -> str:
     return level_with_error(mean, high, low)
 
 
-def _methods_table(snapshot: Snapshot, settings: Settings) -> Table:
-    band = band_of(settings, snapshot)
-    columns = [
-        channel_means(noise, snapshot, settings, band) for noise in snapshot.results.values()
-    ]
+def _methods_table(result: Result) -> Table:
+    snapshot, band = result.snapshot, result.band
+    columns = [result.means(method) for method in snapshot.results]
     rows = tuple(
         (
             f"{label.sensor}.{label.channel}",

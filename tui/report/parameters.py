@@ -24,10 +24,9 @@ from tui.wording.formatting import power_of_ten
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from daq.bench.model import Bench
-    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.results.noise_parameters import ChannelNoise
+    from daq.results.result import Result
 
 HEIGHT = 1.45
 
@@ -75,11 +74,10 @@ class _AllanPanel:
         axes.set_ylabel(f"Allan deviation ({self.unit})")
 
 
-def parameters_section(
-    snapshot: Snapshot, settings: Settings, bench: Bench | None
-) -> Section | None:
+def parameters_section(result: Result) -> Section | None:
     """Return noise terms, Allan deviation and data sheet; None where nothing can be fitted."""
-    found = noise_parameters(snapshot, settings, bench)
+    snapshot = result.snapshot
+    found = noise_parameters(result, result.bench)
     if not any(each.parameters is not None for each in found):
         return None
     parts: list[Part] = []
@@ -95,7 +93,7 @@ def parameters_section(
             parts.append(Table(header, tuple(rows), left=left, title=title))
     lines = [
         *notes(found),
-        *quantisation_notes(snapshot.channels, quantisation_shares(snapshot, settings)),
+        *quantisation_notes(snapshot.channels, quantisation_shares(result)),
     ]
     if lines:
         parts.append(Items(tuple(Paragraph(line, "doubtful") for line in lines)))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.bench.units import in_acceleration
-from daq.results.band_summary import Spectrum, band_of, judged_method, without_sensitivity
+from daq.results.band_summary import without_sensitivity
 from daq.results.uncertainty_budget import STATED, band_budgets
 from estimator.levels.contributions import Source
 from tui.report.figures import drawing
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.model import Bench
-    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from daq.results.result import Result
     from daq.results.uncertainty_budget import Budget
     from estimator.types import FloatArray
     from tui.report.parts import Part
@@ -43,17 +43,14 @@ HALF = 2**0.25
 """From the centre of a half octave to its end."""
 
 
-def uncertainty_section(
-    snapshot: Snapshot, settings: Settings, about: Bench | None
-) -> Section | None:
+def uncertainty_section(result: Result, about: Bench | None) -> Section | None:
     """Return level, contributions, total, and the noise in half octaves; None without a result."""
-    found = band_budgets(snapshot, settings)
+    snapshot = result.snapshot
+    found = band_budgets(result)
     if not found:
         return None
     names = [f"{label.sensor}.{label.channel}" for label in snapshot.channels]
-    method = judged_method(snapshot, settings)
-    band = span(*band_of(settings, snapshot))
-    unit = snapshot.unit
+    method, band, unit = result.method, span(*result.band), snapshot.unit
     of_g, in_si = _ratio(unit, "g"), _ratio(unit, "m/s²")
     rows = tuple(
         (
@@ -112,7 +109,7 @@ def uncertainty_section(
             "ends, and its standard uncertainty, of the level",
         ),
     ]  # fmt: skip
-    parts += _half_octaves(snapshot, settings, about, names)
+    parts += _half_octaves(result, about, names)
     return Section("Uncertainty", tuple(parts))
 
 
@@ -131,12 +128,10 @@ def half_octaves(frequency: FloatArray) -> tuple[FloatArray, list[NDArray[np.int
     return np.array(centres), bins
 
 
-def _half_octaves(
-    snapshot: Snapshot, settings: Settings, about: Bench | None, names: Sequence[str]
-) -> list[Part]:
+def _half_octaves(result: Result, about: Bench | None, names: Sequence[str]) -> list[Part]:
     """Return tables of the rms in half octaves, and of the range up to clipping where known."""
-    noise = snapshot.results[judged_method(snapshot, settings)]
-    spectrum = Spectrum(noise, snapshot, settings)
+    snapshot = result.snapshot
+    spectrum = result.spectrum(result.method)
     centres, bins = half_octaves(snapshot.frequency)
     if not len(centres):
         return []

@@ -13,7 +13,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from daq.errors import HuddleError
-from daq.results.sources import sources
 from daq.whole_file import write_whole
 from tui.report.contents import report_of
 from tui.report.figures import drawing
@@ -23,8 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from daq.bench.masks.mask import Mask
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
+    from daq.results.result import Result
     from tui.report.parts import Plot, Report
 
 _LIGHT = {
@@ -116,11 +114,9 @@ class ReportError(HuddleError, OSError):
 
 
 def write(
-    snapshot: Snapshot,
+    result: Result,
     path: str | Path,
     *,
-    recordings: Sequence[str | Path],
-    settings: Settings,
     models: Sequence[Mask] = (),
     taken: Taken = "refuse",
 ) -> tuple[Report, Path]:
@@ -128,15 +124,11 @@ def write(
 
     Parameters
     ----------
-    snapshot : Snapshot
-        The finished estimate: what `daq.estimation.estimate` or `Estimation.finish` returned.
+    result : Result
+        The finished estimate, with its recordings. In a process that follows one of them while it
+        grows, stop that first: HDF5 shares what it remembers of a file among its readers.
     path : path
         ``.html`` for a page, ``.pdf`` for paper. The file is complete when it has its name.
-    recordings : sequence of path
-        What the estimate was made from. In a process that follows one of them while it grows,
-        stop that first: HDF5 shares what it remembers of a file among its readers.
-    settings : Settings
-        What the estimate was made with.
     models : sequence of Mask
         Noise models to show beside the noise.
     taken : {"refuse", "replace", "beside"}
@@ -161,7 +153,7 @@ def write(
     """
     path = Path(path)
     check_suffix(path)
-    report = report_of(snapshot, settings, sources(recordings), models)
+    report = report_of(result, models)
     content = written(report, path.suffix)
     return report, write_content(path, content, taken)
 

@@ -17,7 +17,7 @@ from daq.errors import HuddleError
 from daq.estimation.follow import RecordingLeftOpenError, follow
 from daq.recording.control import ask
 from daq.recording.reader import Recording
-from daq.results.decision.end import is_reached
+from daq.results.result import Result
 from estimator.errors import EstimatorError
 
 if TYPE_CHECKING:
@@ -60,7 +60,8 @@ class EndObserver:
 
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
         """Stop the recorder if the estimate meets the condition."""
-        if not snapshot.closed and is_reached(self._until, self._bench, snapshot, settings):
+        result = Result(snapshot, settings, self._bench)
+        if not snapshot.closed and result.is_reached(self._until):
             ask(self._path, "stop")
             self.reached.set()
 

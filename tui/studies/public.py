@@ -27,7 +27,8 @@ from daq.estimation.settings import Settings
 from daq.formats.importer import import_files
 from daq.formats.response import Responses, is_response
 from daq.recording.reader import Recording
-from daq.results.band_summary import channel_means, data_means
+from daq.results.band_summary import data_means
+from daq.results.result import Result
 from estimator.self_noise.result import Flag
 from tui.output.console import check_places, for_people, notices, write_json
 from tui.output.extras import require
@@ -115,8 +116,9 @@ def model_free_bound(snapshot: Snapshot) -> tuple[FloatArray, FloatArray]:
     return bound * snapshot.data_psd, left
 
 
-def levels(test: str, snapshot: Snapshot, settings: Settings) -> Iterator[Level]:
+def levels(test: str, result: Result) -> Iterator[Level]:
     """Yield every method, and the bound, of each channel in each octave."""
+    snapshot = result.snapshot
     frequency = snapshot.frequency
     bound, left = model_free_bound(snapshot)
     top = _USED * 2 * frequency[-1]
@@ -131,7 +133,7 @@ def levels(test: str, snapshot: Snapshot, settings: Settings) -> Iterator[Level]
         data = data_means(snapshot, (low, high))
         rows = {BOUND: [*zip(mean, lower, upper, strict=True)]}
         for method, noise in snapshot.results.items():
-            means = channel_means(noise, snapshot, settings, (low, high))
+            means = result.means(method, (low, high))
             limits = ((noise.flags[inside] & Flag.UNIDENTIFIED) != 0).any(axis=0)  # no estimates
             rows[method] = [  # what the method itself says: huddle withdraws what is above a bound
                 (nan, nan, nan) if is_limit else (each.mean[0], *(end[0] for end in each.scatter))
@@ -162,7 +164,7 @@ def _db(psd: float) -> float:
     return 10 * float(np.log10(psd)) if psd > 0 else float("nan")
 
 
-def estimates_of(folder: Path, scratch: Path) -> tuple[Snapshot, Settings]:
+def estimates_of(folder: Path, scratch: Path) -> Result:
     """Return the estimates of a folder of waveforms and responses by every method, and how.
 
     A single response file is taken for all channels, several by code and date.
@@ -193,7 +195,7 @@ def estimates_of(folder: Path, scratch: Path) -> tuple[Snapshot, Settings]:
         segment=round(segment, 1),
         methods=("all",),
     )
-    return estimate([out], settings), settings
+    return Result(estimate([out], settings), settings)
 
 
 def _is_of_others(response: Path, waveforms: Sequence[Path]) -> bool:
@@ -233,16 +235,16 @@ def run(folders: Sequence[str], *, out: Path, json: str | None) -> bool:
     for number, folder in enumerate(map(Path, folders)):
         with TemporaryDirectory() as scratch:
             try:
-                snapshot, settings = estimates_of(folder, Path(scratch))
+                result = estimates_of(folder, Path(scratch))
             except (HuddleError, ValueError) as error:
                 notices().print(f"{folder}: {error}", soft_wrap=True)
                 failed = True
                 continue
         name = folder.resolve().name
-        own = list(levels(name, snapshot, settings))
+        own = list(levels(name, result))
         found += own
         _print(own, json)
-        figures += map(str, save(_study(f"{PUBLIC}-{number + 1}", name, snapshot), out))
+        figures += map(str, save(_study(f"{PUBLIC}-{number + 1}", name, result.snapshot), out))
     for_people(json).print(f"Figures in {out}.")
     write_json(json, {"levels": [asdict(each) for each in found], "figures": figures})
     return not failed and not any(each.contradicts for each in found)

@@ -47,9 +47,9 @@ def choice_of(state: State, asked: Mapping[str, str]) -> Choice:
     ValueError
         If it asks for what there is not.
     """
-    snapshot, settings = state.snapshot, state.settings
-    if snapshot is None or settings is None:
+    if state.result is None:
         return Choice()
+    snapshot, settings = state.result.snapshot, state.result.settings
     channel, unit = int(asked.get("channel", 0)), int(asked.get("unit", 0))
     if not 0 <= channel < len(snapshot.channels) or not 0 <= unit < len(units_of(snapshot.unit)):
         raise ValueError("no such channel or unit")

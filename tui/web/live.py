@@ -24,8 +24,7 @@ from rich.text import Text
 from daq.errors import HuddleError
 from daq.estimation.follow import follow
 from daq.recording.storage.locking import LOCKS_ARE_VISIBLE, is_being_written
-from daq.results.band_summary import band_of, channel_means, judged_method
-from daq.results.decision.limits import judge
+from daq.results.result import Result
 from estimator.errors import EstimatorError
 from tui.application.state import State
 from tui.application.test_view.channels import channel_table
@@ -283,7 +282,7 @@ class _Page:
         self._live, self.state, self._bench = live, state, bench
         self._recent = RecentMotion()
         self._traces: tuple[Trace, ...] = ()
-        self._drawn: Snapshot | None = None
+        self._drawn: Result | None = None
         self._next_note = 0.0
         self._of_estimate = dict.fromkeys(("verdict", "noise", "clocks"), "")
 
@@ -300,15 +299,8 @@ class _Page:
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
         """Take a new estimate."""
         moved = () if snapshot.closed else self._recent.strangers(snapshot)
-        snapshot = with_advice(snapshot, moved)
-        self.state = replace(
-            self.state,
-            snapshot=snapshot,
-            settings=settings,
-            judged_by=self._bench,
-            verdict=judge(self._bench, snapshot, settings),
-            note="",
-        )
+        result = Result(with_advice(snapshot, moved), settings, self._bench)
+        self.state = replace(self.state, result=result, note="")
         self._live.taken(self.state, is_new=True)
         self.draw()
 
@@ -325,20 +317,19 @@ class _Page:
 
     def draw(self) -> None:
         """Draw all parts of the page: what follows from the estimate once for each of them."""
-        state, now = self.state, self.state.now
-        snapshot, settings = state.snapshot, state.settings
-        if snapshot is not None and settings is not None and snapshot is not self._drawn:
-            self._of_estimate = _of_estimate(state, snapshot, settings)
-            self._drawn = snapshot
+        state, now, result = self.state, self.state.now, self.state.result
+        if result is not None and result is not self._drawn:
+            self._of_estimate = _of_estimate(state, result)
+            self._drawn = result
         progress = None
-        if now is not None and snapshot is not None and settings is not None:
-            progress = progress_line(now, snapshot, settings, state.verdict, width=1)
+        if now is not None and result is not None:
+            progress = progress_line(now, result, width=1)
         parts = _parts(
             "now_status",
             state=state,
             now=now,
             progress=progress,
-            alerts=[] if now is None else alerts(now, settings),
+            alerts=[] if now is None else alerts(now, result),
             events=() if now is None else _newest(now.events),
             traces=self._traces,
             service=self._live.status_lines(),
@@ -348,22 +339,24 @@ class _Page:
         self._live.publish({**self._of_estimate, **parts, "at": f"{at:%H:%M:%S} UTC"})
 
 
-def _of_estimate(state: State, snapshot: Snapshot, settings: Settings) -> dict[str, str]:
+def _of_estimate(state: State, result: Result) -> dict[str, str]:
     """Return the parts of the page that follow from the estimate."""
+    snapshot = result.snapshot
     choice, noise, clocks = choice_of(state, {}), None, None
     if snapshot.n_segments:
-        means = band_means(snapshot, settings)
-        noise = channel_table(replace(state, now=None), choice, means=means, width=WIDE)
+        noise = channel_table(
+            replace(state, now=None), choice, means=band_means(result), width=WIDE
+        )
     if snapshot.clocks:
-        clocks = clock_table(snapshot, settings, chosen="", width=WIDE)
+        clocks = clock_table(result, chosen="", width=WIDE)
     return _parts(
         "now_estimate",
         # Without a verdict, what delays it is among the facts.
-        advice=Text() if state.verdict is None else advice(snapshot, choice, state.verdict),
-        facts=[each for each in known(snapshot) if each.needs_action],
-        band=of_band(snapshot, settings),
+        advice=Text() if result.verdict is None else advice(result, choice),
+        facts=[each for each in known(result) if each.needs_action],
+        band=of_band(result),
         noise=noise,
-        clock=clock_line(snapshot, settings, width=WIDE),
+        clock=clock_line(result, width=WIDE),
         clocks=clocks,
     )
 
@@ -380,15 +373,11 @@ def _parts(template: str, **about: object) -> dict[str, str]:
     return dict(zip(parts[1::2], parts[2::2], strict=True))
 
 
-def band_means(snapshot: Snapshot, settings: Settings) -> tuple[BandMeans, ...]:
+def band_means(result: Result) -> tuple[BandMeans, ...]:
     """Return the noise of every channel in the band, by the method that is judged."""
-    method = judged_method(snapshot, settings)
-    if method not in snapshot.results:
-        return ()
-    band = band_of(settings, snapshot)
-    return channel_means(snapshot.results[method], snapshot, settings, band)
+    return () if result.noise is None else result.means(result.method)
 
 
-def of_band(snapshot: Snapshot, settings: Settings) -> str:
+def of_band(result: Result) -> str:
     """Return what the noise of a table is, and its unit."""
-    return f"mean over {span(*band_of(settings, snapshot))}, dB re 1 ({snapshot.unit})²/Hz"
+    return f"mean over {span(*result.band)}, dB re 1 ({result.snapshot.unit})²/Hz"

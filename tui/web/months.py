@@ -85,10 +85,10 @@ class Months:
             return {"answer": None}
         return {
             "answer": found,
-            "titles": (result_title(found.pooled, found.settings), course_title(found)),
-            "tables": (result_table(found.pooled, found.settings), course_table(found)),
+            "titles": (result_title(found.result), course_title(found)),
+            "tables": (result_table(found.result), course_table(found)),
             "averages": averages_line(found.pooled),
-            "facts": [each.line for each in known(found.pooled, found.settings)],
+            "facts": [each.line for each in known(found.result)],
             "remarks": list(remarks(found, "UTC")),
         }
 

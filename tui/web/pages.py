@@ -23,9 +23,10 @@ if TYPE_CHECKING:
 
 def about_test(state: State, settings_table: Mapping[str, Any]) -> dict[str, Any]:
     """Return what the page of a closed test shows beside its curves."""
-    snapshot, settings, verdict = state.snapshot, state.settings, state.verdict
-    if snapshot is None or settings is None:
+    result = state.result
+    if result is None:
         raise ValueError("not estimated")
+    snapshot, verdict = result.snapshot, result.verdict
     has_noise = bool(snapshot.results) and snapshot.n_segments > 0
     differences = None if state.reference is None else _differences(state)
     return {
@@ -35,17 +36,15 @@ def about_test(state: State, settings_table: Mapping[str, Any]) -> dict[str, Any
         "headline": "" if verdict is None else headline(verdict),
         "todo": [] if verdict is None else [*what_to_do(verdict), *not_judged(verdict)],
         "refused": [f"{method}: {why}" for method, why in snapshot.refused.items()],
-        "noise": channel_table(
-            state, choice_of(state, {}), means=band_means(snapshot, settings), width=WIDE
-        )
+        "noise": channel_table(state, choice_of(state, {}), means=band_means(result), width=WIDE)
         if has_noise
         else None,
-        "band": of_band(snapshot, settings),
+        "band": of_band(result),
         "differences": differences,
         "comparison": ""
         if state.reference is None or differences is not None
         else "The two tests cannot be compared: no channel, method, unit or band in common.",
-        "facts": known(snapshot, settings),
+        "facts": known(result),
         "marks": MARKS,
         "nothing_to_do": NOTHING_TO_DO,
         "limits": [] if verdict is None else [limit_line(each) for each in verdict.limits],
@@ -55,10 +54,9 @@ def about_test(state: State, settings_table: Mapping[str, Any]) -> dict[str, Any
 
 def _differences(state: State) -> Table | None:
     """Return by how much the noise of each channel differs from that of the other test."""
-    reference = state.reference
-    if reference is None or state.snapshot is None or state.settings is None:
+    if state.reference is None or state.result is None:
         return None
-    found = compare(state.snapshot, state.settings, reference.snapshot, reference.settings)
+    found = compare(state.result, state.reference.result)
     if not found:
         return None
     table = Table()

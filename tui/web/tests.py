@@ -11,8 +11,7 @@ from daq.errors import HuddleError
 from daq.estimation.estimation import estimate
 from daq.estimation.snapshot import NoResultError
 from daq.recording.storage.locking import is_being_written
-from daq.results.decision.limits import judge
-from daq.results.sources import sources
+from daq.results.result import Result
 from tui.application.state import Reference, State
 from tui.certificate.ledger import ledger_of
 from tui.output.json_document import document
@@ -145,16 +144,12 @@ class Tests:
             path.stem,
             bench,
             path=path,
-            snapshot=snapshot,
-            settings=settings,
-            judged_by=bench,
-            verdict=judge(bench, snapshot, settings),
+            result=Result(snapshot, settings, bench, (path,)),
         )
 
     def document(self, state: State) -> dict[str, Any]:
         """Return the result as `huddle estimate --json` writes it. Blocks."""
-        snapshot, settings, path = _known(state)
-        return document(snapshot, settings, sources=sources([path]), verdict=state.verdict)
+        return document(_known(state))
 
     def report(self, state: State, suffix: str) -> bytes:
         """Return the draft of a report as the content of a file. Blocks.
@@ -167,8 +162,7 @@ class Tests:
         from tui.report.contents import report_of  # noqa: PLC0415 - loads matplotlib
         from tui.report.writing import written  # noqa: PLC0415
 
-        snapshot, settings, path = _known(state)
-        return written(report_of(snapshot, settings, sources([path]), ()), suffix)
+        return written(report_of(_known(state)), suffix)
 
     def certificates(self, state: State) -> list[tuple[Certificate, Path]]:
         """Return the certificates of a test, and their files. Blocks.
@@ -178,11 +172,11 @@ class Tests:
         HuddleError
             If the ledger cannot be read.
         """
-        *_, path = _known(state)
-        ledger = ledger_of(path, self._bench)
+        result = _known(state)
+        ledger = ledger_of(result.recordings[0], self._bench)
         if not ledger.exists:
             return []
-        (source, *_) = sources([path])
+        source = result.sources[0]
         return [
             (entry, ledger.folder / entry.file)
             for entry in ledger.entries()
@@ -208,11 +202,11 @@ def content_of(certificate: Path) -> bytes:
 
 def compared(state: State, other: State) -> State:
     """Return a test beside which another one is drawn."""
-    snapshot, settings, path = _known(other)
-    return replace(state, reference=Reference(path, snapshot, settings))
+    result = _known(other)
+    return replace(state, reference=Reference(result.recordings[0], result))
 
 
-def _known(state: State) -> tuple[Any, Any, Path]:
-    if state.snapshot is None or state.settings is None or state.path is None:
+def _known(state: State) -> Result:
+    if state.result is None:
         raise NoSuchTestError(f"{state.name}: not estimated yet")
-    return state.snapshot, state.settings, state.path
+    return state.result

@@ -73,7 +73,7 @@ from daq.results.facts import (
     WithoutEstimate,
     WrongSensitivity,
 )
-from daq.results.known_facts import facts_of, facts_of_sensors, facts_of_verdict
+from daq.results.known_facts import facts_of_sensors, facts_of_verdict
 from estimator.checks.advice import Untested
 from estimator.decision.verdict import MIN_AVERAGES, Obstacle
 from estimator.self_noise.result import Refusal
@@ -86,9 +86,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
     from daq.results.decision.verdict import TestVerdict
+    from daq.results.result import Result
     from estimator.likelihood.dimension import BandDimension
 
 MARKS: Mapping[Rank, str] = {Rank.INVALIDATES: "✗", Rank.DELAYS: "▲", Rank.TO_KNOW: "·"}
@@ -161,11 +161,10 @@ class Known(NamedTuple):
         return str(self.words)
 
 
-def known(
-    snapshot: Snapshot, settings: Settings | None = None, verdict: TestVerdict | None = None
-) -> tuple[Known, ...]:
+def known(result: Result, *, with_verdict: bool = False) -> tuple[Known, ...]:
     """Return all facts of an estimate with their words, the worst rank first."""
-    return tuple(worded(facts_of(snapshot, settings, verdict), Names.of(snapshot)))
+    facts = result.all_facts if with_verdict else result.facts
+    return tuple(worded(facts, Names.of(result.snapshot)))
 
 
 def worded(facts: Iterable[Fact], names: Names = _NO_NAMES) -> list[Known]:
@@ -183,11 +182,11 @@ def known_of_sensors(now: RecordingStatus, settings: Settings | None) -> list[Kn
     return worded(facts_of_sensors(now, settings))
 
 
-def why_no_estimate(snapshot: Snapshot) -> str:
+def why_no_estimate(result: Result) -> str:
     """Return why a live estimate has no segment or leaves sensors out; empty where it does not."""
-    names = Names.of(snapshot)
+    names = Names.of(result.snapshot)
     reasons = NoSegmentUsable | NotInLiveEstimate
-    found = [fact for fact in facts_of(snapshot) if isinstance(fact, reasons)]
+    found = [fact for fact in result.facts if isinstance(fact, reasons)]
     return " ".join(str(word(fact, names)) for fact in found)
 
 

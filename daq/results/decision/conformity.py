@@ -23,16 +23,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.bench.tables.certificate import Rule
-from daq.results.band_summary import Spectrum, judged_method
 from daq.results.decision.limits import Bands, Columns
 from estimator.decision.comparison import joint_quantile
 from estimator.decision.verdict import Obstacle
 
 if TYPE_CHECKING:
     from daq.bench.model import Bench
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
-    from daq.results.band_summary import Levels
+    from daq.results.band_summary import Estimate, Levels
     from estimator.types import FloatArray
 
 QUANTILES = np.arange(0.0, 6.5, 0.25)
@@ -84,18 +81,18 @@ class Conformity:
     is_traceable: bool
 
 
-def conformity(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> list[Conformity]:
+def conformity(bench: Bench | None, estimate: Estimate) -> list[Conformity]:
     """Return the statement on every channel beside every limit, by the rule of the bench file.
 
     The bands and the channels are those of `daq.results.decision.limits.judge`.
     """
+    snapshot = estimate.snapshot
     if bench is None or not bench.limits:
         return []
     rule, r = bench.certificate.decision_rule, bench.certificate.guard_band
-    noise = snapshot.results.get(judged_method(snapshot, settings))
     bands = [Bands.of(bench, limit, snapshot) for limit in bench.limits]
     quantile = joint_quantile(sum(each.n_bands * len(each.columns) for each in bands))
-    spectrum = None if noise is None else Spectrum(noise, snapshot, settings)
+    spectrum = None if estimate.noise is None else estimate.spectrum(estimate.method)
     found = []
     for each in bands:
         columns, low, high = None, np.empty(0), np.empty(0)

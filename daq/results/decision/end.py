@@ -1,7 +1,6 @@
 """When a growing recording has what was wanted of it: a precision, or a decision.
 
-`is_reached` ends a test, and `remaining` says how long it still takes: the one duration that all
-screens show.
+`remaining` says how long a test still takes: the one duration that all screens show.
 """
 
 from __future__ import annotations
@@ -10,15 +9,12 @@ import enum
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from daq.results.decision.limits import judge
-from daq.results.precision import precision
 from estimator.decision.verdict import Verdict
 
 if TYPE_CHECKING:
     from daq.bench.end_condition import EndCondition
-    from daq.bench.model import Bench
-    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from daq.results.band_summary import Estimate
     from daq.results.decision.verdict import TestVerdict
 
 NOT_KNOWN_FROM = 10.0
@@ -62,26 +58,10 @@ class Remaining:
     target: float | None = None
 
 
-def is_reached(
-    end: EndCondition, bench: Bench | None, snapshot: Snapshot, settings: Settings
-) -> bool:
-    """Return whether a test is to end now by its live estimate.
-
-    Its duration is the recorder's business.
-    """
-    if end.cov is not None and precision(snapshot, settings).cov <= end.cov:
-        return True
-    if not end.decided:
-        return False
-    verdict = judge(bench, snapshot, settings)
-    return verdict is not None and verdict.is_sure
-
-
 def remaining(
     end: EndCondition,
     verdict: TestVerdict | None,
-    snapshot: Snapshot,
-    settings: Settings,
+    estimate: Estimate,
     *,
     elapsed: float,
 ) -> Remaining:
@@ -99,10 +79,10 @@ def remaining(
     elapsed : float
         Seconds since the start of the recording, which may have gone on since the snapshot.
     """
-    known = precision(snapshot, settings, target=end.cov)
+    known = estimate.precision(end.cov)
     left: dict[Goal, float | None] = {}
     if verdict is not None and (end.decided or end.cov is None):
-        left[Goal.DECISION] = _until_decided(verdict, snapshot, surely=end.decided)
+        left[Goal.DECISION] = _until_decided(verdict, estimate.snapshot, surely=end.decided)
     if known.target is not None and (end.cov is not None or verdict is None):
         is_known = known.cov <= NOT_KNOWN_FROM
         left[Goal.PRECISION] = known.seconds_left if is_known else None
@@ -112,7 +92,7 @@ def remaining(
     seconds, short_of = None if goal is None else left[goal], None
     if end.duration is not None:
         planned = max(0.0, end.duration - elapsed)
-        if seconds is None or elapsed + planned < snapshot.elapsed + seconds:
+        if seconds is None or elapsed + planned < estimate.snapshot.elapsed + seconds:
             goal, short_of, seconds = Goal.END, goal, planned
     return Remaining(goal, seconds, short_of, verdict, known.target)
 

@@ -14,9 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.results.band_summary import (
-    Spectrum,
     averages_at,
-    judged_method,
     known_range,
     without_partners,
 )
@@ -41,9 +39,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.model import Bench, Limit
-    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import ChannelLabel, Snapshot
-    from daq.results.band_summary import Levels
+    from daq.results.band_summary import Estimate, Levels
     from estimator.checks.sensitivities import WrongGain
     from estimator.types import FloatArray
 
@@ -51,15 +48,15 @@ ALIKE = 0.05
 """Difference of the gains of a sensor's channels up to which they are one gain."""
 
 
-def judge(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> TestVerdict | None:
+def judge(bench: Bench | None, estimate: Estimate) -> TestVerdict | None:
     """Return the verdict on all limits, by the method of the settings; None without limits."""
+    snapshot = estimate.snapshot
     if bench is None or not bench.limits:
         return None
-    method = judged_method(snapshot, settings)
-    noise = snapshot.results.get(method)
+    method = estimate.method
     bands = [Bands.of(bench, limit, snapshot) for limit in bench.limits]
     quantile = joint_quantile(sum(each.n_bands * len(each.columns) for each in bands))
-    spectrum = None if noise is None else Spectrum(noise, snapshot, settings)
+    spectrum = None if estimate.noise is None else estimate.spectrum(method)
     known: dict[bytes, Columns] = {}  # limits often share their bands
     found: list[Comparison] = []
     judged: list[Judged] = []

@@ -15,6 +15,7 @@ from daq.clocks.clock_model import ClockSource, ClockState
 from daq.estimation.diagnosis import residuals as residuals_between
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.results.result import Result
 from sim_devices.world.scenario import Scenario
 from tui.commands.main import app
 from tui.wording.facts import known
@@ -175,7 +176,7 @@ def test_where_the_resampler_damps_nothing_is_said(tmp_path: Path) -> None:
     noise = snapshot.results["three-sensor"].noise_psd
     assert np.isnan(noise[beyond]).all()
     assert np.isfinite(noise[2:][~beyond[2:]]).all()  # the trend is not in the first bins
-    said = "\n".join(each.line for each in known(snapshot))
+    said = "\n".join(each.line for each in known(Result(snapshot, Settings())))
     assert "no estimate above 90 Hz" in said
     assert "not finite" not in said
     found = snapshot.diagnostics.diagnosis

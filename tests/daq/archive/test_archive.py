@@ -28,7 +28,6 @@ from daq.errors import ArchiveError, RecordingError, WrongArchiveError, WrongSet
 from daq.estimation.contributions import contributions
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
-from daq.results import known_facts
 from daq.results.facts import AbsencesNotUsed, SpanShortened
 from estimator.levels.contributions import Source
 from estimator.spectra.segment_rejection import Reason
@@ -407,7 +406,7 @@ def test_a_sensor_that_shortens_recordings_is_named(tmp_path: Path) -> None:
     assert fill(store, paths) == []
     for entries, _ in (store.entries(), store.entries()):  # from files, and from the index
         found = answer(store, entries, SETTINGS)
-        facts = known_facts.facts_of(found.pooled)
+        facts = found.result.facts
         (fact,) = [each for each in facts if isinstance(each, SpanShortened)]
         assert (fact.sensors, fact.at_end) == (("C",), False)
         assert fact.seconds == pytest.approx(1200.0, abs=1.0)

@@ -15,7 +15,7 @@ from daq.archive.rollup import Grid, merged_levels, rolled_up, summaries
 from daq.archive.spectra_file import Described, Origin, Summary
 from daq.bench.channel import Channel
 from daq.estimation.settings import Settings
-from daq.results.band_summary import channel_means
+from daq.results.result import Result
 from tests.traced_memory import peak_of
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def test_bands_of_the_grid_are_those_of_the_bins(band: tuple[float, float]) -> N
     average.add(DESCRIBED, 0, N_SEGMENTS, csm)
     snapshot = ESTIMATOR.snapshot(average)
     noise = snapshot.results["three-sensor"]
-    wanted = channel_means(noise, snapshot, SETTINGS, grid.ends(span))
+    wanted = Result(snapshot, SETTINGS).means(noise.method, grid.ends(span))
     low, high = found.ends()
     for column, one in enumerate(wanted):
         assert found.mean[0, 0, column] == pytest.approx(one.mean[0], rel=1e-6)

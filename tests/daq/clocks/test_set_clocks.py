@@ -21,7 +21,7 @@ from daq.recorder.block_writer import BlockWriter
 from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
 from daq.recording.writer import RecordingWriter
-from daq.results.band_summary import channel_means
+from daq.results.result import Result
 from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, create
 from tests.peers.digitizer import CODES, START, Digitizer, seedlink
 
@@ -75,7 +75,7 @@ def test_noise_is_right_where_clocks_of_digitizers_are_set(
     writer.write(arrived)
     writer.close(arrival(SECONDS + 1), "the end")
     snapshot = estimate([path], SETTINGS)
-    means = channel_means(snapshot.results["three-sensor"], snapshot, SETTINGS, (1.0, 40.0))
+    means = Result(snapshot, SETTINGS).means("three-sensor", (1.0, 40.0))
     true = 2 * (30_000**2 / SNR) / RATE
     for mean in means:
         assert 0.8 < mean.mean[0] / true < 1.25

@@ -13,8 +13,8 @@ from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
-from daq.results.band_summary import levels
 from daq.results.facts import ClockNotUnderstood, SamplesUncounted
+from daq.results.result import Result
 from tests.daq.clock_facts import clock_facts
 from tests.known_clocks import NOISE, Oscillator, Scene, growing, record, seconds_of
 
@@ -51,7 +51,7 @@ def clocks_of(
 def errors(snapshot: Snapshot, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Return level over truth in dB, and whether the interval holds the truth, by band."""
     edges = np.searchsorted(snapshot.frequency, min(scene.rates) * np.array(EDGES))
-    found = levels(snapshot.results["three-sensor"], snapshot, SETTINGS, edges)
+    found = Result(snapshot, SETTINGS).spectrum("three-sensor").levels(edges)
     low, high = found.ends()
     with np.errstate(invalid="ignore"):
         error = 10 * np.log10(found.mean / NOISE)

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 import huddle
 from daq.estimation.settings import Settings
-from daq.results.band_summary import levels
 from daq.results.calibration import calibrate
+from daq.results.result import Result
 from estimator.checks.advice import NoiseChanges, ResponseChanges
 from tui.wording.findings import Names, alert
 
@@ -87,9 +87,7 @@ def test_a_response_that_changes_is_named_sized_and_dated(
 def test_levels_within_parts_are_those_of_a_steady_bench(kind: str, most: float) -> None:
     """Over all parts, motion 60 dB above the noise leaves up to 28 dB in it."""
     snapshot = estimated(kind, 3, ratio=1e6)
-    found = levels(
-        snapshot.results["three-sensor"], snapshot, Settings(), np.array([5, 20, 45, 90])
-    )
+    found = Result(snapshot, Settings()).spectrum("three-sensor").levels(np.array([5, 20, 45, 90]))
     assert np.abs(10 * np.log10(found.mean / NOISE)).max() < most
     noise = snapshot.results["three-sensor"]
     inside = slice(5, 90)
@@ -134,7 +132,7 @@ def test_steady_noise_of_more_than_4096_segments_scatters_as_all_of_them() -> No
 def test_a_gain_that_drifts_is_in_the_uncertainty_of_the_calibration() -> None:
     """A ramp of 3 % has the standard deviation 3 % / sqrt(12)."""
     snapshot = estimated("ramp", 1)
-    found = calibrate(snapshot, Settings(), None, reference="A")
+    found = calibrate(Result(snapshot, Settings()), None, reference="A")
     by_sensor = {
         budget.sensor: {each.source: each.relative for each in budget.components}
         for budget in found.budgets
@@ -142,5 +140,5 @@ def test_a_gain_that_drifts_is_in_the_uncertainty_of_the_calibration() -> None:
     }
     assert by_sensor["B"]["drift"] == pytest.approx(0.03 / np.sqrt(12), rel=0.05)
     assert "drift" not in by_sensor["C"]
-    found = calibrate(snapshot, Settings(), None, reference="B")
+    found = calibrate(Result(snapshot, Settings()), None, reference="B")
     assert all("drift" in {e.source for e in each.components} for each in found.budgets[:3])

@@ -18,7 +18,7 @@ from daq.formats.arrays import recording_of_arrays
 from daq.formats.importer import import_files
 from daq.recording.reader import Recording
 from daq.results.facts import ChannelsAbsent, SpanShortened
-from daq.results.known_facts import facts_of
+from daq.results.result import Result
 from estimator.checks.advice import Untested
 from estimator.checks.count_limits import CountLimits
 from estimator.levels.pooled import blocks_of
@@ -164,7 +164,9 @@ def test_methods_that_pair_channels_by_number_are_named(
     methods: tuple[str, ...], only: tuple[str, ...]
 ) -> None:
     snapshot = estimated("ABC", {"B0": [1]}, settings=replace(SETTINGS, methods=methods))
-    (fact,) = [each for each in facts_of(snapshot) if isinstance(each, ChannelsAbsent)]
+    (fact,) = [
+        each for each in Result(snapshot, Settings()).facts if isinstance(each, ChannelsAbsent)
+    ]
     assert set(fact.complete_only) == set(only)
 
 
@@ -184,13 +186,17 @@ def test_a_sensor_that_begins_late_or_ends_early_costs_three_others_nothing(
     counts = np.array(snapshot.channel_segments)
     np.testing.assert_allclose(counts[:9], N_PARTS * per_part, atol=N_PARTS)
     np.testing.assert_allclose(counts[9:], (N_PARTS - len(parts)) * per_part, atol=N_PARTS)
-    assert not [fact for fact in facts_of(snapshot) if isinstance(fact, SpanShortened)]
+    assert not [
+        fact for fact in Result(snapshot, Settings()).facts if isinstance(fact, SpanShortened)
+    ]
 
 
 def test_a_third_sensor_that_begins_late_shortens_the_estimate_and_is_named() -> None:
     snapshot = estimated("ABC", {f"B{column}": [0] for column in range(3)})
     assert snapshot.elapsed == (N_PARTS - 1) * PART / RATE
-    (fact,) = [fact for fact in facts_of(snapshot) if isinstance(fact, SpanShortened)]
+    (fact,) = [
+        fact for fact in Result(snapshot, Settings()).facts if isinstance(fact, SpanShortened)
+    ]
     assert (fact.sensors, fact.seconds, fact.at_end) == (("B",), PART / RATE, False)
     whole = estimated("ABC", {})
     assert whole.shortened == {}

@@ -10,7 +10,7 @@ from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
 from daq.results.band_summary import Spectrum
 from daq.results.facts import RoundedAlike
-from daq.results.known_facts import facts_of
+from daq.results.result import Result
 from estimator.levels.contributions import Source
 
 RATE, N_SAMPLES = 100.0, 30_000
@@ -37,7 +37,11 @@ def _levels(
     for without in ((), (Source.COUNTS,)):
         low, high = found.ends(without=without)
         held.append((low <= truth) & (truth <= high))
-    return held[0], held[1], [f for f in facts_of(snapshot) if isinstance(f, RoundedAlike)]
+    return (
+        held[0],
+        held[1],
+        [f for f in Result(snapshot, Settings()).facts if isinstance(f, RoundedAlike)],
+    )
 
 
 @pytest.mark.parametrize(("n_sensors", "n_channels"), [(3, 1), (3, 3), (5, 1)])

@@ -17,7 +17,7 @@ from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError
 from daq.protocols.block import BlockFlag
 from daq.results.facts import ChannelsWrap, Rank, ReadingsRepeat
-from daq.results.known_facts import facts_of
+from daq.results.result import Result
 from estimator.checks.advice import (
     Copies,
     Gain,
@@ -196,7 +196,7 @@ def test_counts_that_wrap_and_readings_that_repeat_invalidate_a_result(tmp_path:
     swell = 40_000 * np.sin(2 * np.pi * n / 777)[:, None]
     sensors["b"].counts[:] = (sensors["b"].counts // 100 + swell + 32768) % 65536 - 32768
     found = estimate([write(tmp_path / "r.h5", sensors)], SETTINGS)
-    facts = {each.name: each for each in facts_of(found, SETTINGS)}
+    facts = {each.name: each for each in Result(found, SETTINGS).facts}
     assert isinstance(wrap := facts["channels-wrap"], ChannelsWrap)
     assert wrap.bits == (16, 16, 16)
     assert isinstance(repeat := facts["readings-repeat"], ReadingsRepeat)

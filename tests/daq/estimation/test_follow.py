@@ -28,7 +28,7 @@ from daq.estimation.settings import Settings
 from daq.estimation.throttle import Throttle
 from daq.recording.control import Command, serve
 from daq.results.facts import NotInLiveEstimate
-from daq.results.known_facts import facts_of
+from daq.results.result import Result
 from daq.results.sources import sources, uncounted_events
 from estimator.errors import InsufficientDataError
 from tests import known_clocks
@@ -317,7 +317,9 @@ def test_more_sensors_than_memory_allows_wait_for_the_result(
     live, last = noted.snapshots
     assert live.sensor_names == ("A", "B")
     assert live.not_estimated == ("C",)
-    (left_out,) = [each for each in facts_of(live) if isinstance(each, NotInLiveEstimate)]
+    (left_out,) = [
+        each for each in Result(live, Settings()).facts if isinstance(each, NotInLiveEstimate)
+    ]
     assert left_out.sensors == ("C",)
     assert left_out.n_all == 3
     assert result is last

@@ -8,9 +8,8 @@ import pytest
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
-from daq.results.band_summary import levels
 from daq.results.facts import NotLinear, Rank
-from daq.results.known_facts import facts_of
+from daq.results.result import Result
 from estimator.checks.advice import ResponseChanges
 
 RATE, N_SAMPLES = 100.0, 30_000
@@ -29,13 +28,17 @@ def test_a_square_is_in_the_interval_or_subtracted(linearise: bool, scale: float
     }
     settings = Settings(segment=5.0, linearise=linearise, axis_tolerance={"": 0.0})
     snapshot = estimate([recording_of_arrays(arrays, sampling_rate=RATE)], settings)
-    (fact,) = (each for each in facts_of(snapshot, settings) if isinstance(each, NotLinear))
+    (fact,) = (each for each in Result(snapshot, settings).facts if isinstance(each, NotLinear))
     assert fact.channels == ("B.1",)
     assert fact.shares[0] == pytest.approx(8 / 9, abs=0.1)  # (2e-3)**2 * 2 * 1e6 over 1
     assert fact.rank is (Rank.TO_KNOW if linearise else Rank.DELAYS)
     assert fact.is_subtracted is linearise
     result = next(iter(snapshot.results.values()))
-    found = levels(result, snapshot, settings, np.searchsorted(snapshot.frequency, EDGES))
+    found = (
+        Result(snapshot, settings)
+        .spectrum(result.method)
+        .levels(np.searchsorted(snapshot.frequency, EDGES))
+    )
     low, high = found.ends()
     truth = 2 / RATE * scale**2
     held = (low < truth) & (truth < high)

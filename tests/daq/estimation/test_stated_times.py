@@ -19,14 +19,13 @@ from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.segments.stated_times import compare, drift_of
 from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
-from daq.results.band_summary import channel_means
 from daq.results.facts import (
     ClockNotUnderstood,
     ClocksMayExplain,
     StatedTimesDrift,
     StatedTimesUnchecked,
 )
-from daq.results.known_facts import facts_of
+from daq.results.result import Result
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
 from tests.daq.clock_facts import clock_facts
@@ -134,7 +133,7 @@ def test_a_drift_that_segments_are_too_short_for_widens_the_intervals(tmp_path: 
     assert set(clock_facts(short)[0].uncorrected) == {"b", "c"}
     assert [clock.drifts for clock in longer.clocks] == [False, False, False]
     for snapshot in (short, longer):
-        means = channel_means(snapshot.results["three-sensor"], snapshot, SETTINGS, (1.0, 20.0))
+        means = Result(snapshot, SETTINGS).means("three-sensor", (1.0, 20.0))
         for mean in means:
             assert mean.low[0] < 1e12 * NOISE < mean.high[0]
 
@@ -402,7 +401,9 @@ def test_a_step_in_the_middle_is_not_taken_for_noise(
         assert clock.corrected or clock.drifts
     else:  # about half a piece and more: nobody knows by how much
         assert not clock.is_understood or clock.drifts
-        may = [each for each in facts_of(snapshot, SETTINGS) if isinstance(each, ClocksMayExplain)]
+        may = [
+            each for each in Result(snapshot, SETTINGS).facts if isinstance(each, ClocksMayExplain)
+        ]
         assert all(math.isfinite(each.error) for each in may)
 
 

@@ -11,9 +11,9 @@ import pytest
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
-from daq.results.band_summary import channel_means, data_interval, data_means
+from daq.results.band_summary import data_interval
 from daq.results.facts import FewSensors, NoiseNotIdentified, SteadyGainsAssumed
-from daq.results.known_facts import facts_of
+from daq.results.result import Result
 from estimator.self_noise.result import Flag, Refusal
 
 if TYPE_CHECKING:
@@ -67,11 +67,11 @@ def test_two_sensors_have_a_noise_where_the_motion_changes(d: int, settings: Set
         rng = np.random.default_rng([d, seed])
         snapshot = estimated(samples(rng, change=6.0, d=d), settings)
         noise = snapshot.results["multi-part"]
-        means = channel_means(noise, snapshot, settings, BAND)
+        means = Result(snapshot, settings).means(noise.method, BAND)
         truth = 2 / RATE * np.repeat(NOISE, d)
         held += [m.low[0] <= t <= m.high[0] for m, t in zip(means, truth, strict=True)]
         errors += [m.mean[0] / t - 1 for m, t in zip(means, truth, strict=True)]
-        kinds = {type(fact) for fact in facts_of(snapshot, settings)}
+        kinds = {type(fact) for fact in Result(snapshot, settings).facts}
         assert SteadyGainsAssumed in kinds
     assert np.mean(held) >= 0.8  # 8 or 24 intervals of 95 %
     assert abs(np.mean(errors)) < 0.1
@@ -82,9 +82,9 @@ def test_steady_motion_leaves_an_upper_limit_and_says_what_is_missing() -> None:
     noise = snapshot.results["multi-part"]
     assert np.all(noise.flags[2:-6] & Flag.UNIDENTIFIED)
     truth = 2 / RATE * np.repeat(NOISE, 3)
-    for mean, true in zip(channel_means(noise, snapshot, SETTINGS, BAND), truth, strict=True):
+    for mean, true in zip(Result(snapshot, SETTINGS).means(noise.method, BAND), truth, strict=True):
         assert mean.low[0] <= 0 < true < mean.high[0]
-    (fact,) = (f for f in facts_of(snapshot, SETTINGS) if isinstance(f, NoiseNotIdentified))
+    (fact,) = (f for f in Result(snapshot, SETTINGS).facts if isinstance(f, NoiseNotIdentified))
     assert fact.refusal is Refusal.STEADY
     assert fact.change < 0.2
     assert len(fact.channels) == 6
@@ -96,7 +96,9 @@ def test_a_gain_that_follows_the_loudness_by_a_percent_gives_no_noise() -> None:
     noise = snapshot.results["multi-part"]
     refused = (noise.flags[1:-6] & Flag.UNIDENTIFIED) != 0
     assert refused.mean() > 0.7
-    causes = {f.refusal for f in facts_of(snapshot) if isinstance(f, NoiseNotIdentified)}
+    causes = {
+        f.refusal for f in Result(snapshot, Settings()).facts if isinstance(f, NoiseNotIdentified)
+    }
     assert Refusal.GAIN_FOLLOWS in causes
 
 
@@ -104,11 +106,11 @@ def test_one_sensor_shows_its_spectrum() -> None:
     rng = np.random.default_rng(7)
     snapshot = estimated({"A": rng.standard_normal((20_000, 2))})
     assert not snapshot.results
-    low, high = data_interval(snapshot, SETTINGS, BAND)
-    mean = data_means(snapshot, BAND)
+    result = Result(snapshot, replace(SETTINGS, band=BAND))
+    (low, high), mean = data_interval(result), result.data
     assert np.all((low < mean) & (mean < high) & (high / low < 1.2))
     assert np.all((low < 2 / RATE) & (high > 2 / RATE))
-    assert any(isinstance(fact, FewSensors) for fact in facts_of(snapshot))
+    assert any(isinstance(fact, FewSensors) for fact in Result(snapshot, Settings()).facts)
 
 
 def test_parts_of_a_recording_hold_all_of_it() -> None:

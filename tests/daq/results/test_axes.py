@@ -12,7 +12,7 @@ from daq.bench.estimate_settings import from_text, to_table
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
-from daq.results.band_summary import channel_means
+from daq.results.result import Result
 from estimator.checks.advice import SharedNoise
 from estimator.levels.contributions import across
 
@@ -47,7 +47,7 @@ def held_by(snapshot: Snapshot, settings: Settings) -> tuple[float, float]:
         [
             (float(mean.low[0]) / truth, float(mean.high[0]) / truth)
             for band in BANDS
-            for mean in channel_means(noise, snapshot, settings, band)
+            for mean in Result(snapshot, settings).means(noise.method, band)
         ]
     )
     held = (ends[:, 0] <= 1) & (ends[:, 1] >= 1)

@@ -10,7 +10,7 @@ import pytest
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
-from daq.results.band_summary import channel_means
+from daq.results.result import Result
 from estimator.checks.advice import SharedNoise
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def held(snapshot: Snapshot, noise: np.ndarray) -> np.ndarray:
     """Return which intervals hold the true noise, shape (n_bands, n_channels)."""
     (result,) = snapshot.results.values()
     truth = noise.transpose(1, 0, 2).reshape(N_SAMPLES, -1).var(axis=0) * 2 / RATE
-    means = [channel_means(result, snapshot, SETTINGS, band) for band in BANDS]
+    means = [Result(snapshot, SETTINGS).means(result.method, band) for band in BANDS]
     return np.array(
         [
             [mean.low[0] <= true <= mean.high[0] for mean, true in zip(band, truth, strict=True)]

@@ -22,6 +22,7 @@ from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
 from daq.results.band_summary import judged_method
 from daq.results.calibration import calibrate
+from daq.results.result import Result
 from daq.results.uncertainty_budget import Budget, Component, student_quantile
 from estimator.responses.derived_quantities import Value
 from tests.daq.clocks.recordings import Sensor, write
@@ -90,7 +91,7 @@ def test_a_delay_is_known_only_where_clocks_are(
     path = write(tmp_path / "r.h5", sensors)
 
     snapshot = estimate([path], SETTINGS)
-    found = calibrate(snapshot, SETTINGS, None)
+    found = calibrate(Result(snapshot, SETTINGS), None)
 
     diagnosis = snapshot.diagnostics.diagnosis
     assert diagnosis is not None
@@ -138,7 +139,7 @@ def bench(value: float, expanded: float) -> Bench:
 
 
 def test_relative_sensitivities_with_their_budget(snapshot: Snapshot) -> None:
-    found = calibrate(snapshot, SETTINGS, None)
+    found = calibrate(Result(snapshot, SETTINGS), None)
     assert found.reference == 0
     budgets = found.whole_band("sensitivity")
     assert len(budgets) == 6
@@ -161,7 +162,7 @@ def noise_of(sensor: str, *, reference: str = "a", certificate: float = 1.0) -> 
 
 
 def test_a_certificate_makes_results_absolute(snapshot: Snapshot) -> None:
-    found = calibrate(snapshot, SETTINGS, bench(1.03, 0.0206))
+    found = calibrate(Result(snapshot, SETTINGS), bench(1.03, 0.0206))
     assert found.reference == 1
     budgets = {(each.sensor, each.channel): each for each in found.whole_band("sensitivity")}
     each = budgets["a", "c0"]
@@ -177,7 +178,7 @@ def test_a_certificate_makes_results_absolute(snapshot: Snapshot) -> None:
 def test_noise_is_in_terms_of_the_calibrated_sensitivities(
     snapshot: Snapshot, certificate: float
 ) -> None:
-    noise = calibrate(snapshot, SETTINGS, bench(certificate, 1e-4)).whole_band("noise")
+    noise = calibrate(Result(snapshot, SETTINGS), bench(certificate, 1e-4)).whole_band("noise")
     assert len(noise) == 9
     for each in noise:
         assert each.is_absolute
@@ -192,7 +193,7 @@ def test_a_sensor_that_is_not_calibrated_has_no_budget_of_its_noise() -> None:
     samples["d"] = 80 * motion[:, :1] + rng.standard_normal((5000, 1))
     settings = Settings(segment=2.0)
     snapshot = estimate([recording_of_arrays(samples, 50.0, unit="m/s²")], settings)
-    found = calibrate(snapshot, settings, None)
+    found = calibrate(Result(snapshot, settings), None)
     assert list(found.refused) == [3]
     assert {each.sensor for each in found.budgets} == {"a", "b", "c"}
 
@@ -207,7 +208,7 @@ def test_a_channel_without_positive_noise_is_named(snapshot: Snapshot) -> None:
     changed = replace(
         snapshot, results={**snapshot.results, method: replace(noise, noise_psd=psd, low=low)}
     )
-    found = calibrate(changed, SETTINGS, None)
+    found = calibrate(Result(changed, SETTINGS), None)
     assert [label.name for label in found.without_noise] == ["b.c1"]
     assert len(found.whole_band("noise")) == 8
     assert any("Mean noise of b.c1: not positive" in line for line in remarks(found, changed))
@@ -215,7 +216,8 @@ def test_a_channel_without_positive_noise_is_named(snapshot: Snapshot) -> None:
 
 def test_a_higher_level_of_confidence_widens_what_is_stated(snapshot: Snapshot) -> None:
     usual, cautious = (
-        calibrate(snapshot, SETTINGS, None, confidence=level).budgets[0] for level in (0.95, 0.99)
+        calibrate(Result(snapshot, SETTINGS), None, confidence=level).budgets[0]
+        for level in (0.95, 0.99)
     )
     assert cautious.k / usual.k == pytest.approx(2.576 / 1.960, rel=0.01)
 
@@ -231,7 +233,7 @@ def test_what_cannot_be_is_refused(
     snapshot: Snapshot, options: dict[str, object], expected: str
 ) -> None:
     with pytest.raises(WrongSettingError, match=expected):
-        calibrate(snapshot, SETTINGS, None, **options)  # type: ignore[arg-type]
+        calibrate(Result(snapshot, SETTINGS), None, **options)  # type: ignore[arg-type]
 
 
 def test_a_budget_adds_squares_and_weighs_degrees_of_freedom() -> None:
@@ -288,14 +290,14 @@ def test_sensors_of_one_channel_have_no_angle() -> None:
     }
     settings = Settings(segment=2.0)
     snapshot = estimate([recording_of_arrays(samples, 50.0, unit="m/s²")], settings)
-    found = calibrate(snapshot, settings, None)
+    found = calibrate(Result(snapshot, settings), None)
     header, rows = sensitivity_table(found, snapshot)
     assert [row[header.index("angle (°)")] for row in rows] == ["–", "–"]
     assert any("cosines of their tilts" in line for line in remarks(found, snapshot))
 
 
 def test_an_ambiguous_delay_is_said(snapshot: Snapshot) -> None:
-    found = calibrate(snapshot, SETTINGS, None)
+    found = calibrate(Result(snapshot, SETTINGS), None)
     unknown = Value(np.full(3, np.nan), np.full(3, np.nan))
     first = replace(found.sensors[0], delay=unknown, is_ambiguous=True)
     changed = replace(found, sensors=(first, *found.sensors[1:]))
@@ -319,7 +321,7 @@ def test_the_delay_of_a_third_sensor_is_in_the_budget_of_the_others() -> None:
     }
     settings = Settings(segment=1.0, equalise="off", band=(1.0, 40.0))
     snapshot = estimate([recording_of_arrays(samples, rate, unit="m/s²")], settings)
-    budget = calibrate(snapshot, settings, None).whole_band("sensitivity")[0]
+    budget = calibrate(Result(snapshot, settings), None).whole_band("sensitivity")[0]
     bias = (2 * np.pi) ** 2 / 3 * (5e-3 * 20e-3 - 5e-3**2 / 2)  # Hann: factor 1 / (3 T²)
     (leakage,) = (part for part in budget.components if part.source == "leakage")
     assert leakage.relative * math.sqrt(3) == pytest.approx(bias, rel=0.05)
@@ -329,9 +331,9 @@ def test_the_delay_of_a_third_sensor_is_in_the_budget_of_the_others() -> None:
 def test_what_widens_the_interval_is_in_the_budget_of_the_noise(snapshot: Snapshot) -> None:
     faulty = replace(snapshot.diagnostics, edge_leakage=None)
     assert snapshot.added_by_clocks is not None
-    for budget in calibrate(replace(snapshot, diagnostics=faulty), SETTINGS, None).whole_band(
-        "noise"
-    ):
+    for budget in calibrate(
+        Result(replace(snapshot, diagnostics=faulty), SETTINGS), None
+    ).whole_band("noise"):
         sources = [part.source for part in budget.components]
         assert "edges" not in sources
         assert "clocks" in sources

@@ -14,7 +14,7 @@ from daq.estimation.diagnosis import bias_of_clocks
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot_diagnostics import CLOCK_FACTOR, Synchronisation
-from daq.results.band_summary import channel_means
+from daq.results.result import Result
 from estimator.methods import self_noise
 from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot
 from tui.output.results import result_table
@@ -30,7 +30,7 @@ OPPOSITE = np.array([[0.0, 1.0, 1.0], [1.0, 0.0, 4.0], [1.0, 4.0, 0.0]])
 
 def test_means_are_lowered_by_four_times_what_is_expected_of_the_clocks() -> None:
     means = [
-        channel_means(snapshot.results["three-sensor"], snapshot, SETTINGS, BAND)
+        Result(snapshot, SETTINGS).means("three-sensor", BAND)
         for snapshot in (made_snapshot(clock_share=0.0), made_snapshot(clock_share=0.01))
     ]
     for without, with_clocks in zip(*means, strict=True):
@@ -59,9 +59,9 @@ def test_tables_show_both_halves_where_the_lower_one_is_wider() -> None:
     assert level_with_error(-1.0, -0.5, -2.0) == "below 0"
     assert level_with_error(100.0, 10**0.01, 1.0) == "below 0.10"  # a bound beneath it
     assert level_with_error(1.0, math.inf, 0.5) == "not known"
-    table = result_table(made_snapshot(clock_share=0.05), SETTINGS)
+    table = result_table(Result(made_snapshot(clock_share=0.05), SETTINGS))
     assert "+" in str(next(iter(table.columns[3].cells)))
-    table = result_table(made_snapshot(clock_share=0.0001), SETTINGS)
+    table = result_table(Result(made_snapshot(clock_share=0.0001), SETTINGS))
     assert "±" in str(list(table.columns[3].cells)[-1])  # the first has an uneven scatter
 
 

@@ -12,6 +12,7 @@ from daq.bench.sensitivity import KnownSensitivity
 from daq.estimation.contributions import with_sensitivities
 from daq.results.band_summary import BandMeans
 from daq.results.comparison import compare, difference
+from daq.results.result import Result
 from estimator.self_noise.result import SelfNoise
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
 
@@ -45,7 +46,7 @@ def test_like_channels_are_compared_in_the_common_band() -> None:
     doubled = SelfNoise.of(noise.method, 2 * noise.noise_psd, scale * noise.cumulants, noise.flags)
     louder = replace(snapshot, csm=2 * snapshot.csm, results={"three-sensor": doubled})
     other = replace(SETTINGS, band=(2.0, 30.0))
-    found = compare(louder, SETTINGS, snapshot, other)
+    found = compare(Result(louder, SETTINGS), Result(snapshot, other))
     assert len(found) == 9
     for each in found.values():
         assert each.db == pytest.approx(10 * math.log10(2), abs=1e-6)
@@ -57,13 +58,13 @@ def test_an_uncertain_sensitivity_is_no_part_of_a_difference() -> None:
     """It is the same in both tests; the temperature may not be."""
     snapshot = made_snapshot(n_effective=2000.0)
     names = [(label.sensor, label.channel) for label in snapshot.channels]
-    exact = compare(snapshot, SETTINGS, snapshot, SETTINGS)
+    exact = compare(Result(snapshot, SETTINGS), Result(snapshot, SETTINGS))
     for known, same in (
         (KnownSensitivity(own=0.1), True),
         (KnownSensitivity(own=0.1, coefficient=0.01), False),
     ):
         stated = with_sensitivities(snapshot, dict.fromkeys(names, known.at((0.0, 40.0))))
-        found = compare(stated, SETTINGS, stated, SETTINGS)
+        found = compare(Result(stated, SETTINGS), Result(stated, SETTINGS))
         assert (found == exact) == same
         assert found[names[0]].high_db >= exact[names[0]].high_db
 
@@ -75,9 +76,11 @@ def test_what_has_nothing_in_common_is_not_compared() -> None:
         replace(snapshot, results={}),
         replace(snapshot, channels=tuple(replace(c, sensor="Z") for c in snapshot.channels)),
     )
-    assert all(compare(snapshot, SETTINGS, other, SETTINGS) == {} for other in others)
+    assert all(
+        compare(Result(snapshot, SETTINGS), Result(other, SETTINGS)) == {} for other in others
+    )
     apart = replace(SETTINGS, band=(30.0, 40.0))
-    assert compare(snapshot, SETTINGS, snapshot, apart) == {}
+    assert compare(Result(snapshot, SETTINGS), Result(snapshot, apart)) == {}
 
 
 def test_a_mean_below_zero_has_no_difference() -> None:

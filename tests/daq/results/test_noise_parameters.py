@@ -25,6 +25,7 @@ from daq.results.noise_parameters import (
     noise_parameters,
     quantisation_shares,
 )
+from daq.results.result import Result
 from estimator.noise_parameters.fit import Term
 from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot
 from tui.output.noise_parameters import notes, quantisation_notes, sheet_table, term_table
@@ -52,7 +53,7 @@ def bench(more: str = "", **numbers: float) -> Bench:
 
 
 def test_white_noise_of_every_channel_is_found() -> None:
-    found = noise_parameters(made_snapshot(), SETTINGS)  # 1e-12, 2e-12, …, exactly
+    found = noise_parameters(Result(made_snapshot(), SETTINGS))  # 1e-12, 2e-12, …, exactly
     for number, each in enumerate(found):
         assert each.parameters is not None
         white = each.parameters.value(Term.WHITE)
@@ -69,7 +70,7 @@ def test_white_noise_of_every_channel_is_found() -> None:
 
 
 def test_without_a_result_or_with_few_frequencies_it_is_said_why() -> None:
-    assert noise_parameters(empty_snapshot(), SETTINGS) == ()
+    assert noise_parameters(Result(empty_snapshot(), SETTINGS)) == ()
     snapshot = made_snapshot()
     few = replace(
         snapshot,
@@ -80,7 +81,7 @@ def test_without_a_result_or_with_few_frequencies_it_is_said_why() -> None:
             for name, found in snapshot.results.items()
         },
     )
-    (first, *_) = noise_parameters(few, SETTINGS)
+    (first, *_) = noise_parameters(Result(few, SETTINGS))
     assert first.parameters is None
     assert "at least 24" in first.refused
     assert "A.X: no noise parameters" in notes((first,))[0]
@@ -96,7 +97,7 @@ def test_values_of_a_data_sheet_are_judged_by_the_interval(factor: float, outcom
     density, rms = math.sqrt(psd), math.sqrt(8 * psd)
     decibels = 20 * math.log10(10 / math.sqrt(2) / rms / factor)
     sheet = bench(density=factor * density, rms=factor * rms, decibels=decibels)
-    first = noise_parameters(snapshot, SETTINGS, sheet)[0]
+    first = noise_parameters(Result(snapshot, SETTINGS), sheet)[0]
     one, beyond, noise, dynamic = first.comparisons
     assert [each.outcome for each in (one, noise, dynamic)] == [outcome] * 3
     assert one.measured == pytest.approx(density, rel=1e-6)
@@ -106,13 +107,15 @@ def test_values_of_a_data_sheet_are_judged_by_the_interval(factor: float, outcom
     assert dynamic.measured == pytest.approx(20 * math.log10(10 / math.sqrt(2) / rms), rel=1e-6)
     assert dynamic.low < dynamic.measured < dynamic.high
     assert beyond.outcome is Outcome.UNKNOWN  # 500 Hz
-    assert noise_parameters(snapshot, SETTINGS, sheet)[3].comparisons == ()  # sensor B has none
+    assert (
+        noise_parameters(Result(snapshot, SETTINGS), sheet)[3].comparisons == ()
+    )  # sensor B has none
     assert len(sheet_table((first,))[1]) == 4
 
 
 def test_a_data_sheet_has_its_own_unit_and_channels() -> None:
     sheet = bench('unit = "g"\nchannels = ["X"]')
-    found = noise_parameters(made_snapshot(), SETTINGS, sheet)
+    found = noise_parameters(Result(made_snapshot(), SETTINGS), sheet)
     assert found[0].comparisons[0].measured == pytest.approx(
         math.sqrt(1e-12 / 0.97) / 9.80665, rel=1e-6
     )
@@ -162,7 +165,7 @@ def test_noise_of_counting_is_known_and_said_where_it_prevails(
     noise = snapshot.results["three-sensor"].noise_psd[2:-2]
     # 599 averages, about 90 frequencies: 0.5 % standard error
     assert noise.mean() == pytest.approx(variance / 50, rel=0.02)
-    shares = quantisation_shares(snapshot, settings)
+    shares = quantisation_shares(Result(snapshot, settings))
     for psd, share in shares:
         assert psd == pytest.approx(step**2 / 12 / 50, rel=1e-12)
         assert share == pytest.approx(step**2 / 12 / variance, rel=0.05)
@@ -177,9 +180,11 @@ def test_an_uncertain_sensitivity_is_in_terms_allan_deviation_and_data_sheet() -
     names = [(label.sensor, label.channel) for label in snapshot.channels]
     own = 0.05
     stated = with_sensitivities(snapshot, dict.fromkeys(names, KnownSensitivity(own=own)))
-    high = noise_parameters(snapshot, SETTINGS, bench())[0].comparisons[0].high
+    high = noise_parameters(Result(snapshot, SETTINGS), bench())[0].comparisons[0].high
     sheet = bench(density=1.003 * high)
-    before, after = (noise_parameters(each, SETTINGS, sheet)[0] for each in (snapshot, stated))
+    before, after = (
+        noise_parameters(Result(each, SETTINGS), sheet)[0] for each in (snapshot, stated)
+    )
     assert before.parameters is not None
     assert after.parameters is not None
     white = after.parameters.value(Term.WHITE)

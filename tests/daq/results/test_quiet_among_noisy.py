@@ -13,7 +13,7 @@ from daq.estimation.settings import Settings
 from daq.protocols.block import HostTime
 from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
-from daq.results.band_summary import channel_means
+from daq.results.result import Result
 from estimator.checks.advice import WeakMotion
 from estimator.levels.bands import band_levels
 from estimator.methods import self_noise
@@ -59,7 +59,7 @@ def test_its_noise_is_within_the_interval_and_the_motion_is_not_called_weak(tmp_
     inside = (snapshot.frequency > BAND[0]) & (snapshot.frequency < BAND[1])
     assert ((noise.flags[inside] & Flag.POOLED) != 0).mean() > 0.9  # what this is about
     truth = np.array([QUIET] * 2 + [NOISY] * 4) ** 2 * 2 / RATE
-    means = channel_means(noise, snapshot, SETTINGS, BAND)
+    means = Result(snapshot, SETTINGS).means(noise.method, BAND)
     for mean, true in zip(means, truth, strict=True):
         assert abs(mean.mean[0] - true) < 4 * mean.spread[0]
     for mean in means[:2]:

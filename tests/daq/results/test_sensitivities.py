@@ -10,7 +10,7 @@ from daq.estimation.contributions import with_sensitivities
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
-from daq.results.band_summary import channel_means
+from daq.results.result import Result
 
 RATE, OWN, SNR = 100.0, 0.03, 300.0
 BAND = (2.0, 40.0)
@@ -31,7 +31,7 @@ def held(method: str, seed: int) -> tuple[list[bool], list[bool]]:
     stated = with_sensitivities(exact, dict.fromkeys(names, KnownSensitivity(own=OWN)))
     found: list[list[bool]] = []
     for snapshot in (exact, stated):
-        means = channel_means(snapshot.results[method], snapshot, settings, BAND)
+        means = Result(snapshot, settings).means(method, BAND)
         found.append([bool(m.low[0] <= 2 / RATE <= m.high[0]) for m in means])
     return found[0], found[1]
 
@@ -59,7 +59,7 @@ def test_temperatures_and_certificates_are_in_the_interval() -> None:
     }.items():
         channels = [(label.sensor, label.channel) for label in snapshot.channels]
         found = with_sensitivities(snapshot, dict.fromkeys(channels, known))
-        mean = channel_means(found.results["three-sensor"], found, settings, BAND)[0]
+        mean = Result(found, settings).means("three-sensor", BAND)[0]
         widths[name] = float(np.log(mean.high[0] / abs(mean.mean[0])))
         bins = found.results["three-sensor"]
         assert (bins.high >= snapshot.results["three-sensor"].high)[np.isfinite(bins.high)].all()

@@ -10,7 +10,7 @@ import pytest
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.results.facts import Rank, SpanShortened
-from daq.results.known_facts import facts_of
+from daq.results.result import Result
 from tests.daq.clocks.recordings import Sensor, write
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def estimated(path: Path, *, begin: float = 0.0, end: float = SECONDS) -> Snapsh
 
 
 def shortened(snapshot: Snapshot) -> list[SpanShortened]:
-    return [fact for fact in facts_of(snapshot, SETTINGS) if isinstance(fact, SpanShortened)]
+    return [fact for fact in Result(snapshot, SETTINGS).facts if isinstance(fact, SpanShortened)]
 
 
 @pytest.mark.parametrize(

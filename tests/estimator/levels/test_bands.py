@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from daq.results.band_summary import band_of
+from daq.results.result import Result
 from estimator.levels.bands import band_edges, band_levels, bin_correlation, log_edges
 from estimator.levels.interval import like_psd
 from estimator.median import median_of_columns
@@ -78,10 +79,10 @@ def test_a_band_without_estimates_is_nan(asked: tuple[float, float] | None) -> N
     snapshot, settings = made_snapshot(), replace(SETTINGS, band=asked)
     snapshot.csm[snapshot.frequency > 80] = np.nan  # resampled
     assert band_of(settings, snapshot)[1] == 80
-    title = result_title(snapshot, settings)
+    title = result_title(Result(snapshot, settings))
     assert "to 80 Hz" in title
     assert ("(98 requested)" in title) == (asked is not None)
-    assert "?" not in list(result_table(snapshot, settings).columns[2].cells)
+    assert "?" not in list(result_table(Result(snapshot, settings)).columns[2].cells)
 
 
 def test_a_band_without_deviations_keeps_its_mean() -> None:

@@ -12,6 +12,7 @@ from textual.widgets import Static
 from daq.bench.end_condition import EndCondition
 from daq.clocks.clock_model import ClockSource
 from daq.recording.sensor_state import SensorState
+from daq.results.result import Result
 from estimator.self_noise.result import SelfNoise
 from tests.tui.application.screen_text import assert_looks_as_before, resized, screen_text
 from tests.tui.example_snapshot import (
@@ -60,14 +61,16 @@ def view(app: App[None]) -> TestView:
 def running(*, n_effective: float = 100.0) -> tuple[Message, Message]:
     """Return what comes from a recording that grows."""
     return StatusUpdated(made_now()), SnapshotReady(
-        made_snapshot(n_effective=n_effective), SETTINGS
+        Result(made_snapshot(n_effective=n_effective), SETTINGS)
     )
 
 
 def ended() -> tuple[Message, Message]:
     """Return what comes when it has ended."""
     result = made_snapshot(n_effective=2000, closed=True)
-    return StatusUpdated(made_now(elapsed=2000.0, closed=True)), SnapshotReady(result, SETTINGS)
+    return StatusUpdated(made_now(elapsed=2000.0, closed=True)), SnapshotReady(
+        Result(result, SETTINGS)
+    )
 
 
 @pytest.fixture
@@ -192,7 +195,7 @@ async def test_names_are_shown_as_they_are(told: ProgressCallback, tmp_path: Pat
     now = replace(now, sensors=status, events=(now.events[0], event))
     async with app.run_test(size=(200, 60)) as pilot:
         await app.workers.wait_for_complete()
-        messages = (StatusUpdated(now), SnapshotReady(snapshot, SETTINGS))
+        messages = (StatusUpdated(now), SnapshotReady(Result(snapshot, SETTINGS)))
         await shown(pilot, app, *messages)
         board = screen_text(app)
         assert all(name in board for name in sensors)
@@ -225,7 +228,10 @@ async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]
         await pilot.pause()
         await assert_looks_as_before(pilot, f"{name}-idle")
         await shown(
-            pilot, app, StatusUpdated(waiting_now()), SnapshotReady(empty_snapshot(), SETTINGS)
+            pilot,
+            app,
+            StatusUpdated(waiting_now()),
+            SnapshotReady(Result(empty_snapshot(), SETTINGS)),
         )
         await assert_looks_as_before(pilot, f"{name}-waiting")
         await shown(pilot, app, *running())
@@ -260,7 +266,9 @@ async def test_negative_estimates_are_marked_not_hidden(told: ProgressCallback) 
     snapshot = replace(snapshot, results={"three-sensor": changed})
     app = HuddleApp(told)
     async with app.run_test(size=WIDE) as pilot:
-        await shown(pilot, app, StatusUpdated(made_now()), SnapshotReady(snapshot, SETTINGS))
+        await shown(
+            pilot, app, StatusUpdated(made_now()), SnapshotReady(Result(snapshot, SETTINGS))
+        )
         text = screen_text(app)
     assert "40 of 199 values at or below zero" in text
     assert "▾" in text.replace("(▾ marks", "")
@@ -300,7 +308,9 @@ async def test_the_worst_is_told_first_and_how_much_more_there_is(told: Progress
     )
     app = HuddleApp(told)
     async with app.run_test(size=NARROW) as pilot:
-        await shown(pilot, app, StatusUpdated(worse), SnapshotReady(made_snapshot(), SETTINGS))
+        await shown(
+            pilot, app, StatusUpdated(worse), SnapshotReady(Result(made_snapshot(), SETTINGS))
+        )
         text = screen_text(app)
         assert "▲ B has been disconnected for 1:15: check cable and power" in text
         assert "+2: d" in text
@@ -322,7 +332,7 @@ async def test_how_far_a_test_is_that_ends_by_itself(
     async with app.run_test(size=WIDE) as pilot:
         live = tuple(replace(sensor, state=SensorState.LIVE) for sensor in made_now().sensors)
         now = replace(made_now(), sensors=live, until=EndCondition(200.0))
-        await shown(pilot, app, StatusUpdated(now), SnapshotReady(snapshot, settings))
+        await shown(pilot, app, StatusUpdated(now), SnapshotReady(Result(snapshot, settings)))
         line = str(app.screen.query_one("#progress", Static).content)
     early = "" if target is None else ": too early for the precision that is wanted"
     assert re.search(rf"Records until \d\d:\d\d \(2 min more\){early}\.$", line)

@@ -14,6 +14,7 @@ from daq.estimation.snapshot_diagnostics import (
     Synchronisation,
 )
 from daq.results.clock_effect import effect, effect_by_sensor
+from daq.results.result import Result
 from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot
 from tui.application.test_view.clocks import clock_line, drift_lines, drift_title
 from tui.application.test_view.plot import TimeAxis
@@ -29,14 +30,14 @@ def test_effect_is_the_share_of_the_band_s_noise() -> None:
     share[2:41, 3] = 0.2  # the band is 1 to 20 Hz, in steps of 0.5 Hz
     share[41:, 4] = 0.9  # above it
     snapshot = replace(snapshot, diagnostics=SnapshotDiagnostics(Synchronisation(noise_bias=share)))
-    shares = effect(snapshot, SETTINGS)
+    shares = effect(Result(snapshot, SETTINGS))
     np.testing.assert_allclose(shares, [0, 0, 0, 0.2, 0, 0, 0, 0, 0], atol=1e-12)
 
 
 def test_effect_is_not_known_where_no_frequency_tells() -> None:
     snapshot = made_snapshot(clock_share=np.nan)
-    assert np.isnan(effect(snapshot, SETTINGS)).all()
-    assert set(map(np.isnan, effect_by_sensor(snapshot, SETTINGS).values())) == {True}
+    assert np.isnan(effect(Result(snapshot, SETTINGS))).all()
+    assert set(map(np.isnan, effect_by_sensor(Result(snapshot, SETTINGS)).values())) == {True}
 
 
 @pytest.mark.parametrize(
@@ -49,29 +50,29 @@ def test_effect_is_not_known_where_no_frequency_tells() -> None:
     ],
 )
 def test_words_and_colour_say_whether_clocks_matter(share: float, said: str, style: str) -> None:
-    line = clock_line(made_snapshot(clock_share=share), SETTINGS, width=100)
+    line = clock_line(Result(made_snapshot(clock_share=share), SETTINGS), width=100)
     assert line.plain.endswith(f": {said}")
     assert line.spans[-1].style == style
 
 
 def test_line_says_most_where_there_is_room() -> None:
     snapshot = made_snapshot()
-    wide, narrow = (clock_line(snapshot, SETTINGS, width=w).plain for w in (120, 60))
+    wide, narrow = (clock_line(Result(snapshot, SETTINGS), width=w).plain for w in (120, 60))
     assert "A +5.9, B −9.1, C +4.0 ppm, within 0.6 µs, by motion" in wide
     assert "A" not in narrow
     assert "within 0.6 µs" in narrow
-    assert len(clock_line(snapshot, SETTINGS, width=78).plain) <= 78
+    assert len(clock_line(Result(snapshot, SETTINGS), width=78).plain) <= 78
 
 
 def test_clocks_that_are_one_or_unknown() -> None:
     snapshot = made_snapshot()
     shared = tuple(clock.shared_by("lab") for clock in snapshot.clocks)
-    one = clock_line(replace(snapshot, clocks=shared), SETTINGS, width=78)
+    one = clock_line(Result(replace(snapshot, clocks=shared), SETTINGS), width=78)
     assert one.plain == "clocks: all sensors share one"
-    unknown = clock_line(replace(snapshot, clocks=()), SETTINGS, width=78)
+    unknown = clock_line(Result(replace(snapshot, clocks=()), SETTINGS), width=78)
     assert unknown.plain == "clocks: not known yet"
     early = clock_line(
-        replace(empty_snapshot(), diagnostics=SnapshotDiagnostics()), SETTINGS, width=100
+        Result(replace(empty_snapshot(), diagnostics=SnapshotDiagnostics()), SETTINGS), width=100
     )
     assert early.plain.endswith("effect not known yet")
 
@@ -111,10 +112,10 @@ def test_report_and_application_judge_clocks_alike(share: float) -> None:
     snapshot = made_snapshot(clock_share=share)
     late = replace(snapshot.clocks[0], residual=7e-6)  # against the host
     snapshot = replace(snapshot, clocks=(late, *snapshot.clocks[1:]))
-    section = clocks_section(snapshot, SETTINGS)
+    section = clocks_section(Result(snapshot, SETTINGS))
     verdict = next(part for part in section.parts if isinstance(part, Paragraph))
     colour = {"good": "green", "doubtful": "yellow", "bad": "bold #ff6b6b"}[verdict.tone]
-    assert clock_line(snapshot, SETTINGS, width=100).spans[-1].style == colour
+    assert clock_line(Result(snapshot, SETTINGS), width=100).spans[-1].style == colour
     (table,) = (part for part in section.parts if isinstance(part, Table))
     left = table.header.index("error (µs rms)")
     assert [row[left] for row in table.rows] == ["–", "0.40", "0.60"]
@@ -127,7 +128,8 @@ def test_demo_allows_for_what_clocks_add(share: float, added: float) -> None:
     text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
     scenario = scenario_of(parse(text))
     exact, ours = (
-        compare(made_snapshot(clock_share=each), SETTINGS, scenario) for each in (0.0, share)
+        compare(Result(made_snapshot(clock_share=each), SETTINGS), scenario)
+        for each in (0.0, share)
     )
     noise = {(e.sensor, e.channel): e.noise_psd for e in exact if e.method == "three-sensor"}
     for before, after in zip(exact, ours, strict=True):

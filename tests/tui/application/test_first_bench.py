@@ -272,7 +272,8 @@ async def test_from_cables_to_a_running_test_in_few_keys(tmp_path: Path) -> None
             for size in SIZES.values():
                 await opened.resize_terminal(*size)
                 await until(opened, lambda: "● recording" in screen_text(app))
-            assert app.state.judged_by is None or app.state.judged_by.operator == "Ann"
+            judged_by = None if app.state.result is None else app.state.result.bench
+            assert judged_by is None or judged_by.operator == "Ann"
             controls.stop(controls.started[0].out)
             await until(opened, lambda: app.snapshot is not None and app.snapshot.closed)
         controls.release()

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from daq.bench.units import decibels
+from daq.results.result import Result
 from tests.tui.example_snapshot import RATE, SETTINGS, diagnosed, made_now, made_snapshot
 from tui.application.test_view.details import details
 from tui.application.test_view.panels import (
@@ -33,7 +34,7 @@ def filled(since: dict[str, float]) -> int:
         ),
     )
     settings = replace(SETTINGS, target_cov=0.15)
-    return progress_line(now, snapshot, settings, None, width=150).plain.count("━")
+    return progress_line(now, Result(snapshot, settings), width=150).plain.count("━")
 
 
 def test_the_bar_goes_on_while_all_sensors_send_and_stands_while_one_is_lost() -> None:
@@ -51,7 +52,7 @@ def test_what_becomes_of_clipped_segments_is_as_the_settings_say(
 ) -> None:
     now = made_now()
     now = replace(now, sensors=(replace(now.sensors[0], is_clipping=True),))
-    (alert,) = alerts(now, replace(SETTINGS, reject=reject))
+    (alert,) = alerts(now, Result(made_snapshot(), replace(SETTINGS, reject=reject)))
     assert said in alert.plain
 
 
@@ -59,11 +60,11 @@ def test_counts_are_grouped_alike() -> None:
     now = made_now()
     much = replace(now.sensors[0], n_samples=113481, n_gaps=1, n_missing=13793)
     now = replace(now, sensors=(much, *now.sensors[1:]))
-    table = sensor_table(now, made_snapshot(), SETTINGS, CHOICE, means=(), width=150)
+    table = sensor_table(now, Result(made_snapshot(), SETTINGS), CHOICE, means=(), width=150)
     screen = console()
     with screen.capture() as said:
         screen.print(table)
-        screen.print(details(now, None, None, trouble=""))
+        screen.print(details(now, None, trouble=""))
     assert said.get().count("113\u202f481") == 1
     assert said.get().count("13\u202f793") == 2
 
@@ -73,8 +74,8 @@ def test_names_of_channels_are_shown_whole_with_and_without_room_for_errors(
     width: int, error: str
 ) -> None:
     snapshot = diagnosed(channels=("X-1", "Y±2", "Z"))
-    means = noise_in_band(snapshot, SETTINGS, CHOICE)
-    table = sensor_table(made_now(), snapshot, SETTINGS, CHOICE, means=means, width=width)
+    means = noise_in_band(Result(snapshot, SETTINGS), CHOICE)
+    table = sensor_table(made_now(), Result(snapshot, SETTINGS), CHOICE, means=means, width=width)
     screen = console()
     with screen.capture() as said:
         screen.print(table, width=150)

@@ -15,8 +15,7 @@ from daq.bench.model import Limit
 from daq.devices.bench_file import load, parse
 from daq.errors import BenchFileError, HuddleError
 from daq.recording.sensor_state import SensorState
-from daq.results.decision.end import is_reached
-from daq.results.decision.limits import judge
+from daq.results.result import Result
 from estimator.decision.verdict import Verdict
 from tests.tui.application.screen_text import screen_text
 from tests.tui.application.test_app import NARROW, ended, running, shown
@@ -24,6 +23,7 @@ from tests.tui.example_snapshot import (
     SETTINGS,
     ProgressCallback,
     demo_bench,
+    judged,
     made_now,
     made_snapshot,
 )
@@ -94,11 +94,12 @@ async def test_the_form_takes_operator_note_and_end(told: ProgressCallback) -> N
 
 def test_the_line_at_the_top_of_a_small_terminal_has_the_whole_verdict() -> None:
     bench = demo_bench().model_copy(update={"limits": (LIMIT,)})
-    verdict = judge(bench, made_snapshot(), SETTINGS)
+    result = Result(made_snapshot(), SETTINGS, bench)
+    verdict = result.verdict
     assert verdict is not None
     now = replace(made_now(), simulated=True)
     for decision in Verdict:
-        state = State("pier", now=now, verdict=replace(verdict, verdict=decision))
+        state = State("pier", now=now, result=judged(result, replace(verdict, verdict=decision)))
         line = status_line(state, TEST, width=80).plain
         assert len(line) <= 78
         assert WORDS[decision] in line
@@ -144,13 +145,13 @@ def test_decided_needs_limits_in_the_bench_file_too() -> None:
 def test_a_test_ends_on_a_verdict_only_if_it_is_surer_than_a_verdict_must_be() -> None:
     bench = demo_bench().model_copy(update={"limits": (LIMIT,)})
     snapshot = made_snapshot(n_effective=2000.0)
-    found = judge(bench, snapshot, SETTINGS)
+    found = Result(snapshot, SETTINGS, bench).verdict
     assert found is not None
     assert found.verdict is Verdict.FAIL
     assert found.is_sure
     end = EndCondition(decided=True)
     assert end.is_estimated
-    assert is_reached(end, bench, snapshot, SETTINGS)
+    assert Result(snapshot, SETTINGS, bench).is_reached(end)
     passed = [each for each in found.limits if each.verdict is Verdict.PASS]
     assert replace(found, verdict=Verdict.PASS, limits=tuple(passed[:3])).is_sure
     barely = replace(passed[0], limit_psd=passed[0].high * 1.001)

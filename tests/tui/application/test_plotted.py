@@ -13,6 +13,7 @@ from textual.widgets import Static
 from daq.bench.masks.mask import NOISE_MODELS
 from daq.bench.masks.mask_file import masks_named
 from daq.bench.model import Limit
+from daq.results.result import Result
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
 from tests.tui.application.test_app import NARROW, WIDE, running, shown, view
 from tests.tui.example_snapshot import SETTINGS, ProgressCallback, demo_bench, made_snapshot
@@ -153,9 +154,7 @@ def test_limits_and_noise_models_are_curves() -> None:
     )
     state = State(
         "b",
-        snapshot=made_snapshot(),
-        settings=SETTINGS,
-        judged_by=bench,
+        result=Result(made_snapshot(), SETTINGS, bench),
         models=masks_named("nhnm"),
     )
     shown = {each.label: each for each in curves(state, Choice(), n_points=60)}

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from daq.bench.model import Limit
+from daq.results.result import Result
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
 from tests.tui.application.test_app import NARROW, WIDE, ended, running, shown
 from tests.tui.example_snapshot import SETTINGS, ProgressCallback, demo_bench, made_snapshot
@@ -44,7 +45,7 @@ def earlier(folder: Path, **changes: object) -> Reference:
         noise, noise_psd=noise.noise_psd * scale, low=noise.low * scale, high=noise.high * scale
     )
     snapshot = replace(snapshot, results={"three-sensor": quieter}, **changes)  # type: ignore[arg-type]
-    return Reference(folder / "lab-8.h5", snapshot, SETTINGS)
+    return Reference(folder / "lab-8.h5", Result(snapshot, SETTINGS))
 
 
 async def at_result(pilot: Pilot[None], app: HuddleApp) -> None:
@@ -101,8 +102,8 @@ def test_the_reference_is_estimated_with_the_settings_of_what_is_shown(tmp_path:
     settings = replace(SETTINGS, segment=1.0)
     found = reference_of(path, settings, lambda *_: (None, None), ended=threading.Event())
     assert found is not None
-    assert found.snapshot.results.keys() == set(SETTINGS.methods)
-    assert found.snapshot.frequency[1] == 1.0
+    assert found.result.snapshot.results.keys() == set(SETTINGS.methods)
+    assert found.result.snapshot.frequency[1] == 1.0
     ended = threading.Event()
     ended.set()
     assert reference_of(path, settings, lambda *_: (None, None), ended=ended) is None
@@ -121,7 +122,7 @@ async def test_the_estimate_and_the_screen_are_saved(told: ProgressCallback) -> 
 
 def test_csv_and_json_are_those_of_the_commands(tmp_path: Path) -> None:
     snapshot = made_snapshot()  # growing: nothing is said of its file
-    csv, json = save_result(tmp_path / "run.h5", snapshot, SETTINGS, None, folder=tmp_path)
+    csv, json = save_result(tmp_path / "run.h5", Result(snapshot, SETTINGS), folder=tmp_path)
     assert csv.read_text(encoding="utf-8") == curves_csv(snapshot)
     found = loads(json.read_text(encoding="utf-8"))
     assert len(found["results"]) == len(snapshot.results)

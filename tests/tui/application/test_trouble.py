@@ -11,6 +11,7 @@ import pytest
 from daq.bench.model import Limit
 from daq.devices.bench_file import parse
 from daq.errors import HuddleError
+from daq.results.result import Result
 from tests.tui.application.screen_text import resized, screen_text
 from tests.tui.application.test_app import NARROW, WIDE, ended, running, shown, view
 from tests.tui.example_snapshot import (
@@ -147,7 +148,9 @@ async def test_the_target_is_judged_by_the_chosen_method_whatever_curve_is_shown
     snapshot = replace(snapshot, results={**snapshot.results, "three-channel": sure})
     app = HuddleApp(told)
     async with app.run_test(size=WIDE) as pilot:
-        await shown(pilot, app, StatusUpdated(made_now()), SnapshotReady(snapshot, SETTINGS))
+        await shown(
+            pilot, app, StatusUpdated(made_now()), SnapshotReady(Result(snapshot, SETTINGS))
+        )
         for _ in range(3):
             await pilot.press("e")
             await shown(pilot, app)
@@ -168,7 +171,7 @@ async def test_what_the_diagnosis_finds_is_shown_while_recording(told: ProgressC
     now = replace(made_now(), sensors=live)
     app = HuddleApp(told)
     async with app.run_test(size=WIDE) as pilot:
-        await shown(pilot, app, StatusUpdated(now), SnapshotReady(snapshot, SETTINGS))
+        await shown(pilot, app, StatusUpdated(now), SnapshotReady(Result(snapshot, SETTINGS)))
         text = screen_text(app)
         assert "✗ A records none of the motion that B and C share: check its input" in text
         assert text.count("no shared motion") == 3
@@ -186,7 +189,9 @@ async def test_the_verdict_so_far_is_shown_with_how_long_to_record(
     app = HuddleApp(told)
     async with app.run_test(size=WIDE) as pilot:
         snapshot = made_snapshot(n_effective=60.0)
-        await shown(pilot, app, StatusUpdated(made_now()), SnapshotReady(snapshot, SETTINGS))
+        await shown(
+            pilot, app, StatusUpdated(made_now()), SnapshotReady(Result(snapshot, SETTINGS))
+        )
         assert screen_text(app).count("NOT DECIDED") == 2  # beside the time, and with what to do
         await resized(pilot, NARROW)
         await shown(pilot, app)
@@ -194,7 +199,10 @@ async def test_the_verdict_so_far_is_shown_with_how_long_to_record(
         await resized(pilot, WIDE)
         snapshot = made_snapshot(n_effective=5000.0, closed=True)
         await shown(
-            pilot, app, StatusUpdated(made_now(closed=True)), SnapshotReady(snapshot, SETTINGS)
+            pilot,
+            app,
+            StatusUpdated(made_now(closed=True)),
+            SnapshotReady(Result(snapshot, SETTINGS)),
         )
         text = screen_text(app)
     assert "✗ FAIL: 1 of 9 channels above data sheet: C.Z." in text
@@ -224,8 +232,8 @@ async def test_a_sensor_moved_during_a_test_is_named_by_the_last_minute(
     for second, is_named in ((same, False), (now, True)):
         async with app.run_test(size=WIDE) as pilot:
             status = StatusUpdated(made_now(elapsed=1100.0))
-            await shown(pilot, app, status, SnapshotReady(before, SETTINGS))
-            await shown(pilot, app, status, SnapshotReady(second, SETTINGS))
+            await shown(pilot, app, status, SnapshotReady(Result(before, SETTINGS)))
+            await shown(pilot, app, status, SnapshotReady(Result(second, SETTINGS)))
             words = "C records none of the motion that A and B share"
             text = screen_text(app)
             assert (words in text) == is_named

@@ -114,10 +114,11 @@ async def test_the_verdict_is_that_of_the_latest_snapshot(told: ProgressCallback
     async with app.run_test(size=NARROW) as pilot:
         first, second = running(), running(n_effective=500)
         await shown(pilot, app, *first)
-        assert app.state.verdict is None  # no limits
+        assert app.state.result is not None
+        assert app.state.result.verdict is None  # no limits
         await shown(pilot, app, *second)
         assert isinstance(second[1], SnapshotReady)
-        assert app.snapshot is second[1].snapshot
+        assert app.snapshot is second[1].result.snapshot
 
 
 @pytest.mark.parametrize(("name", "size"), [("small", (40, 12)), ("middle", (120, 36))])

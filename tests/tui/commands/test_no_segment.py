@@ -11,6 +11,7 @@ import pytest
 from daq.estimation.estimation import Estimation
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError
+from daq.results.result import Result
 from estimator.spectra.segment_rejection import Reason
 from tests.daq.clocks.recordings import write_polled
 from tui.application.test_view.panels import findings
@@ -42,7 +43,7 @@ def test_the_sensor_with_most_gaps_and_its_longest_stretch_are_known(path: Path)
         assert estimation.snapshot().no_segment is None  # nothing looked at yet
         estimation.update()
         found = estimation.snapshot()
-        shown = [line.plain for line in findings(found, width=80)]
+        shown = [line.plain for line in findings(Result(found, Settings()), width=80)]
     assert found.n_segments == 0
     assert found.no_segment is not None
     assert (found.no_segment.reason, found.no_segment.sensor) == (Reason.GAP, "b")

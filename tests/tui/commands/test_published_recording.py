@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.estimation.snapshot import Snapshot
+    from daq.results.result import Result
 from tests.tui.commands.test_command import huddle
 
 PUBLISHED = (
@@ -67,9 +68,9 @@ def published(tst: Path) -> tuple[dict[str, Any], Snapshot]:
     """Return what the command writes with the published settings, and the estimate it shows."""
     shown = []
 
-    def show(snapshot: Snapshot, *rest: Any, **options: Any) -> object:  # noqa: ANN401
-        shown.append(snapshot)
-        return show_result(snapshot, *rest, **options)
+    def show(result: Result, **options: Any) -> None:  # noqa: ANN401
+        shown.append(result.snapshot)
+        show_result(result, **options)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("tui.commands.estimate.show_result", show)

@@ -9,13 +9,14 @@ import numpy as np
 
 from daq.results.decision.verdict import LimitResult, TestVerdict
 from daq.results.facts import Fact, WrongSensitivity
+from daq.results.result import Result
 from estimator.checks import advice
 from estimator.checks.advice import Advice, Untested
 from estimator.checks.count_limits import CountLimits
 from estimator.decision.verdict import Obstacle, Verdict
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
-from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot
+from tests.tui.example_snapshot import SETTINGS, diagnosed, judged, made_snapshot
 from tests.tui.wording.fact_examples import EXAMPLES, kinds
 from tui.output.console import finite
 from tui.output.json_document import UNITS, document, result_document
@@ -25,7 +26,7 @@ from tui.wording.verdict_text import what_to_do
 def test_advice_has_its_kind_its_numbers_and_its_words() -> None:
     change = np.eye(9)
     change[5, 5] = -1
-    found = json.loads(json.dumps(finite(document(diagnosed(change), SETTINGS))))
+    found = json.loads(json.dumps(finite(document(Result(diagnosed(change), SETTINGS)))))
     diagnostics = found["results"][0]["diagnostics"]
     by_kind = {
         fact["numbers"]["findings"][0]["kind"]: fact
@@ -120,7 +121,7 @@ def test_a_verdict_has_its_facts_in_the_document() -> None:
         obstacles=(Obstacle.SENSITIVITY, Obstacle.SPANS_LIMIT),
         sensitivities=(wrong,),
     )
-    written = document(diagnosed(), SETTINGS, verdict=found)
+    written = document(judged(Result(diagnosed(), SETTINGS), found))
     facts = {each["kind"]: each for each in written["facts"]}
     assert facts["wrong-sensitivity"]["numbers"]["gains"] == [0.101, 0.103]
     assert facts["limit-undecided"]["channels"] == ["A.X"]

@@ -17,9 +17,8 @@ from daq.bench.sensitivity import KnownSensitivity
 from daq.bench.units import decibels
 from daq.estimation.contributions import with_sensitivities
 from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics, Synchronisation
-from daq.results.band_summary import levels
-from daq.results.decision.limits import judge
 from daq.results.facts import IntervalsWidened
+from daq.results.result import Result
 from daq.results.uncertainty_budget import band_budgets
 from estimator.levels.bands import band_edges
 from estimator.levels.contributions import Source
@@ -28,7 +27,7 @@ from tests.tui.example_snapshot import SETTINGS, demo_bench, made_snapshot
 from tui.application.test_view.curves import noise_curve
 from tui.application.test_view.units import units_of
 from tui.certificate.dcc import SI, _mean
-from tui.notebook.result import Result
+from tui.notebook import result as notebooks
 from tui.output.json_document import _band_means
 from tui.output.results import result_table
 from tui.report.noise import noise_section
@@ -68,14 +67,14 @@ def test_table_report_certificate_json_page_curve_verdict_and_budget_have_the_sa
     (method,) = snapshot.results
     noise = snapshot.results[method]
     edges = band_edges(snapshot.frequency, BAND)
-    found = levels(noise, snapshot, THIRD, edges)
+    found = Result(snapshot, THIRD).spectrum(noise.method).levels(edges)
     low, high = (end[0] for end in found.ends())
 
-    document = _band_means(snapshot, THIRD)
+    document = _band_means(Result(snapshot, THIRD))
     np.testing.assert_array_equal([each["noise_psd_low"] for each in document], low)
     np.testing.assert_array_equal([each["noise_psd_high"] for each in document], high)
 
-    notebook = Result(snapshot, THIRD).band()
+    notebook = notebooks.Result(snapshot, THIRD).band()
     np.testing.assert_allclose(notebook.noise_low, low, rtol=1e-12)  # of another batch
     np.testing.assert_allclose(notebook.noise_high, high, rtol=1e-12)
 
@@ -96,7 +95,7 @@ def test_table_report_certificate_json_page_curve_verdict_and_budget_have_the_sa
         assert page["high"][0] == pytest.approx(curve.high_db[0], rel=1e-5)
         assert page["low"][0] == pytest.approx(np.nan_to_num(curve.low_db[0], nan=-200.0), rel=1e-5)
 
-    budgets = band_budgets(snapshot, THIRD)
+    budgets = band_budgets(Result(snapshot, THIRD))
     for column, total in enumerate(budgets):
         certified = ET.Element("data")
         _mean(certified, total, "mean", 1.0, "one")
@@ -109,7 +108,7 @@ def test_table_report_certificate_json_page_curve_verdict_and_budget_have_the_sa
 
     console = Console(width=200, no_color=True)
     with console.capture() as capture:
-        console.print(result_table(snapshot, THIRD))
+        console.print(result_table(Result(snapshot, THIRD)))
     rows = capture.get().replace("−", "-").splitlines()[1:]
     for row, below, above, mean in zip(rows, low, high, found.mean[0], strict=False):
         up = decibels(float(above)) - decibels(float(mean))
@@ -125,7 +124,7 @@ def test_table_report_certificate_json_page_curve_verdict_and_budget_have_the_sa
             assert bound is not None
             assert float(bound[1]) == pytest.approx(decibels(float(above)), abs=0.006)
 
-    section = noise_section(snapshot, THIRD, None)
+    section = noise_section(Result(snapshot, THIRD))
     table = next(part for part in section.parts if isinstance(part, Table))
     for row_, below, above in zip(table.rows, low, high, strict=True):
         ends = [float(x) for x in re.findall(r"-?[\d.]+", row_[3].replace("−", "-"))]
@@ -138,7 +137,7 @@ def test_table_report_certificate_json_page_curve_verdict_and_budget_have_the_sa
             sensors=(label.sensor,),
         )  # fmt: skip
         bench = demo_bench().model_copy(update={"limits": (limit,)})
-        verdict = judge(bench, snapshot, THIRD)
+        verdict = Result(snapshot, THIRD, bench).verdict
         assert verdict is not None
         (judged,) = verdict.limits
         assert judged.low == pytest.approx(low[column], rel=1e-12)
@@ -149,10 +148,12 @@ def test_the_budget_has_the_ends_of_the_levels_and_adds_its_lines_by_squares(
     snapshot: Snapshot,
 ) -> None:
     (noise,) = snapshot.results.values()
-    found = levels(noise, snapshot, THIRD, band_edges(snapshot.frequency, BAND))
+    found = (
+        Result(snapshot, THIRD).spectrum(noise.method).levels(band_edges(snapshot.frequency, BAND))
+    )
     low, high = (end[0] for end in found.ends())
-    document = _band_means(snapshot, THIRD)
-    for column, budget in enumerate(band_budgets(snapshot, THIRD)):
+    document = _band_means(Result(snapshot, THIRD))
+    for column, budget in enumerate(band_budgets(Result(snapshot, THIRD))):
         assert budget.interval == (low[column], high[column])
         assert document[column]["k"] == budget.k
         assert document[column]["expanded_uncertainty"] == budget.expanded
@@ -170,10 +171,10 @@ def test_the_budget_has_the_ends_of_the_levels_and_adds_its_lines_by_squares(
 
 
 def test_what_widens_an_interval_is_named_with_its_size(snapshot: Snapshot) -> None:
-    facts = known(snapshot, THIRD)
+    facts = known(Result(snapshot, THIRD))
     lines = [str(each) for each in facts if isinstance(each.fact, IntervalsWidened)]
     if snapshot.sensitivities:
-        document = _band_means(snapshot, THIRD)[0]
+        document = _band_means(Result(snapshot, THIRD))[0]
         assert [each["source"] for each in document["contributions"]][-2:] == [
             Source.SENSITIVITY,
             Source.TEMPERATURE,
@@ -182,7 +183,7 @@ def test_what_widens_an_interval_is_named_with_its_size(snapshot: Snapshot) -> N
         (line,) = lines
         assert "clocks (up to" in line
         assert "axes that may be off (up to" in line
-        document = _band_means(snapshot, THIRD)[0]
+        document = _band_means(Result(snapshot, THIRD))[0]
         assert [each["source"] for each in document["contributions"]] == [
             Source.CLOCKS,
             Source.AXES,

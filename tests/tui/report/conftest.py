@@ -7,6 +7,7 @@ from pypdf import PdfReader
 
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.results.result import Result
 from daq.results.sources import sources
 from tests.tui.night_recording import record
 from tests.tui.report.written_report import Reported, paper_of
@@ -24,7 +25,11 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Reported:
         axis_tolerance={"": 0.0},
     )
     snapshot = estimate([recording], settings)
-    report = report_of(snapshot, settings, sources([recording]))
+    report = report_of(
+        Result(
+            snapshot, settings, sources([recording])[0].bench, examined=tuple(sources([recording]))
+        )
+    )
     return Reported(recording, snapshot, settings, report)
 
 

@@ -11,6 +11,7 @@ from daq.bench.model import Bench, Sensor
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
+from daq.results.result import Result
 from tui.output.calibration import share
 from tui.report.contents import calibration_section
 from tui.report.parts import Facts, Paragraph, Table
@@ -49,7 +50,7 @@ def bench() -> Bench:
 
 
 def test_values_budgets_and_certificates_are_there() -> None:
-    section = calibration_section(made("ABC"), SETTINGS, bench())
+    section = calibration_section(Result(made("ABC"), SETTINGS, bench()))
     assert section is not None
     opening = section.parts[0]
     assert isinstance(opening, Paragraph)
@@ -71,7 +72,7 @@ def test_values_budgets_and_certificates_are_there() -> None:
 
 def test_two_sensors_cannot_be_calibrated() -> None:
     settings = Settings(segment=2.0, methods=("two-channel",))
-    assert calibration_section(made("AB", settings), settings, None) is None
+    assert calibration_section(Result(made("AB", settings), settings)) is None
 
 
 def test_shares_are_short() -> None:

@@ -13,6 +13,8 @@ import pytest
 from typer.testing import CliRunner
 
 from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.results.result import Result
 from daq.results.sources import sources
 from tests.tui.night_recording import HOSTILE, N_SAMPLES, RATE, record
 from tests.tui.report.written_report import Reported, Words, tables, texts_of
@@ -76,7 +78,12 @@ def test_by_all_methods_it_is_the_one_that_needs_no_alignment_that_judges(
 ) -> None:
     settings = replace(reported.settings, methods=("all",))
     report = report_of(
-        estimate([reported.recording], settings), settings, sources([reported.recording])
+        Result(
+            estimate([reported.recording], settings),
+            settings,
+            sources([reported.recording])[0].bench,
+            examined=tuple(sources([reported.recording])),
+        )
     )
     table, _, methods = tables(report, "Self-noise")
     assert "by the three-sensor method" in table.title
@@ -108,7 +115,11 @@ def test_a_recording_left_open_is_not_called_running(reported: Reported, tmp_pat
     recording, copy = tmp_path / "live.h5", tmp_path / "killed.h5"
     record(recording, before_end=lambda: shutil.copyfile(recording, copy))
     snapshot = estimate([copy], reported.settings)
-    report = report_of(snapshot, reported.settings, sources([copy]))
+    report = report_of(
+        Result(
+            snapshot, reported.settings, sources([copy])[0].bench, examined=tuple(sources([copy]))
+        )
+    )
     assert report.verdict.text.startswith("Of a recording whose recorder was killed (huddle repair")
     assert hashlib.sha256(copy.read_bytes()).hexdigest() in texts_of(report)
 
@@ -150,7 +161,9 @@ def test_two_recordings_make_one_report(reported: Reported, tmp_path: Path) -> N
     other = record(tmp_path / "second.h5")
     files = [reported.recording, other]
     snapshot = estimate(files, reported.settings)
-    report = report_of(snapshot, reported.settings, sources(files))
+    report = report_of(
+        Result(snapshot, reported.settings, sources(files)[0].bench, examined=tuple(sources(files)))
+    )
     text = " ".join(texts_of(report))
     assert "night.h5" in text
     assert "second.h5" in text
@@ -162,13 +175,13 @@ def test_the_report_and_json_say_that_shared_noise_was_not_searched_for(
 ) -> None:
     snapshot = estimate([reported.recording])
     plain, searched = (
-        facts_section(known(snapshot)),
+        facts_section(known(Result(snapshot, Settings()))),
         result_document(snapshot, next(iter(snapshot.results))),
     )
     for module in ("daq.results.known_facts", "tui.output.json_diagnostics"):
         monkeypatch.setattr(f"{module}.MAX_CHANNELS", 2)
     words = "Noise that two channels share is not searched for among more than 2 channels"
-    assert words in str(facts_section(known(snapshot)))
+    assert words in str(facts_section(known(Result(snapshot, Settings()))))
     assert words not in str(plain)
     assert searched["diagnostics"]["shared_noise_searched"] is True
     assert (

@@ -12,6 +12,7 @@ from pypdf.generic import Destination
 from typer.testing import CliRunner
 
 from daq.estimation.estimation import estimate
+from daq.results.result import Result
 from daq.results.sources import sources
 from tests.tui.night_recording import RATE
 from tests.tui.report.written_report import Reported, Words, paper_of, texts_of
@@ -31,10 +32,7 @@ def test_the_same_recording_gives_the_same_files(
     reported: Reported, paper: PdfReader, tmp_path: Path
 ) -> None:
     """As PDF; that pages are the same, the test of the demo's reports shows."""
-    write(
-        reported.snapshot, tmp_path / "a.pdf", recordings=[reported.recording],
-        settings=reported.settings,
-    )  # fmt: skip
+    write(reported.result, tmp_path / "a.pdf")
     assert paper.stream is not None
     paper.stream.seek(0)
     assert (tmp_path / "a.pdf").read_bytes() == paper.stream.read()
@@ -124,7 +122,14 @@ def test_one_channel_a_sensor_and_fifteen_sensors_fit(reported: Reported, tmp_pa
     runner = CliRunner()
     assert runner.invoke(app, ["import", str(source), "--out", str(recording)]).exit_code == 0
     snapshot = estimate([recording], reported.settings)
-    report = report_of(snapshot, reported.settings, sources([recording]))
+    report = report_of(
+        Result(
+            snapshot,
+            reported.settings,
+            sources([recording])[0].bench,
+            examined=tuple(sources([recording])),
+        )
+    )
     plots = [part for s in report.sections for part in s.parts if isinstance(part, Plot)]
     assert (
         sum(len(plot.panels) for plot in plots) == 15 + 15 + 1

@@ -16,6 +16,7 @@ from daq.bench.loading import parse
 from daq.bench.masks.mask import NOISE_MODELS, Mask
 from daq.bench.masks.mask_file import masks_named
 from daq.errors import WrongSettingError
+from daq.results.result import Result
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
 from tests.tui.night_recording import record
 from tui.commands.main import app
@@ -77,7 +78,7 @@ def panels(
     snapshot = made_snapshot()
     snapshot.results.clear()
     snapshot.results.update(results)
-    return drawn(noise_plots(snapshot, SETTINGS, bench, models))
+    return drawn(noise_plots(Result(snapshot, SETTINGS, bench), models))
 
 
 @functools.cache
@@ -141,7 +142,7 @@ def test_a_model_of_another_quantity_is_refused() -> None:
 def test_the_key_fits_into_a_narrow_figure() -> None:
     snapshot = made_snapshot(n_channels=1)
     for width in (3.3, 7.1):
-        plots = noise_plots(snapshot, SETTINGS, None, masks_named("nlnm,nhnm,alnm"), width=width)
+        plots = noise_plots(Result(snapshot, SETTINGS), masks_named("nlnm,nhnm,alnm"), width=width)
         with drawing.look():
             figure = Figure(figsize=(width, drawing.stack_height(plots)))
             drawing.stack(plots, figure)
@@ -158,7 +159,7 @@ def test_the_same_estimate_gives_the_same_file(tmp_path: Path) -> None:
     snapshot = made_snapshot(n_channels=1)
     contents = {}
     for name in ("a.svg", "b.svg", "a.pdf", "b.pdf"):
-        write_figure(snapshot, SETTINGS, None, tmp_path / name, width=7.1)
+        write_figure(Result(snapshot, SETTINGS), tmp_path / name, width=7.1)
         contents[name] = (tmp_path / name).read_bytes()
     for kind in ("svg", "pdf"):
         assert contents[f"a.{kind}"] == contents[f"b.{kind}"]

@@ -14,7 +14,8 @@ from typer.testing import CliRunner
 import huddle
 from daq.archive.index import ROLLUP
 from daq.recording.reader import Recording
-from tests.tui.example_snapshot import demo_bench, made_now, made_snapshot
+from daq.results.result import Result
+from tests.tui.example_snapshot import SETTINGS, demo_bench, made_now, made_snapshot
 from tests.tui.report.written_report import Words
 from tui.application.state import VIEWS, State
 from tui.application.view import status_line
@@ -92,7 +93,7 @@ def test_estimates_and_figures_of_simulated_samples_say_so() -> None:
     result = huddle.self_noise(simulation, fs=simulation.fs, sample_unit="m/s²", segment="2s")
     assert result.snapshot.simulated
     assert "simulated" in repr(result)
-    plots = noise_plots(result.snapshot, result.settings, None)
+    plots = noise_plots(result.result)
     assert all("simulated" in plot.title for plot in plots)
 
 
@@ -103,7 +104,7 @@ def test_the_status_line_of_every_view_says_simulated() -> None:
             state = State("pier", now=replace(made_now(), simulated=simulated))
             shown = status_line(state, view, width=100).plain
             assert ("SIMULATED" in shown) == simulated
-        state = State("pier", snapshot=replace(snapshot, simulated=True))
+        state = State("pier", result=Result(replace(snapshot, simulated=True), SETTINGS))
         assert "SIMULATED" in status_line(state, view, width=80).plain
     bench = demo_bench().model_copy(update={"simulation": {}})
     assert not State("pier", bench=bench).is_simulated

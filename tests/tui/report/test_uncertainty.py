@@ -12,6 +12,7 @@ import pytest
 
 from daq.bench.model import DataSheet
 from daq.recording.reader import Recording
+from daq.results.result import Result
 from daq.results.uncertainty_budget import band_budgets
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
 from tests.tui.report.written_report import tables
@@ -33,7 +34,7 @@ def number(text: str) -> float:
 def test_no_total_is_narrower_than_its_statistical_part(n_effective: float, share: float) -> None:
     snapshot = made_snapshot(n_effective=n_effective, clock_share=share)
     for method in SETTINGS.methods:
-        found = band_budgets(snapshot, replace(SETTINGS, methods=(method,)))
+        found = band_budgets(Result(snapshot, replace(SETTINGS, methods=(method,))))
         assert found
         for each in found:
             low, high = (end / abs(each.value) for end in each.interval)
@@ -63,7 +64,7 @@ def test_noise_is_stated_in_the_units_of_the_trade(reported: Reported) -> None:
 
 def test_a_spectrum_in_g_has_its_level_in_si_too(reported: Reported) -> None:
     snapshot = replace(reported.snapshot, unit="g")
-    section = uncertainty_section(snapshot, reported.settings, None)
+    section = uncertainty_section(Result(snapshot, reported.settings), None)
     assert section is not None
     summary = next(part for part in section.parts if isinstance(part, Table))
     assert summary.header[-1] == "dB re 1 (m/s²)²/Hz"
@@ -89,7 +90,7 @@ def test_the_range_reaches_from_the_noise_to_a_sine_of_full_scale(reported: Repo
     sheet = DataSheet(full_scale=2.0, unit="g")
     first = bench.sensors[0].model_copy(update={"data_sheet": sheet})
     about = bench.model_copy(update={"sensors": (first, *bench.sensors[1:])})
-    section = uncertainty_section(reported.snapshot, reported.settings, about)
+    section = uncertainty_section(Result(reported.snapshot, reported.settings), about)
     assert section is not None
     assert any(isinstance(part, Plot) for part in section.parts)
     rms, reach = [part for part in section.parts if isinstance(part, Table)][2:4]

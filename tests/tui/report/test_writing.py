@@ -28,7 +28,7 @@ def test_the_demo_s_reports_outlive_its_folder_and_have_its_noise_models(
     settings, path = reported.settings, ROOT / "tui" / "resources" / "demo.toml"
     models = masks_named("nhnm")
     controls = BenchControls(path, load(path), settings, reports=tmp_path, models=models)
-    out = controls.report(reported.recording, reported.snapshot, settings)
+    out = controls.report(reported.recording, reported.result)
     assert out == tmp_path / "night.html"
     page = out.read_text(encoding="utf-8")
     assert "NHNM" in page
@@ -55,10 +55,7 @@ def test_a_report_is_whole_or_not_there(reported: Reported, tmp_path: Path) -> N
     out.write_text("the old one", encoding="utf-8")
     message = r"old.html: the report cannot be written \(File too"
     with files_limited_to(10_000), pytest.raises(ReportError, match=message):
-        write(
-            reported.snapshot, out, recordings=[reported.recording],
-            settings=reported.settings, taken="replace",
-        )  # fmt: skip
+        write(reported.result, out, taken="replace")
     assert out.read_text(encoding="utf-8") == "the old one"
     assert list(tmp_path.iterdir()) == [out]
 
@@ -91,10 +88,7 @@ def test_a_draft_replaces_no_other_one_unless_forced(reported: Reported, tmp_pat
     assert run.invoke(app, [*arguments[:-1], "2s", "--force"]).exit_code == 4
     page = Words(out.read_text(encoding="utf-8")).text
     assert "segment 1 s → 2 s" in page
-    _, beside = write(
-        reported.snapshot, out, recordings=[reported.recording], settings=reported.settings,
-        taken="beside",
-    )  # fmt: skip
+    _, beside = write(reported.result, out, taken="beside")
     assert beside == tmp_path / "night-2.html"
 
 

@@ -9,6 +9,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daq.results.result import Result
 from tui.report.paper import write_paper
 from tui.report.parts import Facts, Items, Paragraph, Plot, Report, Table
 from tui.report.writing import page
@@ -30,6 +31,11 @@ class Reported:
     snapshot: Snapshot
     settings: Settings
     report: Report
+
+    @property
+    def result(self) -> Result:
+        """What the report is of."""
+        return Result(self.snapshot, self.settings, recordings=(self.recording,))
 
     @cached_property
     def page(self) -> str:

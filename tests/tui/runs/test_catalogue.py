@@ -10,7 +10,7 @@ import pytest
 from daq.bench.model import Limit
 from daq.errors import RecordingError
 from daq.recording.reader import Recording
-from daq.results.decision.limits import judge
+from daq.results.result import Result
 from daq.results.store import store_results
 from estimator.decision.verdict import Verdict
 from tests.tui.example_snapshot import SETTINGS, demo_bench, growing, made_snapshot
@@ -33,7 +33,9 @@ def test_each_recording_says_what_became_of_it(tmp_path: Path) -> None:
     bench = demo_bench().model_copy(update={"limits": (LIMIT,)})
     snapshot = made_snapshot(n_effective=2000.0, closed=True)
     store_results(closed(tmp_path / "bare.h5"), snapshot)
-    store_results(closed(tmp_path / "judged.h5"), snapshot, judge(bench, snapshot, SETTINGS))
+    store_results(
+        closed(tmp_path / "judged.h5"), snapshot, Result(snapshot, SETTINGS, bench).verdict
+    )
     closed(tmp_path / "none.h5")
     with growing(tmp_path / "left.h5"):
         pass

@@ -18,6 +18,7 @@ from daq.estimation.settings import Settings
 from daq.protocols.block import HostTime
 from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
+from daq.results.result import Result
 from tui.commands.main import app
 from tui.service.history.ledger import ledger_path, noise_of, noted, record_test, sensor_tests
 from tui.web.months import Months
@@ -76,7 +77,7 @@ def recorded(
 
 
 def recorded_test(path: Path) -> list[str]:
-    return noted(path, estimate([path], SETTINGS), SETTINGS, None)
+    return noted(path, Result(estimate([path], SETTINGS), SETTINGS))
 
 
 def test_a_sensor_is_known_again_on_another_bench_by_its_serial_number(tmp_path: Path) -> None:
@@ -84,15 +85,15 @@ def test_a_sensor_is_known_again_on_another_bench_by_its_serial_number(tmp_path:
     assert recorded_test(first) == []
     assert len(recorded_test(recorded(tmp_path, bench="lab", day=10))) == 3
     moved = recorded(tmp_path, bench="office", day=31, louder_db=3.0, serials="312")
-    snapshot = estimate([moved], SETTINGS)
-    found = {each.serial_number: each for each in record_test(moved, snapshot, SETTINGS, None)}
+    result = Result(estimate([moved], SETTINGS), SETTINGS)
+    found = {each.serial_number: each for each in record_test(moved, result)}
     assert [found[serial].sensor for serial in ("S1", "S2", "S3")] == ["B", "C", "A"]
     assert {each.n_tests for each in found.values()} == {3}
     for serial, louder_db in (("S1", 3.0), ("S2", 0.0), ("S3", 0.0)):
         drift = found[serial]
         assert 0.05 < drift.error < 1.0
         assert abs(drift.db - louder_db) < drift.error
-    lines = noted(moved, snapshot, SETTINGS, None)  # the test is there once
+    lines = noted(moved, result)  # the test is there once
     assert lines[1].startswith("B S1: +")
     assert "dB since 25 October" in lines[1]
     assert lines[1].endswith("3 tests (1–16 Hz)")

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
+from daq.results.result import Result
 from tui.commands.main import app
 from tui.output.exit_codes import ExitCode
 from tui.studies.public import BOUND, levels, model_free_bound
@@ -58,7 +59,7 @@ def test_what_a_model_of_too_few_dimensions_says_contradicts_the_bound() -> None
     settings = Settings(segment=2.0, methods=("all",), unit="m/s²")
     sensors, true = verticals(6, 3)
     recording = recording_of_arrays(sensors, RATE, unit="m/s²")
-    found = list(levels("a", estimate([recording], settings), settings))
+    found = list(levels("a", Result(estimate([recording], settings), settings)))
     for sensor, expected in zip(sensors, true, strict=True):
         own = [each for each in found if (each.method, each.sensor) == (BOUND, sensor)]
         assert len(own) >= 3
@@ -67,7 +68,8 @@ def test_what_a_model_of_too_few_dimensions_says_contradicts_the_bound() -> None
     wrong = {each.method for each in found if each.contradicts}
     assert {"two-channel", "three-channel"} <= wrong
     one = recording_of_arrays(verticals(6, 1)[0], RATE, unit="m/s²")
-    assert not any(each.contradicts for each in levels("b", estimate([one], settings), settings))
+    alone = Result(estimate([one], settings), settings)
+    assert not any(each.contradicts for each in levels("b", alone))
 
 
 def test_a_folder_of_counts_without_responses(

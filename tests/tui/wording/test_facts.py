@@ -15,9 +15,11 @@ import pytest
 from rich.console import Console
 
 import huddle
+from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Bridged
-from daq.results import facts, known_facts
+from daq.results import facts
 from daq.results.facts import BlocksDamaged, Fact, Finding, GapsBridged, Rank
+from daq.results.result import Result
 from daq.results.sources import sources
 from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot
 from tests.tui.night_recording import record
@@ -74,14 +76,25 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_every_renderer_shows_every_kind(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Console, application, report, JSON and notebook take their facts from one function."""
     snapshot = diagnosed()
-    monkeypatch.setattr("tui.wording.facts.facts_of", lambda *_: tuple(EXAMPLES))
+    monkeypatch.setattr("daq.results.result.facts_of", lambda *_: tuple(EXAMPLES))
     shown = {
-        "console": printed(*details(snapshot, known(snapshot))),
+        "console": printed(*details(snapshot, known(Result(snapshot, Settings())))),
         "application": printed(result(state_of(snapshot), width=160)),
-        "report": " ".join(str(report_of(snapshot, SETTINGS, sources([recorded]))).split()),
-        "notebook": " ".join(map(str, known(snapshot))),
+        "report": " ".join(
+            str(
+                report_of(
+                    Result(
+                        snapshot,
+                        SETTINGS,
+                        sources([recorded])[0].bench,
+                        examined=tuple(sources([recorded])),
+                    )
+                )
+            ).split()
+        ),
+        "notebook": " ".join(map(str, known(Result(snapshot, Settings())))),
     }
-    entries = json.loads(json.dumps(finite(document(snapshot, SETTINGS)["facts"])))
+    entries = json.loads(json.dumps(finite(document(Result(snapshot, SETTINGS))["facts"])))
     words_of = {fact.name: word(fact, Names.of(snapshot)) for fact in EXAMPLES}
     for renderer, text in shown.items():
         for words in words_of.values():
@@ -100,23 +113,23 @@ def test_below_a_table_is_what_delays_or_invalidates(
     fact: Fact, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     snapshot = diagnosed()
-    monkeypatch.setattr("tui.wording.facts.facts_of", lambda *_: (fact,))
-    live = [line.plain for line in findings(snapshot, width=400)]
+    monkeypatch.setattr("daq.results.result.facts_of", lambda *_: (fact,))
+    live = [line.plain for line in findings(Result(snapshot, Settings()), width=400)]
     if fact.rank is Rank.TO_KNOW:
         assert len(live) == isinstance(fact, facts.SensorsSimulated)
-        assert brief(known(snapshot)) == ["Nothing to do. 1 fact: --details shows all"]
+        assert brief(known(Result(snapshot, Settings()))) == [
+            "Nothing to do. 1 fact: --details shows all"
+        ]
     else:
         (line,) = live
         assert line.endswith(word(fact, Names.of(snapshot)).line)
-        assert brief(known(snapshot)) == [line]
+        assert brief(known(Result(snapshot, Settings()))) == [line]
 
 
 def test_a_notebook_has_the_facts_of_the_result() -> None:
     model = huddle.simulate("fig9", duration="1min")
     found = huddle.self_noise(model, fs=model.fs, segment="2s")
-    assert [each.fact.name for each in found.facts] == [
-        each.name for each in known_facts.facts_of(found.snapshot, found.settings)
-    ]
+    assert [each.fact.name for each in found.facts] == [each.name for each in found.result.facts]
     assert set(found.advice) <= {str(each) for each in found.facts}
 
 
@@ -137,13 +150,12 @@ def test_bridged_gaps_and_damaged_blocks_are_facts_of_the_result() -> None:
     snapshot = made_snapshot()
     leakage = np.full((len(snapshot.frequency), len(snapshot.channels)), -0.01)
     damaged = tuple(replace(each, n_damaged=2) for each in snapshot.sensors[:1])
-    bridged = known_facts.facts_of(
-        replace(
-            snapshot,
-            sensors=(*damaged, *snapshot.sensors[1:]),
-            bridged=Bridged(n_segments=3, lost=0.02, leakage=leakage),
-        )
+    snapshot = replace(
+        snapshot,
+        sensors=(*damaged, *snapshot.sensors[1:]),
+        bridged=Bridged(n_segments=3, lost=0.02, leakage=leakage),
     )
+    bridged = Result(snapshot, SETTINGS).facts
     (blocks,) = [each for each in bridged if isinstance(each, BlocksDamaged)]
     assert (blocks.sensors, blocks.n_blocks) == (("A",), 2)
     (gaps,) = [each for each in bridged if isinstance(each, GapsBridged)]
@@ -152,7 +164,7 @@ def test_bridged_gaps_and_damaged_blocks_are_facts_of_the_result() -> None:
 
 
 def state_of(snapshot: Snapshot) -> State:
-    return replace(State(name="bench"), snapshot=snapshot, settings=SETTINGS)
+    return State("bench", result=Result(snapshot, SETTINGS))
 
 
 def printed(*parts: object) -> str:
@@ -171,6 +183,8 @@ def test_a_method_that_waits_for_averages_invalidates_no_test_that_goes_on() -> 
     ended = replace(made_snapshot(), results={}, refused={"three-sensor": "1 average"}, closed=True)
     for snapshot, rank in ((ended, Rank.INVALIDATES), (replace(ended, closed=False), Rank.DELAYS)):
         (refused,) = (
-            each for each in known_facts.facts_of(snapshot) if isinstance(each, facts.MethodRefused)
+            each
+            for each in Result(snapshot, SETTINGS).facts
+            if isinstance(each, facts.MethodRefused)
         )
         assert refused.rank is rank

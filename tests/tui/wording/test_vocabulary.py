@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from daq.results.known_facts import WITHOUT_ESTIMATE
+from daq.results.result import Result
 from estimator.self_noise.result import Flag
 from tests.tui.example_snapshot import SETTINGS, made_now, made_snapshot, said
 from tui.application.test_view.panels import noise_in_band, sensor_table
@@ -31,8 +32,8 @@ def test_table_and_remarks_take_their_words_from_one_place(flag: Flag) -> None:
     results = {"three-sensor": replace(noise, flags=flags)}
     snapshot = replace(snapshot, results=results)
     choice = Choice(methods=("three-sensor",))
-    means = noise_in_band(snapshot, SETTINGS, choice)
-    table = sensor_table(made_now(), snapshot, SETTINGS, choice, means=means, width=150)
+    means = noise_in_band(Result(snapshot, SETTINGS), choice)
+    table = sensor_table(made_now(), Result(snapshot, SETTINGS), choice, means=means, width=150)
     screen = console()
     with screen.capture() as shown:
         screen.print(table, width=150)

@@ -9,16 +9,8 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from daq.results.band_summary import (
-    band_of,
-    channel_means,
-    data_means,
-    judged_method,
-    without_partners,
-)
 from daq.results.comparison import compare
 from daq.results.facts import Rank, TargetMissed
-from daq.results.precision import channel_covs, precision
 from tui.application.test_view.panels import alerts, known_to
 from tui.output.results import averages_line
 from tui.wording.facts import MARKS as MARKS_OF_RANKS
@@ -41,10 +33,8 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
     from daq.results.comparison import Difference
-    from daq.results.decision.verdict import TestVerdict
+    from daq.results.result import Result
     from tui.application.state import State
 
 MUTED, BAD = "#9aa5b8", "bold #ff6b6b"
@@ -54,20 +44,21 @@ WIDE = 110  # columns from which there is room for what can be missed
 
 def result(state: State, *, width: int) -> RenderableType:
     """Return the end of a test: verdict, every channel's noise, advice, and where it all lies."""
-    now, snapshot, settings, path = state.now, state.snapshot, state.settings, state.path
-    if snapshot is None or settings is None:
+    now, found, path = state.now, state.result, state.path
+    if found is None:
         return ""
-    parts: list[RenderableType] = [*_verdict(snapshot, settings, state.verdict)]
-    wrong = [] if now is None else alerts(now, settings)
+    snapshot = found.snapshot
+    parts: list[RenderableType] = [*_verdict(found)]
+    wrong = [] if now is None else alerts(now, found)
     parts += ["", *wrong] if wrong else []
     parts.append("")
     if snapshot.results:
-        parts += [_channels(state, snapshot, settings, width=width)]
-        parts += [*_notes(state, snapshot, settings), *map(Text, state.sensors_since), ""]
+        parts += [_channels(state, found, width=width)]
+        parts += [*_notes(state, found), *map(Text, state.sensors_since), ""]
     facts = [  # with limits, how long to record is said with the verdict
         each
-        for each in known(snapshot, settings)
-        if state.verdict is None or not isinstance(each.fact, TargetMissed)
+        for each in known(found)
+        if found.verdict is None or not isinstance(each.fact, TargetMissed)
     ]
     if not any(each.needs_action for each in facts):
         parts.append(item(NOTHING_TO_DO))
@@ -88,10 +79,11 @@ def item(text: str, mark: str = "·", style: str = "#9aa5b8") -> Table:
     return table
 
 
-def _verdict(snapshot: Snapshot, settings: Settings, found: TestVerdict | None) -> Iterator[Text]:
-    if not snapshot.results:
+def _verdict(result: Result) -> Iterator[Text]:
+    found = result.verdict
+    if not result.snapshot.results:
         yield Text("No result: nothing can be said of the sensors' noise.", BAD)
-        for method, why in snapshot.refused.items():
+        for method, why in result.snapshot.refused.items():
             yield Text(f"{method}: {why}", BAD)
         return
     if found is None:
@@ -105,17 +97,16 @@ def _verdict(snapshot: Snapshot, settings: Settings, found: TestVerdict | None) 
         if known:
             worst = min(known, key=lambda each: each.margin_low_db)
             yield Text(f"Least margin: {limit_line(worst)}.")
-    reached = precision(snapshot, settings)
-    if reached.is_reached:  # a missed target is a fact, below
-        yield Text(f"✓ {known_to(reached)}", "green")
+    if result.precision().is_reached:  # a missed target is a fact, below
+        yield Text(f"✓ {known_to(result.precision())}", "green")
 
 
-def _channels(state: State, snapshot: Snapshot, settings: Settings, *, width: int) -> Table:
-    method, noise = next(iter(snapshot.results.items()))
-    band = band_of(settings, snapshot)
-    data, cov = data_means(snapshot, band), channel_covs(snapshot, settings, method)
-    means = channel_means(noise, snapshot, settings, band)
-    margins, differences = worst_by_channel(state.verdict), _differences(state)
+def _channels(state: State, result: Result, *, width: int) -> Table:
+    snapshot = result.snapshot
+    method, band = next(iter(snapshot.results)), result.band
+    data, cov, alone = result.data, result.covs_of(method), result.alone
+    means = result.means(method)
+    margins, differences = worst_by_channel(result.verdict), _differences(state)
     table = Table(
         box=None,
         pad_edge=False,
@@ -133,7 +124,6 @@ def _channels(state: State, snapshot: Snapshot, settings: Settings, *, width: in
     titles += [f"against {_reference(state)}"] if differences else []
     for title in titles:
         table.add_column(title, justify="right", no_wrap=True)
-    alone = without_partners(snapshot, band)
     for column, label in enumerate(snapshot.channels):
         name = Text(label.name, "bold")
         recorded = [level(float(data[column]))] if is_wide else []
@@ -164,10 +154,9 @@ def _channels(state: State, snapshot: Snapshot, settings: Settings, *, width: in
 
 
 def _differences(state: State) -> dict[tuple[str, str], Difference]:
-    reference, snapshot, settings = state.reference, state.snapshot, state.settings
-    if reference is None or snapshot is None or settings is None:
+    if state.reference is None or state.result is None:
         return {}
-    return compare(snapshot, settings, reference.snapshot, reference.settings)
+    return compare(state.result, state.reference.result)
 
 
 def difference_text(difference: Difference | None) -> Text:
@@ -186,8 +175,9 @@ def difference_text(difference: Difference | None) -> Text:
     return Text(text, "bold" if difference.is_certain else "")
 
 
-def _notes(state: State, snapshot: Snapshot, settings: Settings) -> Iterator[Text]:
+def _notes(state: State, result: Result) -> Iterator[Text]:
     """Yield what the table does not say of itself."""
+    snapshot = result.snapshot
     reference = state.reference
     if reference is not None:
         differences = _differences(state)
@@ -209,13 +199,13 @@ def _notes(state: State, snapshot: Snapshot, settings: Settings) -> Iterator[Tex
             )
         else:
             why = (
-                f"units differ: {snapshot.unit} and {reference.snapshot.unit}"
-                if snapshot.unit != reference.snapshot.unit
+                f"units differ: {snapshot.unit} and {reference.result.snapshot.unit}"
+                if snapshot.unit != reference.result.snapshot.unit
                 else "no channel, method or band in common"
             )
             yield Text(f"{_reference(state)} cannot be compared: {why}", "yellow")
-    if judged_method(snapshot, settings) not in snapshot.results:
-        yield Text(f"{judged_method(snapshot, settings)} gives no result here", "yellow")
+    if result.method not in snapshot.results:
+        yield Text(f"{result.method} gives no result here", "yellow")
 
 
 def _reference(state: State) -> str:

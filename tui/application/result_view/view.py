@@ -70,7 +70,7 @@ class ResultView(View):
 
     def _text(self) -> RenderableType:
         state = self.state
-        if state.snapshot is None or state.settings is None or not state.has_result:
+        if not state.has_result:
             words = "No result yet: a test has one when its recording has ended."
             return Text(state.trouble or state.note or words, MUTED)
         return result(state, width=self.app.size.width)
@@ -98,4 +98,6 @@ class ResultView(View):
             if changes is not None:
                 self.post_message(OpeningRequested(path, changes, RESULT))
 
-        self.app.push_screen(SettingsForm(path.name, self.state.settings), estimate)
+        result = self.state.result
+        settings = None if result is None else result.settings
+        self.app.push_screen(SettingsForm(path.name, settings), estimate)

@@ -8,7 +8,7 @@ from rich.text import Text
 from textual.containers import Vertical, VerticalScroll
 from textual.widgets import Static
 
-from daq.results.facts import SensorLost
+from daq.results.facts import SensorLost, TargetMissed
 from tui.application.test_view import clocks, panels
 from tui.application.test_view.channels import channel_table
 from tui.application.test_view.plot import DriftPlot, PsdPlot
@@ -43,7 +43,6 @@ class Board(Vertical):
         self._frozen: State | None = None
         self._written: dict[str, tuple[RenderableType, int]] = {}
         self._drawn: object = None
-        self._means: tuple[object, tuple[BandMeans, ...]] = (None, ())
 
     def compose(self) -> ComposeResult:
         """Lay out the screen."""
@@ -85,23 +84,22 @@ class Board(Vertical):
         if shown is None:
             return
         self._write_alerts(shown)
-        now, snapshot, settings, choice = shown.now, shown.snapshot, shown.settings, self._choice
+        now, result, choice = shown.now, shown.result, self._choice
         width = self.size.width - 2
-        if now is None or snapshot is None or settings is None:
+        if now is None or result is None:
             table = Text("") if now is None else panels.state_table(now, shown.trouble)
             self._write("#table", table, n_lines=-1)
             waiting = "no test yet: s starts one · ? helps" if shown.path is None else "opening …"
             self._write("#progress", Text(shown.note or waiting, MUTED))
             return
         if choice.clocks:
-            table = clocks.clock_table(snapshot, settings, chosen=self._sensor(), width=width - 1)
+            table = clocks.clock_table(result, chosen=self._sensor(), width=width - 1)
         elif choice.channels:
             table = channel_table(shown, choice, means=self._noise(shown), width=width - 1)
         else:
             table = panels.sensor_table(
                 now,
-                snapshot,
-                settings,
+                result,
                 choice,
                 means=self._noise(shown),
                 width=width - 1,
@@ -110,33 +108,20 @@ class Board(Vertical):
         self._write("#table", table, n_lines=table.row_count + 1)
         if choice.clocks or choice.cursor is None:  # the answer to a key, before the curves
             self._write_title(self._frozen or shown)
-        self._write("#clocks", clocks.clock_line(snapshot, settings, width=width))
-        progress = panels.progress_line(
-            now,
-            snapshot,
-            settings,
-            shown.verdict,
-            width=width,
-            is_followed=not shown.trouble,
-        )
+        self._write("#clocks", clocks.clock_line(result, width=width))
+        progress = panels.progress_line(now, result, width=width, is_followed=not shown.trouble)
         self._write("#progress", Text(shown.note, MUTED) if shown.note else progress)
-        self._write("#advice", panels.advice(snapshot, choice, shown.verdict))
+        self._write("#advice", panels.advice(result, choice))
 
     def _noise(self, shown: State) -> tuple[BandMeans, ...]:
-        """Return the channels' noise, computed once for each snapshot."""
-        snapshot, settings = shown.snapshot, shown.settings
-        if snapshot is None or settings is None:
-            return ()
-        key = (id(snapshot), self._choice.methods)
-        if self._means[0] != key:
-            self._means = key, panels.noise_in_band(snapshot, settings, self._choice)
-        return self._means[1]
+        """Return the channels' noise."""
+        return () if shown.result is None else panels.noise_in_band(shown.result, self._choice)
 
     def _write_alerts(self, shown: State) -> None:
-        alerts = [] if shown.now is None else panels.alerts(shown.now, shown.settings)
-        if shown.snapshot is not None and not shown.trouble:
+        alerts = [] if shown.now is None else panels.alerts(shown.now, shown.result)
+        if shown.result is not None and not shown.trouble:
             alerts += panels.findings(
-                shown.snapshot, width=self.size.width - 10, besides=SensorLost
+                shown.result, width=self.size.width - 10, besides=(SensorLost, TargetMissed)
             )
         if shown.trouble:
             alerts.insert(0, Text(f"▲ {shown.trouble}", BAD))
@@ -149,7 +134,7 @@ class Board(Vertical):
 
     def _draw_curves(self) -> None:
         shown = self._frozen or self._shown
-        if shown is None or shown.snapshot is None or shown.settings is None:
+        if shown is None or shown.snapshot is None:
             return
         snapshot, choice = shown.snapshot, self._choice
         psd, drift = self.query_one(PsdPlot), self.query_one(DriftPlot)

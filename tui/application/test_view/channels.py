@@ -9,8 +9,6 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.bench.units import decibels
-from daq.results.band_summary import band_of, data_means, without_partners
-from daq.results.precision import channel_covs
 from tui.application.test_view.panels import MUTED, grouped
 from tui.wording.formatting import level, level_with_error, percent, signed
 from tui.wording.verdict_text import MARKS, STYLES, worst_by_channel
@@ -26,18 +24,16 @@ if TYPE_CHECKING:
 
 def channel_table(state: State, choice: Choice, *, means: Sequence[BandMeans], width: int) -> Table:
     """Return a row per channel; without room, columns are omitted from the right."""
-    snapshot, settings = state.snapshot, state.settings
+    result = state.result
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style=f"bold {MUTED}")
-    if snapshot is None or settings is None:
+    if result is None:
         return table
-    band = band_of(settings, snapshot)
+    snapshot, data, alone, covs = result.snapshot, result.data, result.alone, result.covs
     titles = ["noise, 95 %", "known to", "margin, dB", "SNR, dB", "data", "gaps"]
     columns: dict[str, list[Text]] = {title: [] for title in ("channel", *titles)}
-    margins = worst_by_channel(state.verdict)
+    margins = worst_by_channel(result.verdict)
     if not margins:
         del columns["margin, dB"]
-    alone, covs = without_partners(snapshot, band), channel_covs(snapshot, settings)
-    data = data_means(snapshot, band)
     totals = snapshot.sensors if state.now is None else state.now.sensors
     gaps = {sensor.name: sensor.n_gaps for sensor in totals}
     for column, label in enumerate(snapshot.channels):

@@ -14,7 +14,6 @@ from daq.results.clock_effect import (
     NEGLIGIBLE_EFFECT,
     NO_EFFECT,
     SMALL_EFFECT,
-    effect_by_sensor,
     grade,
     lags,
     reference,
@@ -25,8 +24,8 @@ from tui.wording.vocabulary import clock_source
 
 if TYPE_CHECKING:
     from daq.clocks.clock_model import ClockState
-    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from daq.results.result import Result
 
 MUTED, GOOD, DOUBTFUL, BAD = "#9aa5b8", "green", "yellow", "bold #ff6b6b"
 STYLES = {"good": GOOD, "doubtful": DOUBTFUL, "bad": BAD}
@@ -36,11 +35,11 @@ _FREE = {ClockSource.ARRIVAL_TIMES, ClockSource.DEVICE_UTC}
 """Clocks that run freely, each at a rate of its own."""
 
 
-def clock_line(snapshot: Snapshot, settings: Settings, *, width: int) -> Text:
+def clock_line(result: Result, *, width: int) -> Text:
     """Return one line on the clocks: rates, residual, and effect on the noise."""
-    clocks = snapshot.clocks
+    clocks = result.snapshot.clocks
     free = [clock for clock in clocks if clock.source in _FREE]
-    if settings.clocks == "nominal":
+    if result.settings.clocks == "nominal":
         return Text("clocks: nominal rates", DOUBTFUL)
     if not clocks:
         return Text("clocks: not known yet", MUTED)
@@ -48,8 +47,8 @@ def clock_line(snapshot: Snapshot, settings: Settings, *, width: int) -> Text:
         shared = all(clock.source is ClockSource.SHARED_CLOCK for clock in clocks)
         words = "all sensors share one" if shared else "the time of every sample is known"
         return Text(f"clocks: {words}", MUTED)
-    words, style = _verdict(snapshot, settings)
-    left = f"within {microseconds(float(np.max(list(residuals(snapshot).values()))))}"
+    words, style = _verdict(result)
+    left = f"within {microseconds(float(np.max(list(residuals(result.snapshot).values()))))}"
     by = "by motion" if any(clock.refined for clock in free) else "by arrival times"
     rates = ", ".join(f"{clock.sensor} {_ppm(clock.ppm)}" for clock in free) + " ppm"
     span = f"{_ppm(min(c.ppm for c in free))} … {_ppm(max(c.ppm for c in free))} ppm"
@@ -61,8 +60,8 @@ def clock_line(snapshot: Snapshot, settings: Settings, *, width: int) -> Text:
     return Text.assemble((text, MUTED), (words, style))
 
 
-def _verdict(snapshot: Snapshot, settings: Settings) -> tuple[str, str]:
-    shares = [s for s in effect_by_sensor(snapshot, settings).values() if math.isfinite(s)]
+def _verdict(result: Result) -> tuple[str, str]:
+    shares = [s for s in result.clock_effects.values() if math.isfinite(s)]
     if not shares:
         return "effect not known yet", MUTED
     worst = max(shares)
@@ -77,15 +76,16 @@ def _verdict(snapshot: Snapshot, settings: Settings) -> tuple[str, str]:
     return words, STYLES[grade(worst)]
 
 
-def clock_table(snapshot: Snapshot, settings: Settings, *, chosen: str, width: int) -> Table:
+def clock_table(result: Result, *, chosen: str, width: int) -> Table:
     """Return a row per sensor: rate, wander, residual, source, effect on the noise."""
+    snapshot = result.snapshot
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style=f"bold {MUTED}")
     table.add_column("clock", no_wrap=True)
     wide = width >= 76
     for title in ("rate, ppm", *(("wander, ppm",) if wide else ()), "error", "of noise"):
         table.add_column(title, justify="right", no_wrap=True)
     table.add_column("known by", no_wrap=True)
-    shares, left = effect_by_sensor(snapshot, settings), residuals(snapshot)
+    shares, left = result.clock_effects, residuals(snapshot)
     against = reference(snapshot)
     for number, clock in enumerate(snapshot.clocks):
         share = shares.get(clock.sensor, math.nan)

@@ -20,26 +20,23 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
+    from daq.results.result import Result
 
 LATEST_EVENTS = 200
 MUTED, HEADER, BAD = "#9aa5b8", "bold #4cc9f0", "bold #ff6b6b"
 _STYLES = {str(EventKind.MARK): "bold #f4a261", str(EventKind.UNCOUNTED): BAD}
 
 
-def details(
-    now: RecordingStatus, snapshot: Snapshot | None, settings: Settings | None, *, trouble: str
-) -> RenderableType:
+def details(now: RecordingStatus, result: Result | None, *, trouble: str) -> RenderableType:
     """Return everything that is known of a test: sensors, segments, diagnosis, events."""
     parts: list[RenderableType] = [Text(trouble, BAD), ""] if trouble else []
     parts += [Text(f"sensors, since {utc(now.started_utc_ns)}", HEADER), _sensors(now)]
-    if snapshot is not None and settings is not None:
-        parts += ["", Text("segments", HEADER), _segments(snapshot, settings)]
+    if result is not None:
+        parts += ["", Text("segments", HEADER), _segments(result)]
         parts += ["", Text("diagnosis", HEADER)]
-        parts += diagnosis_details(snapshot, known(snapshot, settings))
-    clocks = () if snapshot is None else snapshot.clocks
+        parts += diagnosis_details(result.snapshot, known(result))
+    clocks = () if result is None else result.snapshot.clocks
     found = uncounted_events(clocks)
     parts += ["", Text("events, latest first", HEADER), _events(now, found)]
     return Group(*parts)
@@ -62,7 +59,8 @@ def _sensors(now: RecordingStatus) -> Table:
     return table
 
 
-def _segments(snapshot: Snapshot, settings: Settings) -> Text:
+def _segments(result: Result) -> Text:
+    snapshot, settings = result.snapshot, result.settings
     text = (
         f"{snapshot.n_segments} of {settings.segment:g} s ({settings.window}, "
         f"{settings.overlap:.0%} overlap), worth {snapshot.n_effective:.0f} independent averages"

@@ -12,11 +12,9 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.recording.sensor_state import SensorState
-from daq.results.band_summary import band_of, channel_means, without_partners
-from daq.results.decision.end import NOT_KNOWN_FROM, Goal, remaining
+from daq.results.decision.end import NOT_KNOWN_FROM, Goal
 from daq.results.facts import Rank, SensorsSimulated
 from daq.results.known_facts import WITHOUT_ESTIMATE
-from daq.results.precision import precision
 from tui.wording.facts import known, known_of_sensors
 from tui.wording.formatting import clock_time, level_with_error, percent, several
 from tui.wording.verdict_text import STYLES as STYLES_OF_VERDICTS
@@ -26,13 +24,11 @@ from tui.wording.vocabulary import FLAG_WORDS, PARTNER_WORDS
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus, SensorStatus
-    from daq.results.band_summary import BandMeans, WithoutPartner
-    from daq.results.decision.verdict import TestVerdict
+    from daq.results.band_summary import BandMeans, Precision, WithoutPartner
     from daq.results.facts import Fact
-    from daq.results.precision import Precision
+    from daq.results.result import Result
     from tui.application.test_view.plotted import Choice
 
 MUTED = "#9aa5b8"
@@ -40,19 +36,15 @@ _STYLES = {Rank.INVALIDATES: "bold #ff6b6b", Rank.DELAYS: "yellow", Rank.TO_KNOW
 MIN_BAR = 6  # cells
 
 
-def noise_in_band(snapshot: Snapshot, settings: Settings, choice: Choice) -> tuple[BandMeans, ...]:
+def noise_in_band(result: Result, choice: Choice) -> tuple[BandMeans, ...]:
     """Return the mean noise of every channel by the first chosen method; empty before there is."""
-    method = next((m for m in choice.methods[:1] if m in snapshot.results), None)
-    if method is None:
-        return ()
-    band = band_of(settings, snapshot)
-    return channel_means(snapshot.results[method], snapshot, settings, band)
+    method = next((m for m in choice.methods[:1] if m in result.snapshot.results), None)
+    return () if method is None else result.means(method)
 
 
 def sensor_table(
     now: RecordingStatus,
-    snapshot: Snapshot,
-    settings: Settings,
+    result: Result,
     choice: Choice,
     *,
     means: Sequence[BandMeans],
@@ -63,7 +55,7 @@ def sensor_table(
 
     Without room, rates are omitted first, then numbers of samples, then of gaps.
     """
-    noise = partial(_noise_columns, now, snapshot, settings, choice, means)
+    noise = partial(_noise_columns, now, result, choice, means)
     columns = {"sensor": [Text(sensor.name, "bold") for sensor in now.sensors]}
     columns["state"] = _states(now, is_followed=is_followed)
     columns["Hz"] = [Text(f"{sensor.sampling_rate:g}") for sensor in now.sensors]
@@ -110,17 +102,17 @@ def _states(now: RecordingStatus, *, is_followed: bool) -> list[Text]:
 
 def _noise_columns(
     now: RecordingStatus,
-    snapshot: Snapshot,
-    settings: Settings,
+    result: Result,
     choice: Choice,
     means: Sequence[BandMeans],
     *,
     with_error: bool,
 ) -> dict[str, list[Text]]:
     """Return the columns of channels, by their titles."""
-    band, of_sensor = band_of(settings, snapshot), _columns_of(snapshot)
+    snapshot = result.snapshot
+    band, of_sensor = result.band, _columns_of(snapshot)
     titles = ["noise, dB", f"{band[0]:.3g}–{band[1]:.3g} Hz", *choice.methods[:1]]
-    columns, alone = {}, without_partners(snapshot, band)
+    columns, alone = {}, result.alone
     for number in range(max(snapshot.dims)):
         title = titles[number] if number < len(titles) else " " * number
         cells = columns[title] = [Text("") for _ in now.sensors]
@@ -209,9 +201,7 @@ def _flagged(snapshot: Snapshot, column: int) -> str:
 
 def progress_line(
     now: RecordingStatus,
-    snapshot: Snapshot,
-    settings: Settings,
-    verdict: TestVerdict | None,
+    result: Result,
     *,
     width: int,
     is_followed: bool = True,
@@ -220,15 +210,16 @@ def progress_line(
 
     Nothing of an end where the recording `is_followed` no longer: its recorder may be gone.
     """
+    snapshot = result.snapshot
     if snapshot.n_segments == 0:
-        text = f"waits for the first {settings.segment:g} s segment"
+        text = f"waits for the first {result.settings.segment:g} s segment"
         if snapshot.n_dropped:
             text += f" without gaps; {snapshot.n_dropped} excluded"
         return Text(text, "#9aa5b8")
     parts = [several(snapshot.n_segments, "segment")]
     if snapshot.n_dropped:
         parts.append(f"{snapshot.n_dropped} excluded")
-    reached = precision(snapshot, settings, target=now.until.cov)
+    reached = result.precision(now.until.cov)
     if snapshot.closed:
         parts += [] if math.isnan(reached.cov) else [known_to(reached)]
         if reached.target is not None:
@@ -238,7 +229,7 @@ def progress_line(
         parts.append(known_to(replace(reached, target=None)))
     if not is_followed:
         return Text(" · ".join(parts))
-    left = remaining(now.until, verdict, snapshot, settings, elapsed=now.elapsed)
+    left = result.remaining(now.until, now.elapsed)
     if left.seconds is not None and left.goal is not Goal.END:
         left = replace(left, seconds=max(0.0, left.seconds - _gone_on(now, snapshot)))
     lost = [sensor.name for sensor in now.sensors if sensor.state.is_overdue]
@@ -281,24 +272,24 @@ def _gone_on(now: RecordingStatus, snapshot: Snapshot) -> float:
     return max(0.0, min(new))
 
 
-def alerts(now: RecordingStatus, settings: Settings | None) -> list[Text]:
+def alerts(now: RecordingStatus, result: Result | None) -> list[Text]:
     """Return faults of sensors with remedies, the worst first."""
     return [
         Text(f"▲ {each.words.line}", _STYLES[each.fact.rank])
-        for each in known_of_sensors(now, settings)
+        for each in known_of_sensors(now, None if result is None else result.settings)
     ]
 
 
-def findings(snapshot: Snapshot, *, width: int, besides: type[Fact] | None = None) -> list[Text]:
+def findings(result: Result, *, width: int, besides: tuple[type[Fact], ...] = ()) -> list[Text]:
     """Return the facts that invalidate or delay the result, a line each, the worst first.
 
-    Those of the kind `besides` are left out: they are shown elsewhere.
+    Those of the kinds `besides` are left out: they are shown elsewhere.
     """
     needed = [
         each
-        for each in known(snapshot)
+        for each in known(result)
         if (each.needs_action or isinstance(each.fact, SensorsSimulated))
-        and (besides is None or not isinstance(each.fact, besides))
+        and not isinstance(each.fact, besides)
     ]
     lines = [Text(each.line, _STYLES[each.fact.rank]) for each in needed]
     for line in lines:
@@ -306,8 +297,9 @@ def findings(snapshot: Snapshot, *, width: int, besides: type[Fact] | None = Non
     return lines
 
 
-def advice(snapshot: Snapshot, choice: Choice, verdict: TestVerdict | None = None) -> Text:
+def advice(result: Result, choice: Choice) -> Text:
     """Return one line on what to know about what is shown: first the verdict so far."""
+    snapshot, verdict = result.snapshot, result.verdict
     if verdict is not None:
         return Text(headline(verdict), STYLES_OF_VERDICTS[verdict.verdict])
     refused = [f"{method}: {why}" for method, why in snapshot.refused.items()]

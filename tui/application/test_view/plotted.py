@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.results.band_summary import levels
 from daq.results.decision.limits import concerns, mask_psd
 from estimator.levels.bands import log_edges
 from tui.application.test_view.clocks import COLOURS
@@ -19,8 +18,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from daq.bench.masks.mask import Mask
-    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from daq.results.result import Result
     from tui.application.state import State
     from tui.application.test_view.curves import Curve
     from tui.application.test_view.units import SpectrumUnit
@@ -159,9 +158,10 @@ def curves(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
     Its data, noise models, the same channel of the recording it is compared with, the limits, the
     estimates.
     """
-    snapshot, settings = state.snapshot, state.settings
-    if snapshot is None or settings is None or snapshot.n_segments == 0:
+    result = state.result
+    if result is None or result.snapshot.n_segments == 0:
         return []
+    snapshot = result.snapshot
     if choice.span is not None:  # finer, where less is shown
         first, last = whole_span(snapshot)
         n_points = round(n_points * (last - first) / (choice.span[1] - choice.span[0]))
@@ -179,7 +179,7 @@ def curves(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
         if method in snapshot.results:
             shown.append(
                 _noise(
-                    *(snapshot, settings, column),
+                    *(result, column),
                     method=method,
                     label=method,
                     style=STYLES[method],
@@ -194,15 +194,14 @@ def _compared(
     state: State, choice: Choice, columns: Sequence[int], *, n_points: int
 ) -> list[Curve]:
     """Return the noise of some channels, the chosen one on top."""
-    snapshot, settings = state.snapshot, state.settings
-    method = next(iter(choice.methods), "")
-    if snapshot is None or settings is None or method not in snapshot.results:
+    result, method = state.result, next(iter(choice.methods), "")
+    if result is None or method not in result.snapshot.results:
         return []
     return [
         _noise(
-            *(snapshot, settings, column),
+            *(result, column),
             method=method,
-            label=snapshot.channels[column].name,
+            label=result.snapshot.channels[column].name,
             style=(COLOURS[n % len(COLOURS)], "", MARKERS[n % len(MARKERS)]),
             n_points=n_points,
             bins=choice.bins,
@@ -212,8 +211,7 @@ def _compared(
 
 
 def _noise(
-    snapshot: Snapshot,
-    settings: Settings,
+    result: Result,
     column: int,
     *,
     method: str,
@@ -222,9 +220,10 @@ def _noise(
     n_points: int,
     bins: bool,
 ) -> Curve:
+    snapshot = result.snapshot
     n_bands = n_points if bins else steps_of(snapshot, n_points)
     edges = log_edges(snapshot.frequency, n_bands)
-    found = levels(snapshot.results[method], snapshot, settings, edges)
+    found = result.spectrum(method).levels(edges)
     return noise_curve(
         snapshot.frequency,
         found.of_channel(column),
@@ -248,9 +247,9 @@ def steps_of(snapshot: Snapshot, n_points: int) -> int:
 def _reference(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
     """Return the noise of the same channel in the earlier recording, by the first method shown."""
     reference, snapshot = state.reference, state.snapshot
-    if reference is None or snapshot is None or reference.snapshot.unit != snapshot.unit:
+    if reference is None or snapshot is None or reference.result.snapshot.unit != snapshot.unit:
         return []
-    before = reference.snapshot
+    before = reference.result.snapshot
     wanted = snapshot.channels[choice.channel]
     columns = [
         column
@@ -262,7 +261,7 @@ def _reference(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
         return []
     return [
         _noise(
-            *(before, reference.settings, columns[0]),
+            *(reference.result, columns[0]),
             method=methods[0],
             label=reference.path.stem,
             style=REFERENCE_STYLE,
@@ -274,9 +273,10 @@ def _reference(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
 
 def _limits(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
     """Return the masks that are for the chosen channel."""
-    snapshot, bench = state.snapshot, state.judged_by
-    if snapshot is None or bench is None:
+    bench = None if state.result is None else state.result.bench
+    if state.snapshot is None or bench is None:
         return []
+    snapshot = state.snapshot
     label, frequency = snapshot.channels[choice.channel], snapshot.frequency
     return [
         mask_curve(

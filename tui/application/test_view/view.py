@@ -121,9 +121,7 @@ class TestView(View):
 
     def draw(self) -> None:
         """Draw the state."""
-        settings, snapshot = self.state.settings, self.state.snapshot
-        if settings is not None and snapshot is not None:
-            self.choice = fitting(self.choice, self.state)
+        self.choice = fitting(self.choice, self.state)
         if self._frozen is not None and self._frozen.path != self.state.path:
             self._frozen = None
         self.query_one(Board).show(self.state, self.choice, frozen=self._frozen)
@@ -232,14 +230,14 @@ class TestView(View):
         state = self.state
         if state.now is None:
             return "no recording is followed"
-        return details(state.now, state.snapshot, state.settings, trouble=state.trouble)
+        return details(state.now, state.result, trouble=state.trouble)
 
 
 def fitting(choice: Choice, state: State) -> Choice:
     """Return a choice of what the snapshot has: its channels, and methods that are estimated."""
-    snapshot, settings = state.snapshot, state.settings
-    if snapshot is None or settings is None:
+    if state.result is None:
         return choice
+    snapshot, settings = state.result.snapshot, state.result.settings
     channel = min(choice.channel, len(snapshot.channels) - 1)
     methods = choice.methods
     if not set(methods) & set(snapshot.results or methods):  # none yet, or averages are too few

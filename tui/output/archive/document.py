@@ -69,7 +69,7 @@ def archive_json(answer: Answer, store: Store, n_recordings: int, wrong: Sequenc
             ],
         },
         "facts": facts_document(worded(facts_of_archive(answer))),
-        "pooled": document(pooled, answer.settings),
+        "pooled": document(answer.result),
         "method": answer.method,
         "unit": pooled.unit,
         "channels": [label.name for label in pooled.channels],

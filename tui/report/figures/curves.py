@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
 from daq.bench.units import levels_db
-from daq.results.band_summary import levels
 from daq.results.decision.limits import concerns, mask_psd
 from daq.whole_file import write_whole
 from estimator.errors import InsufficientDataError
@@ -32,10 +31,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.masks.mask import Mask
-    from daq.bench.model import Bench
-    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.results.band_summary import BandMeans
+    from daq.results.result import Result
     from estimator.types import FloatArray
 
     BoolArray = NDArray[np.bool_]
@@ -144,9 +142,7 @@ class _NoisePanel:
 
 
 def noise_plots(
-    snapshot: Snapshot,
-    settings: Settings,
-    bench: Bench | None,
+    result: Result,
     models: Sequence[Mask] = (),
     *,
     width: float = WIDTH,
@@ -170,13 +166,14 @@ def noise_plots(
     WrongSettingError
         If a model cannot be turned into the unit of the snapshot.
     """
+    snapshot = result.snapshot
     if not snapshot.results:
         return ()
-    curves = _curves(snapshot, settings, bench, models)
+    curves = _curves(result, models)
     scale = _scale(curves)
     first = next(iter(snapshot.results))
     noise_label = "self-noise" if len(snapshot.results) == 1 else f"self-noise, {first}"
-    band = settings.band
+    band = result.settings.band
     groups = list(_groups(snapshot))
     widest = max(len(columns) for _, columns in groups)
     plots = []
@@ -230,15 +227,14 @@ def _key_rows(curves: list[_Curves], width: float) -> int:
     return math.ceil(n_labels / max(1, int(width / KEY_COLUMN)))
 
 
-def _curves(
-    snapshot: Snapshot, settings: Settings, bench: Bench | None, models: Sequence[Mask]
-) -> list[_Curves]:
-    (_, noise), *others = snapshot.results.items()
+def _curves(result: Result, models: Sequence[Mask]) -> list[_Curves]:
+    snapshot, bench = result.snapshot, result.bench
+    method, *others = snapshot.results
     frequency, data = snapshot.frequency, snapshot.data_psd
     edges = log_edges(frequency, POINTS)
     centre = centres(frequency, edges)
     width = np.gradient(frequency)
-    found = levels(noise, snapshot, settings, edges)
+    found = result.spectrum(method).levels(edges)
     curves = []
     for column, label in enumerate(snapshot.channels):
         means = found.of_channel(column)
@@ -253,7 +249,10 @@ def _curves(
                 centre,
                 _mean(data[:, column], edges, width),
                 means,
-                {name: _mean(other.noise_psd[:, column], edges, width) for name, other in others},
+                {
+                    name: _mean(snapshot.results[name].noise_psd[:, column], edges, width)
+                    for name in others
+                },
                 tuple(masks),
                 {
                     each.name: (points, each.at(points, label.unit))
@@ -362,9 +361,7 @@ RESOLUTION = 300
 
 
 def write_figure(
-    snapshot: Snapshot,
-    settings: Settings,
-    bench: Bench | None,
+    result: Result,
     path: Path,
     *,
     models: Sequence[Mask] = (),
@@ -399,7 +396,7 @@ def write_figure(
     kind = path.suffix.lower().removeprefix(".")
     content = io.BytesIO()
     with look(), mpl.rc_context({"svg.fonttype": "path"}):
-        plots = noise_plots(snapshot, settings, bench, models, width=width)
+        plots = noise_plots(result, models, width=width)
         if not plots:
             raise InsufficientDataError("no noise estimate by any method: nothing can be drawn")
         figure = Figure(figsize=(width, stack_height(plots)), facecolor="white")

@@ -20,8 +20,7 @@ from tui.report.parts import Plot
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
+    from daq.results.result import Result
     from estimator.types import FloatArray
 
 TEST_POINTS = 90
@@ -29,14 +28,15 @@ TEST_HEIGHT = 1.25
 _SHAPE_LENGTH = 512  # only the window's shape and overlap matter to the correlation of bins
 
 
-def model_test_plot(snapshot: Snapshot, settings: Settings) -> Plot | None:
+def model_test_plot(result: Result) -> Plot | None:
     """Return the statistic of the model test over its expectation; None where there is none."""
+    snapshot = result.snapshot
     found = snapshot.diagnostics.diagnosis
     if found is None or not np.isfinite(found.per_frequency.statistic[1:-1]).any():
         return None
     statistic, degrees = found.per_frequency.statistic, found.per_frequency.degrees
-    window = get_window(settings.window, _SHAPE_LENGTH)
-    hop = max(1, round(_SHAPE_LENGTH * (1 - settings.overlap)))
+    window = get_window(result.settings.window, _SHAPE_LENGTH)
+    hop = max(1, round(_SHAPE_LENGTH * (1 - result.settings.overlap)))
     r = neighbour_correlation(window, hop, max(1, snapshot.n_segments))
     edges = log_edges(snapshot.frequency, TEST_POINTS)
     known = np.isfinite(statistic)

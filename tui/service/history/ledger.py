@@ -21,13 +21,7 @@ from typing import TYPE_CHECKING, Any
 from daq.bench.units import decibels
 from daq.errors import HuddleError
 from daq.recording.reader import Recording
-from daq.results.band_summary import (
-    CONSTANT,
-    band_of,
-    channel_means,
-    judged_method,
-    known_range,
-)
+from daq.results.band_summary import CONSTANT, known_range
 from estimator.errors import BandError
 from tui.service.records.run_state import BandNoise, utc_text
 from tui.wording.findings import drift_line
@@ -35,10 +29,9 @@ from tui.wording.findings import drift_line
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
     from daq.recording.sensor_record import SensorRecord
     from daq.results.decision.verdict import TestVerdict
+    from daq.results.result import Result
     from tui.service.history.series import Found
 
 _LOGGER = logging.getLogger(__name__)
@@ -153,8 +146,7 @@ def ledger_path() -> Path | None:
 
 
 def band_noise(
-    snapshot: Snapshot,
-    settings: Settings,
+    result: Result,
     bands: Iterable[tuple[float, float]],
     about: Mapping[str, tuple[str, str]],
     notes: list[str],
@@ -170,15 +162,13 @@ def band_noise(
     notes : list of str
         Takes why a band has none.
     """
-    method = judged_method(snapshot, settings)
+    snapshot = result.snapshot
+    method, found = result.method, []
     if method not in snapshot.results:
         return ()
-    found = []
-    for band in dict.fromkeys([band_of(settings, snapshot), *bands]):
+    for band in dict.fromkeys([result.band, *bands]):
         try:
-            means = channel_means(
-                snapshot.results[method], snapshot, settings, band, without=CONSTANT
-            )
+            means = result.means(method, band, without=CONSTANT)
         except BandError as error:
             notes.append(f"no noise for the history: {error}")
             continue
@@ -190,9 +180,7 @@ def band_noise(
     return tuple(found)
 
 
-def record_test(
-    path: Path, snapshot: Snapshot, settings: Settings, verdict: TestVerdict | None
-) -> list[Drift]:
+def record_test(path: Path, result: Result) -> list[Drift]:
     """Add a test to the ledger; return how its sensors differ from their first tests.
 
     Raises
@@ -200,6 +188,7 @@ def record_test(
     HuddleError, OSError, sqlite3.Error
         If the recording cannot be read, or the ledger not be written.
     """
+    snapshot = result.snapshot
     place = ledger_path()
     if place is None:
         return []
@@ -207,7 +196,7 @@ def record_test(
         bench, run_id = recording.bench, recording.run_id
         started = recording.created_at.utc_ns * 1e-9
         known = {each.name: each for each in recording.sensors if each.serial_number}
-        rows = [_sensor_row(run_id, each, verdict) for each in known.values()]
+        rows = [_sensor_row(run_id, each, result.verdict) for each in known.values()]
     if not known:
         return []
     about = {name: (each.model, each.serial_number) for name, each in known.items()}
@@ -215,7 +204,7 @@ def record_test(
     octaves = [each for each in OCTAVES if low <= each[0] and each[1] <= high]
     noise = [
         (run_id, started, snapshot.simulated, *_values(each))
-        for each in band_noise(snapshot, settings, octaves, about, [])
+        for each in band_noise(result, octaves, about, [])
         if each.serial_number
     ]
     test = run_id, path.name, "" if bench is None else bench.name, started, snapshot.simulated
@@ -345,15 +334,13 @@ def noise_of(serial_number: str) -> list[Found]:
     ]
 
 
-def noted(
-    path: Path, snapshot: Snapshot, settings: Settings, verdict: TestVerdict | None
-) -> list[str]:
+def noted(path: Path, result: Result) -> list[str]:
     """Add a test to the ledger; return a sentence on each sensor that it has had before.
 
     A ledger that cannot be written spoils no test: it is logged.
     """
     try:
-        found = record_test(path, snapshot, settings, verdict)
+        found = record_test(path, result)
     except (HuddleError, OSError, sqlite3.Error) as error:
         _LOGGER.warning("the ledger of sensors has not got this test: %s", error)
         return []

@@ -27,8 +27,7 @@ from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
 from daq.recording.repair import repair
 from daq.recording.signing import identity, sign, signature_of
-from daq.results.decision.limits import judge
-from daq.results.sources import sources
+from daq.results.result import Result
 from daq.results.store import store_results
 from daq.whole_file import remove_parts
 from estimator.errors import EstimatorError
@@ -43,8 +42,6 @@ from tui.service.records.run_state import RUN, BandNoise
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
-
-    from daq.estimation.snapshot import Snapshot
 
 
 MEMORY_SHARE = 0.6
@@ -191,10 +188,9 @@ def _finished(request: Request, progress: Callable[[], object]) -> Outcome:
 
     snapshot = estimate(paths, settings, progress=of_segments)
     progress()
-    last = paths[-1]
-    found = judge(bench, snapshot, settings)
-    verdict = "" if found is None else str(found.verdict)
-    noise = band_noise(snapshot, settings, request.bands, about, notes)
+    last, result = paths[-1], Result(snapshot, settings, bench, tuple(paths))
+    verdict = "" if result.verdict is None else str(result.verdict.verdict)
+    noise = band_noise(result, request.bands, about, notes)
     about_run = {}
     if request.run is not None:
         record = request.run | {
@@ -208,16 +204,16 @@ def _finished(request: Request, progress: Callable[[], object]) -> Outcome:
     except HuddleError as error:
         notes.append(f"the result is not in the recording: {error}")
         refused |= is_of_disk(error)
-    noted(last, snapshot, settings, found)
-    result = document(snapshot, settings, sources=sources(paths), verdict=found)
+    noted(last, result)
+    text = document(result)
     try:
-        write_json(str(last.with_suffix(".json")), result)
+        write_json(str(last.with_suffix(".json")), text)
     except OSError as error:
         notes.append(f"the result is not in the JSON file: {error}")
         refused |= is_of_disk(error)
     if request.report is not None:
         try:
-            _report(snapshot, last, paths, settings, request.report)
+            _report(result, last, request.report)
         except (HuddleError, OSError) as error:
             notes.append(f"no report: {error}")
             refused |= is_of_disk(error)
@@ -282,13 +278,10 @@ def _long_enough(paths: list[Path], segment: float, notes: list[str]) -> list[Pa
     return found or paths
 
 
-def _report(
-    snapshot: Snapshot, last: Path, paths: list[Path], settings: Settings, kind: str
-) -> None:
+def _report(result: Result, last: Path, kind: str) -> None:
     from tui.report.writing import write  # noqa: PLC0415 - matplotlib only where there is a report
 
-    out = last.with_suffix(f".{kind}")
-    write(snapshot, out, recordings=paths, settings=settings, taken="beside")
+    write(result, last.with_suffix(f".{kind}"), taken="beside")
 
 
 class _Heartbeat:

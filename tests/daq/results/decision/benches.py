@@ -6,7 +6,7 @@ from importlib import resources
 from typing import TYPE_CHECKING
 
 from daq.bench.loading import parse
-from daq.results.decision.limits import judge
+from daq.results.result import Result
 from tests.tui.example_snapshot import SETTINGS
 
 if TYPE_CHECKING:
@@ -29,6 +29,6 @@ def bench_with(psd: float, more: str = "") -> Bench:
 
 
 def verdict_on(snapshot: Snapshot, psd: float, more: str = "") -> TestVerdict:
-    found = judge(bench_with(psd, more), snapshot, SETTINGS)
+    found = Result(snapshot, SETTINGS, bench_with(psd, more)).verdict
     assert found is not None
     return found

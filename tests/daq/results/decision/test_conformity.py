@@ -21,7 +21,7 @@ from daq.results.decision.conformity import (
     risk_of_item,
     stated,
 )
-from daq.results.decision.limits import judge
+from daq.results.result import Result
 from estimator.decision.verdict import Obstacle, Verdict
 from estimator.levels.interval import interval
 from tests.tui.night_recording import record
@@ -142,14 +142,14 @@ def test_the_guard_band_of_one_uncertainty_agrees_with_the_verdict(tmp_path: Pat
     snapshot = estimate([recording], settings)
     with Recording.open(recording) as opened:
         bench = opened.bench
-    exact = conformity(bench, snapshot, settings)
+    exact = conformity(bench, Result(snapshot, settings))
     assert {each.statement for each in exact} == {Statement.NOT_STATED}  # without traceability
     toleranced = judged_with(snapshot, KnownSensitivity(own=0.002))
-    found = conformity(bench, toleranced, settings)
+    found = conformity(bench, Result(toleranced, settings))
     assert {each.statement for each in found} == {Statement.NOT_STATED}
     certified = judged_with(snapshot, KnownSensitivity(own=0.002, is_certified=True))
-    found = conformity(bench, certified, settings)
-    verdict = judge(bench, certified, settings)
+    found = conformity(bench, Result(certified, settings))
+    verdict = Result(certified, settings, bench).verdict
     assert verdict is not None
     assert [(e.sensor, e.channel) for e in found] == [(e.sensor, e.channel) for e in verdict.limits]
     for each, before, limit in zip(found, exact, verdict.limits, strict=True):
@@ -171,7 +171,7 @@ def test_an_uncertain_sensitivity_widens_the_interval_and_takes_the_pass(tmp_pat
     found = {}
     for own in (0.01, 0.25):
         known = judged_with(snapshot, KnownSensitivity(own=own, is_certified=True))
-        verdict = judge(bench, known, settings)
+        verdict = Result(known, settings, bench).verdict
         assert verdict is not None
         found[own] = verdict.limits[0]
     assert found[0.01].verdict is Verdict.PASS

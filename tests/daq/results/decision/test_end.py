@@ -9,6 +9,7 @@ import pytest
 
 from daq.bench.end_condition import NEVER, EndCondition
 from daq.results.decision.end import Goal, Remaining, remaining
+from daq.results.result import Result
 from estimator.decision.verdict import Obstacle, Verdict
 from tests.daq.results.decision.benches import verdict_on
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
@@ -27,8 +28,7 @@ def left(
     return remaining(
         end,
         CLOSE_TO_IT if verdict else None,
-        SNAPSHOT,
-        replace(SETTINGS, target_cov=target),
+        Result(SNAPSHOT, replace(SETTINGS, target_cov=target)),
         elapsed=SNAPSHOT.elapsed,
     )
 
@@ -73,12 +73,12 @@ def test_a_planned_end_that_comes_first_is_the_one_duration() -> None:
 def test_what_does_not_end_by_recording_longer_says_so() -> None:
     """Whatever the planned end is."""
     stuck = replace(CLOSE_TO_IT, obstacles=(Obstacle.CLOCKS,), prediction=None)
-    found = remaining(NEVER, stuck, SNAPSHOT, FREE, elapsed=SNAPSHOT.elapsed)
+    found = remaining(NEVER, stuck, Result(SNAPSHOT, FREE), elapsed=SNAPSHOT.elapsed)
     assert found.seconds is None
     assert "errors of the clocks are too large" in how_long(found, None)
     assert CLOSE_TO_IT.prediction is not None
     too_close = replace(CLOSE_TO_IT, prediction=replace(CLOSE_TO_IT.prediction, seconds=None))
-    found = remaining(NEVER, too_close, SNAPSHOT, FREE, elapsed=SNAPSHOT.elapsed)
+    found = remaining(NEVER, too_close, Result(SNAPSHOT, FREE), elapsed=SNAPSHOT.elapsed)
     assert "too close to the limit" in how_long(found, None)
 
 
@@ -86,11 +86,11 @@ def test_a_verdict_that_is_not_sure_ends_only_what_nobody_looks_at() -> None:
     """A test that ends by itself goes on until its verdict is sure, and says for how long."""
     passed = verdict_on(SNAPSHOT, 16e-12)
     assert (passed.verdict, passed.is_sure) == (Verdict.PASS, False)
-    by_hand = remaining(NEVER, passed, SNAPSHOT, FREE, elapsed=SNAPSHOT.elapsed)
+    by_hand = remaining(NEVER, passed, Result(SNAPSHOT, FREE), elapsed=SNAPSHOT.elapsed)
     assert how_long(by_hand, AT) == "Enough is recorded: the limits are decided."
     assert what_to_do(passed) == []  # a finished recording need not be longer
     assert what_to_do(CLOSE_TO_IT)[-1].startswith("Record for ")
     until = EndCondition(decided=True)
-    by_itself = remaining(until, passed, SNAPSHOT, FREE, elapsed=SNAPSHOT.elapsed)
+    by_itself = remaining(until, passed, Result(SNAPSHOT, FREE), elapsed=SNAPSHOT.elapsed)
     assert by_itself.seconds is not None
     assert by_itself.seconds > 0

@@ -13,8 +13,7 @@ import pytest
 from daq.bench.loading import parse
 from daq.estimation.contributions import contributions
 from daq.estimation.snapshot_diagnostics import Synchronisation
-from daq.results.band_summary import channel_means
-from daq.results.decision.limits import judge
+from daq.results.result import Result
 from estimator.checks.advice import Level, ModelMisfit
 from estimator.checks.count_limits import CountLimits
 from estimator.decision.verdict import MIN_AVERAGES, Obstacle, Verdict
@@ -84,7 +83,7 @@ def test_a_channel_just_at_its_mask_seldom_fails() -> None:
     for _ in range(n_tests):
         drawn = level * (1 + 0.05 * rng.normal(size=shape))
         results = {"three-sensor": SelfNoise.of("three-sensor", drawn, cumulants, noise.flags)}
-        found = judge(bench, replace(snapshot, results=results), settings)
+        found = Result(replace(snapshot, results=results), settings, bench).verdict
         assert found is not None
         n_failing += found.verdict is Verdict.FAIL
     # One test in forty, and four standard deviations: 10; channel by channel it would be 24.
@@ -94,8 +93,8 @@ def test_a_channel_just_at_its_mask_seldom_fails() -> None:
 
 def test_without_limits_there_is_no_verdict() -> None:
     text = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
-    assert judge(parse(text), made_snapshot(), SETTINGS) is None
-    assert judge(None, made_snapshot(), SETTINGS) is None
+    assert Result(made_snapshot(), SETTINGS, parse(text)).verdict is None
+    assert Result(made_snapshot(), SETTINGS).verdict is None
 
 
 def by_channel(psd: float, *, n_effective: float = 1000.0) -> dict[str, LimitResult]:
@@ -274,7 +273,9 @@ def test_the_error_of_further_dimensions_is_not_averaged_away() -> None:
     plain, wide = (with_further_dimensions(cov, accepted=True) for cov in (0.0, 0.2))
     noise = plain.results["maximum-likelihood"]
     for band, share in (((1.0, 10.0), 0.1), ((20.0, 30.0), 0.0)):  # 2.5 times 0.2 squared
-        (old, *_), (new, *_) = (channel_means(noise, s, settings, band) for s in (plain, wide))
+        (old, *_), (new, *_) = (
+            Result(s, settings).means(noise.method, band) for s in (plain, wide)
+        )
         assert new.mean == old.mean
         wanted = old.high[0] * (1 + 1.96 * share)
         assert new.high[0] == pytest.approx(wanted, rel=1e-3)
@@ -287,7 +288,7 @@ def test_dimensions_that_do_not_explain_the_averages_decide_nothing(
 ) -> None:
     settings = replace(SETTINGS, methods=("maximum-likelihood",))
     snapshot = with_further_dimensions(0.04, accepted=accepted)
-    found = judge(bench_with(1.05e-11), snapshot, settings)
+    found = Result(snapshot, settings, bench_with(1.05e-11)).verdict
     assert found is not None
     assert found.verdict is (verdict or Verdict.NOT_DECIDED)
     if verdict is None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from daq.bench.loading import parse
-from daq.results.decision.limits import judge
+from daq.results.result import Result
 from estimator.decision.comparison import mask_edges
 from estimator.decision.verdict import Obstacle, Verdict
 from estimator.self_noise.result import SelfNoise
@@ -21,7 +21,7 @@ from tui.wording.verdict_text import not_judged
 def test_a_mask_outside_the_spectrum_decides_nothing() -> None:
     text = MASK.format(psd=1e-15, more="").replace("[1.0, 30.0]", "[300.0, 400.0]")
     base = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
-    found = judge(parse(base + text), made_snapshot(), SETTINGS)
+    found = Result(made_snapshot(), SETTINGS, parse(base + text)).verdict
     assert found is not None
     assert found.verdict is Verdict.NOT_DECIDED
     assert found.obstacles == (Obstacle.OUTSIDE_SPECTRUM,)
@@ -51,7 +51,7 @@ def test_a_mask_is_judged_in_a_notch_narrower_than_a_band(psd: str, verdict: Ver
     text = MASK.format(psd=0, more="").replace("[0, 0]", psd)
     text = text.replace("[1.0, 30.0]", "[1.0, 15.9, 16.0, 17.0, 17.1, 30.0]")
     bench = parse(resources.files("tui.resources").joinpath("bench.toml").read_text("utf-8") + text)
-    found = judge(bench, made_snapshot(n_effective=20_000.0), SETTINGS)
+    found = Result(made_snapshot(n_effective=20_000.0), SETTINGS, bench).verdict
     assert found is not None
     assert found.verdict is verdict
     if verdict is Verdict.FAIL:
@@ -95,7 +95,7 @@ def test_where_a_mask_goes_beyond_the_spectrum_the_verdict_says_so(
 ) -> None:
     text = MASK.format(psd=12e-12, more="").replace("[1.0, 30.0]", f"[{low}, {high}]")
     bench = parse(resources.files("tui.resources").joinpath("bench.toml").read_text("utf-8") + text)
-    found = judge(bench, made_snapshot(n_effective=5000.0), SETTINGS)
+    found = Result(made_snapshot(n_effective=5000.0), SETTINGS, bench).verdict
     assert found is not None
     assert found.verdict is Verdict.PASS
     assert {(each.covers, each.judged) for each in found.limits} == {((low, high), judged)}
@@ -116,7 +116,7 @@ def test_unusable_high_frequencies_are_not_judged_and_said() -> None:
     }
     text = MASK.format(psd=12e-12, more="").replace("[1.0, 30.0]", "[1.0, 90.0]")
     bench = parse(resources.files("tui.resources").joinpath("bench.toml").read_text("utf-8") + text)
-    found = judge(bench, replace(snapshot, csm=csm, results=results), SETTINGS)
+    found = Result(replace(snapshot, csm=csm, results=results), SETTINGS, bench).verdict
     assert found is not None
     assert found.verdict is Verdict.PASS
     (line,) = not_judged(found)
@@ -128,7 +128,7 @@ def test_a_model_is_a_limit_in_any_unit() -> None:
     """The ground's noise models are in m/s²; the channels of this bench are, too."""
     more = '[[limits]]\nname = "loud"\nmodel = "ahnm"\n[[limits]]\nname = "quiet"\nmodel = "nlnm"'
     text = resources.files("tui.resources").joinpath("bench.toml").read_text("utf-8")
-    found = judge(parse(f"{text}\n{more}"), made_snapshot(n_effective=5000.0), SETTINGS)
+    found = Result(made_snapshot(n_effective=5000.0), SETTINGS, parse(f"{text}\n{more}")).verdict
     assert found is not None
     verdicts = {(each.limit, each.verdict) for each in found.limits}
     # noise of -120 to -110 dB: below -91 dB in part, above -120 dB at 0.8 s, above the NLNM

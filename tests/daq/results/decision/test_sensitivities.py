@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from daq.results.decision.limits import judge
+from daq.results.result import Result
 from estimator.checks.relative_response import relative_response
 from estimator.decision.verdict import Obstacle, Verdict
 from estimator.methods import self_noise
@@ -62,7 +62,7 @@ def drawn_gains(rng: np.random.Generator) -> np.ndarray[tuple[int], np.dtype[np.
 
 
 def verdict_of(snapshot: Snapshot, limit: float, more: str = "") -> TestVerdict:
-    found = judge(bench_with(limit, more), snapshot, SETTINGS)
+    found = Result(snapshot, SETTINGS, bench_with(limit, more)).verdict
     assert found is not None
     return found
 

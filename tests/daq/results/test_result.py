@@ -1,0 +1,58 @@
+"""A result derives each quantity once, whoever asks, and however often."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from daq.results import band_summary, result
+from daq.results.decision import limits
+from daq.results.result import Result
+from tests.daq.results.decision.benches import bench_with
+from tests.tui.example_snapshot import SETTINGS, diagnosed
+from tui.commands.estimate import show_result
+from tui.output.json_document import document
+
+if TYPE_CHECKING:
+    import pytest
+
+ONCE = (
+    (limits, "judge"),
+    (result, "facts_of"),
+    (result, "facts_of_verdict"),
+    (result, "effect_by_sensor"),
+    (band_summary, "band_of"),
+    (band_summary, "judged_method"),
+    (band_summary, "data_means"),
+    (band_summary, "without_partners"),
+)
+
+
+def test_an_estimate_derives_each_quantity_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    counts: Counter[str] = Counter()
+
+    def counted(module: object, name: str) -> None:
+        derive = getattr(module, name)
+
+        def count(*args: object, **options: object) -> object:
+            counts[name] += 1
+            return derive(*args, **options)
+
+        monkeypatch.setattr(module, name, count)
+
+    for module, name in (*ONCE, (band_summary, "contributions"), (band_summary, "shared_parts")):
+        counted(module, name)
+    found = Result(diagnosed(), SETTINGS, bench_with(1e-9))
+    for _ in range(2):
+        show_result(found, json=None, csv=None, diagnostics=True)
+        document(found)
+    methods = len(found.snapshot.results)
+    assert methods > 1
+    once = {name for _, name in ONCE} - {"effect_by_sensor"}  # nothing here shows the clocks
+    assert counts == dict.fromkeys(once, 1) | {"contributions": methods, "shared_parts": methods}
+
+
+def test_means_of_a_band_are_made_once() -> None:
+    found = Result(diagnosed(), SETTINGS)
+    assert found.means("three-sensor") is found.means("three-sensor", found.band)
+    assert found.means("three-sensor", (2.0, 3.0)) is not found.means("three-sensor")
