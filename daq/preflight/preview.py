@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -55,6 +55,8 @@ class SensorPreview:
         The latest samples in the units of the channels.
     last_ns : int
         Host monotonic time of the last sample, in ns.
+    age : float
+        Seconds since it arrived.
     measured_rate : float or None
         Samples per second by the host's clock; None while it is not known.
     rate_error : float
@@ -77,6 +79,7 @@ class SensorPreview:
     information: DeviceInformation | None
     samples: NDArray[np.float64]
     last_ns: int = 0
+    age: float = 0.0
     measured_rate: float | None = None
     rate_error: float = 0.0
     arrival_scatter: float = 0.0
@@ -144,10 +147,11 @@ class _SensorBuffer:
         while self._n_samples - self._blocks[0].n_samples >= most:
             self._n_samples -= self._blocks.popleft().n_samples
 
-    def preview(self) -> SensorPreview:
-        return SensorPreview.of(
+    def preview(self, now_ns: int) -> SensorPreview:
+        latest = SensorPreview.of(
             self.sensor, self.information, list(self._blocks), trouble=self.trouble
         )
+        return replace(latest, age=(now_ns - latest.last_ns) * 1e-9 if latest.last_ns else 0.0)
 
 
 async def preview(
@@ -179,7 +183,8 @@ async def preview(
         ]
         while not ended.is_set():
             await asyncio.sleep(interval)
-            show(tuple(buffer.preview() for buffer in buffers.values()))
+            now_ns = clock.now().monotonic_ns
+            show(tuple(buffer.preview(now_ns) for buffer in buffers.values()))
         for task in tasks:
             task.cancel()
 

@@ -18,6 +18,7 @@ from daq.devices.interface import DeviceInformation
 from daq.preflight.preview import SensorPreview
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
 from tests.tui.application.test_app import NARROW, WIDE, shown
+from tests.tui.application.test_attach import until
 from tests.tui.example_snapshot import SETTINGS, ProgressCallback, demo_bench
 from tests.waiting import limit
 from tui.application.app import HuddleApp
@@ -25,6 +26,7 @@ from tui.application.bench_view.sensors import (
     SPECTRUM_POINTS,
     SPECTRUM_SEGMENT,
     channel_traces,
+    sensor_states,
     sensors_of_bench,
     spectra,
     trace,
@@ -167,6 +169,36 @@ async def test_the_ports_are_released_before_a_test_and_with_the_view(
         await pilot.press(key, *(["enter"] if key == "s" else []))
         await shown(pilot, app)
         assert reading.is_over.wait(limit())
+
+
+async def test_reading_goes_on_under_help_and_after_a_dialog(told: ProgressCallback) -> None:
+    reading = await live(told)
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await pilot.press("p")
+        reading.begun.wait(limit())
+        for opens in ("question_mark", "ctrl+p"):
+            await pilot.press(opens)
+            await shown(pilot, app)
+            assert not reading.is_over.is_set()
+            await pilot.press("escape")
+        again = await live(told)
+        await pilot.press("s")
+        await shown(pilot, app)
+        assert reading.is_over.wait(limit())
+        assert "● live" not in screen_text(app)
+        await pilot.press("escape")
+        await until(pilot, again.begun.is_set)
+        await shown(pilot, app)
+        assert screen_text(app).count("● live") == 3
+        await pilot.press("p")
+        assert again.is_over.wait(limit())
+
+
+def test_a_silent_or_frozen_sensor_is_not_called_live() -> None:
+    silent = replace(SOUND[0], age=75.2)
+    assert "○ silent 1m15s" in sensor_states([silent], width=100).plain
+    assert "○ frozen" in sensor_states(SOUND, width=100, is_frozen=True).plain
 
 
 async def test_frozen_traces_stay(told: ProgressCallback) -> None:

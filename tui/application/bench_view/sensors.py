@@ -10,6 +10,7 @@ from rich.cells import cell_len
 from rich.style import Style
 from rich.text import Text
 
+from daq.bench.durations import format_duration
 from daq.errors import HuddleError
 from daq.preflight.findings import Check, Outcome
 from daq.preflight.preflight import check_list, is_complete
@@ -111,6 +112,8 @@ def trace(values: NDArray[np.float64], *, width: int) -> str:
 
 
 MUTED, GOOD, DOUBTFUL, BAD = "#9aa5b8", "green", "yellow", "bold #ff6b6b"
+OLD = 3.0
+"""Seconds since its last sample from which on a sensor is not called live."""
 LEAST_TRACE, WIDEST_TRACE = 12, 60  # columns
 NUMBERS = {"Hz", "°C"}
 
@@ -150,7 +153,9 @@ def _failure(sensor: str, failures: str) -> str:
     return ""
 
 
-def sensor_states(sensors: Sequence[SensorPreview], *, width: int, chosen: str = "") -> Text:
+def sensor_states(
+    sensors: Sequence[SensorPreview], *, width: int, chosen: str = "", is_frozen: bool = False
+) -> Text:
     """Return a row per sensor: state, identity, actual rate, temperature, port."""
     rows = []
     for each in sensors:
@@ -159,7 +164,7 @@ def sensor_states(sensors: Sequence[SensorPreview], *, width: int, chosen: str =
         rows.append(
             (
                 _name(each.sensor.name, chosen),
-                _state(each),
+                Text("○ frozen", DOUBTFUL) if is_frozen else _state(each),
                 Text("" if about is None else about.model or each.sensor.model),
                 Text("" if about is None else about.serial_number),
                 Text("…" if rate is None else f"{rate:.1f}"),
@@ -188,6 +193,8 @@ def _state(each: SensorPreview) -> Text:
         return Text("▲ trouble", BAD)
     if len(each.samples) == 0:
         return Text("○ waiting", DOUBTFUL)
+    if each.age > OLD:
+        return Text(f"○ silent {format_duration(round(each.age))}", DOUBTFUL)
     return Text("▲ clipping", BAD) if each.is_clipping else Text("● live", GOOD)
 
 

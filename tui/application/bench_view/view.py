@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from rich.text import Text
 from textual import on, work
 from textual.binding import Binding, BindingType
+from textual.command import CommandPalette
 from textual.containers import VerticalScroll
 from textual.widgets import Static
 
@@ -22,7 +23,7 @@ from tui.application.bench_view.sensors import (
     sensors_of_bench,
     spectra,
 )
-from tui.application.dialogs import QuestionScreen
+from tui.application.dialogs import QuestionScreen, TextScreen
 from tui.application.forms.bench import BenchForm
 from tui.application.forms.certificate import CertificateForm
 from tui.application.forms.sensor import PortForm, SensorForm, sensor_table
@@ -45,6 +46,10 @@ if TYPE_CHECKING:
 
 SITES = tuple(NOISE_MODELS[name] for name in ("nlnm", "nhnm"))
 """Noise models beside the spectra, if no others were chosen."""
+OVER_LIVE = (TextScreen, CommandPalette)
+"""Screens over the view under which the sensors are read on."""
+RESUMES_AFTER = 0.3
+"""Seconds in which the answer of a dialog becomes the state: a test that starts needs the ports."""
 MOST_LINES = 6
 """Lines of findings that are shown."""
 CHECKED_EVERY = 2
@@ -99,7 +104,7 @@ class BenchView(View):
         self._controls = controls
         self._sensors: Sequence[SensorPreview] = ()
         self._ended: threading.Event | None = None
-        self._is_frozen = self._shows_spectra = False
+        self._is_frozen = self._shows_spectra = self._resumes = False
         self._chosen = ""
         self._n_lines, self._alert = (-1, -1), ""
         self._findings: list[Text] = []
@@ -122,7 +127,9 @@ class BenchView(View):
         table = self.query_one("#table", Static)
         if is_live:
             width = self.app.size.width - 4
-            shown = sensor_states(self._sensors, width=width, chosen=self._chosen)
+            shown = sensor_states(
+                self._sensors, width=width, chosen=self._chosen, is_frozen=self._is_frozen
+            )
             if not self._shows_spectra:
                 traces = channel_traces(self._sensors, width=width)
                 shown = Text("\n\n", no_wrap=True).join((shown, traces))
@@ -172,8 +179,21 @@ class BenchView(View):
         return self._ended is not None if action in {"freeze", "spectra"} else True
 
     def on_screen_suspend(self) -> None:
-        """Release the ports when another view is shown."""
-        self.end_preview()
+        """Release the ports, unless help or the palette lies over this view."""
+        if self._ended is not None and not isinstance(self.app.screen, OVER_LIVE):
+            self.end_preview()
+            self._resumes = True
+            self.show(self.state)
+
+    def on_screen_resume(self) -> None:
+        """Read the sensors again, if they were read before and no test is to start."""
+        if self._resumes:
+            self._resumes = False
+            self.set_timer(RESUMES_AFTER, self._read_on)
+
+    def _read_on(self) -> None:
+        if self.is_current and self._ended is None and self.check_action("preview", ()):
+            self.action_preview()
 
     def on_unmount(self) -> None:
         """Release the ports."""
