@@ -348,7 +348,7 @@ class DelayEstimator:
         height = np.fft.irfft(np.pad(crossed, ((1, 0), (0, 0))), n=self._n_grid, axis=0)
         at = np.argmax(height, axis=0)
         at = np.where(at > self._n_grid // 2, at - self._n_grid, at)
-        return self._polished(crossed, at * self._step)
+        return self._polished(crossed, np.asarray(at * self._step, np.float64))
 
     def _peak(self, crossed: ComplexArray, alike: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Return the τ that maximises Re Σ crossed exp(iωτ) for every column, and if it is alone.

@@ -217,7 +217,7 @@ def _at_soft_end(values: FloatArray, parts: int) -> float:
         return 0.0
     below = np.bincount(np.minimum((top - values) / width, parts - 1).astype(np.int64))
     n_end, n_near = int(below[0]), int(below[1 : int(SLOPES * parts)].sum())
-    few = n_end < max(MIN_REPEATS, TIMES * below[1:BESIDE].max(initial=0))
+    few = n_end < max(MIN_REPEATS, float(TIMES * below[1:BESIDE].max(initial=0)))
     if few or n_end > AT_SOFT_END * len(values) or n_near < MIN_ON_SLOPES * n_end:
         return 0.0
     at_end = values > top - width

@@ -350,7 +350,8 @@ def _fitted(
     # noise at first: what the other sensors do not predict
     alone = np.linalg.inv(np.where(sensor[:, None] == sensor, np.linalg.inv(mean), 0))
     alone *= (N / (N - p * (1 - 1 / (sensor[-1] + 1))))[:, None, None]
-    whitener = np.linalg.inv(np.linalg.cholesky(parts.mean(alone)))
+    root = np.linalg.cholesky(parts.mean(alone))
+    whitener: ComplexArray = np.asarray(np.linalg.inv(root), np.complex128)
     for turn in range(ROUNDS):
         X = white(mean, whitener[own])
         P = np.broadcast_to(np.eye(p, dtype=np.complex128), X.shape)
@@ -395,7 +396,7 @@ def _fitted(
     hidden = SHOWN * np.sqrt(2 * _degrees(sensor, q)) / ((1 - 1 / n_sensors) * p * n_sensors)
     unseen = 1 + UNSEEN * hidden * (1 - q / np.maximum(wanted, 1)) * (wanted > 0)
     mean_noise = loss[:, None] * parts.mean(times(inverse(couples), y))
-    root: ComplexArray = np.asarray(np.linalg.inv(whitener), np.complex128)
+    root = np.asarray(np.linalg.inv(whitener), np.complex128)
     return _Fit(
         parts=parts,
         projector=Q,
@@ -451,7 +452,8 @@ def _nearest(P: ComplexArray, parts: _Parts, sensor: IntArray) -> IntArray:
     stands out in one sub-block, not in the median one, and what is left would be magnified.
     """
     own = [np.flatnonzero(sensor == i) for i in range(int(sensor[-1]) + 1)]
-    kept = np.min([np.linalg.eigvalsh(P[:, c[:, None], c])[:, 0] for c in own], axis=0)
+    least = [np.linalg.eigvalsh(P[:, c[:, None], c])[:, 0] for c in own]
+    kept: FloatArray = np.min(np.array(least, np.float64), axis=0)
     usual = np.array([median(each) for each in np.split(kept, parts.first[1:])])
     seen = kept >= HIDES * usual[parts.block]
     at, far = np.arange(len(seen)), 2 * len(seen)
