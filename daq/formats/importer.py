@@ -414,6 +414,11 @@ def _described(
         known = responses and responses.of(foreign.name, name, stretches)
         if not known:
             continue
+        if units[number] != "counts":
+            raise ImportFormatError(
+                f"{foreign.source}: {foreign.name}.{name} is in {units[number]} already; expected"
+                " no response, or samples in counts"
+            )
         changes: dict[str, Any] = {
             "sensitivity": known.sensitivity,
             "unit": known.unit,

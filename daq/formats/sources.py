@@ -117,22 +117,33 @@ _BY_SUFFIX: dict[str, WholeFile] = {
     ".wav": read_wav,
     ".npz": read_npz,
     ".mat": read_mat,
-    ".csv": read_delimited,
-    ".tsv": read_delimited,
-    ".txt": read_delimited,
-    ".lvm": read_delimited,
 }
+_DELIMITED = frozenset({".csv", ".tsv", ".txt", ".lvm"})
+_ASCII = b"TIMESERIES "
+"""With which the texts of data centres begin, SLIST and TSPAIR."""
 
 
-def parts_of(path: Path, sampling_rate: float | None = None) -> Iterator[Part]:
-    """Yield the parts of a file; ``sampling_rate`` (Hz) is used where the file has none.
+def parts_of(path: Path, sampling_rate: float | None = None, columns: str = "") -> Iterator[Part]:
+    """Yield the parts of a file.
+
+    Parameters
+    ----------
+    path : Path
+    sampling_rate : float, optional
+        In Hz, where the file has none.
+    columns : str
+        Names of the columns of a CSV file, in place of its header.
 
     Raises
     ------
     ImportFormatError
         It cannot be read.
     """
+    with path.open("rb") as file:
+        is_ascii = file.read(len(_ASCII)) == _ASCII
     whole = _BY_SUFFIX.get(path.suffix.lower())
+    if path.suffix.lower() in _DELIMITED and not is_ascii:
+        whole = partial(read_delimited, columns=columns)
     if whole is not None:
         yield FilePart(path, partial(_load, whole, sampling_rate))
     elif path.suffix.lower() in _UNIVERSAL:
@@ -171,6 +182,10 @@ class Selection:
         Which samples are taken where files overlap and differ.
     networks, stations, locations : str, optional
         Patterns of codes in SDS folders.
+    columns : str, optional
+        Names of the columns of CSV files, in place of their headers: ``time [s],X [g],-``.
+    unit : str, optional
+        Unit of the samples, where the files have none.
     """
 
     channels: Sequence[str] = ()
@@ -180,6 +195,8 @@ class Selection:
     networks: str = "*"
     stations: str = "*"
     locations: str = "*"
+    columns: str = ""
+    unit: str = ""
 
     def reason_against(self, sensor: str, channel: str, *, fdsn: bool) -> str:
         """Return why a channel is left aside; empty if it is taken."""
@@ -248,13 +265,14 @@ def open_sources(
     for order, path in enumerate(_files(sources, selection)):
         n_files += 1
         try:
-            for part in _parts(path, sampling_rate):
+            n_problems = len(problems)
+            for part in _parts(path, sampling_rate, selection.columns):
                 if part.reaches(selection.start_ns, selection.end_ns):
                     index.add(part, cache, order, problems)
         except (ImportFormatError, OSError) as error:
             problems.append(_message(path, error))
             continue
-        if logged:
+        if logged and len(problems) == n_problems:
             _LOGGER.info("%s read", path, extra={"file": str(path)})
     cache.make_room(index.n_bytes_together)
     sensors: dict[str, ForeignSensor] = {}
@@ -279,14 +297,14 @@ def _files(sources: Sequence[str | Path], selection: Selection) -> Iterable[Path
             yield Path(source)
 
 
-def _parts(path: Path, sampling_rate: float | None) -> Iterator[Part]:
+def _parts(path: Path, sampling_rate: float | None, columns: str) -> Iterator[Part]:
     if path.is_dir():
         raise ImportFormatError(
             f"{path}: a folder; expected files, or sds://{path} for an archive of day files"
         )
     if not path.is_file():
         raise ImportFormatError(f"{path}: no such file")
-    yield from parts_of(path, sampling_rate)
+    yield from parts_of(path, sampling_rate, columns)
 
 
 def _message(path: Path, error: Exception) -> str:
@@ -352,9 +370,12 @@ class _Index:
             if cut is None:
                 continue
             key = trace.sensor, trace.channel
-            if self._units.setdefault(key, trace.unit) != trace.unit:
+            unit = trace.unit
+            if self._selection.unit and unit in {"", "counts"} and trace.calibration is None:
+                unit = self._selection.unit
+            if self._units.setdefault(key, unit) != unit:
                 problems.append(
-                    f"{part.source}: {name} in {trace.unit or 'counts'}, in another file in"
+                    f"{part.source}: {name} in {unit or 'counts'}, in another file in"
                     f" {self._units[key] or 'counts'}; expected one unit"
                 )
                 continue

@@ -47,6 +47,7 @@ _ORIGINS = {
     "huddle import 'fdsn://EARTHSCOPE/IU.ANMO.{00,10}.BH?' --start 2026-11-01 --end 2026-11-02"
     " --out anmo.h5",
     "huddle import samples.csv --bench lab.toml --out lab.h5",
+    "huddle import corrected.mseed --sample-unit m/s² --out lab.h5",
 )
 @with_logging
 @with_estimate_options
@@ -88,6 +89,23 @@ def import_(
     end: Annotated[
         str | None, typer.Option("--end", metavar="UTC", help="End of the time to import.")
     ] = None,
+    columns: Annotated[
+        str,
+        typer.Option(
+            "--columns",
+            metavar="NAMES",
+            help="Names of the columns of CSV files, in place of their headers; - leaves one out:"
+            " 'time [s],X [m/s²],Y [m/s²],-'.",
+        ),
+    ] = "",
+    sample_unit: Annotated[
+        str,
+        typer.Option(
+            "--sample-unit",
+            metavar="UNIT",
+            help="Unit of the samples, such as m/s², where files have none and no --response.",
+        ),
+    ] = "",
     overlap: Annotated[
         str | None,
         typer.Option(
@@ -114,7 +132,8 @@ def import_(
     .npz, .mat: sampling_rate (Hz), start_time (UTC, optional), and for each sensor an array of
     counts (n_samples, n_channels) under its name.
 
-    .csv: a header such as: time (s), A.X (m/s²), A.Y (m/s²), B.X (m/s²).
+    .csv, .lvm: a header such as: time (s), A.X (m/s²), A.Y (m/s²), B.X
+    (m/s²); or --columns.
 
     .wav: a file is a sensor, its channels are numbered.
 
@@ -134,6 +153,8 @@ def import_(
             end=end,
             overlap=overlap if segments is None else None,
             codes=(net, sta, loc),
+            columns=columns,
+            unit=sample_unit,
         ),
         json=json,
         overlap=read_option("overlap", segments),
@@ -148,6 +169,8 @@ def selected(
     end: str | None,
     overlap: str | None,
     codes: tuple[str, str, str],
+    columns: str = "",
+    unit: str = "",
 ) -> Selection:
     """Return what is to be taken from files.
 
@@ -170,6 +193,8 @@ def selected(
         networks=networks,
         stations=stations,
         locations=locations,
+        columns=columns,
+        unit=unit,
     )
 
 

@@ -332,6 +332,8 @@ def read(
     start: str | datetime | None = None,
     end: str | datetime | None = None,
     overlap: Overlap = "refuse",
+    columns: str = "",
+    sample_unit: str = "",
 ) -> Waveforms:
     """Open files of other programs; nothing but their outlines is read until it is needed.
 
@@ -354,6 +356,11 @@ def read(
     overlap : str
         Which samples count where files overlap and differ: ``"first"`` or ``"last"``; refused by
         default.
+    columns : str
+        Names of the columns of CSV files in place of their headers, ``"time [s],X [g],-"``; ``-``
+        leaves one out.
+    sample_unit : str
+        Unit of the samples, where files have none and no `response`.
 
     Returns
     -------
@@ -395,7 +402,9 @@ def read(
             response=some,
             response_for=assigned,
             sampling_rate=fs,
-            selection=Selection(tuple(channels), began, ended, overlap),
+            selection=Selection(
+                tuple(channels), began, ended, overlap, columns=columns, unit=sample_unit
+            ),
         )
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)

@@ -80,8 +80,8 @@ class TdmsPart:
         start = np.datetime64(properties.get("wf_start_time", np.datetime64(0, "ns")), "ns")
         offset = float(properties.get("wf_start_offset") or 0) + self.first / rate
         return Trace(
-            sensor=group,
-            channel=channel.name,
+            sensor=group.replace("/", "_"),  # Dev1/ai0: recordings have no / in names
+            channel=channel.name.replace("/", "_"),
             start_ns=int(start.astype(np.int64)) + round(offset * NS_PER_S),
             sampling_rate=rate,
             samples=samples,

@@ -2,7 +2,8 @@
 
 In a universal file a node is a sensor, named by its entity if there is one; its channels are the
 directions X, Y, Z; the unit is that of the label, or else follows from the data type and the units
-of data set 164. In a WAV file the file is a sensor, its channels are numbered. Neither has a date.
+of data set 164; the third line of identification is the date, if it is one. In a WAV file the file
+is a sensor, its channels are numbered; it has no date.
 24-bit samples of WAV files are in the upper bits of 32, as scipy returns them.
 """
 
@@ -11,6 +12,7 @@ from __future__ import annotations
 import logging
 import re
 import warnings
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -84,15 +86,25 @@ def _trace(function: dict[str, Any], length: float) -> Trace:
         elif quantity and length > 0:
             origin = f"data type of UFF 58, with {length:g} length units in a metre of UFF 164"
             calibration = Calibration(length, quantity, origin)
+    after = round(float(function.get("abscissa_min") or 0) * NS_PER_S)
     return Trace(
         sensor=name,
         channel=f"-{axis}" if direction < 0 else axis,
-        start_ns=round(float(function.get("abscissa_min") or 0) * NS_PER_S),
+        start_ns=_date(str(function.get("id3") or "")) + after,
         sampling_rate=_rate(interval),
         samples=np.asarray(function["data"]),
         unit=unit,
         calibration=calibration,
     )
+
+
+def _date(text: str) -> int:
+    """Return the date of a function in ns, as written in 28-NOV-26 03:00:00; 0 if there is none."""
+    try:
+        found = datetime.strptime(text.strip(), "%d-%b-%y %H:%M:%S").replace(tzinfo=UTC)
+    except ValueError:
+        return 0
+    return int(found.timestamp()) * NS_PER_S
 
 
 def _rate(interval: float) -> float:

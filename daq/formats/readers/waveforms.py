@@ -9,6 +9,7 @@ SAC is not taken, and said: some writers put counts per unit there, others units
 from __future__ import annotations
 
 import glob
+import io
 import math
 import warnings
 from importlib.metadata import entry_points
@@ -36,7 +37,18 @@ _NUMBERED = {"SEGY", "SEG2"}
 _VOLTS = {"v": 1.0, "mv": 1e-3, "uv": 1e-6, "nv": 1e-9}
 _EVT_FULL_SCALE = 1 << 23
 _HEAD = 4096
-_RESPONSES = (b"B050F03", b"FDSNStationXML")  # RESP, StationXML
+_RESPONSES = (b"B050F03", b"FDSNStationXML", b"\nPOLES")  # RESP, StationXML, SACPZ
+_LEVEN = 4 * 105
+_SAC_LOGICALS, _SAC_HEADER = range(_LEVEN, _LEVEN + 20, 4), 632
+_MINUS_ONE = b"\xff\xff\xff\xff"
+_OTHERS = {
+    b"PK\x03\x04": "a spreadsheet; save it as CSV, then: huddle import FILE.csv",
+    b"\xd0\xcf\x11\xe0": "a spreadsheet; save it as CSV, then: huddle import FILE.csv",
+    b"PAR1": "Parquet; write CSV with pandas (read_parquet, to_csv), then: huddle import FILE.csv",
+    b"\x89HDF": "an HDF5 file; huddle estimate takes recordings of huddle. Write arrays of other"
+    " programs with numpy.savez, then: huddle import FILE.npz",
+}
+"""Files that are not read, by their first bytes, and what can be done with them."""
 
 Stream: TypeAlias = Any  # ObsPy has no types
 
@@ -67,16 +79,27 @@ def waveform_format(path: Path) -> str:
         for found in entry_points(group=f"obspy.plugin.waveform.{name}", name="isFormat"):
             if found.load()(str(path)):
                 return name
+    known = ", ".join(FORMATS)
+    raise ImportFormatError(
+        f"unknown format; expected one of {known}. Rows of text are read from files called"
+        f" {path.stem}.csv"
+    )
+
+
+def _refuse_others(path: Path) -> None:
+    """Raise ImportFormatError, with what to do, for files without samples that are read."""
     with path.open("rb") as file:
         head = file.read(_HEAD)
     if any(mark in head for mark in _RESPONSES):
         raise ImportFormatError("it holds responses, no samples; give it with --response")
-    known = ", ".join(FORMATS)
-    raise ImportFormatError(f"unknown format; expected one of {known}")
+    for mark, what in _OTHERS.items():
+        if head.startswith(mark):
+            raise ImportFormatError(what.replace("FILE", path.stem))
 
 
 def waveform_parts(path: Path) -> Iterator[FilePart]:
     """Yield a file as one part."""
+    _refuse_others(path)
     load_obspy()
     yield FilePart(path, _read)
 
@@ -86,12 +109,33 @@ def _read(path: Path) -> Sequence[Trace]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            name = waveform_format(path)
-            stream = obspy.read(glob.escape(str(path)), format=name, check_compression=False)
+            source: Any = _sac_with_ones(path)
+            name = waveform_format(path) if source is None else "SAC"
+            source = source or glob.escape(str(path))
+            stream = obspy.read(source, format=name, check_compression=False)
             traces = _traces(stream, path.stem, numbered=name in _NUMBERED)
+    except ImportFormatError as error:
+        raise ImportFormatError(f"{path}: {error}") from error
     except Exception as error:
         raise ImportFormatError(f"{path}: ObsPy cannot read it: {error}") from error
     return traces
+
+
+def _sac_with_ones(path: Path) -> io.BytesIO | None:
+    """Return a SAC file whose logicals are -1 where they are true, as some programs write, with 1.
+
+    ObsPy takes these for no SAC files.
+    """
+    with path.open("rb") as file:
+        head = bytearray(file.read(_SAC_HEADER))
+        versions = [head[304:308], head[307:303:-1]]
+        if b"\x06\0\0\0" not in versions or head[_LEVEN : _LEVEN + 4] != _MINUS_ONE:
+            return None
+        one = (1).to_bytes(4, "little" if head[304] else "big")
+        for at in _SAC_LOGICALS:
+            if head[at : at + 4] == _MINUS_ONE:
+                head[at : at + 4] = one
+        return io.BytesIO(bytes(head) + file.read())
 
 
 def stream_part(stream: Stream, source: str) -> LoadedPart:

@@ -10,6 +10,7 @@ the first 48 bytes.
 from __future__ import annotations
 
 import io
+import shlex
 import stat
 import struct
 from dataclasses import dataclass
@@ -25,6 +26,16 @@ _FIELDS = struct.Struct("<8sBBBBQQQQ")
 _VERSION, _FLAGS, _END = 1, 4, 7
 _SIZE = 48
 _MASK = 0xFFFFFFFF
+
+
+def _way_in(path: Path) -> str:
+    """Return which command takes a file that is no recording."""
+    if path.suffix.lower() == ".toml":
+        return f"of a bench file: huddle run {shlex.quote(str(path))}"
+    if path.is_dir() or path.suffix in {".h5", ".hdf5"}:
+        return "expected an HDF5 file"
+    recording = shlex.quote(f"{path.stem}.h5")
+    return f"of another program: huddle import {shlex.quote(str(path))} --out {recording}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +64,7 @@ class Superblock:
             raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
         n_bytes = status.st_size
         if head[: len(SIGNATURE)] != SIGNATURE:
-            raise NotARecordingError(f"{path}: not a huddle recording; expected an HDF5 file")
+            raise NotARecordingError(f"{path}: not a huddle recording; {_way_in(path)}")
         if n_bytes < _SIZE:
             raise NotARecordingError(f"{path}: truncated to {n_bytes} bytes; copy the file again")
         return cls(head, n_bytes)

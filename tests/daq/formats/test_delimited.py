@@ -13,6 +13,7 @@ from daq.formats.readers.delimited.reader import read_delimited
 from daq.formats.readers.delimited.times import nanoseconds
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -41,6 +42,52 @@ X_Value\tA.X\tA.Y\tComment
 0.000000\t0.5\t-1.25\t
 0.010000\t0.75\t2.0\t
 0.020000\t1.0\t2.5\t
+"""
+LABVIEW_DATED = """LabVIEW Measurement\t
+Separator\tTab
+X_Columns\tOne
+Date\t2026/11/21
+Time\t11:59:59.0000000000000000000
+***End_of_Header***\t
+\t
+Channels\t2\t\t
+Samples\t3\t3\t
+Date\t2026/11/21\t2026/11/21\t
+Time\t12:00:00.0000000000000000000\t12:00:00.0000000000000000000\t
+Y_Unit_Label\tm/s^2\tm/s^2\t
+X_Dimension\tTime\tTime\t
+X0\t0.0000000000000000E+0\t0.0000000000000000E+0\t
+Delta_X\t1.000000E-2\t1.000000E-2\t
+***End_of_Header***\t\t\t
+X_Value\tA.X\tA.Y\tComment
+0.000000\t0.5\t-1.25\t
+0.010000\t0.75\t2.0\t
+0.020000\t1.0\t2.5\t
+"""
+LABVIEW_TIMELESS = LABVIEW_DATED.replace("X_Columns\tOne", "X_Columns\tNo").replace(
+    "0.000000\t0.5", "\t0.5"
+)
+for _time in ("0.010000", "0.020000"):
+    LABVIEW_TIMELESS = LABVIEW_TIMELESS.replace(f"\n{_time}\t", "\n\t")
+PREAMBLE = """Device,ADXL355
+Serial,12345
+Sample Rate (Hz),100
+Start,"2026-11-21 12:00:00"
+
+"t_s","A.X_g","A.Y_g"
+0,0.5,-1.25
+0.01,0.75,2
+0.02,1,2.5
+"""
+GEOCSV = """# dataset: GeoCSV 2.0
+# delimiter: ,
+# SID: AM_R1A2B_00_E_N_Z
+# sample_rate_hz: 100
+# field_unit: UTC, M/S**2
+Time, A.X [m/s**2], A.Y [m/s**2]
+2026-11-21T12:00:00.000000Z, 0.5, -1.25
+2026-11-21T12:00:00.010000Z, 0.75, 2
+2026-11-21T12:00:00.020000Z, 1, 2.5
 """
 CAMPBELL = """"TOA5","CR6","CR6","1234","CR6.Std.10","CPU:huddle.CR6","777","Fast"
 "TIMESTAMP","RECORD","A.X","A.Y"
@@ -73,12 +120,19 @@ BLANKS = """# a recorder of our own
     [
         (GERMAN, "m/s²", NOON),
         (LABVIEW, "counts", 0),
+        (LABVIEW_DATED, "m/s^2", NOON),
+        (LABVIEW_TIMELESS, "m/s^2", NOON),
+        (PREAMBLE, "g", 0),
+        (GEOCSV, "m/s**2", NOON),
         (CAMPBELL, "mV", NOON),
         (AMERICAN, "g", NOON),
         (QUOTED, "m/s²", NOON),
         (BLANKS, "counts", NOON),
     ],
-    ids=["german", "labview", "campbell", "american", "quoted", "blanks"],
+    ids=[
+        *("german", "labview", "labview dated", "labview timeless", "preamble", "geocsv"),
+        *("campbell", "american", "quoted", "blanks"),
+    ],
 )
 def test_dialects_give_the_same_samples(tmp_path: Path, text: str, unit: str, date: int) -> None:
     path = tmp_path / "a.csv"
@@ -96,6 +150,77 @@ def test_dialects_give_the_same_samples(tmp_path: Path, text: str, unit: str, da
         np.testing.assert_array_equal(last.counts, [[0.5, -1.25], [0.75, 2], [1, np.nan]])
     else:
         np.testing.assert_array_equal(last.counts, [[0.5, -1.25], [0.75, 2], [1, 2.5]])
+
+
+def rows(header: str, *clocks: Callable[[float], str], after: str = "") -> str:
+    """Return 40 rows at 100 Hz: clocks, three axes, and what follows."""
+    rng = np.random.default_rng(3)
+    lines = []
+    for k in range(40):
+        axes = [f"{value:.6f}" for value in rng.standard_normal(3)]
+        lines.append(",".join([*(each(k / 100) for each in clocks), *axes]) + after)
+    return "\n".join([header, *lines, ""])
+
+
+PHONE = rows(
+    "time,seconds_elapsed,z,y,x",
+    lambda t: f"{NOON + round(t * 1e9)}",
+    lambda t: f"{t + 0.0231:.6f}",
+)
+PHYPHOX = rows(
+    '"Time (s)","Linear Acceleration x (m/s^2)","Linear Acceleration y (m/s^2)",'
+    '"Linear Acceleration z (m/s^2)","Absolute acceleration (m/s^2)"',
+    lambda t: f"{t:.9E}",
+    after=",1.5",
+)
+LOGGER = rows(
+    "utc_timestamp,time_ms,ax,ay,az",
+    lambda t: f"2026-11-21T12:00:{t:06.3f}Z",
+    lambda t: f"{t * 1000:.0f}",
+)
+UNITS = rows("sampleTime_ms,acc_x_g,acc_y_mg,acc_z_ms2", lambda t: f"{1000 * t:.0f}")
+COUNTED = rows("packet,t,T,R,Z", lambda t: f"{500 + 100 * t:.0f}", lambda t: f"{t:.3f}")
+
+
+@pytest.mark.parametrize(
+    ("text", "channels", "units", "start"),
+    [
+        (PHONE, "z y x", "counts counts counts", NOON),
+        (
+            PHYPHOX,
+            "Linear Acceleration x,Linear Acceleration y,Linear Acceleration z",
+            "m/s^2 m/s^2 m/s^2",
+            0,
+        ),
+        (LOGGER, "ax ay az", "counts counts counts", NOON),
+        (UNITS, "acc_x acc_y acc_z", "g mg m/s²", 0),
+        (COUNTED, "T R Z", "counts counts counts", 0),
+    ],
+    ids=["Sensor Logger", "phyphox", "two clocks", "units in names", "a counter"],
+)
+def test_clocks_counters_and_magnitudes_are_no_accelerations(
+    tmp_path: Path, text: str, channels: str, units: str, start: int
+) -> None:
+    path = tmp_path / "phone.csv"
+    path.write_text(text, encoding="utf-8")
+    (sensor,) = read_delimited(path)
+    assert sensor.channels == tuple(channels.split("," if "," in channels else " "))
+    assert sensor.units == tuple(units.split())
+    assert (sensor.sampling_rate, sensor.stretches[0].start_utc_ns) == (100.0, start)
+    samples = np.random.default_rng(3).standard_normal((40, 3)).round(6)
+    np.testing.assert_allclose(sensor.stretches[0].counts, samples, atol=1e-6)
+
+
+def test_columns_are_named_where_a_file_names_none(tmp_path: Path) -> None:
+    path = tmp_path / "bare.csv"
+    path.write_text(rows("", lambda t: f"{t:.2f}").lstrip(), encoding="utf-8")
+    said = r"name them, as in --columns 'time \[s\],X \[m/s²\],Y \[m/s²\],Z \[m/s²\]'"
+    with pytest.raises(ImportFormatError, match=said):
+        read_delimited(path)
+    (sensor,) = read_delimited(path, columns="time [s],A.X [g],A.Y [g],-")
+    assert (sensor.name, sensor.channels, sensor.units) == ("A", ("X", "Y"), ("g", "g"))
+    with pytest.raises(ImportFormatError, match="--columns names 2 columns; expected 4, as in"):
+        read_delimited(path, columns="time,X")
 
 
 @pytest.mark.parametrize(

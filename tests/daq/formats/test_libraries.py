@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,6 @@ from scipy.io import wavfile
 
 from daq.errors import ImportFormatError
 from daq.formats.importer import import_files
-from daq.formats.readers.waveforms import load_obspy
 from daq.formats.sources import open_sources
 from daq.recording.reader import Recording
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 START = "2026-11-21T03:00:00.25"
 START_NS = 1_795_230_000_250_000_000
-obspy = load_obspy()
+obspy: Any = pytest.importorskip("obspy", reason="ObsPy is an extra")
 OBSPY_IO = Path(obspy.__file__).parent / "io"
 
 
@@ -82,6 +82,50 @@ def test_files_that_obspy_provides(path: str, n_sensors: int) -> None:
         assert sensor.stretches[0].start_utc_ns == trace.stats.starttime.ns
 
 
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_sac_with_logicals_of_minus_one(tmp_path: Path, order: str) -> None:
+    trace = obspy.Trace(counts(300, 1)[:, 0].astype(np.float32), {"sampling_rate": 50.0})
+    path = tmp_path / "a.sac"
+    trace.write(str(path), format="SAC", byteorder=order)
+    content = bytearray(path.read_bytes())
+    for at in (4 * 105, 4 * 107):  # LEVEN, LOVROK
+        content[at : at + 4] = struct.pack(f"{order}i", -1)
+    path.write_bytes(content)
+    (sensor,) = opened(path).values()
+    assert sensor.sampling_rate == 50.0
+    np.testing.assert_array_equal(whole(sensor)[:, 0], trace.data)
+
+
+def test_texts_of_data_centres_are_read_whatever_their_name(tmp_path: Path) -> None:
+    samples = counts(300, 1)[:, 0].astype(np.int32)
+    header = {"network": "AM", "station": "R1A2B", "location": "00", "channel": "ENZ"}
+    trace = obspy.Trace(samples, {**header, "sampling_rate": 100.0})
+    for kind in ("TSPAIR", "SLIST"):
+        path = tmp_path / f"{kind}.csv"
+        trace.write(str(path), format=kind)
+        sensor = opened(path)["AM.R1A2B.00"]
+        assert (sensor.channels, sensor.sampling_rate) == (("ENZ",), 100.0)
+        np.testing.assert_array_equal(whole(sensor)[:, 0], samples)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("sheet.xlsx", b"PK\x03\x04...", r"a spreadsheet.*: huddle import sheet\.csv"),
+        ("a.parquet", b"PAR1...", r"to_csv\), then: huddle import a\.csv"),
+        ("b.h5", b"\x89HDF...", r"numpy\.savez, then: huddle import b\.npz"),
+        ("SACPZ.X", b"* INPUT UNIT: M\nZEROS 0\nPOLES 0\nCONSTANT 1\n", "give it with --response"),
+    ],
+)
+def test_what_is_not_read_says_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, content: bytes, said: str
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "obspy", None)
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ImportFormatError, match=said):
+        open_sources([tmp_path / name])
+
+
 @pytest.mark.filterwarnings("ignore")  # ObsPy's, about headers that it makes
 def test_segy_traces_are_sensors(tmp_path: Path) -> None:
     samples = counts(500, 3).astype(np.float32)
@@ -117,6 +161,7 @@ def test_time_responses_of_a_universal_file(tmp_path: Path) -> None:
         pyuff.UFF(str(path)).write_sets(
             prepared_58(
                 func_type=1,
+                id3="21-NOV-26 03:00:00",
                 rsp_node=node,
                 rsp_dir=direction,
                 ref_node=1,
@@ -136,6 +181,7 @@ def test_time_responses_of_a_universal_file(tmp_path: Path) -> None:
     pyuff.UFF(str(path)).write_sets(spectrum, "add")
     sensors = opened(path)
     assert {name: s.channels for name, s in sensors.items()} == {"7": ("X", "-Z"), "12": ("X", "Z")}
+    assert {s.stretches[0].start_utc_ns for s in sensors.values()} == {1_795_230_000_000_000_000}
     np.testing.assert_allclose(
         np.hstack([whole(s) for s in sensors.values()]), samples, rtol=1e-6, atol=1e-9
     )
@@ -160,12 +206,14 @@ def test_groups_of_tdms(tmp_path: Path) -> None:
         writer.write_segment(
             [
                 nptdms.ChannelObject(sensor, channel, samples[:, column], properties)
-                for column, (sensor, channel) in enumerate([("A", "x"), ("A", "y"), ("B", "x")])
+                for column, (sensor, channel) in enumerate(
+                    [("A/1", "x"), ("A/1", "ai/1"), ("B", "x")]
+                )
             ]
         )
     sensors = opened(path)
     assert {name: (s.channels, s.units) for name, s in sensors.items()} == {
-        "A": (("x", "y"), ("g", "g")),
+        "A_1": (("x", "ai_1"), ("g", "g")),
         "B": (("x",), ("g",)),
     }
     for sensor in sensors.values():  # of several parts

@@ -287,6 +287,10 @@ def test_files_in_trouble_are_exit_3(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["estimate", str(tmp_path / "a.h5")])
     assert result.exit_code == 3
     assert "a.h5: not a huddle recording" in result.stderr
+    for name, command in (("b.csv", "import"), ("c.toml", "run")):
+        (tmp_path / name).write_text("1,2\n")
+        result = CliRunner().invoke(app, ["estimate", str(tmp_path / name)])
+        assert f"huddle {command} {tmp_path / name}" in result.stderr
     result = CliRunner().invoke(app, ["estimate", str(tmp_path / "none.h5")])
     assert result.exit_code == 3
     assert "none.h5" in result.stderr

@@ -34,6 +34,19 @@ def test_the_rest_is_imported_and_what_is_not_is_listed(tmp_path: Path) -> None:
     assert "not imported: " in found.stderr
 
 
+def test_columns_and_the_unit_of_samples_are_said_on_the_command_line(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("".join(f"{k / 100},{k % 7},{k % 5}\n" for k in range(300)))
+    command = ["import", str(tmp_path / "a.csv"), "-o", str(tmp_path / "a.h5")]
+    refused = CliRunner().invoke(app, command)
+    assert refused.exit_code == ExitCode.TROUBLE
+    assert "--columns 'time [s],X [m/s²],Y [m/s²]'" in refused.stderr
+    done = CliRunner().invoke(app, [*command, "--columns", "time,X,Y [m/s]", "--sample-unit", "g"])
+    assert done.exit_code == ExitCode.DONE
+    with Recording.open(tmp_path / "a.h5") as recording:
+        (sensor,) = recording.sensors
+        assert [(each.name, each.unit) for each in sensor.channels] == [("X", "g"), ("Y", "m/s")]
+
+
 def test_overlap_is_a_choice_of_files_or_a_number_for_segments(tmp_path: Path) -> None:
     write_records(tmp_path / "a", counts(600, 1))
     write_records(tmp_path / "b", counts(600, 2))

@@ -33,7 +33,8 @@ _UNIT = re.compile(
     r"[munµ]?v|volts?|counts?|digits?|hz|pa|°?c|-)?$",
     re.IGNORECASE,
 )
-_EXAMPLE = "'time [s],A.X [m/s²],A.Y [m/s²]'"
+_EXAMPLE = ("time [s]", "X [m/s²]", "Y [m/s²]", "Z [m/s²]")
+LEFT_OUT = "-"
 WHITESPACE = " "
 
 
@@ -54,8 +55,12 @@ class Dialect:
         Lines before the first row of samples.
     used : sequence of int
         Columns that are not empty throughout the first rows.
-    example : sequence of str
-        Cells of the first row.
+    rows : sequence of sequence of str
+        Cells of the first rows.
+    start, interval : str
+        Of LabVIEW: date and time from which its times count, and seconds between samples.
+    is_given : bool
+        Whether a person named the columns.
     """
 
     delimiter: str
@@ -65,7 +70,10 @@ class Dialect:
     units: Sequence[str]
     n_before: int
     used: Sequence[int]
-    example: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    start: str = ""
+    interval: str = ""
+    is_given: bool = False
 
     def cells(self, lines: Iterable[str]) -> Iterator[list[str]]:
         """Yield the cells of each line."""
@@ -101,8 +109,14 @@ def split(lines: Iterable[str], delimiter: str, *, quoted: bool) -> Iterator[lis
             yield [cell.strip() for cell in line.rstrip("\r\n").split(delimiter)]
 
 
-def find_dialect(path: Path) -> Dialect:
+def find_dialect(path: Path, columns: str = "") -> Dialect:
     """Find how a file is written, from its first lines.
+
+    Parameters
+    ----------
+    path : Path
+    columns : str
+        Names of its columns, with units, in place of its header; ``-`` leaves one out.
 
     Raises
     ------
@@ -130,7 +144,21 @@ def find_dialect(path: Path) -> Dialect:
         )
     comma = delimiter != "," or quoted
     first = _first_data_row(cells, decimal_comma=comma)
-    names, units = _header(path, lines, cells, first, delimiter)
+    before = [row for number, row in cells.items() if first is None or number < first]
+    labview = _labview(before)
+    if columns and first is not None:
+        titles = [cell.strip() for cell in columns.split(",")]
+        if len(titles) != len(cells[first]):
+            raise ImportFormatError(
+                f"{path}: --columns names {len(titles)} columns; expected"
+                f" {len(cells[first])}, {columns_example(len(cells[first]))}"
+            )
+        names, units = _names_and_units(titles)
+    else:
+        names, units = _header(path, lines, cells, first, delimiter=delimiter, before=before)
+    labels = labview.get("Y_Unit_Label", [])[: len(names) - 1]
+    for k, label in enumerate(labels, start=1):
+        units[k] = units[k] or label
     if first is None:
         raise ImportFormatError(
             f"{path}: expected rows of {len(names)} cells as in its header, found none"
@@ -144,9 +172,31 @@ def find_dialect(path: Path) -> Dialect:
         names=names,
         units=units,
         n_before=first,
-        used=used,
-        example=cells[first],
+        used=[k for k in used if names[k] != LEFT_OUT],
+        rows=[row for row in samples if len(row) == len(names)],
+        start=" ".join(labview[key][0] for key in ("Date", "Time") if labview.get(key)),
+        interval=next(iter(labview.get("Delta_X", [])), ""),
+        is_given=bool(columns),
     )
+
+
+def columns_example(n: int) -> str:
+    """Return how the columns of a file are named on the command line."""
+    names = [*_EXAMPLE[:n], *[LEFT_OUT] * (n - len(_EXAMPLE))]
+    return f"as in --columns '{','.join(names)}'"
+
+
+def _labview(before: Sequence[Sequence[str]]) -> dict[str, Sequence[str]]:
+    """Return the header of a LabVIEW measurement file: values by key, a cell a channel."""
+    if not before or before[0][0] != "LabVIEW Measurement":
+        return {}
+    return {row[0]: row[1:] for row in before}
+
+
+def _names_and_units(titles: Iterable[str]) -> tuple[list[str], list[str]]:
+    matches = [_COLUMN.match(title) for title in titles]
+    names = [match["name"] if match else "" for match in matches]
+    return names, [(match["unit"] or "").strip() if match else "" for match in matches]
 
 
 def _head(file: TextIO) -> list[str]:
@@ -213,10 +263,11 @@ def _header(
     lines: Sequence[str],
     cells: dict[int, list[str]],
     first: int | None,
+    *,
     delimiter: str,
+    before: Sequence[Sequence[str]],
 ) -> tuple[list[str], list[str]]:
     """Return names and units of the columns."""
-    before = [row for number, row in cells.items() if first is None or number < first]
     width = len(cells[first]) if first is not None else len(before[0]) if before else 0
     titles = [row for row in before if len(row) == width]
     if not titles and first is not None:
@@ -237,10 +288,8 @@ def _header(
         if first is not None and not header:
             found = delimiter.join(cells[first])
         raise ImportFormatError(
-            f"{path}: expected a first line that names every column, as in {_EXAMPLE};"
-            f" found {found[:80]!r}"
+            f"{path}: expected a first line that names every column; found {found[:80]!r}: name"
+            f" them, {columns_example(width)}"
         )
-    matches = [_COLUMN.match(cell) for cell in header]
-    names = [match["name"] if match else "" for match in matches]
-    stated = [(match["unit"] or "").strip() if match else "" for match in matches]
+    names, stated = _names_and_units(header)
     return names, [a or b for a, b in zip(stated, units or [""] * width, strict=True)]

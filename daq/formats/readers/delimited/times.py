@@ -22,10 +22,10 @@ _DATE = re.compile(
     r"(?:[T\s,]+(?P<clock>\d.*))?$"
 )
 _CLOCK = re.compile(
-    r"^(?P<h>\d{1,2}):(?P<m>\d{2})(?::(?P<s>\d{2})(?:[.,:](?P<f>\d{1,12}))?)?\s*(?P<half>[AaPp][Mm])?"
+    r"^(?P<h>\d{1,2}):(?P<m>\d{2})(?::(?P<s>\d{2})(?:[.,:](?P<f>\d{1,24}))?)?\s*(?P<half>[AaPp][Mm])?"
     r"\s*(?P<zone>Z|UTC|GMT|[+-]\d{2}:?\d{2})?$"
 )
-_SCALES = {
+SCALES = {
     **dict.fromkeys(("s", "sec", "second", "seconds"), NS_PER_S),
     **dict.fromkeys(("ms", "msec", "millis", "milliseconds"), 1_000_000),
     **dict.fromkeys(("us", "µs", "μs", "usec", "micros", "microseconds"), 1000),
@@ -65,10 +65,10 @@ def nanoseconds(cells: Sequence[str], unit: str, *, decimal_comma: bool) -> NDAr
     except ValueError:
         order = _order(cells)
         return _within_range([_dated(cell, order) for cell in cells], cells)
-    scale = _SCALES.get(unit.lower())
+    scale = SCALES.get(unit.lower())
     if scale is None:
         guessed = next((each for least, each in _EPOCHS if abs(value) > least), "s")
-        scale = _SCALES[guessed]
+        scale = SCALES[guessed]
         if guessed != "s":
             _LOGGER.info(
                 "times such as %s have no unit; read as %s since 1970: state the unit in the"
