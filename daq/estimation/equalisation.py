@@ -226,7 +226,9 @@ class Equalisation:
         if self.is_settled or n_effective < _MIN_AVERAGES:
             return False
         found = self._leaks_as_filtered(bands)
-        return found is not None and found.share.max(initial=0.0) > leakage_threshold(n_effective)
+        if found is None:
+            return False
+        return bool(found.share.max(initial=0.0) > leakage_threshold(n_effective))
 
     def prove(self, pieces: Sequence[tuple[Pass, int, int]]) -> bool:
         """Drop estimated filters that do not lower the noise; return whether any was dropped.

@@ -185,7 +185,8 @@ def _mean(several: Sequence[_Gains]) -> _Gains:
     Its error is not reduced by their number: all share the motion that the sensor did not see well.
     """
     gains = np.exp(np.mean([np.log(each.gains) for each in several], axis=0))
-    return _Gains(gains, np.min([each.errors / each.gains for each in several], axis=0) * gains)
+    errors = np.array([each.errors / each.gains for each in several], np.float64)
+    return _Gains(gains, np.min(errors, axis=0) * gains)
 
 
 def _majority(agreeing: dict[int, set[int]]) -> set[int]:

@@ -231,7 +231,7 @@ def stepwise(scores: Scores, level: float, groups: Sequence[IntArray]) -> IntArr
             break
         if not rank:
             statistic, rank = scores.statistic()
-        gains = {(best,): float(z[best] ** 2) - A_PARAMETER}
+        gains: dict[tuple[int, ...], float] = {(best,): float(z[best] ** 2) - A_PARAMETER}
         for group in groups:
             more = np.setdiff1d(group, chosen)
             if len(more) > 1 and 2 * (len(chosen) + len(more)) <= rank:

@@ -350,8 +350,9 @@ def _fitted(
     # noise at first: what the other sensors do not predict
     alone = np.linalg.inv(np.where(sensor[:, None] == sensor, np.linalg.inv(mean), 0))
     alone *= (N / (N - p * (1 - 1 / (sensor[-1] + 1))))[:, None, None]
-    root = np.linalg.cholesky(parts.mean(alone))
-    whitener: ComplexArray = np.asarray(np.linalg.inv(root), np.complex128)
+    whitener: ComplexArray = np.asarray(
+        np.linalg.inv(np.linalg.cholesky(parts.mean(alone))), np.complex128
+    )
     for turn in range(ROUNDS):
         X = white(mean, whitener[own])
         P = np.broadcast_to(np.eye(p, dtype=np.complex128), X.shape)
@@ -396,7 +397,7 @@ def _fitted(
     hidden = SHOWN * np.sqrt(2 * _degrees(sensor, q)) / ((1 - 1 / n_sensors) * p * n_sensors)
     unseen = 1 + UNSEEN * hidden * (1 - q / np.maximum(wanted, 1)) * (wanted > 0)
     mean_noise = loss[:, None] * parts.mean(times(inverse(couples), y))
-    root = np.asarray(np.linalg.inv(whitener), np.complex128)
+    root: ComplexArray = np.asarray(np.linalg.inv(whitener), np.complex128)
     return _Fit(
         parts=parts,
         projector=Q,

@@ -302,7 +302,7 @@ def _start(parts: _Parts, model: _Model) -> tuple[FloatArray, _Point]:
     N is what the others do not predict; A is where parts differ, or where motion is strongest.
     """
     mean, q = parts.mean, model.n_dims
-    inverse = np.where(model.mask, np.linalg.inv(mean), 0.0)
+    inverse = np.asarray(np.where(model.mask, np.linalg.inv(mean), 0.0), np.complex128)
     noise = _hermitian(np.linalg.inv(inverse).mean(axis=0)) * model.mask
     root, back = _power(mean, 0.5), _power(mean, -0.5)[:, None]
     excess = back @ parts.csm @ back - np.eye(len(noise))

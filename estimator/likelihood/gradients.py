@@ -362,7 +362,7 @@ def with_gradients(
     )
     if n_sensors >= MIN_DETERMINED_SENSORS and (basis**2).sum(axis=1).max() > MOST_LEVERAGE:
         return None, choices  # of fewer sensors nothing is taken for known
-    loadings = _loadings(response, basis) * late[:, :, None]
+    loadings = np.asarray(_loadings(response, basis) * late[:, :, None], np.complex128)
     found = []
     for choice in choices:
         rows = np.flatnonzero(whole & (frequency >= choice.low) & (frequency <= choice.high))

@@ -376,9 +376,8 @@ class World:
         scenario = self._scenario
         model = scenario.sensor(sensor)
         channel = scenario.gains(sensor)[:, None] * scenario.directions(sensor)
-        common = _whole_to(scenario.bandwidth, frequency) * np.exp(
-            -2j * np.pi * frequency * model.delay
-        )
+        delayed = np.exp(-2j * np.pi * frequency * model.delay)
+        common = np.asarray(_whole_to(scenario.bandwidth, frequency) * delayed, np.complex128)
         if model.response is not None:
             common = common * _poles_and_zeros(model.response, frequency)
         return np.asarray(

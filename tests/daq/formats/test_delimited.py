@@ -208,7 +208,7 @@ def test_clocks_counters_and_magnitudes_are_no_accelerations(
     assert sensor.units == tuple(units.split())
     assert (sensor.sampling_rate, sensor.stretches[0].start_utc_ns) == (100.0, start)
     samples = np.random.default_rng(3).standard_normal((40, 3)).round(6)
-    np.testing.assert_allclose(sensor.stretches[0].counts, samples, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(sensor.stretches[0].counts[:]), samples, atol=1e-6)
 
 
 def test_columns_are_named_where_a_file_names_none(tmp_path: Path) -> None:

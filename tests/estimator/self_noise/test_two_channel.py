@@ -20,7 +20,7 @@ def aligned(snr: float, n_sensors: int = 2) -> tuple[np.ndarray, np.ndarray]:
 
 def test_the_true_matrix_gives_the_true_noise_for_any_known_gains() -> None:
     csm, noise_psd = aligned(1e3)
-    gain = 10.0 ** np.linspace(-3, 3, 6) * np.exp(1j * np.arange(6))
+    gain = np.asarray(10.0 ** np.linspace(-3, 3, 6) * np.exp(1j * np.arange(6)), np.complex128)
     csm = gain[:, None] * csm * gain.conj()
     found = two_channel(csm[None], dims=(3, 3), n_effective=50, response=gain)
     np.testing.assert_allclose(found.noise_psd[0], noise_psd * abs(gain) ** 2, rtol=1e-9)

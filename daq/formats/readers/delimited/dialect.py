@@ -274,7 +274,7 @@ def _header(
         comments = [line.lstrip("# ") for line in lines[:first] if line.startswith("#")]
         titles = [row for row in split(comments, delimiter, quoted=False) if len(row) == width]
         before = titles
-    units: list[str] | None = None
+    units: Sequence[str] | None = None
     if first is None:
         titles = titles[:1]
     elif before and before[0][0] == "TOA5" and len(titles) > 1:  # Campbell: names, units, kind
