@@ -11,6 +11,7 @@ import numpy as np
 from daq.estimation.settings import DIMENSIONS
 from estimator.checks.advice import Level, ModelMisfit, SharedNoise, TooFewDimensions
 from estimator.checks.counts import MARGIN
+from estimator.checks.steadied import bounds
 from estimator.levels.contributions import (
     Contribution,
     Source,
@@ -129,12 +130,16 @@ def _changes(snapshot: Snapshot, psd: FloatArray) -> list[Contribution]:
     if steady is None or not steady.changes:
         return []
     motion = np.maximum(np.nan_to_num(snapshot.data_psd) - psd, 0.0)
-    if (within := steady.steadied) is not None:
-        below, above = (part * motion for part in (within.below, within.above))
+    if within := [each for each in steady.steadied if each is not None]:
+        below = np.max([each.below for each in within], axis=0) * motion
+        above = np.max([each.above for each in within], axis=0) * motion
         return [contribution(Source.CHANGES, psd.shape, below=np.minimum(below, psd), above=above)]
-    below = steady.added * motion
-    below = np.where(below > MUCH_CHANGED * psd, psd, below)
-    return [contribution(Source.CHANGES, psd.shape, below=below)]
+    most = np.maximum.reduceat(steady.added, np.cumsum([0, *snapshot.dims[:-1]]))
+    less, more = (
+        np.repeat(each, snapshot.dims) * motion for each in bounds(most, len(steady.changes))
+    )
+    less = np.where(less > MUCH_CHANGED * psd, psd, less)
+    return [contribution(Source.CHANGES, psd.shape, below=less, above=more)]
 
 
 def _nonlinear(snapshot: Snapshot, psd: FloatArray) -> Iterator[Contribution]:

@@ -25,12 +25,14 @@ from estimator.checks.advice import (
     Gain,
     Level,
     ModelMisfit,
+    NoiseChanges,
     ResponseChanges,
     SharedNoise,
     Untested,
 )
 from estimator.checks.count_limits import CountLimits
 from estimator.checks.diagnose import Diagnostics, diagnose
+from estimator.checks.stability import Stability
 from estimator.errors import InsufficientDataError
 from estimator.median import median
 from estimator.responses.equalisation import leakage_advice
@@ -46,7 +48,7 @@ if TYPE_CHECKING:
     from daq.estimation.segments.segment_pass import Pass
     from daq.estimation.snapshot import NonlinearChannel
     from estimator.checks.band import BandDiagnosis
-    from estimator.checks.stability import SegmentCourse, Stability
+    from estimator.checks.stability import SegmentCourse
     from estimator.likelihood.factor_analysis import Maxima
     from estimator.self_noise.result import SelfNoise
     from estimator.spectra.multiresolution import Band
@@ -129,7 +131,7 @@ class Findings:
             steady,
             changes=changes,
             added=np.where(np.repeat([n in left for n in range(len(dims))], dims), steady.added, 0),
-            steadied=steady.steadied if changes else None,
+            steadied=steady.steadied if changes else (),
         )
         advice = (
             each
@@ -137,6 +139,13 @@ class Findings:
             if not isinstance(each, ResponseChanges) or left.issuperset(each.sensors)
         )
         return replace(self, diagnosis=replace(whole, advice=tuple(advice), stability=steady))
+
+    def of_all_segments(self) -> Findings:
+        """Return findings of which the averages within parts are not used."""
+        whole, steady = self.diagnosis, self.stability
+        if whole is None or steady is None:
+            return self
+        return replace(self, diagnosis=replace(whole, stability=replace(steady, steadied=())))
 
     def fits(self, frequency: FloatArray) -> bool:
         """Whether it is about these frequencies: with octaves, there are more as time goes by."""
@@ -333,7 +342,7 @@ def diagnosis(
                     neighbours=neighbours(band),
                     vertical=vertical,
                     course=course if len(bands) == 1 else None,
-                    parts=band.parts if len(bands) == 1 else None,
+                    parts=band.parts,
                     maxima=maxima,
                 )
             except InsufficientDataError:
@@ -342,6 +351,7 @@ def diagnosis(
             found.append(diagnostics)
     if not found:
         return None, Untested.NO_SEGMENTS
+    stability = Stability.joined([each.stability for each in found], len(dims))
     clearest = max(found, key=lambda each: sum(r.coherence for r in each.responses))
     whole = Diagnosis(
         n_factors=found[0].n_factors,
@@ -357,12 +367,12 @@ def diagnosis(
             advice
             for each in found
             for advice in each.advice
-            if (each is clearest or not advice.sensors)
+            if _counts(advice, each, clearest, stability)
             and not _is_explained(advice, faulty)
             and not _is_fitted(advice, dimensions)
             and not _is_across(advice, each.bands, dims, axes)
         ),
-        stability=found[0].stability if len(found) == 1 else None,
+        stability=stability,
         per_frequency=FrequencyDiagnosis(
             coherence=_over(bands, [each.coherence for each in found]),
             condition=_over(bands, [each.condition for each in found]),
@@ -375,6 +385,16 @@ def diagnosis(
     )
     tested = any(np.isfinite(band.test.p_value) for band in whole.bands)
     return whole, None if tested else found[-1].untested or Untested.SINGULAR
+
+
+def _counts(
+    advice: Advice, by: Diagnostics, clearest: Diagnostics, stability: Stability | None
+) -> bool:
+    """Whether advice of one octave counts among those of all."""
+    if isinstance(advice, ResponseChanges) and stability is not None and by.stability is not None:
+        (sensor,) = advice.sensors
+        return any(c.sensor == sensor and c in by.stability.changes for c in stability.changes)
+    return by is clearest or not advice.sensors or isinstance(advice, NoiseChanges)
 
 
 def _is_explained(advice: Advice, faulty: Collection[int]) -> bool:

@@ -77,6 +77,7 @@ if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.protocols.block import Reading
     from daq.recording.interface import ReadableRecording
+    from estimator.checks.steadied import Steadied
     from estimator.self_noise.result import SelfNoise
     from estimator.spectra.multiresolution import Band
     from estimator.spectra.welch import SegmentSpectra
@@ -312,7 +313,7 @@ class SnapshotBuilder:
             bands, estimates = self._within_parts(
                 recordings, passes, raw, bands, estimates, nonlinear=nonlinear
             )
-            csm = csm if len(bands) > 1 else bands[0].csm
+            csm = np.concatenate([b.csm for b in bands]) if len(bands) > 1 else bands[0].csm
             n_effective = bands[-1].n_effective
         if self._findings.fits(frequency):
             diagnostics = self._findings.added_to(diagnostics)
@@ -375,27 +376,26 @@ class SnapshotBuilder:
 
         Twice: noise in which motion is left is no scale by which changes are told.
         """
-        first, dims = self._findings, passes[0].aligned.dims
-        psd = np.diagonal(bands[0].csm, axis1=1, axis2=2).real
+        first, dims, within = self._findings, passes[0].aligned.dims, bands
+        psd = np.concatenate([np.diagonal(b.csm, axis1=1, axis2=2).real for b in bands])
         for _ in range(ROUNDS):
             steady = self._findings.stability
-            if steady is None or steady.steadied is None:
+            if steady is None or not any(steady.steadied):
                 break
-            found = steady.steadied
-            band = replace(bands[0], csm=found.csm, n_effective=found.n_effective)
-            maxima, n = Maxima(), band.n_segments
+            within = tuple(map(_steadied, within, steady.steadied))
+            maxima, n = Maxima(), within[-1].n_segments
             again = self._estimates(
-                (band,), raw, recordings[0], passes[0], n, maxima=maxima, final=True
+                within, raw, recordings[0], passes[0], n, maxima=maxima, final=True
             )
             self._findings = self._diagnose(
-                recordings, passes, raw, (band,), again, maxima=maxima
+                recordings, passes, raw, within, again, maxima=maxima
             ).linear_first(nonlinear, psd, dims)
             after = self._findings.stability
             if after is None or not after.changes:
-                self._findings = first
+                self._findings = first.of_all_segments()
                 return bands, estimates
         else:
-            return (band,), again
+            return within, again
         return bands, estimates
 
     def _sets(self, passes: Sequence[Pass], raw: tuple[Band, ...]) -> tuple[ChannelSet, ...]:
@@ -519,6 +519,15 @@ class SnapshotBuilder:
         """Whether the dimensions chosen before are for the same frequencies."""
         before = () if self._dimensions is None else self._dimensions.n_factors
         return [len(n_factors) for n_factors in before] == [len(each.frequencies) for each in bands]
+
+
+def _steadied(band: Band, found: Steadied | None) -> Band:
+    """Return averages of a bench whose responses are steady, where these are known."""
+    if found is None:
+        return band
+    csm = np.full_like(band.csm, np.nan)
+    csm[: len(found.csm)] = found.csm
+    return replace(band, csm=csm, n_effective=found.n_effective)
 
 
 def _largest(sets: Sequence[ChannelSet], csm: NDArray[np.complex128]) -> tuple[Band, ...]:

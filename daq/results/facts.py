@@ -610,9 +610,17 @@ class SharedNoiseNotSearched(Fact):
     most: int
 
 
+ARCHIVES = "archives"
+"""A cause of `SteadinessNotTested`."""
+
+
 @record
 class SteadinessNotTested(Fact):
-    """Whether the noise changes during the recording is not tested; `causes` are why."""
+    """Whether noise and responses change during the recording is not tested; `causes` are why.
+
+    In an archive, which keeps neither parts of time nor samples, linearity and the rounding that
+    channels share are not tested either.
+    """
 
     name: ClassVar[str] = "steadiness-not-tested"
     causes: tuple[str, ...]

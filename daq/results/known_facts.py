@@ -13,6 +13,7 @@ from daq.estimation.noise_estimates import BY_MOTION
 from daq.results.band_summary import known_range
 from daq.results.clock_effect import reference
 from daq.results.facts import (
+    ARCHIVES,
     RANK_OF_LEVEL,
     BlocksDamaged,
     ChannelsAbsent,
@@ -508,6 +509,7 @@ def _methods(snapshot: Snapshot) -> Iterator[Fact]:
         ("--octaves", bool(snapshot.octaves)),
         ("--reject", bool(snapshot.left_out.get(Reason.TRANSIENT))),
         ("segments with gaps", snapshot.bridged is not None),
+        (ARCHIVES, not snapshot.sensors),  # of which no averages know
     )
     if found is not None and found.stability is None and any(holds for _, holds in causes):
         names = tuple(name for name, holds in causes if holds)

@@ -61,6 +61,8 @@ PAIR_BYTES = 1 << 24
 """Bytes of products of pairs of channels with all others that exist together: 16 MB."""
 SIGNIFICANCE = 3.0
 """Standard errors by which scatter must exceed its expectation to be significant."""
+DOUBT = 4.0
+"""By which a doubtful noise may be wrong as the scale of a test."""
 SECOND_ORDER = 4.0
 """Times the variance of a response between parts, a change is at most, squared. Scores are linear
 in changes: the share of its statistic that may look like changes of other sensors."""
@@ -117,6 +119,16 @@ class Scatter:
     statistic: FloatArray
 
     @classmethod
+    def joined(cls, found: Sequence[Scatter]) -> Scatter:
+        """Return the scatter of neighbouring ranges of frequencies, rising, as one."""
+        return cls(
+            max(each.n_parts for each in found),
+            np.concatenate([each.deviation for each in found]),
+            np.concatenate([each.expected for each in found]),
+            np.concatenate([each.statistic for each in found]),
+        )
+
+    @classmethod
     def of(cls, levels: Sequence[Levels | None], n_channels: int) -> Scatter:
         """Return the scatter of the levels of each band; NaN where there are none."""
         unknown = np.full(n_channels, np.nan)
@@ -169,8 +181,9 @@ class Stability:
         Noise added by these segments, as a fraction, for the worst band and channel.
     channel : int
         That channel.
-    steadied : Steadied or None
-        Averages without the changes of responses; None where nothing tells of any.
+    steadied : tuple of Steadied or None
+        Averages without the changes of responses, of each range of frequencies; None where nothing
+        tells of any.
     """
 
     low: FloatArray
@@ -184,12 +197,44 @@ class Stability:
     disturbed: IntArray
     excess: float
     channel: int
-    steadied: Steadied | None = None
+    steadied: tuple[Steadied | None, ...] = ()
 
     @property
     def inflation(self) -> float:
         """The largest of `inflations`."""
         return float(self.inflations.max(initial=1.0))
+
+    @classmethod
+    def joined(cls, ranges: Sequence[Stability | None], n_sensors: int) -> Stability | None:
+        """Return what neighbouring ranges of frequencies show, rising, as one; None of none.
+
+        Of each sensor the clearest change of all counts, where it is clear among as many tests.
+        """
+        found = [each for each in ranges if each is not None]
+        if len(ranges) < 2 or not found:
+            return found[0] if found else None
+        alarm = FALSE_ALARM / (n_sensors * len(found))
+        clearest: dict[int, ResponseChange] = {}
+        second_order = 0.0
+        for each in sorted((c for one in found for c in one.changes), key=lambda c: -c.statistic):
+            most = critical_value(each.degrees, alarm) + second_order
+            if each.sensor not in clearest and each.statistic > most:
+                clearest[each.sensor] = each
+                second_order += each.statistic * each.size**2
+        runs = [each.runs for each in found if each.runs is not None]
+        return replace(
+            found[-1],
+            low=np.concatenate([each.low for each in found]),
+            high=np.concatenate([each.high for each in found]),
+            parts=Scatter.joined([each.parts for each in found]),
+            runs=Scatter.joined(runs) if len(runs) == len(found) else None,
+            inflations=np.concatenate([each.inflations for each in found]),
+            changes=tuple(clearest.values()),
+            added=np.max([each.added for each in found], axis=0) * bool(clearest),
+            steadied=tuple(
+                None if each is None or not each.steadied else each.steadied[0] for each in ranges
+            ),
+        )
 
     def inflation_at(self, frequency: FloatArray) -> FloatArray:
         """Return the inflation at frequencies, shape (n_freqs,); 1 outside of the bands."""
@@ -207,7 +252,7 @@ class Stability:
             runs=None if self.runs is None else self.runs.among(channels, n_channels),
             channel=channels[self.channel],
             added=added,
-            steadied=self.steadied if len(channels) == n_channels else None,
+            steadied=self.steadied if len(channels) == n_channels else (),
             changes=tuple(
                 replace(
                     each,
@@ -293,7 +338,7 @@ def stability(
         bands = [None if band is None else replace(band, levels=None) for band in bands]
     suspect = any(band.share.min() < WITHIN_PARTS for band in found)
     levels = [None if band is None else band.levels for band in bands]
-    changes, added = _changed(bands, dims, begin, end)
+    changes, added = _changed(bands, dims, begin, end, doubtful=doubtful and suspect)
     without = None
     if changes or suspect:
         sensors = [each.sensor for each in changes]
@@ -323,7 +368,7 @@ def stability(
         disturbed=np.flatnonzero(out),
         excess=float(excess.max()),
         channel=int(excess.max(axis=0).argmax()),
-        steadied=without,
+        steadied=() if without is None else (without,),
     )
 
 
@@ -408,18 +453,24 @@ def _changed(
     dims: tuple[int, ...],
     begin: FloatArray,
     end: FloatArray,
+    *,
+    doubtful: bool,
 ) -> tuple[tuple[ResponseChange, ...], FloatArray]:
     """Return the responses that change, and what this adds as a fraction of the motion's PSD.
 
     The fraction has the shape (n_channels,).
 
     Noise that changes, in any channel, scatters the scores more: they are weighted by the part's
-    loudest channel where the noise of the band is not steady.
+    loudest channel where the noise of the band is not steady. Where the noise is `doubtful`, it is
+    a scale but for a factor.
     """
     n_parts = len(begin)
     total = ResponseScores(dims, n_parts)
     for band in bands:
-        if band is None or band.levels is None:
+        if band is None or (band.levels is None and not doubtful):
+            continue
+        if band.levels is None:
+            total = total + band.responses
             continue
         unsteady = band.levels.statistic > critical_value(n_parts - 1, FALSE_ALARM)
         level = np.ones(n_parts)
@@ -440,7 +491,8 @@ def _changed(
         }
         sensor = max(strength, key=lambda each: strength[each])
         chi, df = tests[sensor]
-        if not (df > 0 and chi > critical_value(df, FALSE_ALARM / len(dims)) + second_order):
+        most = critical_value(df, FALSE_ALARM / len(dims)) if df > 0 else math.inf
+        if not chi > (DOUBT if doubtful else 1.0) * most + second_order:
             break
         own = total.without(taken)
         change = response_change(own, sensor, begin, end, int(first[sensor]))

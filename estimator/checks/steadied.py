@@ -12,8 +12,9 @@ Together with the motion it makes a matrix
 that is distributed like one of n' averages of a bench whose responses are steady. So every method
 estimates *within* parts, by being given this matrix.
 
-Within a part responses change, too. A course g between the means of its neighbours, with the slope
-s and the second difference c, leaves ``s**2 / 12 + c**2 / 12`` of the motion. Parts in which this
+Within a part responses change, too. A course of slope s, between the means of the part's
+neighbours, leaves ``s**2 / 12`` of the motion. One that wanders leaves a sixth of its second
+difference c, squared, on average: ``c**2 / 3`` holds with few parts, too. Parts in which this
 is far more than in others, as about a step, are left out.
 """
 
@@ -41,6 +42,8 @@ APART = 4.0
 """A part whose responses change so many times as much as those of the median is left out."""
 MOST_LEFT_OUT = 0.4
 """Share of the averages, at most."""
+ROUGH = 4.0
+"""Weight of squares of second differences, beside those of slopes."""
 MARGIN = 2.0
 """By which what responses leave within parts is bounded: of few parts, it is not better known."""
 
@@ -112,7 +115,7 @@ def steadied(
         whole = U @ motion @ U.conj().swapaxes(1, 2)
         whole += np.tensordot(averages / more, found.left, axes=1)
         csm[parts.bins[some]] = whole / (found.scale[:, :, None] * found.scale[:, None, :])
-    below, above = _bounds(MARGIN * left, len(changed))
+    below, above = bounds(MARGIN * left, len(changed))
     return Steadied(csm, more, left_out, np.repeat(below, dims), np.repeat(above, dims))
 
 
@@ -135,8 +138,9 @@ def _within(
                 [2 * course[:1] - course[1:2], course, 2 * course[-1:] - course[-2:-1]]
             )
             slope, bend = (padded[2:] - padded[:-2]) / 2, np.diff(padded, n=2, axis=0)
-            square = (slope**2 + bend**2).reshape(len(averages), dims[sensor], -1).sum(axis=2)
-            found[:, sensor] = square.max(axis=1) / 12
+            square = (slope**2 + ROUGH * bend**2) / 12
+            of_rows = square.reshape(len(averages), dims[sensor], -1).sum(axis=2)
+            found[:, sensor] = of_rows.max(axis=1)
     most, kept = found.max(axis=1), np.ones(len(averages), np.bool_)
     for part in np.argsort(-most).tolist():
         out = averages[~kept].sum() + averages[part]
@@ -147,8 +151,8 @@ def _within(
     return weight @ found[kept], kept
 
 
-def _bounds(variance: FloatArray, n_changed: int) -> tuple[FloatArray, FloatArray]:
-    """Return what variances of responses within parts, (n_sensors,), add and take at most.
+def bounds(variance: FloatArray, n_changed: int) -> tuple[FloatArray, FloatArray]:
+    """Return what variances of responses, shape (n_sensors,), add to the noise and take at most.
 
     Beside sensors j and k, the noise of i changes by the mean of ``(g_i - g_j) (g_i - g_k)``: only
     its own variance, where the others are steady.

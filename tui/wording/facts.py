@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from daq.protocols.block import UNCOUNTED_CHECK
 from daq.results.facts import (
+    ARCHIVES,
     AbsencesNotUsed,
     BlocksDamaged,
     ChangesUndecided,
@@ -795,10 +796,10 @@ def _not_searched(fact: SharedNoiseNotSearched, names: Names) -> Wording:
 @word.register(SteadinessNotTested)
 def _steadiness(fact: SteadinessNotTested, names: Names) -> Wording:
     del names
-    text = (
-        f"whether the noise changes during the recording is not tested with {listed(fact.causes)}"
-    )
-    return Wording(text, f"{text[0].upper()}{text[1:]}: the intervals hold for steady noise.")
+    text = f"whether noise or responses change is not tested with {listed(fact.causes)}"
+    if ARCHIVES in fact.causes:
+        text += "; neither are linearity, nor the rounding that channels share"
+    return Wording(text, f"{text[0].upper()}{text[1:]}: the intervals hold for a steady bench.")
 
 
 @word.register(LikeChannelsAssumed)

@@ -23,7 +23,9 @@ N = round(1200 * RATE)
 NOISE = 2 / RATE  # PSD of white noise of variance 1
 
 
-def estimated(kind: str, seed: int, *, ratio: float = 1e4, n: int = N) -> Snapshot:
+def estimated(
+    kind: str, seed: int, *, ratio: float = 1e4, n: int = N, option: str = ""
+) -> Snapshot:
     """White motion of this ratio to white noise; something changes in sensor B."""
     rng = np.random.default_rng([seed, 4747])
     time = np.arange(n) / n
@@ -46,7 +48,9 @@ def estimated(kind: str, seed: int, *, ratio: float = 1e4, n: int = N) -> Snapsh
         elif kind == "temperature":
             felt *= 1 + 0.02 * rng.standard_normal(3) * (np.sin(np.pi * time) - 0.5)[:, None]
         samples[name] = felt + rng.standard_normal((n, 3))
-    return huddle.self_noise(samples, fs=RATE, segment="5s").snapshot
+    return huddle.self_noise(
+        samples, fs=RATE, segment="5s", octaves=option == "octaves", reject=option == "reject"
+    ).snapshot
 
 
 @pytest.mark.parametrize(
@@ -95,9 +99,27 @@ def test_levels_within_parts_are_those_of_a_steady_bench(kind: str, most: float)
     assert snapshot.n_effective < 420  # of 455: every part has spent three
 
 
-def test_gains_that_follow_one_temperature_are_found() -> None:
-    found = estimated("temperature", 2).diagnostics.advice
+@pytest.mark.parametrize("option", ["octaves", "reject"])
+def test_changes_are_found_with_every_option(option: str) -> None:
+    snapshot = estimated("step", 4, ratio=1e6, option=option)
+    (change,) = [e for e in snapshot.diagnostics.advice if isinstance(e, ResponseChanges)]
+    assert change.channel == 3
+    assert change.size == pytest.approx(-0.05, rel=0.1)
+    noise = snapshot.results["three-sensor"]
+    inside = (snapshot.frequency > 1) & (snapshot.frequency < 18)
+    known = np.isfinite(noise.noise_psd) & inside[:, None]
+    assert known.sum() > 500
+    assert np.mean(((noise.low <= NOISE) & (noise.high >= NOISE))[known]) > 0.93
+
+
+@pytest.mark.parametrize("ratio", [1e4, 1e6])
+def test_gains_that_follow_one_temperature_are_found(ratio: float) -> None:
+    """Motion in which all sensors differ hides the noise of one: it seems to be zero."""
+    snapshot = estimated("temperature", 2, ratio=ratio)
+    found = snapshot.diagnostics.advice
     assert any(isinstance(each, ResponseChanges) for each in found)
+    noise, inside = snapshot.results["three-sensor"], slice(5, 90)
+    assert np.mean((noise.low[inside] <= NOISE) & (noise.high[inside] >= NOISE)) > 0.93
 
 
 @pytest.mark.parametrize("kind", ["steady", "stops", "red"])

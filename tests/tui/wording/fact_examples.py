@@ -124,7 +124,7 @@ EXAMPLES: tuple[Fact, ...] = (
     facts.DimensionsUnexplained(rank=Rank.INVALIDATES, bands=((1.0, 2.0), (2.0, 4.0))),
     facts.DimensionsUndetermined(rank=Rank.INVALIDATES, bands=((1.0, 2.0),), usual=3, n_sensors=5),
     facts.SharedNoiseNotSearched(rank=Rank.TO_KNOW, n_channels=120, most=96),
-    facts.SteadinessNotTested(rank=Rank.TO_KNOW, causes=("--octaves",)),
+    facts.SteadinessNotTested(rank=Rank.TO_KNOW, causes=("archives",)),
     facts.LikeChannelsAssumed(rank=Rank.TO_KNOW, method="two-channel"),
     facts.DirectionsPooled(
         rank=Rank.TO_KNOW, method="three-sensor", band=(10.0, 20.0), n=21, n_frequencies=199
