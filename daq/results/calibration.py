@@ -311,6 +311,8 @@ class _Work:
             ]
             if drift := self._drift(column, found.reference):
                 components.append(Component("drift", "B", "normal", drift))
+            if bent_by := self._nonlinearity(column, found.reference, inside):
+                components.append(Component("linearity", "B", "normal", bent_by))
             absolute = bool(self._certificates) and channel is not None
             if self._of_reference:
                 source = "certificate" if self._certificates else "tolerance"
@@ -341,6 +343,23 @@ class _Work:
         )
         added = found.stability.added
         return float(np.sqrt(added[column] + added[of_reference].max()))
+
+    def _nonlinearity(self, column: int, reference: int, inside: np.ndarray) -> float:
+        """Return by how much a gain at this loudness may differ from that at another.
+
+        A cube ``c x**3`` adds ``3 c s**2`` to the gain, with s the standard deviation, and noise of
+        ``6 c**2 s**6``: two thirds of the square of what it adds to the gain, of the motion. A
+        square adds about as much at an offset of s.
+        """
+        first = int(self._first[reference])
+        of_reference = range(first, first + self.snapshot.dims[reference])
+        psd = self.snapshot.data_psd[inside]
+        squares = {
+            each.column: 1.5 * float(each.explained[inside].sum() / psd[:, each.column].sum())
+            for each in self.snapshot.nonlinear
+        }
+        most = max((squares.get(each, 0.0) for each in of_reference), default=0.0)
+        return math.sqrt(squares.get(column, 0.0) + most)
 
     def _counting(self, column: int, inside: np.ndarray) -> float:
         """Return the relative uncertainty of a gain by the noise of whole counts."""

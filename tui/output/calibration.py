@@ -45,6 +45,7 @@ _SHORT = {
     "faulty": "faulty",
     "drift": "drift",
     "changes": "changes",
+    "linearity": "lin.",
 }
 LEGEND = (
     "Budgets are relative standard uncertainties. A: from the scatter of these data; B: from other "
@@ -52,7 +53,8 @@ LEGEND = (
     "incoherence or by responses that vary. clocks: error of the alignment of the clocks. leak.: "
     "leakage by the width and the edges of segments. quant.: quantisation. cert.: certificate of "
     "the reference; tol.: its tolerance, without one. drift: change of the response during the "
-    "recording; changes: motion that this leaves in the noise. sens.: twice the uncertainty of the "
+    "recording; changes: motion that this leaves in the noise. lin.: squares and cubes of the "
+    "motion. sens.: twice the uncertainty of the "
     "sensitivity. temp.: temperature. edges, gaps: leakage at the "
     "edges of segments and by gaps. misfit: motion that the model does not explain. shared: noise "
     "that channels share. dim.: doubtful number of dimensions of the motion. axes: motion outside "

@@ -8,6 +8,7 @@ import pytest
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
+from daq.results.calibration import calibrate
 from daq.results.facts import NotLinear, Rank
 from daq.results.result import Result
 from estimator.checks.advice import ResponseChanges
@@ -72,3 +73,21 @@ def test_a_square_is_no_change_of_a_gain() -> None:
     snapshot = estimate([recording_of_arrays(arrays, sampling_rate=RATE)], Settings(segment=2.5))
     assert snapshot.nonlinear[0].column == 0
     assert not [e for e in snapshot.diagnostics.advice if isinstance(e, ResponseChanges)]
+
+
+def test_a_compressed_gain_is_uncertain_by_what_it_lacks() -> None:
+    """At 12 times the standard deviation of the motion, tanh takes 1/144 of the gain."""
+    rng = np.random.default_rng([47, 2])
+    motion = 300 * rng.standard_normal((N_SAMPLES, 1))
+    arrays = {name: motion + rng.standard_normal((N_SAMPLES, 1)) for name in "ABC"}
+    arrays["B"] = 3600 * np.tanh(motion / 3600) + rng.standard_normal((N_SAMPLES, 1))
+    snapshot = estimate([recording_of_arrays(arrays, sampling_rate=RATE)], Settings(segment=5.0))
+    for reference, bent in (("A", {"B"}), ("B", {"A", "C"})):
+        found = calibrate(Result(snapshot, Settings(segment=5.0)), None, reference=reference)
+        by_sensor = {
+            budget.sensor: each.relative
+            for budget in found.budgets
+            for each in budget.components
+            if budget.quantity == "sensitivity" and each.source == "linearity"
+        }
+        assert by_sensor == dict.fromkeys(bent, pytest.approx(1 / 144, rel=0.2))
