@@ -21,6 +21,7 @@ import numpy as np
 from daq.errors import ArchiveError, RecordingError, WrongArchiveError
 from daq.recording.file_format import channel_attributes, channels_of
 from daq.recording.storage.opening import open_file
+from daq.recording.storage.packing import check_chunks
 from daq.recording.storage.refusals import dataset, member, number, text
 from daq.recording.storage.whole_hdf5 import WholeHdf5, little_endian
 from daq.whole_file import replaced
@@ -361,7 +362,8 @@ class SpectraFile:
         """Whether the matrices of stretches have become those of days."""
         self.is_single = bool(attributes.get("single", self.is_daily))
         """Whether the matrices are in single precision."""
-        self._csm = dataset(file, "csm", np.dtype("<f4" if self.is_single else "<f8"))
+        csm_type = np.dtype("<f4" if self.is_single else "<f8")
+        self._csm = dataset(file, "csm", csm_type, in_parts=True)
         self.months: dict[str, str] = {}
         """SHA-256 of the summary of each month; empty in files of format version 1."""
         if version > 1 and "months" in file:
@@ -391,6 +393,8 @@ class SpectraFile:
             If it is damaged.
         """
         with _damage_named(self.path):
+            if self._csm.chunks:
+                check_chunks(self._csm, row, row + 1)
             found = self._csm[row]
         return unpacked(found)
 
@@ -410,8 +414,8 @@ class SpectraFile:
         with _damage_named(self.path):
             group = member(member(self._file, "months"), month)
             names = (each.name for each in fields(Summary) if each.name != "total")
-            arrays = {name: member(group, name)[...] for name in names}
-            total = None if self.is_daily else unpacked(member(group, "total")[...])
+            arrays = {name: dataset(group, name)[...] for name in names}
+            total = None if self.is_daily else unpacked(dataset(group, "total")[...])
         if total is None:
             days = set(arrays["days"].tolist())
             total = np.sum([n * csm for day, n, csm in self.rows() if day in days], axis=0)

@@ -35,7 +35,8 @@ from daq.archive.rollup import (
     summaries,
 )
 from daq.archive.spectra_file import SUMMARY_VERSION, SpectraFile, packed
-from daq.errors import ArchiveError
+from daq.errors import ArchiveError, HuddleError
+from daq.recording.storage.refusals import check_all
 from daq.recording.storage.whole_hdf5 import WholeHdf5
 from daq.whole_file import hidden, put_in_place, remove
 
@@ -130,7 +131,9 @@ class Years:
 
     def _current(self, year: str) -> dict[str, str]:
         """Return the months of a file, with what they were made of; none where it is damaged."""
-        with contextlib.suppress(OSError, RuntimeError, KeyError), h5py.File(self._path(year)) as f:
+        damage = (HuddleError, OSError, RuntimeError, KeyError)
+        with contextlib.suppress(*damage), h5py.File(self._path(year)) as f:
+            check_all(f)
             return {str(m): str(group.attrs["digest"]) for m, group in f["months"].items()}
         return {}
 

@@ -315,7 +315,7 @@ def _read(path: Path) -> list[_Epoch]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            inventory = obspy.read_inventory(str(path), format=kind)
+            inventory = obspy.read_inventory(str(path), format=kind, check_compression=False)
     except Exception as error:
         raise ImportFormatError(
             f"{path}: expected a RESP or StationXML file; ObsPy cannot read it: {error}"

@@ -73,8 +73,8 @@ class SensorRecord:
             float(number(attributes, "temperature")) if "temperature" in attributes else None
         )
         """In °C, as the device reported at the start; None if it reported none."""
-        self._samples = dataset(group, "samples")
-        self._instants = dataset(group, "instants", np.dtype("<i8"))
+        self._samples = dataset(group, "samples", in_parts=True)
+        self._instants = dataset(group, "instants", np.dtype("<i8"), in_parts=True)
         self.channels: tuple[Channel, ...] = file_format.channels_of(self._samples.attrs)
         self.absent: NDArray[np.int64] = np.array(
             self._samples.attrs.get("absent", np.empty((0, 3))), np.int64

@@ -143,7 +143,7 @@ class RecordingWriter:
             Length of a chunk. Longer chunks are read faster, but samples are buffered longer.
         hidden : bool
             Keep the temporary name until `close`, to hide an incomplete recording; `abandon` then
-            removes the file. Chunks are packed as in `daq.recording.chunks.packing`. No write that
+            removes the file. Chunks are packed as in `daq.recording.storage.packing`. No write that
             fails is repeated.
 
         Raises

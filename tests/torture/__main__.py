@@ -48,6 +48,7 @@ CHANGES = {
 PAGES, BENCH_FILES, CLOCK_STEPS = 2000, 20_000, 24
 STARVED, DAY = 300.0, 86_400.0
 """Seconds of a recorder that shares its processors, and of a service."""
+STEPS_OF_DAY = 6
 KEPT = PAGE.parents[2] / "build" / "torture"
 """Folder of the files in which something was not seen."""
 HEAD = """# Recordings and the service under torture
@@ -84,7 +85,9 @@ TAIL = """
 - *Bench files*: one to three lines lost, repeated, exchanged, or with another value or byte.
 - *Clocks*: a service at 20 times real time, whose clock is set by −25 to 30 min once a minute.
 - *Starved recorder*: a busy process for each processor beside the recorder and the played devices.
-- *Accelerated day*: a service at 20 times real time. It may grow by 50 kB a run.
+- *Accelerated day*: a service at 20 times real time, with a leap second as a run is due, the end of
+  summer time and six steps of the clock. It may grow by 50 kB a run, its database by 16 kB. Each
+  due time must have one row.
 """
 
 
@@ -217,7 +220,7 @@ def _starved(share: float, _: Path) -> Iterator[Row]:
 
 def _day(share: float, _: Path) -> Iterator[Row]:
     seconds = DAY / RATE * share
-    found, remarks = soak(seconds)
+    found, remarks = soak(seconds, n_steps=round(STEPS_OF_DAY * share))
     hours = seconds * RATE / 3600
     yield Row(f"service of {hours:.1f} h, accelerated", 1, found, f" ({'; '.join(remarks)})")
 

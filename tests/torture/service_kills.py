@@ -6,8 +6,9 @@ kills (default 300; one in INTERVAL seconds, default 4) or seconds have passed, 
 of the clock. One kill of the service in three is a restart by SIGTERM. In the last CALM seconds
 (default 0) the service itself is left alone, so that its memory can be followed. One kill in five
 strikes a ``huddle repair`` or ``huddle report`` that someone starts on a recording of the service.
-Cables are pulled meanwhile. It prints what came of every due run, what is wrong, and how memory and
-descriptors of the service went. The clock begins an hour before clocks change in Berlin.
+Cables are pulled meanwhile. It prints what came of every due run, what is wrong, and how memory,
+descriptors and database of the service went. The clock begins 25 minutes before a leap second, at
+the end of which a run is due, and 85 minutes before clocks change in Berlin.
 """
 
 from __future__ import annotations
@@ -50,9 +51,12 @@ if TYPE_CHECKING:
 RATE = 20.0
 LEAK = 0.05
 """MB that the service may grow with each run that is done."""
+ROWS = 16.0
+"""kB that the database may grow with each run that is done: its row and those of its noise."""
 TREND = 1.0
 """Hours from which growth is judged: what happens for the first time loads modules."""
-BEGIN = datetime(2026, 10, 24, 23, 55, tzinfo=UTC)  # an hour and five minutes before clocks change
+LEAP = datetime(2026, 10, 25, tzinfo=UTC)
+BEGIN = LEAP - timedelta(minutes=25)
 ENTRY = ScheduledRun(
     name="soak", cron="*/20 * * * *", time_zone="Europe/Berlin", duration=480.0, when_busy="queue"
 )
@@ -92,7 +96,7 @@ class Soak:
     def __init__(self, folder: Path, rate: float, *, seed: int) -> None:
         self.folder = folder
         self.bench = folder / "bench.toml"
-        self.clock = FastClock.create(folder / "clock", shows=BEGIN, rate=rate)
+        self.clock = FastClock.create(folder / "clock", shows=BEGIN, rate=rate, leap=LEAP)
         self.rng = np.random.default_rng(seed)
         self.kills: Counter[str] = Counter()
         self.usage: list[tuple[float, ...]] = []
@@ -161,7 +165,10 @@ class Soak:
         self.never.append((before, self.clock.now()))
 
     def measure(self) -> None:
-        """Note memory (MB) and descriptors of the service every ten seconds, once it is warm."""
+        """Note what the service takes every ten seconds, once it is warm.
+
+        Memory (MB), descriptors, and the database of runs with its journal (kB).
+        """
         now, last = time.monotonic(), self.usage[-1][0] if self.usage else 0.0
         if self._service is None or min(now - self._since - 50.0, now - last) < 10.0:
             return
@@ -172,7 +179,8 @@ class Soak:
             n_open = len(list(Path(f"/proc/{pid}/fd").iterdir()))
             found = processes(self.folder)
             has = [float(bool(found[kind])) for kind in ("recorder", "estimate")]
-            self.usage.append((now, memory, n_open, self._n_started, *has, os.getloadavg()[0]))
+            database = sum(path.stat().st_size / 1e3 for path in self.folder.glob("*/runs.sqlite*"))
+            self.usage.append((now, memory, n_open, self._n_started, *has, database))
 
     def finish(self, until: datetime) -> None:
         """Let runs that were due before an instant end, then stop the service."""
@@ -210,7 +218,8 @@ def faults(
     store = RunStore(bench.recording_directory)
     runs = store.runs()
     found = [f"{run.name}: left {run.state}" for run in runs if _is_left(run, until)]
-    known = {run.due.timestamp() for run in runs}
+    known = Counter(run.due.timestamp() for run in runs)
+    found += [f"{run.name}: one of several rows" for run in runs if known[run.due.timestamp()] > 1]
     # What is due before a service has planned anything, nobody knows of.
     begin = min((run.due for run in runs), default=BEGIN) - timedelta(seconds=1)
     due: Iterable[datetime] = takewhile(lambda at: at < until, due_times(entry, begin))
@@ -302,7 +311,12 @@ def soak(
         f"reasons {dict(Counter(re.sub(r'/[^ :]+', '…', run.reason)[:100] for run in runs))}",
     ]
     used = np.array(service.usage)
-    for column, what, most in ((1, "memory in MB", LEAK * states["done"]), (2, "descriptors", 1)):
+    allowed = (
+        (1, "memory in MB", LEAK * states["done"]),
+        (2, "descriptors", 1),
+        (6, "database in kB", ROWS * states["done"]),
+    )
+    for column, what, most in allowed:
         if len(used):
             ends = f"{what} {used[:, column].min():.0f} to {used[:, column].max():.0f}"
             trend = slope(service.usage, column)

@@ -1,8 +1,9 @@
 """A service whose clock goes fast and can be set, to be killed at any moment.
 
 ``python -m tests.torture.service_program BENCH CLOCK`` where the file CLOCK holds, as JSON, the
-time of the computer at which it began, the time that it then showed, its rate, and by how many
-seconds it has been set since.
+time of the computer at which it began, the time that it then showed, its rate, the time before
+which it shows one second twice (a leap second, as POSIX clocks do), and by how many seconds it has
+been set since.
 """
 
 from __future__ import annotations
@@ -28,9 +29,12 @@ class FastClock(SystemTime):
         self.rate = json.loads(path.read_text(encoding="utf-8"))["rate"]
 
     @classmethod
-    def create(cls, path: Path, *, shows: datetime, rate: float) -> FastClock:
+    def create(
+        cls, path: Path, *, shows: datetime, rate: float, leap: datetime | None = None
+    ) -> FastClock:
         """Start a clock."""
         began = {"began": time.time(), "shows": shows.timestamp(), "rate": rate, "set_by": 0.0}
+        began["leap"] = float("inf") if leap is None else leap.timestamp()
         path.write_text(json.dumps(began), encoding="utf-8")
         return cls(path)
 
@@ -46,7 +50,8 @@ class FastClock(SystemTime):
         """Return the time that it shows."""
         found = json.loads(self._path.read_text(encoding="utf-8"))
         passed = (time.time() - found["began"]) * found["rate"]
-        return datetime.fromtimestamp(found["shows"] + found["set_by"] + passed, UTC)
+        shown = found["shows"] + found["set_by"] + passed
+        return datetime.fromtimestamp(shown - (shown >= found["leap"]), UTC)
 
     def elapsed(self) -> float:
         """Return seconds of this clock, however it is set."""

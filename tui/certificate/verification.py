@@ -22,6 +22,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from daq.errors import HuddleError
+from daq.memory_limit import memory_limit
 from daq.python_process import install_command
 from daq.recording.reader import Recording
 from daq.recording.repair import verify as verify_recording
@@ -35,10 +36,13 @@ from tui.report.certificate import SPECIMEN
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from contextlib import AbstractContextManager
     from pathlib import Path
 
 JSON_NAME = "result.json"
 """Name of the result in the certificate."""
+_AT_LEAST, _MOST = 1 << 28, 100
+"""Bytes that any PDF may take in memory, and each of its bytes: pypdf and pyHanko bound streams."""
 
 
 class VerificationError(HuddleError, ValueError):
@@ -215,7 +219,8 @@ def verify(
 
         wanted = key_id(public_key(key))
     content = path.read_bytes()
-    claims = Claims.of(path, content)
+    with _bounded(content):
+        claims = Claims.of(path, content)
     if wanted and not ledger.exists:
         return _without_ledger(path, content, claims, recordings, wanted)
     entries = ledger.entries()
@@ -243,6 +248,10 @@ def verify(
     if not claims.roots:
         lines.append("issued by an earlier version: it does not say of which contents it is")
     return [*lines, *signed, *_recordings(path, entry, recordings, ledger)]
+
+
+def _bounded(content: bytes) -> AbstractContextManager[None]:
+    return memory_limit(max(_AT_LEAST, _MOST * len(content)))
 
 
 def _without_ledger(
@@ -318,7 +327,8 @@ def _signatures(content: bytes, entry: Entry, wanted: str) -> tuple[list[str], l
 
     lines, wrong = [], []
     try:
-        found = signatures(content)
+        with _bounded(content):
+            found = signatures(content)
     except Exception as error:  # noqa: BLE001 - of a damaged file, pyHanko raises anything
         return [], [f"its signature cannot be read ({error})"]
     for each in found:

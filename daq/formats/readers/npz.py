@@ -20,8 +20,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.errors import ImportFormatError
+from daq.errors import ImportFormatError, RecordingError
 from daq.formats.foreign_sensor import ForeignSensor, finite_stretches
+from daq.recording.storage.refusals import dataset
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,8 +32,11 @@ if TYPE_CHECKING:
 
 _LARGE = 1 << 28
 _INFLATION = 100
-"""Archives larger than 256 MB that are packed more tightly than this hold no samples."""
+"""Files larger than 256 MB that are packed more tightly than this hold no samples."""
 RESERVED = ("sampling_rate", "start_time")
+_PLAIN = {"char", "logical", "single", "double"} | {
+    f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64)
+}
 _COMPRESSED = 15
 """Kind of a compressed element of a MATLAB file, miCOMPRESSED."""
 
@@ -64,13 +68,17 @@ def _refuse_bombs(path: Path) -> None:
     ValueError
         Naming the array.
     """
+    total = 0
     with zipfile.ZipFile(path) as archive:
         for member in archive.infolist():
             size = member.file_size
-            _refuse_bomb(member.filename, size, member.compress_size)
+            total += size  # members may share their bytes
+            _refuse_bomb(path, member.filename, total)
+            if not member.filename.endswith(".npy"):
+                raise ValueError(f"{member.filename}: not an array")
+            if member.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
+                raise ValueError(f"{member.filename}: packed otherwise than numpy does")
             with archive.open(member) as file:
-                if not member.filename.endswith(".npy"):
-                    continue
                 version = np.lib.format.read_magic(file)
                 read = (
                     np.lib.format.read_array_header_1_0
@@ -84,7 +92,8 @@ def _refuse_bombs(path: Path) -> None:
                     )
 
 
-def _refuse_bomb(name: str, size: int, packed: int) -> None:
+def _refuse_bomb(path: Path, name: str, size: int) -> None:
+    packed = path.stat().st_size
     if size > _LARGE and size > _INFLATION * packed:
         raise ValueError(f"{name}: {packed} bytes that become {size}")
 
@@ -112,7 +121,25 @@ def read_mat(path: Path, sampling_rate: float | None = None) -> tuple[ForeignSen
 
 
 def _refuse_mat_bombs(path: Path) -> None:
-    """Refuse compressed arrays of version 5 that become far more than they are.
+    """Refuse arrays that become far more than they are, or say that they are more than they hold.
+
+    Raises
+    ------
+    ValueError
+        Naming the array.
+    """
+    from scipy.io import whosmat  # noqa: PLC0415 - takes long
+
+    held = _held(path)
+    for name, shape, kind in whosmat(path, chars_as_strings=False):
+        if kind not in _PLAIN:  # of a cell and others, what it says of its size is allocated
+            raise ValueError(f"{name}: expected numbers, found {kind}")
+        if math.prod(shape) > held:
+            raise ValueError(f"{name}: an array of shape {shape} in {held} bytes")
+
+
+def _held(path: Path) -> int:
+    """Return how many bytes a file becomes; refuse arrays of version 5 that become far more.
 
     After a header of 128 bytes an element has its kind and length (MAT-File Format, "Data Element
     Format"). Its contents may lie about their size, so they are counted.
@@ -122,18 +149,21 @@ def _refuse_mat_bombs(path: Path) -> None:
     ValueError
         With the sizes.
     """
+    total = path.stat().st_size
     with path.open("rb") as file:
         header = file.read(128)
         order = {b"IM": "<", b"MI": ">"}.get(header[126:])
         if order is None:
-            return  # of another version
+            return total  # of another version
         tag = struct.Struct(f"{order}II")
         while len(head := file.read(tag.size)) == tag.size:
             kind, packed = tag.unpack(head)
             following = file.tell() + packed
             if kind == _COMPRESSED:
-                _refuse_bomb("array", _inflated(file, packed), packed)
+                total += _inflated(file, packed)
+                _refuse_bomb(path, "array", total)
             file.seek(following)
+    return total
 
 
 def _inflated(file: BinaryIO, packed: int) -> int:
@@ -145,7 +175,7 @@ def _inflated(file: BinaryIO, packed: int) -> int:
         if not content:
             break
         packed -= len(content)
-        size += len(inflate.decompress(content))
+        size += len(inflate.decompress(content))  # 64 MB at most
     return size
 
 
@@ -154,6 +184,7 @@ def _mat73(path: Path) -> dict[str, NDArray[Any]]:
     import h5py  # noqa: PLC0415 - seldom needed
 
     arrays: dict[str, NDArray[Any]] = {}
+    total = 0
     try:
         with h5py.File(path, "r") as file:
             for name in file:
@@ -161,15 +192,17 @@ def _mat73(path: Path) -> dict[str, NDArray[Any]]:
                 if name[0] == "#" or not isinstance(link, h5py.HardLink):  # no other file
                     continue
                 found = file[name]
-                if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external:
-                    continue
-                _refuse_bomb(name, found.size * found.dtype.itemsize, found.id.get_storage_size())
                 kind = found.attrs.get("MATLAB_class", b"")
-                if found.dtype.kind in "iuf" and "MATLAB_empty" not in found.attrs:
+                if not isinstance(found, h5py.Dataset) or found.dtype.kind not in "iuf":
+                    continue
+                if "MATLAB_empty" not in found.attrs:
+                    found = dataset(file, name)
+                    total += found.size * found.dtype.itemsize
+                    _refuse_bomb(path, name, total)
                     array = np.asarray(found).T  # MATLAB counts the first index fastest
                     text = kind in {b"char", "char"}
                     arrays[name] = np.array("".join(map(chr, array.ravel()))) if text else array
-    except (OSError, RuntimeError, ValueError, KeyError) as error:
+    except (OSError, RuntimeError, ValueError, KeyError, RecordingError) as error:
         raise ImportFormatError(
             f"{path}: expected a MATLAB file of version 7.3; {error}"
         ) from error

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daq.recording.chunks.packing import deflate
 from daq.recording.file_format import BLOCK_DTYPE
+from daq.recording.storage.packing import deflate
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -7,15 +7,13 @@ whoever reads them finds out what is damaged.
 
 from __future__ import annotations
 
-import contextlib
-import math
 import os
 import threading
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daq.recording.chunks.packing import PIPELINE, RAW, InflationError, check_chunk, unpacked
+from daq.recording.storage.packing import PIPELINE, RAW, InflationError, check_chunks, unpacked
 
 if TYPE_CHECKING:
     import h5py
@@ -87,7 +85,6 @@ class ChunkedRows:
         self._kept: tuple[int, NDArray[Any]] = (0, np.empty((0, *columns), self._dtype))
         self._lock = threading.Lock()
         self._direct = filters == PIPELINE and tuple(columns) == dataset.shape[1:]
-        self._n_bytes = math.prod(dataset.chunks) * dataset.dtype.itemsize
         self._checked: set[int] = set()
         """First rows of the chunks that inflate to no more than their size."""
         self._n_fetched = 0
@@ -131,15 +128,9 @@ class ChunkedRows:
 
     def _check_chunks(self, first_row: int, last_row: int) -> None:
         """Refuse chunks that HDF5 would inflate beyond their size; each is looked at once."""
-        if self._dataset.compression is None:
-            return
-        fetch, n_bytes = self._dataset.id.read_direct_chunk, self._n_bytes
-        last = min(last_row, len(self._dataset))
-        for row in range(first_row // self._length * self._length, last, self._length):
+        for row in range(first_row // self._length * self._length, last_row, self._length):
             if row not in self._checked:
-                with contextlib.suppress(RuntimeError, ValueError, KeyError):  # HDF5 names it
-                    mask, content = fetch((row, *self._corner))
-                    check_chunk(mask, content, n_bytes)
+                check_chunks(self._dataset, row, row + self._length)
                 self._checked.add(row)
 
     def _decompressed(

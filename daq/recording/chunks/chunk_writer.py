@@ -12,7 +12,7 @@ from h5py import h5s, h5t
 
 from daq.errors import RecordingError
 from daq.recording import file_format
-from daq.recording.chunks.packing import RAW, packed
+from daq.recording.storage.packing import RAW, packed
 from daq.recording.storage.retries import repeated, report
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ class ChunkBuffer:
     ----------
     dataset : h5py.Dataset
     packs : bool
-        Pack chunks as in `daq.recording.chunks.packing`. Not in a file that may be left open: when
+        Pack chunks as in `daq.recording.storage.packing`. Not in a file that may be left open: when
         HDF5 2.0 shrinks a dataset to what was acknowledged, it filters the last chunk without
         regard to the chunk's mask, and destroys it.
     """

@@ -140,7 +140,7 @@ def _within(group: h5py.Group, name: str, seen: set[int]) -> Iterator[tuple[str,
     if isinstance(found, h5py.Group):
         yield from _below(found, seen)
     else:
-        found = dataset(group, name)
+        found = dataset(group, name, in_parts=True)
         yield found.name, found
         yield from _attributes(found)
 

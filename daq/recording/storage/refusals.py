@@ -15,6 +15,7 @@ import h5py
 import numpy as np
 
 from daq.errors import NotARecordingError, RecordingError
+from daq.recording.storage.packing import PIPELINE, check_chunks
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -24,7 +25,6 @@ MAX_CHUNK = 1 << 28
 """Maximum size of a chunk in bytes."""
 _MAX_INFLATION = 1100
 """Maximum ratio of inflated to deflated size: 1032, and a margin for headers."""
-_FILTERS = {h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32}
 _DAMAGE = (AttributeError, IndexError, KeyError, MemoryError, OSError, RuntimeError, TypeError)
 
 
@@ -58,14 +58,25 @@ def _place(group: h5py.Group, name: str) -> str:
     return f"{group.file.filename}: {group.name.rstrip('/')}/{name}"
 
 
-def dataset(group: h5py.Group, name: str, dtype: np.dtype[Any] | None = None) -> h5py.Dataset:
+def dataset(
+    group: h5py.Group, name: str, dtype: np.dtype[Any] | None = None, *, in_parts: bool = False
+) -> h5py.Dataset:
     """Return a dataset of numbers stored in the file itself.
+
+    Parameters
+    ----------
+    group : h5py.Group
+    name : str
+    dtype : dtype, optional
+        Expected.
+    in_parts : bool, optional
+        Whether who reads it checks its chunks.
 
     Raises
     ------
     NotARecordingError
-        If it is a link, is stored elsewhere, has other filters or another type than expected, or is
-        longer than the file can hold.
+        If it is a link, is stored elsewhere, has other filters or another type than expected, is
+        longer than the file can hold, or has chunks that inflate to more than they hold.
     """
     found = member(group, name)
     if not isinstance(found, h5py.Dataset):
@@ -73,16 +84,33 @@ def dataset(group: h5py.Group, name: str, dtype: np.dtype[Any] | None = None) ->
     if fault := _fault(found, dtype):
         raise NotARecordingError(f"{_place(group, name)}: {fault}")
     check_length(found)
+    if found.chunks and not in_parts:
+        check_chunks(found)
     return found
+
+
+def check_all(group: h5py.Group) -> None:
+    """Check all that is below a group, as `dataset` does.
+
+    Raises
+    ------
+    NotARecordingError, OSError
+        Naming the first dataset that is none of ours.
+    """
+    for name in group:
+        if isinstance(found := member(group, name), h5py.Group):
+            check_all(found)
+        else:
+            dataset(group, name)
 
 
 def _fault(found: h5py.Dataset, dtype: np.dtype[Any] | None) -> str:
     created = found.id.get_create_plist()
     if created.get_external_count() or found.is_virtual:
         return "stored in other files; they are not opened"
-    filters = {created.get_filter(number)[0] for number in range(created.get_nfilters())}
-    if not filters <= _FILTERS:
-        return f"filters {sorted(filters)}; expected gzip"
+    filters = [created.get_filter(number)[0] for number in range(created.get_nfilters())]
+    if filters != [each for each in PIPELINE if each in filters]:  # deflated twice is a million
+        return f"filters {filters}; expected gzip"
     found_type, chunks = found.dtype, found.chunks
     kinds = {found_type[n].kind for n in found_type.names} if found_type.names else found_type.kind
     if found_type.hasobject or not set(kinds) <= set("iufS"):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 import h5py
 import numpy as np
 
+from daq.recording.storage.packing import check_chunks
 from daq.whole_file import RememberingFile, wrong_content
 
 if TYPE_CHECKING:
@@ -133,6 +134,8 @@ def contents_sha256(found: h5py.Dataset, progress: Callable[[], object] = lambda
     length = found.chunks[0] if found.chunks else 1
     n_rows = max(1, _BYTES_PER_READ // (per_row * length)) * length
     for first in range(0, found.shape[0], n_rows):
+        if found.chunks:
+            check_chunks(found, first, first + n_rows)
         digest.update(little_endian(found[first : first + n_rows]))
         progress()
     return digest.digest()

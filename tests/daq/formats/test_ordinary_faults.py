@@ -17,6 +17,7 @@ from daq.formats.importer import import_files
 from daq.formats.readers import npz
 from daq.recording.reader import Recording
 from tests.daq.formats.test_libraries import opened
+from tests.traced_memory import peak_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -90,8 +91,60 @@ def test_a_matlab_file_that_inflates_to_gigabytes_is_refused(
     packed = zlib.compress(bytes(1 << 22))
     with (tmp_path / "a.mat").open("ab") as file:
         file.write(struct.pack("<II", 15, len(packed)) + packed)
-    with pytest.raises(ImportFormatError, match=r"array: \d+ bytes that become 4194304"):
+    with pytest.raises(ImportFormatError, match=r"array: \d+ bytes that become 42\d{5}"):
         import_files([tmp_path / "a.mat"], tmp_path / "a.h5")
+
+
+def element(kind: int, content: bytes) -> bytes:
+    return struct.pack("<II", kind, len(content)) + content + bytes(-len(content) % 8)
+
+
+@pytest.mark.parametrize(("of_class", "said"), [(1, "found cell"), (4, "in 192 bytes")])
+def test_a_matlab_file_that_says_more_than_it_holds_is_refused(
+    tmp_path: Path, of_class: int, said: str
+) -> None:
+    matrix = element(6, struct.pack("<II", of_class, 0)) + element(
+        5, struct.pack("<ii", 1, 1 << 28)
+    )
+    matrix += element(1, b"A") + element(16, b"")
+    (tmp_path / "a.mat").write_bytes(
+        b"MATLAB 5.0 MAT-file".ljust(124) + b"\0\1IM" + element(14, matrix)
+    )
+
+    def read() -> None:
+        with pytest.raises(ImportFormatError, match=said):
+            import_files([tmp_path / "a.mat"], tmp_path / "a.h5", sampling_rate=100.0)
+
+    assert peak_of(read) < 1 << 24
+
+
+def test_all_arrays_of_a_file_together_become_no_more_than_it_can_hold(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(npz, "_LARGE", 1 << 20)
+    many = {f"A{n}": np.zeros(1 << 16) for n in range(9)}
+    np.savez_compressed(tmp_path / "a.npz", **many)
+    savemat(tmp_path / "a.mat", many, do_compression=True)
+    for name in ("a.npz", "a.mat"):
+        with pytest.raises(ImportFormatError, match="bytes that become 1"):
+            import_files([tmp_path / name], tmp_path / "a.h5", sampling_rate=100.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "method", "said"),
+    [
+        ("A.npy", zipfile.ZIP_BZIP2, "packed otherwise than numpy does"),
+        ("A.npy", zipfile.ZIP_LZMA, "packed otherwise than numpy does"),
+        ("README", zipfile.ZIP_STORED, "not an array"),
+    ],
+)
+def test_what_numpy_does_not_write_is_refused(
+    tmp_path: Path, name: str, method: int, said: str
+) -> None:
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", method) as archive:
+        archive.writestr(name, header((1 << 20,)) + bytes(8 << 20))
+    with pytest.raises(ImportFormatError, match=f"{name}: {said}"):
+        import_files([tmp_path / "a.npz"], tmp_path / "a.h5", sampling_rate=100.0)
 
 
 _WAV = b"RIFF\x24\0\0\0WAVEfmt "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+import zipfile
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from daq.errors import ImportFormatError
 from daq.formats.importer import import_files
 from daq.formats.response import ChannelResponse, Responses
 from daq.recording.reader import Recording
+from tests.traced_memory import peak_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -208,3 +210,15 @@ def test_entities_are_not_resolved(tmp_path: Path) -> None:
     )
     with pytest.raises(ImportFormatError, match="declares entities"):
         taken(path)
+
+
+def test_an_archive_behind_a_response_is_not_unpacked(tmp_path: Path) -> None:
+    path = station_file(tmp_path / "s.xml", EPOCHS)
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("bomb", bytes(100 << 20))
+
+    def read() -> None:
+        with pytest.raises(ImportFormatError, match="ObsPy cannot read it"):
+            taken(path)
+
+    assert peak_of(read) < 50 << 20

@@ -12,9 +12,12 @@ import h5py
 import numpy as np
 import pytest
 
+from daq.errors import NotARecordingError
 from daq.recording.chunks.chunk_reader import ChunkedRows
-from daq.recording.chunks.packing import PIPELINE, InflationError
 from daq.recording.storage.journal import journal_path, read_journal
+from daq.recording.storage.packing import PIPELINE, InflationError
+from daq.recording.storage.refusals import dataset
+from daq.recording.storage.whole_hdf5 import contents_sha256
 from estimator.errors import EstimatorError
 from estimator.spectra.welch import CrossSpectra
 from tests.traced_memory import peak_of
@@ -92,6 +95,47 @@ def test_a_chunk_inflates_to_no_more_than_its_rows(tmp_path: Path, rows: tuple[i
             reader.read(*rows, 2 * length)
         assert (reader.read(length, 2 * length, 2 * length) == 7).all()
         assert (reader.read(length + 1, length + 9, 2 * length) == 7).all()
+
+
+BOMB = zlib.compress(bytes(64 << 20), 9)
+
+
+def shuffled(stream: bytes, size: int) -> bytes:
+    """Return bytes as the filter shuffle stores elements of a size."""
+    whole = len(stream) // size * size
+    return np.frombuffer(stream[:whole], "u1").reshape(-1, size).T.tobytes() + stream[whole:]
+
+
+@pytest.mark.parametrize(
+    ("filters", "mask", "content"),
+    [
+        ("deflate", 0, BOMB),
+        ("deflate", 0b10, BOMB),  # the second of one filter is left out
+        ("shuffle deflate fletcher32", 0b100, BOMB),
+        ("deflate shuffle", 0, shuffled(BOMB, 8)),
+        ("deflate deflate", 0, zlib.compress(BOMB, 9)),
+    ],
+)
+def test_a_table_inflates_to_no_more_than_its_rows(
+    tmp_path: Path, filters: str, mask: int, content: bytes
+) -> None:
+    path = tmp_path / "r.h5"
+    with h5py.File(path, "w") as file:
+        created = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        created.set_chunk((100, 3))
+        for each in filters.split():
+            getattr(created, f"set_{each}")()
+        space = h5py.h5s.create_simple((100, 3))
+        made = h5py.h5d.create(file.id, b"table", h5py.h5t.STD_I64LE, space, created)
+        made.write_direct_chunk((0, 0), content, mask)
+
+    def read() -> None:
+        with h5py.File(path) as file, pytest.raises((NotARecordingError, InflationError)):
+            dataset(file, "table")
+        with h5py.File(path) as file, pytest.raises((NotARecordingError, InflationError)):
+            contents_sha256(dataset(file, "table", in_parts=True))
+
+    assert peak_of(read) < 4 << 20
 
 
 def test_sums_of_another_computer_are_not_packed() -> None:

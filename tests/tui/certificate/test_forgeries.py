@@ -7,6 +7,8 @@ import io
 import json
 import shutil
 import sqlite3
+import sys
+import zlib
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,14 +25,53 @@ from pypdf.generic import ContentStream, NameObject
 
 from daq.recording.chunks.manifest import write_manifest
 from daq.recording.description import write_checksums
+from tests.traced_memory import peak_of
 from tests.tui.certificate.laboratory import Laboratory, key, laboratory
 from tui.certificate import issuing
 from tui.certificate.ledger import NAME, Ledger
 from tui.certificate.signing import Signer
-from tui.certificate.verification import JSON_NAME, Claims, VerificationError, _signatures
+from tui.certificate.verification import JSON_NAME, Claims, VerificationError, _signatures, verify
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+
+def bomb(n: int) -> bytes:
+    """Return a PDF with n results, each of which becomes 64 MB."""
+    packed = zlib.compress(zlib.compress(bytes(64 << 20), 9), 9)
+    names = " ".join(f"(result.json) {2 * k + 2} 0 R" for k in range(n))
+    parts = [
+        f"<</Type/Catalog/Names<</EmbeddedFiles<</Names[{names}]>>>>"
+        f"/Pages<</Type/Pages/Kids[]/Count 0>>>>".encode()
+    ]
+    for k in range(n):
+        parts.append(
+            f"<</Type/Filespec/F(result.json)/UF(result.json)/EF<</F {2 * k + 3} 0 R>>>>".encode()
+        )
+        head = f"<</Filter[/FlateDecode/FlateDecode]/Length {len(packed)}>>stream\n"
+        parts.append(head.encode() + packed + b"\nendstream")
+    content, places = b"%PDF-1.7\n", []
+    for number, part in enumerate(parts, 1):
+        places.append(len(content))
+        content += b"%d 0 obj\n" % number + part + b"\nendobj\n"
+    table = b"".join(b"%010d 00000 n \n" % place for place in places)
+    head = b"xref\n0 %d\n0000000000 65535 f \n" % (len(parts) + 1)
+    end = b"trailer<</Size %d/Root 1 0 R>>\nstartxref\n%d\n%%%%EOF\n"
+    return content + head + table + end % (len(parts) + 1, len(content))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is limited on Linux")
+def test_what_is_in_a_pdf_takes_no_more_memory_than_it_can_hold(tmp_path: Path) -> None:
+    path = tmp_path / "C-1.pdf"
+    path.write_bytes(bomb(10))
+    assert path.stat().st_size < 20_000
+
+    def read() -> None:
+        with pytest.raises(VerificationError, match="not genuine"):
+            verify(path, [], Ledger(tmp_path))
+
+    assert peak_of(read) < 300 << 20
+
 
 SECRET = "secret"  # noqa: S105 - of keys that the tests make
 DROP = "".join(

@@ -12,8 +12,9 @@ import h5py
 import numpy as np
 import pytest
 
-from daq.recording.chunks import chunk_reader, packing
+from daq.recording.chunks import chunk_reader
 from daq.recording.chunks.chunk_reader import ChunkedRows, RawChunks
+from daq.recording.storage import packing
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -25,7 +26,7 @@ LENGTH, N_ROWS = 10, 257
 def inflater(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Decompress by either library: the extra "fast" may be missing."""
     if request.param == "zlib":
-        monkeypatch.setattr("daq.recording.chunks.packing.deflate", zlib)
+        monkeypatch.setattr("daq.recording.storage.packing.deflate", zlib)
     else:
         pytest.importorskip("isal")
 

@@ -16,6 +16,8 @@ written any more, and not checked.
 from __future__ import annotations
 
 import contextlib
+import itertools
+import math
 from typing import TYPE_CHECKING, Any
 
 import h5py
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["PIPELINE", "RAW", "InflationError", "check_chunk", "deflate", "packed", "unpacked"]
+__all__ = ["PIPELINE", "RAW", "InflationError", "check_chunks", "deflate", "packed", "unpacked"]
 
 PIPELINE = (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32)
 """The filters of a dataset in chunks."""
@@ -110,15 +112,36 @@ def unpacked(stored: Sequence[tuple[int, bytes]], rows: NDArray[Any]) -> bool:
     return True
 
 
-def check_chunk(mask: int, content: bytes, n_bytes: int) -> None:
-    """Inflate a chunk as far as its dataset says, before HDF5 inflates all of it.
+def check_chunks(dataset: h5py.Dataset, first_row: int = 0, last_row: int | None = None) -> None:
+    """Inflate the chunks of rows as far as their dataset says, before HDF5 inflates all of them.
+
+    Parameters
+    ----------
+    dataset : h5py.Dataset
+        Whose filters are some of `PIPELINE`, in this order.
+    first_row, last_row : int
+        Rows, without ``last_row``; default: all.
 
     Raises
     ------
     InflationError
-        If it becomes more.
+        If one becomes more.
     """
-    if not mask & 0b10 and len(content) * 1100 > n_bytes:
-        with contextlib.suppress(deflate.error):  # type: ignore[arg-type]  # a class, as above
-            if len(deflate.decompressobj().decompress(content, n_bytes + 1)) > n_bytes:
-                raise InflationError(f"a chunk of {n_bytes} bytes inflates to more")
+    created = dataset.id.get_create_plist()
+    filters = [created.get_filter(number)[0] for number in range(created.get_nfilters())]
+    if h5py.h5z.FILTER_DEFLATE not in filters:
+        return
+    is_left_out = 1 << filters.index(h5py.h5z.FILTER_DEFLATE)
+    n_bytes = math.prod(dataset.chunks) * dataset.dtype.itemsize
+    (n_rows, *shape), (length, *others) = dataset.shape, dataset.chunks
+    last_row = n_rows if last_row is None else min(last_row, n_rows)
+    rows = range(first_row // length * length, last_row, length)
+    columns = (range(0, size, step) for size, step in zip(shape, others, strict=True))
+    for corner in itertools.product(rows, *columns):
+        with contextlib.suppress(RuntimeError, ValueError, KeyError):  # HDF5 names it
+            mask, content = dataset.id.read_direct_chunk(corner)
+            if mask & is_left_out:
+                continue
+            with contextlib.suppress(deflate.error):  # type: ignore[arg-type]  # as above
+                if len(deflate.decompressobj().decompress(content, n_bytes + 1)) > n_bytes:
+                    raise InflationError(f"a chunk of {n_bytes} bytes inflates to more")
