@@ -19,7 +19,7 @@ from daq.results.calibration import calibrate as calibrated
 from tui.notebook.curve_files import MINISEED, WRITERS, write_curves, write_samples
 from tui.notebook.estimates import PathLike, estimate
 from tui.notebook.result import Result
-from tui.output.extras import load as package
+from tui.notebook.stored_curves import loaded
 from tui.output.extras import require
 from tui.output.json_document import provenance
 
@@ -237,7 +237,7 @@ def load(path: PathLike) -> xr.Dataset:
     Raises
     ------
     OSError
-        The file is missing, or neither netCDF nor Zarr.
+        The file is missing, is neither netCDF nor Zarr, or none that they write.
 
     Examples
     --------
@@ -248,7 +248,4 @@ def load(path: PathLike) -> xr.Dataset:
     >>> huddle.load("noise.nc").noise_psd.attrs["units"]
     '(m s-2)2 Hz-1'
     """
-    engine = "zarr" if Path(path).suffix == ".zarr" else "h5netcdf"
-    package(engine)
-    found: xr.Dataset = package("xarray").load_dataset(path, engine=engine)
-    return found
+    return loaded(Path(path))

@@ -81,12 +81,25 @@ def dataset(
     found = member(group, name)
     if not isinstance(found, h5py.Dataset):
         raise NotARecordingError(f"{_place(group, name)}: not a dataset")
+    check_stored(found, in_parts=in_parts)
     if fault := _fault(found, dtype):
         raise NotARecordingError(f"{_place(group, name)}: {fault}")
+    return found
+
+
+def check_stored(found: h5py.Dataset, *, in_parts: bool = False) -> None:
+    """Check how a dataset is stored, whatever its type.
+
+    Raises
+    ------
+    NotARecordingError, InflationError
+        As `dataset` does.
+    """
+    if fault := _fault_of_storage(found):
+        raise NotARecordingError(f"{found.file.filename}: {found.name}: {fault}")
     check_length(found)
     if found.chunks and not in_parts:
         check_chunks(found)
-    return found
 
 
 def check_all(group: h5py.Group) -> None:
@@ -104,21 +117,25 @@ def check_all(group: h5py.Group) -> None:
             dataset(group, name)
 
 
-def _fault(found: h5py.Dataset, dtype: np.dtype[Any] | None) -> str:
+def _fault_of_storage(found: h5py.Dataset) -> str:
     created = found.id.get_create_plist()
     if created.get_external_count() or found.is_virtual:
         return "stored in other files; they are not opened"
     filters = [created.get_filter(number)[0] for number in range(created.get_nfilters())]
     if filters != [each for each in PIPELINE if each in filters]:  # deflated twice is a million
         return f"filters {filters}; expected gzip"
-    found_type, chunks = found.dtype, found.chunks
+    if found.chunks and math.prod(found.chunks) * found.dtype.itemsize > MAX_CHUNK:
+        return f"chunks of shape {found.chunks}; expected smaller ones"
+    return ""
+
+
+def _fault(found: h5py.Dataset, dtype: np.dtype[Any] | None) -> str:
+    found_type = found.dtype
     kinds = {found_type[n].kind for n in found_type.names} if found_type.names else found_type.kind
     if found_type.hasobject or not set(kinds) <= set("iufS"):
         return f"of type {found_type}; expected numbers"
     if dtype is not None and found_type != dtype:
         return f"of type {found_type}; expected {dtype}"
-    if chunks and math.prod(chunks) * found_type.itemsize > MAX_CHUNK:
-        return f"chunks of shape {chunks}; expected smaller ones"
     return ""
 
 

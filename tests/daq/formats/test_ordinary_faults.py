@@ -122,7 +122,7 @@ def test_all_arrays_of_a_file_together_become_no_more_than_it_can_hold(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(npz, "_LARGE", 1 << 20)
-    many = {f"A{n}": np.zeros(1 << 16) for n in range(9)}
+    many: dict[str, Any] = {f"A{n}": np.zeros(1 << 16) for n in range(9)}
     np.savez_compressed(tmp_path / "a.npz", **many)
     savemat(tmp_path / "a.mat", many, do_compression=True)
     for name in ("a.npz", "a.mat"):

@@ -48,8 +48,8 @@ def bomb(n: int) -> bytes:
         parts.append(
             f"<</Type/Filespec/F(result.json)/UF(result.json)/EF<</F {2 * k + 3} 0 R>>>>".encode()
         )
-        head = f"<</Filter[/FlateDecode/FlateDecode]/Length {len(packed)}>>stream\n"
-        parts.append(head.encode() + packed + b"\nendstream")
+        about = f"<</Filter[/FlateDecode/FlateDecode]/Length {len(packed)}>>stream\n"
+        parts.append(about.encode() + packed + b"\nendstream")
     content, places = b"%PDF-1.7\n", []
     for number, part in enumerate(parts, 1):
         places.append(len(content))

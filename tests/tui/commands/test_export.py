@@ -8,14 +8,17 @@ import importlib
 import io
 import json
 import os
+import zlib
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import h5py
 import numpy as np
 import pytest
 import pyuff
 import xarray as xr
+from numcodecs import blosc
 from scipy.io import loadmat
 from typer.testing import CliRunner
 
@@ -33,7 +36,7 @@ from tui.notebook.curve_files import WRITERS
 from tui.output.exit_codes import ExitCode
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from typer.testing import Result
 
@@ -278,6 +281,68 @@ def test_zarr(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
     with pytest.raises(OSError, match="mine"):
         huddle.estimate(recording).save(own)
     assert [each.name for each in own.iterdir()] == ["thesis"]
+
+
+def _of_pickle(folder: Path, about: dict[str, Any]) -> None:
+    del folder
+    about["filters"] = [{"id": "pickle", "protocol": 4}]
+
+
+def _of_another_packer(folder: Path, about: dict[str, Any]) -> None:
+    del folder
+    about["compressor"] = {"id": "bz2", "level": 1}
+
+
+def _of_huge_shape(folder: Path, about: dict[str, Any]) -> None:
+    del folder
+    about["shape"] = [1 << 20] * 3
+
+
+def _of_a_bomb(folder: Path, about: dict[str, Any]) -> None:
+    del about
+    chunk = next(each for each in (folder / "noise_psd").iterdir() if each.name[0] != ".")
+    chunk.write_bytes(blosc.compress(bytes(1 << 28), b"zstd", 5))
+
+
+@pytest.mark.usefixtures("zarr_threads")
+@pytest.mark.parametrize("forged", [_of_pickle, _of_another_packer, _of_huge_shape, _of_a_bomb])
+def test_zarr_from_elsewhere_is_checked_before_it_is_inflated(
+    recording: Path, tmp_path: Path, forged: Callable[[Path, dict[str, Any]], None]
+) -> None:
+    out = tmp_path / "a.zarr"
+    assert run(recording, "--format", "zarr", "-o", out).exit_code == ExitCode.DONE
+    described = json.loads((out / ".zmetadata").read_text(encoding="utf-8"))
+    forged(out, described["metadata"]["noise_psd/.zarray"])
+    (out / ".zmetadata").write_text(json.dumps(described), encoding="utf-8")
+    with pytest.raises(OSError, match=r"a\.zarr: not written by huddle, or damaged: .*noise_psd"):
+        huddle.load(out)
+
+
+@pytest.mark.usefixtures("zarr_threads")
+def test_texts_of_zarr_are_no_more_than_they_hold(recording: Path, tmp_path: Path) -> None:
+    out = tmp_path / "a.zarr"
+    assert run(recording, "--format", "zarr", "-o", out).exit_code == ExitCode.DONE
+    (out / "channel" / "0").write_bytes(blosc.compress(bytes([0, 0, 0, 40, *range(9)]), b"lz4", 5))
+    with pytest.raises(OSError, match=r"channel/0: more than \d+ texts"):
+        huddle.load(out)
+
+
+def test_netcdf_from_elsewhere_is_checked_before_it_is_inflated(
+    recording: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "a.nc"
+    assert run(recording, "--format", "netcdf", "-o", out).exit_code == ExitCode.DONE
+    huddle.load(out)
+    with h5py.File(out, "r+") as file:
+        made = file.create_dataset("x", (9,), "f8", chunks=(9,), compression="gzip")
+        made.id.write_direct_chunk((0,), zlib.compress(bytes(1 << 24)))
+    with pytest.raises(OSError, match="a chunk of 72 bytes inflates to more"):
+        huddle.load(out)
+    with h5py.File(out, "r+") as file:
+        del file["x"]
+        file["x"] = h5py.ExternalLink("other.nc", "/x")
+    with pytest.raises(OSError, match="a link"):
+        huddle.load(out)
 
 
 def test_mat_and_numpy(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
