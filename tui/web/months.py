@@ -13,6 +13,7 @@ from tui.service.history.ledger import noise_of
 from tui.service.history.series import history
 from tui.service.history.shown import history_figure, history_lines, history_table
 from tui.service.records.store import RunStore
+from tui.web.work import check_wanted
 from tui.wording.facts import known
 
 if TYPE_CHECKING:
@@ -118,7 +119,7 @@ class Months:
         state = tuple((each.path, each.path.stat().st_mtime_ns) for each in entries)
         if self._answer is None or self._answer[0] != state:
             settings = archive.plan.changed({}, None)
-            self._answer = state, answer(archive, entries, settings)
+            self._answer = state, answer(archive, entries, settings, progress=check_wanted)
         return self._answer[1]
 
 

@@ -82,6 +82,8 @@ if TYPE_CHECKING:
 _LOGGER = logging.getLogger(__name__)
 PATIENCE = 10.0
 """Seconds for which a page waits for an estimate, before it says that it is being made."""
+LEASE = 60.0
+"""Seconds for which the estimate goes on, unless the page comes again."""
 LARGEST_FORM, SLOWEST_FORM = 1 << 14, 10.0
 """Bytes, and seconds."""
 STREAMS = 32
@@ -489,7 +491,7 @@ class Server:
         Raises
         ------
         ClientDisconnect
-            If the visitor leaves: work that has not begun, and that nobody else wants, is dropped.
+            If the visitor leaves: work that nobody else wants is dropped.
         TooMuchWorkError
             If too much waits for this visitor.
         """
@@ -498,16 +500,18 @@ class Server:
         made = asyncio.wrap_future(piece.future)
         made.add_done_callback(lambda each: each.cancelled() or each.exception())
         gone = asyncio.create_task(_gone(request))
+        lease = 0.0
         try:
             await asyncio.wait({made, gone}, timeout=patience, return_when=asyncio.FIRST_COMPLETED)
             if made.done():
                 return made.result()
             if gone.done():
                 raise ClientDisconnect
+            lease = LEASE
             return None
         finally:
-            if gone.done() or not gone.cancel():
-                work.leave(piece)
+            gone.cancel()
+            work.leave(piece, lease=lease)
 
     async def _report_of(self, request: Request, kind: str) -> tuple[State, bytes] | None:
         """Return a test and its result as a file of a kind; None while the test is estimated."""

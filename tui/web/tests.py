@@ -17,7 +17,7 @@ from tui.certificate.ledger import ledger_of
 from tui.output.json_document import document
 from tui.runs.catalogue import Entry, catalogue
 from tui.runs.estimate_settings import settings_for
-from tui.web.work import Work
+from tui.web.work import Work, check_wanted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -137,7 +137,7 @@ class Tests:
         """Return the estimate of a test. Blocks."""
         settings, bench = settings_for(path)
         try:
-            snapshot = estimate([path], settings)
+            snapshot = estimate([path], settings, progress=check_wanted)
         except NoResultError as error:
             snapshot = error.snapshot
         return State(
@@ -162,7 +162,9 @@ class Tests:
         from tui.report.contents import report_of  # noqa: PLC0415 - loads matplotlib
         from tui.report.writing import written  # noqa: PLC0415
 
-        return written(report_of(_known(state)), suffix)
+        report = report_of(_known(state))
+        check_wanted()
+        return written(report, suffix)
 
     def certificates(self, state: State) -> list[tuple[Certificate, Path]]:
         """Return the certificates of a test, and their files. Blocks.

@@ -4,15 +4,18 @@ Theory of operation
 -------------------
 Who asks for work that is being done or kept shares it. A visitor may have `WAITING` pieces in their
 queue; the thread takes one from each queue in turn, so that nobody waits for the queue of another.
-Work that has not begun is dropped when all who asked for it have left. The results of the last
-`KEPT` pieces with a key are kept.
+When all who asked for a piece have left, it is dropped; if it has begun, it ends at its next
+`check_wanted`. A page that comes again for its result leaves for a while only. The results of the
+last `KEPT` pieces with a key are kept.
 """
 
 from __future__ import annotations
 
 import threading
+import time
 from collections import OrderedDict, deque
 from concurrent.futures import Future
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from daq.errors import HuddleError
@@ -30,20 +33,34 @@ class TooMuchWorkError(HuddleError):
     """A visitor asks for more work than may wait for them."""
 
 
+class LeftError(Exception):
+    """All who asked for the work have left; no fault, so none that work may pass over."""
+
+
+_OWN = threading.local()
+
+
+def check_wanted(*_: object) -> None:
+    """Raise LeftError in work that nobody waits for any more; takes what a `progress` receives."""
+    check: Callable[[], None] | None = getattr(_OWN, "check", None)
+    if check is not None:
+        check()
+
+
 class Piece:
-    """Work, its result, and how many wait for it."""
+    """Work, its result, how many wait for it, and until when others may come again."""
 
     def __init__(self, act: Callable[[], Any], visitor: str, key: Hashable) -> None:
         self.act, self.visitor, self.key = act, visitor, key
         self.future: Future[Any] = Future()
-        self.n_waiting = 0
+        self.n_waiting, self.until = 0, 0.0
 
 
 class Work:
     """One thread that works for all visitors in turn."""
 
-    def __init__(self, name: str) -> None:
-        self._name = name
+    def __init__(self, name: str, *, now: Callable[[], float] = time.monotonic) -> None:
+        self._name, self._now = name, now
         self._queues: OrderedDict[str, deque[Piece]] = OrderedDict()
         self._known: OrderedDict[Hashable, Piece] = OrderedDict()
         self._changed = threading.Lock()
@@ -70,6 +87,8 @@ class Work:
             piece = self._known.get(key)
             if piece is None or _has_failed(piece.future):
                 queue = self._queues.setdefault(visitor, deque())
+                for each in [each for each in queue if not self._is_wanted(each)]:
+                    self._drop(each, queue)
                 if len(queue) >= WAITING:
                     raise TooMuchWorkError(
                         f"{WAITING} pages wait to be made for you; try again in a moment"
@@ -88,17 +107,30 @@ class Work:
                     del self._known[known]
             return piece
 
-    def leave(self, piece: Piece) -> None:
-        """Drop work that nobody waits for any more, unless it has begun."""
+    def leave(self, piece: Piece, *, lease: float = 0.0) -> None:
+        """Drop work that nobody waits for any more; `lease`: seconds for which it is kept on."""
         with self._changed:
             piece.n_waiting -= 1
+            piece.until = max(piece.until, self._now() + lease)
             queue = self._queues.get(piece.visitor)
-            if piece.n_waiting <= 0 and queue is not None and piece in queue:
-                queue.remove(piece)
-                piece.future.cancel()
-                self._known.pop(piece.key, None)
+            if not self._is_wanted(piece) and queue is not None and piece in queue:
+                self._drop(piece, queue)
                 if not queue:
                     del self._queues[piece.visitor]
+
+    def _is_wanted(self, piece: Piece) -> bool:
+        return piece.n_waiting > 0 or piece.until > self._now()
+
+    def _drop(self, piece: Piece, queue: deque[Piece]) -> None:
+        queue.remove(piece)
+        piece.future.cancel()
+        self._known.pop(piece.key, None)
+
+    def _check(self, piece: Piece) -> None:
+        with self._changed:  # who asks from now on has it begun again
+            if not self._is_wanted(piece):
+                self._known.pop(piece.key, None)
+                raise LeftError
 
     def close(self) -> None:
         """Begin no further work."""
@@ -124,7 +156,9 @@ class Work:
         while (piece := self._next()) is not None:
             if not piece.future.set_running_or_notify_cancel():
                 continue
+            _OWN.check = partial(self._check, piece)
             try:
+                check_wanted()
                 piece.future.set_result(piece.act())
             except BaseException as error:  # noqa: BLE001 - whoever waits for it raises it
                 piece.future.set_exception(error)

@@ -11,13 +11,15 @@ import threading
 import time
 from contextlib import ExitStack
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, cast
 from urllib.parse import urlsplit
 
 import pytest
 from pydantic import ValidationError
 
 from daq.bench.tables.unattended import Web
+from daq.devices.bench_file import load
 from tests.tui.web.pages import READER, SECRETS, STEERER, Server, bench_file, serving
 from tests.tui.web.strangers import fuzzed
 from tests.waiting import limit, wait_until
@@ -25,11 +27,15 @@ from tui.certificate.ledger import Ledger
 from tui.web.access import Right, token_hash
 from tui.web.connections import HEAD, OF_ADDRESS, Connections
 from tui.web.server import Server as Pages
-from tui.web.work import WAITING, Piece, TooMuchWorkError, Work
+from tui.web.tests import Tests
+from tui.web.work import WAITING, LeftError, Piece, TooMuchWorkError, Work, check_wanted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
+
+    from tui.application.controls import Controls
+    from tui.application.state import State
 
 resource = pytest.importorskip("resource", reason="limits of descriptors")
 OPEN = {"/login"}
@@ -461,3 +467,53 @@ def test_work_that_nobody_waits_for_is_dropped_and_results_are_kept() -> None:
     busy.ask("c", "left")
     busy.finish(3)
     assert busy.done == ["running", "shared", "left"]
+
+
+def test_work_that_has_begun_ends_when_all_have_left_and_not_before() -> None:
+    clock = Clock()
+    work, begun, steps = Work("test", now=clock), threading.Event(), threading.Semaphore(0)
+
+    def act() -> None:
+        begun.set()
+        for _ in range(100):
+            steps.acquire(timeout=limit(60))
+            check_wanted()
+
+    piece = work.ask("a", "long", act)
+    assert work.ask("b", "long", act) is piece
+    begun.wait(limit(60))
+    work.leave(piece)
+    steps.release()  # b still waits
+    work.leave(piece, lease=60.0)
+    clock.now = 59.0  # its page may come again
+    steps.release()
+    again = work.ask("b", "next", lambda: "made")
+    wait_until(lambda: steps._value == 0, "the steps are taken")  # noqa: SLF001
+    assert not piece.future.done()
+    assert work.ask("b", "long", act) is piece
+    work.leave(piece)
+    clock.now = 61.0
+    steps.release()
+    assert isinstance(piece.future.exception(limit(60)), LeftError)
+    assert again.future.result(limit(60)) == "made"
+    assert work.ask("c", "long", lambda: None) is not piece
+
+
+def test_an_estimate_ends_when_its_visitor_has_left(tmp_path: Path) -> None:
+    bench = load(bench_file(tmp_path))
+    controls = cast("Controls", SimpleNamespace(folder=tmp_path / "recordings"))
+    tests, begun = Tests(controls, bench, lambda: None), threading.Event()
+    key = tests.key_of("night.h5")
+
+    def act() -> State:
+        begun.wait(limit(60))
+        return tests.estimate(key[0])
+
+    left, wanted = (tests.work.ask(visitor, number, act) for number, visitor in enumerate("ab"))
+    wait_until(lambda: len(tests.work._queues) == 1, "the first has begun")  # noqa: SLF001
+    tests.work.leave(left)
+    begun.set()
+    with pytest.raises(LeftError):
+        left.future.result(limit(60))
+    assert wanted.future.result(limit(60)).snapshot is not None
+    tests.close()
