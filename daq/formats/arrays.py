@@ -19,7 +19,7 @@ from daq.bench.units import canonical
 from daq.errors import ArrayError
 from daq.formats.foreign_sensor import NS_PER_S, ForeignSensor, Stretch, finite_stretches
 from daq.formats.memory import RecordingInMemory, SensorInMemory
-from daq.formats.readers.waveforms import stream_part
+from daq.formats.readers.waveforms import is_corrected, stream_part
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -317,6 +317,26 @@ def _of_traces(foreign: ForeignSensor, rate: object, channels: Sequence[str] | N
     return _Sensor(whole, sum(each.n_samples for each in whole.stretches), "", timed=True)
 
 
+def attached_responses(sensors: Any) -> dict[str, Any]:  # noqa: ANN401 - whatever it is
+    """Return the responses of ObsPy that traces carry, by sensor and channel.
+
+    Those of traces from which one was removed do not count.
+    """
+    given = (
+        {"": sensors} if _is_stream(sensors) else sensors if isinstance(sensors, Mapping) else {}
+    )
+    found = {}
+    for name, stream in given.items():
+        if not _is_stream(stream):
+            continue
+        for trace in [stream] if hasattr(stream, "stats") else stream:
+            stats = trace.stats
+            if stats.get("response") is not None and not is_corrected(stats):
+                (known,) = stream_part([trace], NAME).traces
+                found[f"{name or known.sensor}.{known.channel}"] = stats.response
+    return found
+
+
 def _check_together(given: Sequence[_Sensor]) -> None:
     """Refuse arrays that were not sampled together."""
     timed = [each.foreign.name for each in given if each.timed]
@@ -344,9 +364,10 @@ def _duration(given: _Sensor) -> float:
 def _in_memory(given: _Sensor, unit: str | None, responses: Responses | None) -> SensorInMemory:
     foreign = given.foreign
     own = foreign.calibrations or (None,) * len(foreign.channels)
+    units = foreign.units or (given.unit,) * len(foreign.channels)
     channels = []
-    for name, calibration in zip(foreign.channels, own, strict=True):
-        channel = Channel(name=name, sensitivity=1.0, unit=canonical(unit or given.unit or COUNTS))
+    for name, calibration, own_unit in zip(foreign.channels, own, units, strict=True):
+        channel = Channel(name=name, sensitivity=1.0, unit=canonical(unit or own_unit or COUNTS))
         if calibration is not None and not unit:
             channel = Channel(
                 name=name, sensitivity=calibration.sensitivity, unit=canonical(calibration.unit)

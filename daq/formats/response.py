@@ -1,5 +1,6 @@
-"""Instrument responses from RESP and StationXML, read by ObsPy, with all their stages.
+"""Instrument responses with all their stages: RESP and StationXML, read by ObsPy, and SACPZ.
 
+Objects of ObsPy and dictionaries of poles and zeros are taken as well.
 Each stage is scaled so that its size is its stated gain at the frequency of that gain. The rules
 are those of evalresp, see :func:`whole_response`; a file whose factor A0 evalresp would take
 against a stated gain that is more than 1 dB away is refused. A file may hold many channels and
@@ -11,11 +12,14 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -70,6 +74,8 @@ _NAMED = 8
 _REMARKS = {"name", "description", "resource_id", "resource_id2"}
 """Of stages: they do not change the response."""
 _HEAD = 1 << 16
+_POLES = re.compile(rb"^POLES\s+\d", re.MULTILINE)
+_SACPZ_COMMENT = re.compile(r"^\*\s*(?P<key>[A-Z][A-Z ]*?)\s*(?:\(\w*\))?\s*:(?P<value>.*)$")
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,9 +150,10 @@ class Responses:
 
     Parameters
     ----------
-    files : sequence of Path or Inventory
-        RESP or StationXML, folders of them, or inventories of ObsPy; each channel takes the
-        response of its own code.
+    files : sequence of Path, Inventory, Response or mapping
+        RESP, StationXML or SACPZ, folders of them, or inventories of ObsPy; each channel takes the
+        response of its own code. A Response of ObsPy, or a mapping of its ``poles``, ``zeros``,
+        ``gain`` and ``sensitivity``, is that of every channel.
     assigned : sequence of (str, Path or Inventory)
         Patterns of ``network.station.location.channel``, of a sensor or of a channel code, each
         with a file whose response those channels take whatever its code is. A sensor and a
@@ -161,8 +168,11 @@ class Responses:
     def __init__(
         self, files: Sequence[Path | Any], assigned: Sequence[tuple[str, Path | Any]] = ()
     ) -> None:
-        self._epochs = _read_all(files)
+        known = _read_all(files)
+        self._epochs = [each for each in known if each.channel]
         self._assigned = [(pattern, _read_all([path])) for pattern, path in assigned]
+        if len(self._epochs) < len(known):  # without codes: of every channel
+            self._assigned.append(("*", [each for each in known if not each.channel]))
         self._by_channel: dict[tuple[str, str], list[_Epoch]] = {}
         for each in self._epochs:
             self._by_channel.setdefault((each.sensor, each.channel), []).append(each)
@@ -278,7 +288,7 @@ def _contents_of(value: Any) -> Iterator[str]:  # noqa: ANN401 - ObsPy has no ty
 
 
 def is_response(path: Path) -> bool:
-    """Whether a file is RESP or StationXML."""
+    """Whether a file is RESP, StationXML or SACPZ."""
     return _format_of(path) is not None
 
 
@@ -288,6 +298,10 @@ def _read_all(paths: Sequence[Path | Any]) -> list[_Epoch]:
     for path in paths:
         if hasattr(path, "networks"):
             epochs = _epochs_of(path, Path("inventory"))
+        elif hasattr(path, "response_stages"):
+            epochs = [_epoch_of(Path("response"), path)] if path.response_stages else []
+        elif isinstance(path, Mapping):
+            epochs = [_of_dictionary(path)]
         elif path.is_dir():
             inside = (each for each in sorted(path.rglob("*")) if each.is_file())
             epochs = [
@@ -303,15 +317,17 @@ def _read_all(paths: Sequence[Path | Any]) -> list[_Epoch]:
 
 def _read(path: Path) -> list[_Epoch]:
     """Return the channel epochs of a file."""
-    obspy = load_obspy()
     if not path.is_file():
-        raise ImportFormatError(f"{path}: no such file; expected RESP or StationXML")
+        raise ImportFormatError(f"{path}: no such file; expected RESP, StationXML or SACPZ")
     kind = _format_of(path)
     if kind is None:
         raise ImportFormatError(
-            f"{path}: expected a RESP or StationXML file; it has neither the element"
-            " FDSNStationXML nor the field B050F03"
+            f"{path}: expected a RESP, StationXML or SACPZ file; it has neither the element"
+            " FDSNStationXML, nor the field B050F03, nor lines ZEROS, POLES and CONSTANT"
         )
+    if kind == "SACPZ":
+        return _sacpz(path)
+    obspy = load_obspy()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -354,7 +370,111 @@ def _format_of(path: Path) -> str | None:
         if b"<!DOCTYPE" in head or b"<!ENTITY" in head:
             raise ImportFormatError(f"{path}: it declares entities, which StationXML does not need")
         return "STATIONXML"
+    if _POLES.search(head):
+        return "SACPZ"
     return "RESP" if b"B050F03" in head else None
+
+
+@dataclass(frozen=True, slots=True)
+class PolesZerosResponseStage:
+    """A stage with the attributes of ObsPy's class, known without ObsPy: counts of a motion."""
+
+    input_units: str
+    zeros: tuple[complex, ...]
+    poles: tuple[complex, ...]
+    stage_gain: float
+    normalization_factor: float
+    stage_sequence_number: int = 1
+    output_units: str = "COUNTS"
+    stage_gain_frequency: float = 1.0
+    normalization_frequency: float = 1.0
+    pz_transfer_function_type: str = "LAPLACE (RADIANS/SECOND)"
+    decimation_input_sample_rate: None = None
+    decimation_factor: None = None
+
+    @classmethod
+    def of(
+        cls, unit: str, zeros: Iterable[complex], poles: Iterable[complex], constant: float
+    ) -> PolesZerosResponseStage:
+        """Return the stage of counts in a unit, ``constant`` times its zeros over its poles."""
+        found = tuple(map(complex, zeros)), tuple(map(complex, poles))
+        size = _size(AnalogPolesZeros(1.0, *found), 1.0)
+        if not np.isfinite(size) or size == 0:
+            raise ValueError("poles or zeros at 1 Hz, where the gain is taken; expected none")
+        return cls(unit, *found, stage_gain=constant * size, normalization_factor=1 / size)
+
+
+def _epoch_of(path: Path, response: Any, **known: Any) -> _Epoch:  # noqa: ANN401 - of ObsPy, or as its
+    """Return an epoch of a response alone; of every channel and time, if it is not `known`."""
+    raw = SimpleNamespace(response=response, azimuth=None, dip=None, sensor=None, sample_rate=None)
+    of = {"sensor": "", "channel": "", "start_ns": 0, "end_ns": _END_OF_TIME_NS, **known}
+    return _Epoch(path, raw=raw, **of)
+
+
+def _of_stage(stage: PolesZerosResponseStage) -> SimpleNamespace:
+    return SimpleNamespace(response_stages=[stage], instrument_sensitivity=None)
+
+
+def _of_dictionary(given: Mapping[str, Any]) -> _Epoch:
+    """Return poles and zeros as ``simulate`` of ObsPy takes them: in rad/s, of velocity."""
+    try:
+        constant = float(given["gain"]) * float(given["sensitivity"])
+        unit = str(given.get("input_units", "M/S"))
+        stage = PolesZerosResponseStage.of(unit, given["zeros"], given["poles"], constant)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ImportFormatError(
+            f"poles and zeros: {error}; expected the keys poles, zeros, gain (A0) and sensitivity,"
+            " and input_units where they are not of M/S"
+        ) from error
+    return _epoch_of(Path("poles and zeros"), _of_stage(stage))
+
+
+def _sacpz(path: Path) -> list[_Epoch]:
+    """Return the epochs of a SACPZ file; zeros at the origin may be left out of its lists."""
+    about: dict[str, str] = {}
+    lists: dict[str, list[complex]] = {"ZEROS": [], "POLES": []}
+    lengths, current, found = {"ZEROS": 0, "POLES": 0}, "", []
+    for number, line in enumerate(
+        path.read_text(encoding="utf-8", errors="replace").splitlines(), 1
+    ):
+        comment, words = _SACPZ_COMMENT.match(line), line.split()
+        try:
+            if comment:
+                about[comment["key"]] = comment["value"].strip()
+            elif not words or words[0].startswith("*"):
+                continue
+            elif words[0] in lists:
+                current = words[0]
+                lists[current], lengths[current] = [], int(words[1])
+            elif words[0] == "CONSTANT":
+                zeros, poles = ([*lists[k], *[0j] * (lengths[k] - len(lists[k]))] for k in lists)
+                unit = about.get("INPUT UNIT", "M")
+                stage = PolesZerosResponseStage.of(unit, zeros, poles, float(words[1]))
+                found.append(_epoch_of(path, _of_stage(stage), **_sacpz_codes(about)))
+                about = {}
+            else:
+                lists[current].append(complex(float(words[0]), float(words[1])))
+        except (KeyError, IndexError, ValueError) as error:
+            raise ImportFormatError(f"{path}: line {number}, {line!r}: {error}") from error
+    return found
+
+
+def _sacpz_codes(about: Mapping[str, str]) -> dict[str, Any]:
+    """Return sensor, channel and span of time of the comments of a SACPZ file."""
+    if not about.get("CHANNEL"):
+        return {}
+    codes = [about.get(key, "") for key in ("NETWORK", "STATION", "LOCATION")]
+    span = []
+    for key, otherwise in (("START", 0), ("END", _END_OF_TIME_NS)):
+        at = datetime.fromisoformat(about[key]) if about.get(key) else None
+        ns = otherwise if at is None else int(at.replace(tzinfo=UTC).timestamp()) * 10**9
+        span.append(min(ns, _END_OF_TIME_NS))
+    return {
+        "sensor": ".".join(code for code in codes if code.strip("-? ")),
+        "channel": about["CHANNEL"],
+        "start_ns": span[0],
+        "end_ns": span[1],
+    }
 
 
 def _in_order(epochs: Iterable[_Epoch]) -> list[_Epoch]:

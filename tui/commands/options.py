@@ -52,8 +52,8 @@ ResponseOption: TypeAlias = Annotated[
     _of_files(
         "--response",
         "FILE",
-        "Instrument responses: RESP or StationXML files, or folders of them; repeatable. Each"
-        " channel takes the response of its code and date.",
+        "Instrument responses: RESP, StationXML or SACPZ files, or folders of them; repeatable."
+        " Each channel takes the response of its code and date.",
     ),
 ]
 ResponseForOption: TypeAlias = Annotated[

@@ -13,7 +13,7 @@ from daq.bench.units import is_motion
 from daq.errors import ArrayError, WrongSettingError
 from daq.estimation.estimation import Estimation
 from daq.estimation.settings import Settings, check_fit
-from daq.formats.arrays import COUNTS, recording_of_arrays
+from daq.formats.arrays import COUNTS, attached_responses, recording_of_arrays
 from daq.formats.memory import RecordingInMemory
 from daq.recording.reader import Recording
 from tui.notebook.options import EstimateOptions, Time, called, moment, settings_of
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 PathLike: TypeAlias = "str | os.PathLike[str]"
 Response: TypeAlias = "PathLike | Any"
-"""A file or folder of responses, or an Inventory of ObsPy."""
+"""A file or folder of responses, an Inventory or Response of ObsPy, or poles and zeros."""
 """Sensors that a method takes; three if it is not named here."""
 
 
@@ -63,10 +63,14 @@ def self_noise(
     channels : sequence of str, optional
         Names of the channels, the same for every sensor, as in ``"XYZ"``.
     sample_unit : str, optional
-        Unit of the samples. Where not given: what DataArrays and Streams say, else counts.
-    response : path, Inventory, sequence or mapping of them, optional
-        Responses that turn counts into motion: RESP or StationXML files, folders of them, or
-        inventories of ObsPy, each for the channels of its codes; or, in a mapping, for those whose
+        Unit of the samples. Where not given: what DataArrays and Streams say (of a Stream, what
+        ``remove_response`` left), else counts.
+    response : path, Inventory, Response, sequence or mapping of them, optional
+        Responses that turn counts into motion: RESP, StationXML or SACPZ files, folders of them, or
+        inventories of ObsPy, each for the channels of its codes; a Response of ObsPy, or its
+        dictionary of poles, zeros, gain and sensitivity (of velocity, unless ``input_units`` says
+        other), for all. By default those attached to the traces of a Stream. In a mapping, each is
+        for the channels whose
         ``network.station.location.channel``, sensor or channel fits a pattern. A sensor and its
         digitizer may be two.
     **options
@@ -104,6 +108,8 @@ def self_noise(
     (201,)
     """
     settings = settings_of(Settings(), options)
+    if response is None and sample_unit is None:
+        response = attached_responses(sensors) or None
     if response is not None and sample_unit is not None:
         raise ArrayError(
             f"sample_unit={sample_unit!r} and a response: samples with a unit have no response;"
@@ -265,7 +271,7 @@ def response_sources(given: object) -> tuple[list[Any], list[tuple[str, Any]]]:
     """Return responses for the channels of their codes, and those with patterns."""
     if given is None:
         return [], []
-    if isinstance(given, dict):
+    if isinstance(given, dict) and "poles" not in given:
         return [], [(name, each) for name, value in given.items() for each in _sources(value)]
     return _sources(given), []
 

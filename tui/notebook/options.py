@@ -98,11 +98,13 @@ _SAMPLING_RATES = frozenset({"sampling_rate", "sample_rate", "sampling_frequency
 
 
 def _known(key: str) -> str:
-    known = (*table_keys(), "start", "end")
-    if key in table_keys():
+    known = table_keys()
+    if key in known:
         return key
     close = difflib.get_close_matches(key, known, n=1)
     hint = f" (did you mean {close[0]!r}?)" if close else ""
+    if key in {"start", "end"}:
+        hint = " (of recordings: huddle.estimate has it; cut samples that are in memory)"
     if key in _SAMPLING_RATES:
         hint = " (the sampling rate of arrays is fs)"
     raise WrongSettingError(f"option {key!r}: expected one of {', '.join(known)}{hint}")

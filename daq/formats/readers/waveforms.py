@@ -11,6 +11,7 @@ from __future__ import annotations
 import glob
 import io
 import math
+import re
 import warnings
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -157,11 +158,34 @@ def _traces(stream: Stream, fallback: str, *, numbered: bool) -> list[Trace]:
                 start_ns=int(stats.starttime.ns),
                 sampling_rate=float(stats.sampling_rate),
                 samples=np.asarray(trace.data),
+                unit=_unit(stats),
                 fdsn=bool(codes) and not numbered,
                 calibration=_calibration(stats),
             )
         )
     return found
+
+
+_DERIVATIVES = {"'DISP'": 0, "'VEL'": 1, "'ACC'": 2}
+_CORRECTIONS = ("remove_response(", "remove_sensitivity(", "simulate(")
+
+
+def is_corrected(stats: Any) -> bool:  # noqa: ANN401 - ObsPy has no types
+    """Tell whether ObsPy has taken a response out of a trace."""
+    done = stats.get("processing", ())
+    return any(correction in step for step in done for correction in _CORRECTIONS)
+
+
+def _unit(stats: Any) -> str:  # noqa: ANN401 - ObsPy has no types
+    """Return the unit that a trace has since its response was removed, as ObsPy notes; or none."""
+    found: int | None = None
+    for step in stats.get("processing", ()):
+        if "remove_response(" in step:
+            output = re.search(r"output=('\w+')", step)
+            found = _DERIVATIVES.get(output[1] if output else "")
+        elif found is not None:
+            found += ("differentiate(" in step) - ("integrate(" in step)
+    return {0: "m", 1: "m/s", 2: "m/s²"}.get(-1 if found is None else found, "")
 
 
 def _calibration(stats: Any) -> Calibration | None:  # noqa: ANN401 - ObsPy has no types

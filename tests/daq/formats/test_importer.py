@@ -182,7 +182,7 @@ def test_what_does_not_fit_is_said_and_leaves_no_file(tmp_path: Path) -> None:
         import_files([tmp_path / "b.npz", tmp_path / "c.npz"], out)
     with pytest.raises(ImportFormatError, match="no such file"):
         import_files([tmp_path / "d.npz"], out)
-    with pytest.raises(ImportFormatError, match="expected a RESP or StationXML"):
+    with pytest.raises(ImportFormatError, match="expected a RESP, StationXML"):
         import_files([tmp_path / "a.npz"], out, response=tmp_path / "a.npz")
     assert not out.exists()
     import_files([tmp_path / "a.npz"], out)
