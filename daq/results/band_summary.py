@@ -288,6 +288,11 @@ class Estimate:
         """The band of the tables, in Hz: `band_of`."""
         return band_of(self.settings, self.snapshot)
 
+    @property
+    def concern(self) -> tuple[float, float] | None:
+        """Frequencies in Hz that matter to who asks: the band asked for; None for all."""
+        return self.settings.band
+
     @cached_property
     def method(self) -> str:
         """The method that judges, also where it gives no result: `judged_method`."""

@@ -117,11 +117,11 @@ _LIKE_A_CLOCK = Delay | Gain | ModelMisfit | NoSharedMotion
 _TURN = 0.3  # rad at the highest frequency: 9 % of the motion is taken for noise there
 
 
-def facts_of(estimate: Estimate) -> tuple[Fact, ...]:
-    """Return all facts of an estimate, the worst rank first; not those of its verdict."""
+def facts_of(estimate: Estimate) -> list[Fact]:
+    """Return all facts of an estimate; not those of its verdict."""
     snapshot = estimate.snapshot
-    found = [
-        *_findings(snapshot),
+    return [
+        *_findings(snapshot, estimate.concern),
         *_recording(snapshot),
         *_segments(snapshot),
         *_channels(snapshot),
@@ -132,20 +132,31 @@ def facts_of(estimate: Estimate) -> tuple[Fact, ...]:
         *_methods(snapshot),
         *_precision(estimate),
     ]
-    return ranked(found)
 
 
-def ranked(facts: Iterable[Fact]) -> tuple[Fact, ...]:
-    """Return facts by their rank, the worst first."""
-    ranks = list(Rank)
-    return tuple(sorted(facts, key=lambda fact: ranks.index(fact.rank)))
+def ranked(facts: Iterable[Fact], estimate: Estimate) -> tuple[Fact, ...]:
+    """Return facts that concern the band asked for by their rank, the worst first; then others."""
+    ranks, asked = list(Rank), estimate.concern
+    return tuple(
+        sorted(facts, key=lambda fact: (is_outside(fact.band, asked), ranks.index(fact.rank)))
+    )
 
 
-def _findings(snapshot: Snapshot) -> Iterator[Fact]:
-    """Yield the findings of the diagnosis, those of one kind together."""
-    kinds: dict[type[Advice], list[Advice]] = {}
+def is_outside(band: tuple[float, float] | None, asked: tuple[float, float] | None) -> bool:
+    """Return whether a band has nothing in common with the one asked for."""
+    if band is None or asked is None:
+        return False
+    return band[1] < asked[0] or asked[1] < band[0]
+
+
+def _findings(snapshot: Snapshot, asked: tuple[float, float] | None) -> Iterator[Fact]:
+    """Yield the findings of the diagnosis, those of one kind together.
+
+    Those outside of the band asked for go by themselves: they must not hide what is inside.
+    """
+    kinds: dict[tuple[type[Advice], bool], list[Advice]] = {}
     for each in snapshot.diagnostics.advice:
-        kinds.setdefault(type(each), []).append(each)
+        kinds.setdefault((type(each), is_outside(each.band, asked)), []).append(each)
     ranks, names = list(Rank), snapshot.sensor_names
     for found in kinds.values():
         concerned = sorted({sensor for each in found for sensor in each.sensors})
@@ -458,11 +469,19 @@ def _model(snapshot: Snapshot) -> Iterator[Fact]:
         )
 
 
+def _is_young(snapshot: Snapshot) -> bool:
+    """Return whether a test that goes on lacks nothing but averages yet: nothing is wrong."""
+    why = snapshot.diagnostics.untested
+    return why is Untested.UNFINISHED or (
+        not snapshot.closed and why in {Untested.NO_SEGMENTS, Untested.TOO_FEW_AVERAGES}
+    )
+
+
 def _untested(snapshot: Snapshot, why: Untested) -> ModelUntested:
     """Return why the model was not tested."""
     found = snapshot.diagnostics.diagnosis
     return ModelUntested(
-        rank=Rank.TO_KNOW if why is Untested.UNFINISHED else Rank.DELAYS,
+        rank=Rank.TO_KNOW if _is_young(snapshot) else Rank.DELAYS,
         why=why,
         n_effective=snapshot.n_effective,
         n_channels=len(snapshot.channels),
@@ -537,6 +556,8 @@ def _methods(snapshot: Snapshot) -> Iterator[Fact]:
             yield ValuesBelowZero(rank=Rank.TO_KNOW, method=method, n=n, n_values=values.size)
     grows = not snapshot.closed  # it may come yet
     rank = Rank.DELAYS if snapshot.results or grows else Rank.INVALIDATES
+    if grows and _is_young(snapshot):
+        rank = Rank.TO_KNOW
     for method, reason in snapshot.refused.items():
         yield MethodRefused(rank=rank, method=method, reason=reason)
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from daq.results.band_summary import Estimate
 from daq.results.clock_effect import effect_by_sensor
 from daq.results.decision.end import remaining
-from daq.results.known_facts import facts_of, facts_of_verdict, ranked
+from daq.results.known_facts import facts_of, facts_of_verdict, is_outside, ranked
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -67,15 +67,28 @@ class Result(Estimate):
         return judge(self.bench, self)
 
     @cached_property
+    def concern(self) -> tuple[float, float] | None:
+        """The band asked for, widened to all that limits judge."""
+        asked = self.settings.band
+        if asked is None or self.bench is None or not self.bench.limits:
+            return asked
+        points = [each.mask.frequency for each in self.bench.limits]
+        return min([asked[0], *(e[0] for e in points)]), max([asked[1], *(e[-1] for e in points)])
+
+    @cached_property
     def facts(self) -> tuple[Fact, ...]:
         """What is known beside the numbers, the worst rank first; not those of the verdict."""
-        return facts_of(self)
+        return ranked(facts_of(self), self)
 
     @cached_property
     def all_facts(self) -> tuple[Fact, ...]:
         """With those of the verdict."""
         found = self.verdict
-        return ranked([*self.facts, *(() if found is None else facts_of_verdict(found))])
+        return ranked([*self.facts, *(() if found is None else facts_of_verdict(found))], self)
+
+    def is_outside(self, fact: Fact) -> bool:
+        """Return whether all that a fact concerns is outside of what matters here."""
+        return is_outside(fact.band, self.concern)
 
     @cached_property
     def clock_effects(self) -> dict[str, float]:

@@ -137,7 +137,7 @@ def drive(session: Session) -> None:
         "`s`, then a note, and `decided`: the test ends when every limit is passed or failed.",
     )
     session.press("\r")
-    session.see("power spectral density", "known to", "● recording")
+    session.see("power spectral density", "c.o.v.", "● recording")
     session.keep("The test runs", "The first curves, and a verdict that is not decided yet.")
     session.see("disconnected")
     session.keep("A cable is pulled", "The recorder goes on with the other two sensors.")

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 HINTS = {
     "operator": "Who does the test. It stands in the recording and in the report.",
     "note": "What is special about this test. Recorded as a mark at its start.",
-    "end": "3h: after this time · 5 %: when the noise is known to 5 % · decided: when the limits"
+    "end": "3h: after this time · 5 %: when the c.o.v. is 5 % · decided: when the limits"
     " are · several: the first of them · empty: x stops it. The recorder sees to it: this"
     " application may be closed.",
 }

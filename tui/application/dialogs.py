@@ -29,7 +29,7 @@ WORDS = (
     ("data", "what the channel recorded: motion and noise (grey)"),
     ("noise", "the channel's own noise (colour), ± its 95 % interval (whisker)"),
     ("▾", "the estimate came out below zero there: its upper bound, or floor"),
-    ("known to", "c.o.v. in the worst third of an octave, worst channel"),
+    ("c.o.v.", "scatter of the noise in the worst third of an octave, worst channel"),
     ("wanted", "the scatter to reach: the bench file's target_cov"),
     ("segment", "a piece of the recording; more of them make the noise more certain"),
     ("excluded", "segments with a gap, clipping or a transient"),

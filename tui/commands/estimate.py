@@ -157,14 +157,19 @@ def show_result(
 ) -> None:
     """Print the table, and write JSON and CSV if requested."""
     from daq.results.noise_parameters import quantisation_shares
+    from estimator.decision.verdict import Verdict
     from tui.output.console import STANDARD_OUTPUT, for_people, write_json, write_text
     from tui.output.diagnosis import details
     from tui.output.noise_parameters import quantisation_notes
     from tui.output.results import averages_line, curves_csv, result_table, result_title
-    from tui.wording.facts import brief, known
+    from tui.wording.facts import NOTHING_TO_DO, brief, known
+    from tui.wording.verdict_text import STYLES, Decision, limit_line
 
     snapshot, screen = result.snapshot, for_people(json, csv)
     table = result_table(result)  # refuses a band without frequencies
+    decision = None if result.verdict is None else Decision.of(result.verdict)
+    if decision is not None:
+        screen.print(str(decision), style=STYLES[decision.state])
     screen.print(result_title(result))
     screen.print(averages_line(snapshot))
     screen.print(table)
@@ -173,8 +178,14 @@ def show_result(
     if parameters is not None:
         _show_parameters(screen, parameters, snapshot.unit)
     facts = known(result)
-    for part in details(snapshot, facts) if diagnostics else brief(facts):
+    is_open = decision is not None and decision.next_step != NOTHING_TO_DO
+    for part in details(snapshot, facts) if diagnostics else brief(facts, is_open=is_open):
         screen.print(part)
+    for each in () if result.verdict is None else result.verdict.limits:
+        if each.verdict is not Verdict.PASS:
+            screen.print(limit_line(each), style=STYLES[each.verdict].removeprefix("bold "))
+    for line in () if decision is None else decision.remarks:
+        screen.print(line)
     if json is not None:
         from tui.output.json_document import document
 
@@ -186,20 +197,6 @@ def show_result(
             from tui.output.json_document import provenance
 
             write_metadata(Path(csv), provenance(result))
-    if result.verdict is not None:
-        _show_verdict(screen, result.verdict)
-
-
-def _show_verdict(screen: Console, found: TestVerdict) -> None:
-    from estimator.decision.verdict import Verdict
-    from tui.wording.verdict_text import STYLES, headline, limit_line, not_judged, what_to_do
-
-    for each in found.limits:
-        if each.verdict is not Verdict.PASS:
-            screen.print(limit_line(each), style=STYLES[each.verdict].removeprefix("bold "))
-    screen.print(headline(found), style=STYLES[found.verdict])
-    for line in (*what_to_do(found), *not_judged(found)):
-        screen.print(line)
 
 
 def _show_parameters(screen: Console, found: Sequence[ChannelNoise], unit: str) -> None:

@@ -55,7 +55,7 @@ def record(
             "--until",
             metavar="CONDITION",
             help="Stop by the live estimate: 'decided' once all limits are decided, '5 %' once the"
-            " noise in the worst third of an octave of the band is known to 5 %, or both,"
+            " noise in the worst third of an octave of the band has a c.o.v. of 5 %, or both,"
             " separated by a comma: the first of them.",
         ),
     ] = "",

@@ -11,10 +11,12 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from estimator.decision.verdict import Verdict
 from estimator.errors import BandError
 from tui.output.results import averages_line, result_table, result_title
 from tui.wording.facts import brief, known
 from tui.wording.formatting import level, level_with_error
+from tui.wording.verdict_text import Decision
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -32,14 +34,22 @@ def text(result: Result) -> str:
     """Return the table that ``huddle estimate`` prints, and where the advice is."""
     try:
         parts: list[RenderableType] = [
+            *(Text(line) for line in _decision(result)),
             result_title(result),
             Text(averages_line(result.snapshot)),
             result_table(result),
         ]
     except BandError as error:
         return rendered([Text(f"Self-noise: {error}"), Text(averages_line(result.snapshot))])
-    parts += map(Text, brief(known(result), "print(*result.facts, sep='\\n')"))
+    is_open = result.verdict is not None and result.verdict.verdict is not Verdict.PASS
+    more = "print(*result.facts, sep='\\n')"
+    parts += map(Text, brief(known(result), more, is_open=is_open))
     return rendered(parts)
+
+
+def _decision(result: Result) -> list[str]:
+    """Return the first line of a test with limits."""
+    return [] if result.verdict is None else [str(Decision.of(result.verdict))]
 
 
 def html(result: Result) -> str:
@@ -59,8 +69,9 @@ def html(result: Result) -> str:
     body = "".join(f"<tr>{row}</tr>" for row in rows)
     lines = (averages_line(result.snapshot), *(each.line for each in known(result)))
     below = "".join(f"<p>{escape(line)}</p>" for line in lines)
+    above = "".join(f"<p>{escape(line)}</p>" for line in _decision(result))
     return (
-        f"<table><caption>{escape(title.plain)}</caption><thead><tr>{header}</tr></thead>"
+        f"{above}<table><caption>{escape(title.plain)}</caption><thead><tr>{header}</tr></thead>"
         f"<tbody>{body}</tbody></table>{below}"
     )
 

@@ -47,7 +47,7 @@ def details(snapshot: Snapshot, facts: Sequence[Known]) -> list[RenderableType]:
     """Return the diagnosis of every band and pair of sensors, and all facts in full."""
     found = snapshot.diagnostics.diagnosis
     listed_facts: list[RenderableType] = [
-        Text(f"{RANKS[fact.rank]}: {words}") for fact, words in facts
+        Text(f"{RANKS[each.fact.rank]}: {each}") for each in facts
     ]
     if found is None:
         return listed_facts

@@ -314,7 +314,7 @@ def facts_document(facts: Sequence[Known]) -> list[dict[str, Any]]:
             "explanation": words.explanation,
             "action": words.action or None,
         }
-        for fact, words in facts
+        for fact, words, _ in facts
     ]
 
 

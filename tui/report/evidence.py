@@ -275,8 +275,8 @@ def facts_section(facts: Sequence[Known]) -> Section:
     """Return what is known of the test beyond its numbers, the worst first."""
     items = tuple(
         Paragraph(
-            f"{MARKS[each.fact.rank]} {each}" if each.needs_action else str(each),
-            TONES[each.fact.rank],
+            f"{each.mark} {each}" if each.needs_action else str(each),
+            TONES[each.fact.rank] if each.needs_action else "plain",
         )
         for each in facts
     )
@@ -292,7 +292,7 @@ def facts_section(facts: Sequence[Known]) -> Section:
 def invalidating(facts: Sequence[Known]) -> tuple[Paragraph, ...]:
     """Return the lines of facts that invalidate the result, for the first page."""
     return tuple(
-        Paragraph(each.line, TONES[each.fact.rank])
+        Paragraph(each.line, TONES[each.fact.rank] if each.needs_action else "doubtful")
         for each in facts
         if each.fact.rank is Rank.INVALIDATES
     )

@@ -23,7 +23,7 @@ from tui.wording.formatting import (
     scientific,
     span,
 )
-from tui.wording.verdict_text import WORDS, headline, margin, not_judged, what_to_do
+from tui.wording.verdict_text import WORDS, Decision, margin
 from tui.wording.vocabulary import FLAG_WORDS, PARTNER_WORDS
 
 if TYPE_CHECKING:
@@ -59,8 +59,8 @@ def verdict(found: TestVerdict | None) -> Paragraph:
     """Return what it all comes to, in a sentence or two."""
     if found is None:
         return Paragraph("No verdict: the bench file has no limits.", "quiet")
-    text = " ".join([headline(found), *what_to_do(found), *not_judged(found)])
-    return Paragraph(text, _TONES[found.verdict])
+    decision = Decision.of(found)
+    return Paragraph(" ".join([str(decision), *decision.remarks]), _TONES[found.verdict])
 
 
 def limits_section(

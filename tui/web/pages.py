@@ -13,7 +13,7 @@ from tui.application.test_view.channels import channel_table
 from tui.web.chart import choice_of
 from tui.web.live import WIDE, band_means, of_band
 from tui.wording.facts import MARKS, NOTHING_TO_DO, known
-from tui.wording.verdict_text import headline, limit_line, not_judged, what_to_do
+from tui.wording.verdict_text import Decision, limit_line
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -27,14 +27,15 @@ def about_test(state: State, settings_table: Mapping[str, Any]) -> dict[str, Any
     if result is None:
         raise ValueError("not estimated")
     snapshot, verdict = result.snapshot, result.verdict
+    decision = None if verdict is None else Decision.of(verdict)
     has_noise = bool(snapshot.results) and snapshot.n_segments > 0
     differences = None if state.reference is None else _differences(state)
     return {
         "title": state.name,
         "is_simulated": state.is_simulated,
         "verdict": verdict,
-        "headline": "" if verdict is None else headline(verdict),
-        "todo": [] if verdict is None else [*what_to_do(verdict), *not_judged(verdict)],
+        "headline": "" if decision is None else str(decision),
+        "todo": [] if decision is None else decision.remarks,
         "refused": [f"{method}: {why}" for method, why in snapshot.refused.items()],
         "noise": channel_table(state, choice_of(state, {}), means=band_means(result), width=WIDE)
         if has_noise

@@ -102,6 +102,8 @@ MOST_LINES = 3
 """Below a table."""
 SIMULATED = "Simulated sensors: the noise is that of a model, not of instruments."
 NOTHING_TO_DO = "Nothing to do."
+OUTSIDE = "Outside your band: "
+"""Before a fact that does not concern the band asked for."""
 _NO_NAMES = Names((), (), ())
 """For facts that have names themselves."""
 _MOST_FILES = 8
@@ -147,25 +149,32 @@ class Known(NamedTuple):
 
     fact: Fact
     words: Wording
+    is_outside: bool = False
+    """Whether all that it concerns is outside of the band asked for."""
 
     @property
     def needs_action(self) -> bool:
-        """Whether the result is wrong or delayed."""
-        return self.fact.rank is not Rank.TO_KNOW
+        """Whether the result is wrong or delayed in the band asked for."""
+        return self.fact.rank is not Rank.TO_KNOW and not self.is_outside
+
+    @property
+    def mark(self) -> str:
+        """The mark of its rank."""
+        return MARKS[Rank.TO_KNOW if self.is_outside else self.fact.rank]
 
     @property
     def line(self) -> str:
         """The line behind the mark of its rank."""
-        return f"{MARKS[self.fact.rank]} {self.words.line}"
+        return f"{self.mark} {OUTSIDE if self.is_outside else ''}{self.words.line}"
 
     def __str__(self) -> str:
-        return str(self.words)
+        return f"{OUTSIDE if self.is_outside else ''}{self.words}"
 
 
 def known(result: Result, *, with_verdict: bool = False) -> tuple[Known, ...]:
     """Return all facts of an estimate with their words, the worst rank first."""
-    facts = result.all_facts if with_verdict else result.facts
-    return tuple(worded(facts, Names.of(result.snapshot)))
+    facts, names = result.all_facts if with_verdict else result.facts, Names.of(result.snapshot)
+    return tuple(Known(fact, word(fact, names), result.is_outside(fact)) for fact in facts)
 
 
 def worded(facts: Iterable[Fact], names: Names = _NO_NAMES) -> list[Known]:
@@ -191,7 +200,9 @@ def why_no_estimate(result: Result) -> str:
     return " ".join(str(word(fact, names)) for fact in found)
 
 
-def brief(facts: Sequence[Known], more: str = "--details shows all") -> list[str]:
+def brief(
+    facts: Sequence[Known], more: str = "--details shows all", *, is_open: bool = False
+) -> list[str]:
     """Return at most three lines: the worst facts, and how many more there are.
 
     Parameters
@@ -200,17 +211,17 @@ def brief(facts: Sequence[Known], more: str = "--details shows all") -> list[str
         Worst rank first.
     more : str
         How to see all facts.
+    is_open : bool
+        Whether something is to be done beside the facts: the limits are not decided, or not met.
     """
     needed = [each for each in facts if each.needs_action]
     shown = needed if len(needed) <= MOST_LINES and len(needed) == len(facts) else needed[:2]
     lines = [each.line for each in shown]
-    left = len(facts) - len(shown)
-    rest = (
-        f"{several(left, 'more fact', 'more facts') if lines else several(left, 'fact')}: {more}"
-        if left
-        else ""
-    )
-    if not needed:
+    left, outside = len(facts) - len(shown), sum(each.is_outside for each in facts)
+    count = several(left, "more fact", "more facts") if lines else several(left, "fact")
+    count += f" ({outside} outside your band)" if outside else ""
+    rest = f"{count}: {more}" if left else ""
+    if not needed and not is_open:
         return [f"{NOTHING_TO_DO} {rest}".rstrip()]
     return [*lines, f"{MARKS[Rank.TO_KNOW]} {rest}"] if rest else lines
 
@@ -848,7 +859,7 @@ def _widened(fact: IntervalsWidened, names: Names) -> Wording:
 @word.register(TargetMissed)
 def _target(fact: TargetMissed, names: Names) -> Wording:
     del names
-    text = f"The noise is known to {percent(fact.cov)}, wanted {percent(fact.target)}"
+    text = f"The c.o.v. of the noise is {percent(fact.cov)}, wanted {percent(fact.target)}"
     if fact.total is None:
         return Wording(f"{text}: record longer", f"{text}.", "Record longer.")
     long = roughly(fact.total)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from daq.results.decision.end import Goal
 from daq.results.facts import LimitUndecided, WrongSensitivity
 from estimator.decision.verdict import REMOVED_BY_TIME, Verdict
-from tui.wording.facts import known_of_verdict
+from tui.wording.facts import NOTHING_TO_DO, known_of_verdict
 from tui.wording.formatting import level, listed, percent, roughly, several, signed
 
 if TYPE_CHECKING:
@@ -29,6 +30,10 @@ STYLES: Mapping[Verdict, str] = {
     Verdict.NOT_DECIDED: "bold yellow",
 }
 MARKS: Mapping[Verdict, str] = {Verdict.PASS: "✓", Verdict.FAIL: "✗", Verdict.NOT_DECIDED: "?"}
+YOUNG = "#9aa5b8"
+"""Style of a test that only lacks time: nothing is wrong."""
+REPAIR = "Repair or replace these sensors, or correct the limit."
+"""After a limit that is not met."""
 TOO_EARLY: Mapping[Goal, str] = {
     Goal.DECISION: "too early to decide",
     Goal.PRECISION: "too early for the precision that is wanted",
@@ -36,6 +41,44 @@ TOO_EARLY: Mapping[Goal, str] = {
 """What a planned end is."""
 _NEXT_DAYS = 12 * 3600.0
 """Seconds from which the day of a moment is named."""
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What a test comes to, in words: the first line of every output of a test with limits.
+
+    Attributes
+    ----------
+    state : Verdict
+    reason, next_step : str
+        In sentences; every state has a next step.
+    remarks : tuple of str
+        What else keeps the test from a decision, and where limits are not judged, a line each.
+    """
+
+    state: Verdict
+    reason: str
+    next_step: str
+    remarks: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{self.reason} {self.next_step}"
+
+    @classmethod
+    def of(cls, found: TestVerdict) -> Decision:
+        """Return the decision on limits: the next step is the one that decides."""
+        steps = what_to_do(found)
+        if record_for(found):  # by time alone: nothing else is missing
+            steps = [steps[-1], *steps[:-1]]
+        usual = NOTHING_TO_DO if found.verdict is Verdict.PASS else REPAIR
+        remarks = (*steps[1:], *not_judged(found))
+        return cls(found.verdict, headline(found), steps[0] if steps else usual, remarks)
+
+
+def style_of(found: TestVerdict, *, grows: bool) -> str:
+    """Return the style of a verdict: nothing is wrong while a test that grows lacks only time."""
+    is_young = grows and REMOVED_BY_TIME.issuperset(found.obstacles or [None])
+    return YOUNG if is_young else STYLES[found.verdict]
 
 
 def headline(found: TestVerdict) -> str:
@@ -56,7 +99,8 @@ def _headline(found: TestVerdict) -> str:
         if not undecided:
             return f"{word}: whether the channels are below {names} cannot be said."
         who = f"{len(undecided)} of {several(n_channels, 'channel')}"
-        return f"{word}: whether {who} are below {names} cannot be said yet."
+        are = "is" if len(undecided) == 1 else "are"
+        return f"{word}: whether {who} {are} below {names} cannot be said yet."
     failing = _channels(found.having(Verdict.FAIL))
     text = (
         f"{word}: {len(failing)} of {several(n_channels, 'channel')} above {names}: "
@@ -139,14 +183,16 @@ def how_long(left: Remaining, ends: datetime | None) -> str:
     if left.goal is Goal.END:
         why = "" if left.short_of is None else f": {TOO_EARLY[left.short_of]}"
         return f"Records {moment(seconds, ends)}{why}{_slowest(found) if why else ''}."
-    known = "" if left.target is None else f" to {percent(left.target)}"
+    known = "" if left.target is None else f" {percent(left.target)} or less"
     is_decision = left.goal is Goal.DECISION
     if seconds == 0:
-        reached = "limits are decided" if is_decision else f"noise is known{known}"
+        if is_decision and found is not None and found.verdict is Verdict.NOT_DECIDED:
+            return "Record on: the next estimates may decide."
+        reached = "limits are decided" if is_decision else f"c.o.v. is{known}"
         return f"Enough is recorded: the {reached}."
     is_close = found is None or found.prediction is None or found.prediction.is_close
     about = "" if is_close or not is_decision else "about "
-    then = f"decides{_slowest(found)}" if is_decision else f"makes the noise known{known}"
+    then = f"decides{_slowest(found)}" if is_decision else f"makes the c.o.v.{known}"
     return f"Record {moment(seconds, ends, about)}: that {then}."
 
 

@@ -117,12 +117,12 @@ async def test_frozen_curves_stay_while_the_test_goes_on(told: ProgressCallback)
         await shown(pilot, app, *running())
         await pilot.press("f")
         await shown(pilot, app)
-        assert "known to 46 %" in screen_text(app)
+        assert "c.o.v. 46 %" in screen_text(app)
         curves = screen_text(app).splitlines()[2:15]
         await shown(pilot, app, *running(n_effective=5000.0))
         text = screen_text(app)
         assert "frozen at 1:40" in text
-        assert "known to 6.4 %" in text
+        assert "c.o.v. 6.4 %" in text
         assert text.splitlines()[2:15] == curves
         await pilot.press("f")
         await shown(pilot, app)

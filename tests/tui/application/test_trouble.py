@@ -155,7 +155,7 @@ async def test_the_target_is_judged_by_the_chosen_method_whatever_curve_is_shown
             await pilot.press("e")
             await shown(pilot, app)
             text = screen_text(app)
-            assert "known to 46 %" in text
+            assert "c.o.v. 46 %" in text
             assert "target reached" not in text
         assert view(app).choice.methods != ("three-sensor",)
 

@@ -141,7 +141,7 @@ async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]
         assert reading.is_over.wait(limit())
         await assert_looks_as_before(pilot, f"{name}-running")
         text = screen_text(app)
-        for said in ("1:40  FAIL", "known to 46 %", "C has been silent", "X −119.9"):
+        for said in ("1:40  FAIL", "c.o.v. 46 %", "C has been silent", "X −119.9"):
             assert said in text
         await shown(pilot, app, *ended())
         await assert_looks_as_before(pilot, f"{name}-result")

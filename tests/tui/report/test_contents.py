@@ -55,7 +55,7 @@ def test_noise_is_that_of_the_estimate(reported: Reported) -> None:
 @pytest.mark.usefixtures("empty_figures")
 def test_limits_are_judged_with_their_margin(reported: Reported, tmp_path: Path) -> None:
     text = reported.report.verdict.text
-    assert text.startswith("NOT DECIDED: whether 1 of 8 channels are below data sheet")
+    assert text.startswith("NOT DECIDED: whether 1 of 8 channels is below data sheet")
     assert f"{HOSTILE}.Y: no noise estimate at some frequencies" in text
     assert "Record for" not in text  # time does not bring the dead channel back
     (table,) = tables(reported.report, "Verdict")

@@ -181,7 +181,7 @@ def squeezed(text: str) -> str:
 
 def test_a_method_that_waits_for_averages_invalidates_no_test_that_goes_on() -> None:
     ended = replace(made_snapshot(), results={}, refused={"three-sensor": "1 average"}, closed=True)
-    for snapshot, rank in ((ended, Rank.INVALIDATES), (replace(ended, closed=False), Rank.DELAYS)):
+    for snapshot, rank in ((ended, Rank.INVALIDATES), (replace(ended, closed=False), Rank.TO_KNOW)):
         (refused,) = (
             each
             for each in Result(snapshot, SETTINGS).facts

@@ -24,7 +24,7 @@ HINTS = {
     "limits": "Most noise: a data sheet (brochure.csv), a model"
     f" ({', '.join(NOISE_MODELS)}), or noise at the ends of the band in µg/√Hz (2 0.5); several:"
     " semicolons between.",
-    "end": "decided: when the limits are · 5 %: when the noise is known to that · 3h: after this"
+    "end": "decided: when the limits are · 5 %: when the c.o.v. is that · 3h: after this"
     " time · several: the first of them. Empty: x stops a test.",
     "unit": "Of results, such as m/s² or g. Empty: that of the first channel.",
     "name": "The name of the bench, in recordings and reports.",

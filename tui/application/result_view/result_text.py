@@ -11,19 +11,17 @@ from rich.text import Text
 
 from daq.results.comparison import compare
 from daq.results.facts import Rank, TargetMissed
+from estimator.decision.verdict import Verdict
 from tui.application.test_view.panels import alerts, known_to
 from tui.output.results import averages_line
-from tui.wording.facts import MARKS as MARKS_OF_RANKS
 from tui.wording.facts import NOTHING_TO_DO, known
 from tui.wording.formatting import level, level_with_error, percent, signed
 from tui.wording.verdict_text import (
     MARKS,
     STYLES,
-    headline,
+    Decision,
     limit_line,
     margin,
-    not_judged,
-    what_to_do,
     worst_by_channel,
 )
 from tui.wording.vocabulary import PARTNER_WORDS
@@ -60,10 +58,11 @@ def result(state: State, *, width: int) -> RenderableType:
         for each in known(found)
         if found.verdict is None or not isinstance(each.fact, TargetMissed)
     ]
-    if not any(each.needs_action for each in facts):
+    is_open = found.verdict is not None and found.verdict.verdict is not Verdict.PASS
+    if not is_open and not any(each.needs_action for each in facts):
         parts.append(item(NOTHING_TO_DO))
     parts += [
-        item(str(each), MARKS_OF_RANKS[each.fact.rank], _STYLES_OF_RANKS[each.fact.rank])
+        item(str(each), each.mark, _STYLES_OF_RANKS[each.fact.rank] if each.needs_action else MUTED)
         for each in facts
     ]
     parts.append(item(averages_line(snapshot)))
@@ -89,10 +88,9 @@ def _verdict(result: Result) -> Iterator[Text]:
     if found is None:
         yield Text("No limits in the bench file: neither passed nor failed.", MUTED)
     else:
-        style = STYLES[found.verdict]
-        yield Text(f"{MARKS[found.verdict]} {headline(found)}", style)
-        yield from (Text(line, style.removeprefix("bold ")) for line in what_to_do(found))
-        yield from map(Text, not_judged(found))
+        decision, style = Decision.of(found), STYLES[found.verdict]
+        yield Text(f"{MARKS[found.verdict]} {decision}", style)
+        yield from map(Text, decision.remarks)
         known = [each for each in found.limits if math.isfinite(each.margin_low_db)]
         if known:
             worst = min(known, key=lambda each: each.margin_low_db)
@@ -119,7 +117,7 @@ def _channels(state: State, result: Result, *, width: int) -> Table:
     is_wide = width >= WIDE
     table.add_column("channel", no_wrap=True)
     is_full = is_wide or not (margins and differences)
-    titles = [*(["data"] if is_wide else []), "noise, 95 %", *(["known to"] if is_full else [])]
+    titles = [*(["data"] if is_wide else []), "noise, 95 %", *(["c.o.v."] if is_full else [])]
     titles += ["margin, dB", *(["at"] if is_full else [])] if margins else ["from", "to"]
     titles += [f"against {_reference(state)}"] if differences else []
     for title in titles:

@@ -29,7 +29,7 @@ def channel_table(state: State, choice: Choice, *, means: Sequence[BandMeans], w
     if result is None:
         return table
     snapshot, data, alone, covs = result.snapshot, result.data, result.alone, result.covs
-    titles = ["noise, 95 %", "known to", "margin, dB", "SNR, dB", "data", "gaps"]
+    titles = ["noise, 95 %", "c.o.v.", "margin, dB", "SNR, dB", "data", "gaps"]
     columns: dict[str, list[Text]] = {title: [] for title in ("channel", *titles)}
     margins = worst_by_channel(result.verdict)
     if not margins:
@@ -47,7 +47,7 @@ def channel_table(state: State, choice: Choice, *, means: Sequence[BandMeans], w
             cells["noise, 95 %"] = Text(level_with_error(mean, high, low))
             cells["SNR, dB"] = Text(_ratio(float(data[column]), mean))
         if not math.isnan(covs[column]):
-            cells["known to"] = Text(percent(covs[column]))
+            cells["c.o.v."] = Text(percent(covs[column]))
         worst = margins.get((label.sensor, label.channel))
         if worst is not None and worst.known:
             words = f"{MARKS[worst.verdict]} {signed(worst.margin_db, '+.1f')}"

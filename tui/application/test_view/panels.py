@@ -17,8 +17,7 @@ from daq.results.facts import Rank, SensorsSimulated
 from daq.results.known_facts import WITHOUT_ESTIMATE
 from tui.wording.facts import known, known_of_sensors
 from tui.wording.formatting import clock_time, level_with_error, percent, several
-from tui.wording.verdict_text import STYLES as STYLES_OF_VERDICTS
-from tui.wording.verdict_text import headline, how_long
+from tui.wording.verdict_text import headline, how_long, style_of
 from tui.wording.vocabulary import FLAG_WORDS, PARTNER_WORDS
 
 if TYPE_CHECKING:
@@ -259,9 +258,12 @@ def note(now: RecordingStatus | None, done: int, total: int) -> str:
 
 
 def known_to(reached: Precision) -> str:
-    """Return how well the noise at one frequency is known, and how well that is wanted."""
+    """Return the scatter of the noise, and the one that is wanted.
+
+    How well the noise is known is the whole interval, beside each level.
+    """
     wanted = "" if reached.target is None else f", wanted {percent(reached.target)}"
-    known = "not known yet" if reached.cov > NOT_KNOWN_FROM else f"known to {percent(reached.cov)}"
+    known = "not known yet" if reached.cov > NOT_KNOWN_FROM else f"c.o.v. {percent(reached.cov)}"
     return f"{known}{wanted}"
 
 
@@ -301,10 +303,10 @@ def advice(result: Result, choice: Choice) -> Text:
     """Return one line on what to know about what is shown: first the verdict so far."""
     snapshot, verdict = result.snapshot, result.verdict
     if verdict is not None:
-        return Text(headline(verdict), STYLES_OF_VERDICTS[verdict.verdict])
+        return Text(headline(verdict), style_of(verdict, grows=not snapshot.closed))
     refused = [f"{method}: {why}" for method, why in snapshot.refused.items()]
     if refused:
-        return Text(refused[0], "yellow")
+        return Text(refused[0], "yellow" if snapshot.closed else MUTED)
     for method in choice.methods:
         noise = snapshot.results.get(method)
         if noise is None:
