@@ -205,6 +205,7 @@ class Grid:
             BandLevels(mean, np.where(total > 0, cumulants, np.nan), n_unknown == 0),
             (widening,),
             BandLevels(bound, scatter, bounded),
+            np.zeros(mean.shape, np.bool_),
         )
 
     def _pairs(self, deviation: FloatArray, spans: Sequence[slice]) -> FloatArray:

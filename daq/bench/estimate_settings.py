@@ -257,6 +257,20 @@ class EstimateSettings:
             text=repr,
         ),
     ] = 0.1
+    shared_noise: Annotated[
+        tuple[tuple[str, str], ...],
+        Option(
+            "Two of three or more sensors whose noise may be shared (A:B), as by a cable or a"
+            " supply, for method multi-part; may be repeated.",
+            check=values.pairs,
+            flags=("--shared-noise",),
+            metavar="A:B",
+            read=lambda texts: [text.split(":") for text in texts],
+            show=lambda pairs: [list(pair) for pair in pairs],
+            text=lambda pairs: [":".join(pair) for pair in pairs],
+            repeated=True,
+        ),
+    ] = ()
     lean: Annotated[
         Mapping[str, tuple[float, float]],
         Option(

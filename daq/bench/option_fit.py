@@ -1,7 +1,7 @@
 """Whether the options of an estimate fit the sensors of a bench or recording."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -11,6 +11,10 @@ from daq.bench.option_values import one_of
 
 MIN_SEGMENT_SAMPLES = 4
 """Samples of a segment, for one frequency between 0 and half the sampling rate."""
+
+
+LEAST_OF_A_PAIR = 3
+"""Sensors among which two may share noise."""
 
 
 class _Channel(Protocol):
@@ -71,8 +75,13 @@ def misfits(settings: EstimateSettings, sensors: Sequence[_Sensor]) -> Iterator[
             yield Misfit("gains", f"{name}={gain:g}", str(error))
 
     names = [sensor.name for sensor in sensors]
-    for option in ("axis_tolerance", "lean", "sampling_rates"):
-        given: Mapping[str, object] = getattr(settings, option)
+    paired = [name for pair in settings.shared_noise for name in pair]
+    if paired and len(names) < LEAST_OF_A_PAIR:
+        yield Misfit(
+            "shared_noise", ":".join(paired), f"expected {LEAST_OF_A_PAIR} sensors or more"
+        )
+    for option in ("axis_tolerance", "lean", "sampling_rates", "shared_noise"):
+        given = paired if option == "shared_noise" else getattr(settings, option)
         for name in filter(None, given):
             try:
                 one_of(name, names)

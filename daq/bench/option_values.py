@@ -208,6 +208,15 @@ def sampling_rates(value: object) -> dict[str, float]:
     return {str(name): number(rate) for name, rate in value.items()}
 
 
+def pairs(value: object) -> tuple[tuple[str, str], ...]:
+    """Return pairs of sensors."""
+    given = value if isinstance(value, (list, tuple)) else [value]
+    found = [tuple(map(str, each)) for each in given if isinstance(each, (list, tuple))]
+    if len(found) < len(given) or any(len(set(each)) != 2 for each in found):
+        raise ValueError('expected pairs of sensors, such as [["A", "B"]] or A:B')
+    return tuple((each[0], each[1]) for each in found)
+
+
 def to_gains(texts: Sequence[str]) -> dict[str, float]:
     """Return the gains in texts such as B=1.02."""
     found: dict[str, float] = {}

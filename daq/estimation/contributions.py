@@ -20,7 +20,7 @@ from estimator.levels.contributions import (
     deviation,
     widened,
 )
-from estimator.levels.interval import NORMAL_95
+from estimator.levels.interval import NORMAL_95, interval
 from estimator.levels.pooled import blocks_of
 from estimator.likelihood.dimension import most_testable
 from estimator.self_noise.result import Flag, SelfNoise
@@ -90,6 +90,7 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
             found.append(contribution(source, shape, above=above, share=share[:, None]))
     found += _by_motion_that_changes(snapshot, method, psd)
     found += _changes(snapshot, psd)
+    found += _contradicted(snapshot, method, tuple(found))
     faulty = sorted(diagnostics.faulty)
     if faulty:
         below = np.zeros(shape)
@@ -101,17 +102,45 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
 
 
 def _by_motion_that_changes(snapshot: Snapshot, method: str, psd: FloatArray) -> list[Contribution]:
-    """Return what may be wrong with the noise of two sensors."""
-    changing = snapshot.diagnostics.multi_part
-    if changing is None or method != "multi-part":
+    """Return what may be wrong with noise that motion tells by its changes."""
+    flags = snapshot.results[method].flags
+    found, alone = snapshot.diagnostics, method == "multi-part"
+    changing = found.multi_part if alone else found.beside
+    rests = alone | ((flags & Flag.CHANGING) != 0)
+    if changing is None or not np.any(rests):
         return []
-    lever = np.nan_to_num(changing.lever)
-    # anywhere below the bound
-    unknown = (snapshot.results[method].flags & Flag.UNIDENTIFIED) != 0
+    lever = np.where(rests, np.nan_to_num(changing.lever), 0.0)
+    unknown = (flags & Flag.UNIDENTIFIED) != 0  # anywhere below the bound
     return [
         contribution(Source.GAINS, psd.shape, below=lever, above=lever),
         contribution(Source.STEADY_MOTION, psd.shape, below=np.where(unknown, psd, 0.0)),
     ]
+
+
+def _contradicted(
+    snapshot: Snapshot, method: str, found: tuple[Contribution, ...]
+) -> list[Contribution]:
+    """Return by how much motion that changes contradicts a method, beyond both intervals."""
+    noise, beside = snapshot.results[method], snapshot.diagnostics.beside
+    if beside is None or beside.noise.method != method:
+        return []
+    below, above = np.zeros((2, *noise.noise_psd.shape))
+    low, high = interval(noise.noise_psd, noise.cumulants)
+    wide = widened(low, high, found)
+    with np.errstate(invalid="ignore"):
+        moved = wide[0] - low, wide[1] - high
+    for block in beside.compared:
+        inside = (snapshot.frequency >= block.low) & (snapshot.frequency <= block.high)
+        low, high = (
+            ends + np.nan_to_num(move[inside].mean(axis=0))
+            for ends, move in zip(block.other, moved, strict=True)
+        )
+        apart = (block.own[0] > high) | (block.own[1] < low)
+        below[inside] = np.where(apart, np.maximum(low - block.own[0], 0.0), 0.0)
+        above[inside] = np.where(apart, np.maximum(block.own[1] - high, 0.0), 0.0)
+    if not (below + above).any():
+        return []
+    return [contribution(Source.PARTS, below.shape, below=below, above=above)]
 
 
 def _counts(snapshot: Snapshot, shape: tuple[int, int]) -> Iterator[Contribution]:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from daq.recording.interface import ReadableRecording
     from estimator.likelihood.factor_analysis import Maxima
     from estimator.likelihood.gradients import Gradients
-    from estimator.likelihood.multi_part import MultiPart
+    from estimator.likelihood.multi_part import Beside, MultiPart
 
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
@@ -67,13 +67,15 @@ class Dimensions:
 class Estimates:
     """Results by method, reasons of refused methods, and the dimension of the motion.
 
-    `multi_part` is what motion that changes says of two sensors, or None.
+    `multi_part` is what motion that changes says by itself, and `beside` what it says of the noise
+    by the method that judges, or None.
     """
 
     results: dict[str, SelfNoise]
     refused: dict[str, str]
     dimensions: Dimensions | None
     multi_part: MultiPart | None = None
+    beside: Beside | None = None
 
 
 def averages(passes: Sequence[Pass]) -> tuple[Band, ...]:
@@ -438,6 +440,13 @@ def known_gains(settings: Settings, channels: Channels) -> FloatArray:
     return gains
 
 
+def known_pairs(settings: Settings, channels: Channels) -> tuple[tuple[int, int], ...]:
+    """Return the sensors whose noise may be shared, by their numbers; without those left out."""
+    names = list(dict.fromkeys(sensor for sensor, _ in channels))
+    pairs = [pair for pair in settings.shared_noise if set(pair) <= set(names)]
+    return tuple((names.index(first), names.index(second)) for first, second in pairs)
+
+
 def known_positions(recording: ReadableRecording, channels: Channels) -> FloatArray | None:
     """Return the positions of sensors in metres, (n_sensors, 3); None unless all are known."""
     names = dict.fromkeys(sensor for sensor, _ in channels)
@@ -471,6 +480,7 @@ def noise_estimates(
     positions: FloatArray | None = None,
     known: Mapping[str, Sequence[SelfNoise]] | None = None,
     maxima: Maxima | None = None,
+    shared: Sequence[tuple[int, int]] = (),
 ) -> Estimates:
     """Estimate by every method that is wanted.
 
@@ -489,6 +499,8 @@ def noise_estimates(
         What some methods give for each band, where that is estimated already.
     maxima : Maxima, optional
         Fits of the same averages, to share.
+    shared : sequence of (int, int)
+        Pairs of sensors whose noise may be shared.
     """
     chosen, known = "auto" in settings.methods, known or {}
     settings = settings.for_sensors(dims)
@@ -500,7 +512,7 @@ def noise_estimates(
         for method in wanted:
             try:
                 if method == "multi-part":
-                    changing = _by_changes(bands, settings, dims)
+                    changing = _by_changes(bands, settings, dims, shared)
                     results[method] = changing.noise
                     continue
                 options: list[dict[str, Any]] = [{} for _ in bands]
@@ -538,7 +550,12 @@ def noise_estimates(
     return Estimates(results, refused, dimensions, changing)
 
 
-def _by_changes(bands: Sequence[Band], settings: Settings, dims: tuple[int, ...]) -> MultiPart:
+def _by_changes(
+    bands: Sequence[Band],
+    settings: Settings,
+    dims: tuple[int, ...],
+    shared: Sequence[tuple[int, int]],
+) -> MultiPart:
     """Return the noise of sensors from motion that changes.
 
     Raises
@@ -565,12 +582,54 @@ def _by_changes(bands: Sequence[Band], settings: Settings, dims: tuple[int, ...]
             parts.averages,
             frequency,
             dims=dims,
+            shared=shared,
             correlation=_power_correlation(band),
             steadiness=settings.gain_steadiness / 100,
             usable=known,
         )
         found.append(of_band.at(band.frequencies))
     return MultiPart.joined(found)
+
+
+def beside_changes(
+    estimates: Estimates, bands: Sequence[Band], settings: Settings, dims: tuple[int, ...]
+) -> Estimates:
+    """Return what `auto` gives of three sensors or more, with what motion that changes says of it.
+
+    Of a finished estimate, at a small share of its cost.
+    """
+    method = next(iter(settings.for_sensors(dims).methods), "")
+    noise = estimates.results.get(method)
+    if (
+        (noise is None or "auto" not in settings.methods or not settings.correct)
+        or (len(dims) < _WHOLE or len(set(dims)) > 1 or method == "multi-part")
+        or not bands
+    ):
+        return estimates
+    from estimator.likelihood.multi_part import Beside, beside  # noqa: PLC0415 - rarely used
+
+    found, begin = [], 0
+    for band in bands:
+        if band.parts is None:
+            return estimates
+        here = slice(begin, begin := begin + len(band.frequencies))
+        own = SelfNoise.of(
+            method, noise.noise_psd[here], noise.cumulants[:, here], noise.flags[here]
+        )
+        data = np.einsum("fii->fi", band.csm).real
+        with np.errstate(invalid="ignore", divide="ignore"):
+            motion = np.median(data / own.noise_psd - 1, axis=1)
+        motion[band.settings.real(band.frequencies)] = np.nan
+        found.append(
+            beside(
+                *(own, band.parts, band.frequencies, motion),
+                dims=dims,
+                correlation=_power_correlation(band),
+                steadiness=settings.gain_steadiness / 100,
+            )
+        )
+    whole = Beside.joined(found)
+    return replace(estimates, results=estimates.results | {method: whole.noise}, beside=whole)
 
 
 def _by_gradients(

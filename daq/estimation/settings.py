@@ -33,7 +33,11 @@ AXIS_TOLERANCE, OF_KNOWN_LEAN = 1.0, 0.1
 """Degrees, rms, if nothing else is given: of any lean, and of what remains of a known one."""
 MAX_CHANNELS = 96
 """Channels up to which ``auto`` is maximum likelihood, to limit its cost."""
-_NEEDED = {"dimension": "maximum-likelihood", "gains": "two-channel"}
+_NEEDED = {
+    "dimension": "maximum-likelihood",
+    "gains": "two-channel",
+    "shared_noise": "multi-part",
+}
 """Options that are for one method."""
 
 
@@ -59,12 +63,12 @@ class Settings(EstimateSettings):
     def for_sensors(self, dims: tuple[int, ...]) -> Settings:
         """Return settings with a method in place of ``auto``, by the channels of each sensor.
 
-        Maximum likelihood needs room for more dimensions than a sensor has channels. Two sensors
-        take motion that changes; no method gives the noise of one.
+        Maximum likelihood needs room for more dimensions than a sensor has channels. Two sensors,
+        and those that share noise, take motion that changes; no method gives the noise of one.
         """
         if "auto" not in self.methods:
             return self
-        if len(dims) < 3:
+        if len(dims) < 3 or self.shared_noise:
             return replace(self, methods=("multi-part",) if len(dims) > 1 else ())
         roomy = has_room(dims)
         chosen = "maximum-likelihood" if roomy else "three-sensor"
@@ -130,7 +134,7 @@ def with_changes(
 ) -> Settings:
     """Return settings with options replaced.
 
-    A dimension or gains without a method ask for the method that takes them.
+    A dimension, gains or shared noise without a method ask for the method that takes them.
 
     Parameters
     ----------

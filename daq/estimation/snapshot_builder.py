@@ -33,10 +33,12 @@ from daq.estimation.noise_estimates import (
     Dimensions,
     Estimates,
     averages,
+    beside_changes,
     channel_sets,
     chosen_dimensions,
     in_units,
     known_gains,
+    known_pairs,
     known_positions,
     noise_estimates,
     quantisation_psd,
@@ -221,6 +223,7 @@ class SnapshotBuilder:
     ) -> None:
         self._settings, self._unit, self._equalisation = settings, unit, equalisation
         self._gains = known_gains(settings, channels)
+        self._pairs = known_pairs(settings, channels)
         counts = Counter(sensor for sensor, _ in channels)
         self._axes = settings.across_axes(list(counts), tuple(counts.values()))
         self._dimensions: Dimensions | None = None
@@ -342,7 +345,7 @@ class SnapshotBuilder:
             channel_segments=_segments_of(sets, n_segments if raw else 0, first.n_channels),
             octaves=_octaves(bands, sets) if self._settings.octaves else (),
             shortened=_shortened(passes),
-            diagnostics=diagnostics,
+            diagnostics=replace(diagnostics, beside=estimates.beside),
             no_segment=None if sets else _no_segment(passes, self._settings.segment),
             nonlinear=nonlinear,
             linearised=bool(taken_off),
@@ -378,6 +381,10 @@ class SnapshotBuilder:
         """
         first, dims, within = self._findings, passes[0].aligned.dims, bands
         psd = np.concatenate([np.diagonal(b.csm, axis1=1, axis2=2).real for b in bands])
+        estimates = beside_changes(estimates, bands, self._settings, dims)
+        if estimates.beside is not None and estimates.beside.pairs:
+            self._findings = first.of_all_segments()  # shared noise looks like such changes
+            return bands, estimates
         for _ in range(ROUNDS):
             steady = self._findings.stability
             if steady is None or not any(steady.steadied):
@@ -476,6 +483,7 @@ class SnapshotBuilder:
                 positions=positions,
                 known=self._known(bands, raw),
                 maxima=maxima,
+                shared=self._pairs,
             )
         if estimates.dimensions is not self._dimensions:
             self._dimensions, self._chosen_at = estimates.dimensions, n_segments

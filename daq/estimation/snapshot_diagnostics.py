@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from estimator.checks.relative_response import RelativeResponse
     from estimator.checks.stability import Stability
     from estimator.likelihood.dimension import BandDimension
-    from estimator.likelihood.multi_part import MultiPart
+    from estimator.likelihood.multi_part import Beside, MultiPart
     from estimator.self_noise.result import SelfNoise
 
     FloatArray = NDArray[np.float64]
@@ -189,7 +189,9 @@ class SnapshotDiagnostics:
     edge_leakage : EdgeLeakage or None
         None where it is not known.
     multi_part : MultiPart or None
-        What motion that changes says of two sensors; None of an estimate without it.
+        What motion that changes says by itself; None of an estimate without it.
+    beside : Beside or None
+        What it says of the noise of three sensors or more, by another method.
     """
 
     synchronisation: Synchronisation = field(default_factory=Synchronisation)
@@ -200,6 +202,7 @@ class SnapshotDiagnostics:
     untested: Untested | None = Untested.UNFINISHED
     edge_leakage: EdgeLeakage | None = None
     multi_part: MultiPart | None = None
+    beside: Beside | None = None
 
     @property
     def faulty(self) -> set[int]:

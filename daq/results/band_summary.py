@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from estimator.levels.bands import BandLevels
     from estimator.levels.contributions import Contribution
     from estimator.self_noise.result import SelfNoise
-    from estimator.types import FloatArray
+    from estimator.types import BoolArray, FloatArray
 
 CONSTANT = frozenset({Source.SENSITIVITY})
 """What is the same in all tests of a sensor, and no part of the difference of two."""
@@ -49,7 +49,8 @@ class BandMeans:
 
     ``spread`` is the standard deviation of the mean by its scatter, ``low`` and ``high`` the ends
     of its interval with all that widens it; NaN for a band without estimates. ``scatter`` has the
-    ends by scatter alone, ``parts`` what each contribution adds below and above.
+    ends by scatter alone, ``parts`` what each contribution adds below and above. ``is_bound`` is
+    true where the mean is no estimate, but a bound.
     """
 
     mean: FloatArray
@@ -60,11 +61,12 @@ class BandMeans:
     parts: Mapping[Source, tuple[FloatArray, FloatArray]] = field(
         default_factory=dict, kw_only=True
     )
+    is_bound: BoolArray = field(default_factory=lambda: np.zeros(1, np.bool_), kw_only=True)
 
     @property
-    def outside(self) -> NDArray[np.bool_]:
-        """Where the estimate is at or below zero, or above its interval: only `high` is known."""
-        return (self.mean <= 0) | (self.mean > self.high)
+    def outside(self) -> BoolArray:
+        """Where the estimate is a bound, not positive, or above its interval: `high` is known."""
+        return (self.mean <= 0) | (self.mean > self.high) | self.is_bound
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,11 +82,14 @@ class Levels:
     bound : BandLevels
         What the other sensors do not predict: the noise is below it by any model; not known where
         a channel shares noise with others.
+    is_bound : bool, shape (n_bands, n_channels)
+        Whether the level of a bin is such a bound, and no estimate.
     """
 
     of_scatter: BandLevels
     contributions: tuple[Contribution, ...]
     bound: BandLevels
+    is_bound: BoolArray
 
     @property
     def mean(self) -> FloatArray:
@@ -134,7 +139,7 @@ class Levels:
         """
         return np.broadcast_to(deviation(self.contributions), self.mean.shape[1:])
 
-    def withdrawn(self, quantile: float = NORMAL_95) -> NDArray[np.bool_]:
+    def withdrawn(self, quantile: float = NORMAL_95) -> BoolArray:
         """Whether the whole interval is above the bound: the model has too few dimensions."""
         low, _ = widened(*self.of_scatter.interval(quantile), self.contributions)
         return np.asarray(low > self._most(quantile))
@@ -150,6 +155,7 @@ class Levels:
             *(mean, spread, low[:, column], high[:, column]),
             scatter=(scatter[0][:, column], scatter[1][:, column]),
             parts={each.source: each.adds(column, mean, quantile) for each in self.contributions},
+            is_bound=self.is_bound[:, column],
         )
 
     def _most(self, quantile: float) -> FloatArray:
@@ -201,6 +207,10 @@ class Spectrum:
         self._correlation = correlation_of(settings)
         self._contributions = contributions(snapshot, noise.method)
         self._shares = shared_parts(snapshot) > 0
+        beside, names = snapshot.diagnostics.beside, snapshot.sensor_names
+        paired = {name for pair in settings.shared_noise for name in pair}
+        paired |= {names[n] for each in (beside.pairs if beside else ()) for n in each.pair}
+        self._shares[:, [label.sensor in paired for label in snapshot.channels]] = True
         if (alike := snapshot.rounded_alike) is not None:
             self._shares |= alike.most > MUCH_SHARED * np.nan_to_num(np.abs(noise.noise_psd))
         known = np.isfinite(noise.noise_psd)
@@ -222,7 +232,8 @@ class Spectrum:
         rest = np.where(self._shares[here], np.nan, rest)  # others predict noise that they share
         bound = band_levels(rest, scatter, edges - first, correlation, weights=width[here])
         parts = (e.in_bands(edges, self._weight, noise.noise_psd) for e in self._contributions)
-        return Levels(found, tuple(parts), bound)
+        unknown = (noise.flags[: edges[-1]] & Flag.UNIDENTIFIED) != 0
+        return Levels(found, tuple(parts), bound, np.logical_or.reduceat(unknown, edges[:-1]))
 
     def _unpredicted(self, begin: int, end: int) -> tuple[int, FloatArray, FloatArray]:
         """Return the bound at these bins or more, with the first of them."""

@@ -108,8 +108,37 @@ class FewSensors(Fact):
 
 
 @record
+class PairCompared(Fact):
+    """The second of two sensors against the first, from the motion in `band`, with errors (1 σ).
+
+    Attributes
+    ----------
+    coherence, coherence_error : float
+        Mean over directions.
+    rotation, rotation_error : float
+        Degrees; NaN of sensors with one channel.
+    gains, gain_errors : tuple of float
+        Of each channel.
+    delay, delay_error : float
+        Seconds; NaN where the motion does not tell.
+    """
+
+    name: ClassVar[str] = "pair-compared"
+    coherence: float
+    coherence_error: float
+    rotation: float
+    rotation_error: float
+    gains: tuple[float, ...]
+    gain_errors: tuple[float, ...]
+    delay: float
+    delay_error: float
+
+
+@record
 class SteadyGainsAssumed(Fact):
-    """Two sensors tell noise from motion that changes, if their gains do not follow its loudness.
+    """Motion that changes tells noise from motion, if gains do not follow its loudness.
+
+    With a `band`, it lowers the scatter of `method` there; without, the noise rests on it alone.
 
     Attributes
     ----------
@@ -119,6 +148,38 @@ class SteadyGainsAssumed(Fact):
 
     name: ClassVar[str] = "steady-gains-assumed"
     share: float
+
+
+@record
+class NoisePartShared(Fact):
+    """Motion that changes tells how much of their noise two `sensors` share in `band`.
+
+    Attributes
+    ----------
+    share, share_error : float
+        Coherency of their noise, of the like channels with most, and its standard deviation.
+    is_known : bool
+        Whether the pair was given; without, no other pair agrees with the parts.
+    """
+
+    name: ClassVar[str] = "noise-part-shared"
+    share: float
+    share_error: float
+    is_known: bool
+
+
+@record
+class MethodsDiffer(Fact):
+    """The noise of `channels` by `method` and by motion that changes differs beyond both intervals.
+
+    Attributes
+    ----------
+    difference : float
+        Most by which the interval of `method` is extended to hold that of motion that changes, dB.
+    """
+
+    name: ClassVar[str] = "methods-differ"
+    difference: float
 
 
 @record

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.clocks.clock_model import ClockSource
-from daq.estimation.contributions import MUCH_NONLINEAR
+from daq.estimation.contributions import MUCH_NONLINEAR, contributions
 from daq.estimation.noise_estimates import BY_MOTION
-from daq.results.band_summary import known_range
+from daq.results.band_summary import averages_at, correlation_of, known_range
 from daq.results.clock_effect import reference
 from daq.results.facts import (
     ARCHIVES,
@@ -38,14 +38,17 @@ from daq.results.facts import (
     LimitNotJudged,
     LimitUndecided,
     MethodRefused,
+    MethodsDiffer,
     ModelPasses,
     ModelUntested,
     NoEstimateAbove,
     NoiseNotIdentified,
+    NoisePartShared,
     NoSegmentUsable,
     NotInLiveEstimate,
     NotLinear,
     OctaveSegments,
+    PairCompared,
     Rank,
     RatesNominal,
     ReadingsRepeat,
@@ -78,11 +81,13 @@ from estimator.checks.advice import (
     TooFewSensors,
     Untested,
 )
+from estimator.checks.relative_response import pair_coherence
 from estimator.checks.shared_noise import MAX_CHANNELS
 from estimator.decision.verdict import Obstacle, Verdict
 from estimator.errors import BandError
 from estimator.levels.bands import third_octaves
-from estimator.self_noise.result import Flag, Refusal
+from estimator.levels.contributions import Source
+from estimator.self_noise.result import Flag, Refusal, SelfNoise
 from estimator.spectra.segment_rejection import Reason
 
 if TYPE_CHECKING:
@@ -94,7 +99,7 @@ if TYPE_CHECKING:
     from daq.results.band_summary import Estimate
     from daq.results.decision.verdict import TestVerdict
     from estimator.checks.advice import Advice
-    from estimator.levels.contributions import Source
+    from estimator.types import BoolArray
 
 LEAST_SHARE = 0.01
 """Share of the noise from which a contribution to an interval is a fact; of the time, too."""
@@ -112,6 +117,7 @@ WITHOUT_ESTIMATE = (
 )
 """Flags of frequencies that have no estimate."""
 _NO_FLAG = Flag(0)
+_TWO = 2  # sensors
 _LIKE_A_CLOCK = Delay | Gain | ModelMisfit | NoSharedMotion
 """Findings that unknown clocks alone can bring about."""
 _TURN = 0.3  # rad at the highest frequency: 9 % of the motion is taken for noise there
@@ -491,12 +497,22 @@ def _untested(snapshot: Snapshot, why: Untested) -> ModelUntested:
 
 
 def _by_changes(snapshot: Snapshot) -> Iterator[Fact]:
-    """Yield what the noise of two sensors rests on, and where motion does not give it."""
-    found = snapshot.diagnostics.multi_part
+    """Yield where noise rests on motion that changes, contradicts it, or is not known by it."""
+    found, beside = snapshot.diagnostics.multi_part, snapshot.diagnostics.beside
+    for each in (found, beside):
+        if each is not None and (rests := _rests(each.noise)).any():
+            inside = snapshot.frequency[rests]
+            yield SteadyGainsAssumed(
+                rank=Rank.TO_KNOW,
+                method=each.noise.method,
+                band=(float(inside[0]), float(inside[-1])) if each is beside else None,
+                share=each.steadiness,
+            )
+    yield from _shared_parts(snapshot)
+    if beside is not None:
+        yield from _contradicted(snapshot, beside.noise.method)
     if found is None:
         return
-    if any(None in block.refusal for block in found.blocks):
-        yield SteadyGainsAssumed(rank=Rank.TO_KNOW, method="multi-part", share=found.steadiness)
     names = [label.name for label in snapshot.channels]
     causes = dict.fromkeys(why for block in found.blocks for why in block.refusal if why)
     for cause in causes:
@@ -513,6 +529,58 @@ def _by_changes(snapshot: Snapshot) -> Iterator[Fact]:
             refusal=cause,
             change=float(np.median(changes)),
             axis=names[least.still] if is_axis and least is not None else "",
+        )
+
+
+def _shared_parts(snapshot: Snapshot) -> Iterator[NoisePartShared]:
+    """Yield how much of their noise two sensors share, known pairs first."""
+    found, beside = snapshot.diagnostics.multi_part, snapshot.diagnostics.beside
+    known = (
+        [] if found is None else [(e.low, e.high, part) for e in found.blocks for part in e.shared]
+    )
+    seen = (
+        [] if beside is None else [(e.low, e.high, e.shared) for e in beside.compared if e.shared]
+    )
+    for parts in (known, seen):
+        for pair in dict.fromkeys(part.pair for *_, part in parts):
+            own = [(low, high, part) for low, high, part in parts if part.pair == pair]
+            most = max((part for *_, part in own), key=lambda part: part.share)
+            yield NoisePartShared(
+                rank=Rank.TO_KNOW if parts is known else Rank.DELAYS,
+                sensors=tuple(snapshot.sensor_names[sensor] for sensor in pair),
+                band=(own[0][0], own[-1][1]),
+                share=most.share,
+                share_error=most.error,
+                is_known=parts is known,
+            )
+
+
+def _rests(noise: SelfNoise) -> BoolArray:
+    """Return at which frequencies noise rests on motion that changes."""
+    if noise.method == "multi-part":
+        known = np.isfinite(noise.noise_psd) & ((noise.flags & Flag.UNIDENTIFIED) == 0)
+    else:
+        known = (noise.flags & Flag.CHANGING) != 0
+    return np.asarray(known.any(axis=1))
+
+
+def _contradicted(snapshot: Snapshot, method: str) -> Iterator[MethodsDiffer]:
+    """Yield where motion that changes contradicts another method's noise."""
+    noise = np.abs(snapshot.results[method].noise_psd)
+    for each in contributions(snapshot, method):
+        if each.source is not Source.PARTS:
+            continue
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = np.fmax(1 + each.above / noise, 1 / np.maximum(1 - each.below / noise, 0.0))
+        apart = np.asarray((each.above + each.below > 0) & (noise > 0))
+        band = snapshot.frequency[apart.any(axis=1)]
+        columns = np.flatnonzero(apart.any(axis=0)).tolist()
+        yield MethodsDiffer(
+            rank=Rank.DELAYS,
+            method=method,
+            channels=tuple(snapshot.channels[column].name for column in columns),
+            band=(float(band[0]), float(band[-1])),
+            difference=10 * math.log10(float(ratio[apart].max())),
         )
 
 
@@ -594,8 +662,39 @@ def without_estimate(
             )
 
 
+def _compared(estimate: Estimate) -> Iterator[PairCompared]:
+    """Yield coherence, rotation, gains and delay where there are two sensors only."""
+    snapshot = estimate.snapshot
+    found = snapshot.diagnostics.diagnosis
+    for pair in found.responses if found is not None and len(snapshot.dims) == _TWO else ():
+        inside = (snapshot.frequency >= pair.low) & (snapshot.frequency <= pair.high)
+        averages = averages_at(snapshot, np.array([pair.low]))
+        coherence, error = pair_coherence(
+            snapshot.csm[inside],
+            dims=snapshot.dims,
+            pair=(pair.first, pair.second),
+            n_effective=float(averages[0]),
+            correlation=correlation_of(estimate.settings),
+        )
+        turns = len(pair.gains) > 1
+        yield PairCompared(
+            rank=Rank.TO_KNOW,
+            sensors=tuple(snapshot.sensor_names[each] for each in (pair.first, pair.second)),
+            band=(pair.low, pair.high),
+            coherence=coherence,
+            coherence_error=error,
+            rotation=pair.rotation_deg if turns else math.nan,
+            rotation_error=pair.rotation_error_deg if turns else math.nan,
+            gains=tuple(pair.gains.tolist()),
+            gain_errors=tuple(pair.gain_errors.tolist()),
+            delay=pair.delay,
+            delay_error=pair.delay_error,
+        )
+
+
 def _precision(estimate: Estimate) -> Iterator[Fact]:
-    """Yield what widens the intervals of the table, and whether the wanted precision is reached."""
+    """Yield how two sensors compare, what widens intervals, and whether a target is reached."""
+    yield from _compared(estimate)
     for method in estimate.snapshot.results:
         if shares := widening(estimate, method):
             rank = Rank.TO_KNOW

@@ -24,6 +24,7 @@ from estimator.checks.shared_motion import (
     seen_by_others,
 )
 from estimator.errors import EstimatorError, InsufficientDataError
+from estimator.levels.interval import worth
 from estimator.self_noise.coherency import (
     blocks,
     check_dims,
@@ -284,6 +285,42 @@ def relative_response(
 
     found = _between(*(by(each) for each in own)) if is_pair else by(rest)
     return replace(found, coherence=float(g[inside].mean()))
+
+
+def pair_coherence(
+    csm: ComplexArray,
+    *,
+    dims: tuple[int, ...],
+    pair: tuple[int, int],
+    n_effective: float,
+    correlation: FloatArray,
+) -> tuple[float, float]:
+    """Return the mean coherence of two sensors over directions and frequencies, and its error.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        Of a band.
+    dims : tuple of int
+    pair : (int, int)
+        Sensors of as many channels.
+    n_effective : float
+    correlation : float64, shape (n_lags,)
+        Of the power of neighbouring frequencies, 1 at a lag of 0.
+
+    Notes
+    -----
+    Without the bias of few averages, ``(1 - c) -> (1 - c) n / (n - d)``. The variance of one
+    coherence is ``2 c (1 - c)**2 / n``, or ``1 / n**2`` where there is none.
+    """
+    found = CanonicalCoherence(coherency(csm, dims).matrix).between(
+        *(np.array(own_channels(dims, sensor)) for sensor in pair)
+    )
+    less = n_effective / (n_effective - found.shape[1])
+    scatter = 2 * found * (1 - found) ** 2 / n_effective + n_effective**-2
+    independent = worth(len(found), correlation)[-1] * found.shape[1]
+    value = 1 - (1 - float(found.mean())) * less
+    return max(value, 0.0), less * float(np.sqrt(scatter.mean() / independent))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

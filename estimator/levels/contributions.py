@@ -53,6 +53,8 @@ class Source(enum.StrEnum):
     """Gains may follow the loudness of the motion, by which two sensors tell noise from it."""
     STEADY_MOTION = "steady-motion"
     """Motion that changes does not identify the noise of two sensors: it is below a bound."""
+    PARTS = "parts"
+    """Parts of the recording between which the motion changes contradict the method."""
     LINEARITY = "linearity"
     """The channel is not linear: squares and cubes of the motion add to its noise."""
     COUNTS = "counts"

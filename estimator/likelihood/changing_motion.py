@@ -35,18 +35,19 @@ Method item 27a of the design; K = 1 is the ordinary likelihood with a block of 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import chdtrc, chdtri, ndtr, polygamma, psi
 
 from estimator.errors import InsufficientDataError
 from estimator.levels.interval import NORMAL_95
+from estimator.likelihood.goodness_of_fit import digamma, trigamma, upper_tail
 from estimator.self_noise.result import Refusal
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
@@ -60,7 +61,7 @@ LEAVE = 3
 """At most one part in so many is left out."""
 CHANGES = 1e-4
 """Probability of a change of the motion as large as seen, by chance, below which it counts."""
-_GUARD = 5e-4  # by which scatter that looks like changing motion exceeds what is taken off
+_GUARD = 3.29  # normal quantile of 5e-4: scatter that looks like changing motion is below it
 _CLEAR = 20.0  # information on a response in a bin, by its dimensions: with less, few cover
 _FLOOR = 3e-3  # of N over its start, in any direction
 _ROUNDS = 60
@@ -87,6 +88,8 @@ class BandNoise:
         Why a channel is not identified.
     noise : complex128, shape (n_channels, n_channels)
         The matrix N.
+    scatter : float64, shape (n_channels, n_channels)
+        Standard deviation of the real part of each free element of N.
     kept : bool, shape (n_parts,)
         Parts that count: the contrasts of the others stand out.
     p_value : float
@@ -110,6 +113,7 @@ class BandNoise:
     bound: FloatArray
     refusal: tuple[Refusal | None, ...]
     noise: ComplexArray
+    scatter: FloatArray
     kept: BoolArray
     p_value: float
     of_noise: float
@@ -126,13 +130,21 @@ class BandNoise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Model:
-    """Which elements of N are free: ``basis`` (n_free, p, p), Hermitian, orthogonal."""
+    """Which elements of N are free: ``basis`` (n_free, p, p), Hermitian, orthogonal.
+
+    ``place`` (p, p) has the number in it of the real part of each, -1 where it is not free.
+    """
 
     n_dims: int
     sensor: IntArray
     mask: BoolArray
     basis: ComplexArray
-    diagonal: list[int]
+    place: IntArray
+
+    @property
+    def diagonal(self) -> list[int]:
+        """Return the elements of the basis that are powers of channels."""
+        return [int(each) for each in np.diag(self.place)]
 
     @classmethod
     def of(cls, dims: Sequence[int], n_dims: int, shared: Sequence[tuple[int, int]]) -> _Model:
@@ -141,15 +153,16 @@ class _Model:
         for i, j in shared:
             both = np.isin(sensor, (i, j))
             mask = mask | (both[:, None] & both)
-        basis, diagonal = [], []
+        basis: list[ComplexArray] = []
+        place = np.full(mask.shape, -1)
         for i, j in np.argwhere(np.triu(mask)):
             for value in (1.0,) if i == j else (1.0, 1j):
                 element = np.zeros(mask.shape, np.complex128)
                 element[i, j], element[j, i] = value, np.conj(value)
+                if value == 1.0:
+                    place[i, j] = place[j, i] = len(basis)
                 basis.append(element)
-            if i == j:
-                diagonal.append(len(basis) - 1)
-        return cls(n_dims, sensor, mask, np.array(basis), diagonal)
+        return cls(n_dims, sensor, mask, np.array(basis), place)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -467,7 +480,12 @@ def band_noise(
 
 
 def bound_of_parts(
-    csm: ComplexArray, noise: ComplexArray, *, dims: Sequence[int], n_dims: int
+    csm: ComplexArray,
+    noise: ComplexArray,
+    *,
+    dims: Sequence[int],
+    n_dims: int,
+    shared: Sequence[tuple[int, int]] = (),
 ) -> FloatArray:
     """Return the least standard deviation of the noise of every channel, by Cramér and Rao.
 
@@ -480,13 +498,15 @@ def bound_of_parts(
     dims : sequence of int
     n_dims : int
         Dimensions of the motion.
+    shared : sequence of (int, int)
+        Pairs of sensors whose noise may be shared.
 
     Returns
     -------
     float64, shape (n_channels,)
         Times the root of the averages of all parts; infinite where the noise is not identified.
     """
-    model = _Model.of(dims, n_dims, ())
+    model = _Model.of(dims, n_dims, shared)
     n_parts = csm.shape[1]
     parts = _Parts(csm, np.full(n_parts, 1 / n_parts), 1.0)
     white = _power(noise, -0.5)
@@ -548,17 +568,19 @@ def _estimate(
     scatter = q * point.motion.sum(axis=1)
     freedom = 2 * q * q * max(len(parts.n) - 1, 1) / (q + 1)
     worth = n_freqs / parts.alike
-    beyond = chdtri(freedom * worth, _GUARD) / (freedom * worth) - 1
+    beyond = _quantile(freedom * worth) - 1
     certain = _left(p, cross, r, beyond * scatter)
     usual = _left(p, cross, r, np.sqrt(2 / (freedom * worth)) * scatter)
     raw = _sums(point.motion, parts.weight, point.inverse)
     variance = _left(*raw) + usual - _left(p, cross, r)
     determined = _determined(point.mixed_part(certain) + contrasts, diagonal)
-    beyond = chdtri(freedom, _GUARD) / freedom - 1
+    beyond = _quantile(freedom) - 1
     clear = np.median(np.linalg.eigvalsh(r - beyond * scatter)[:, 0]) > q * _CLEAR
-    deviation = np.sqrt(parts.alike) * _sandwich(
-        point.mixed_part(usual) + contrasts, point.mixed_part(variance) + contrasts, diagonal
+    free = np.sqrt(parts.alike) * _sandwich(
+        *(point.mixed_part(usual) + contrasts, point.mixed_part(variance) + contrasts),
+        list(range(len(model.basis))),
     )
+    deviation = free[diagonal]
     changes = _change_by_chance(point, parts, q) < CHANGES
     narrow = np.maximum(NORMAL_95 * deviation, lever) < MOST * bound
     refusal = tuple(
@@ -574,7 +596,7 @@ def _estimate(
     identified = np.array([each is None for each in refusal])
     p_value, of_noise, of_responses = _fit(point, parts, model, promised)
     if at_floor:  # the power of the contrasts is not at its best there
-        p_value = float(ndtr(-of_responses))
+        p_value = math.erfc(of_responses / math.sqrt(2)) / 2
     power = unit**2
     own = parts.alike / (parts.total * n_freqs)  # variance of a PSD; the rest does not grow with it
     noise = np.einsum("ii->i", point.noise).real
@@ -587,6 +609,7 @@ def _estimate(
         bound=bound * power,
         refusal=refusal,
         noise=point.noise * unit[:, None] * unit,
+        scatter=np.where(model.mask, free[model.place], 0.0) * unit[:, None] * unit,
         kept=kept,
         p_value=p_value,
         of_noise=of_noise,
@@ -698,10 +721,22 @@ def _sandwich(information: FloatArray, variance: FloatArray, diagonal: list[int]
     return np.asarray(np.sqrt(np.maximum(found, 0.0))[diagonal] / scale[diagonal])
 
 
+def _quantile(freedom: float) -> float:
+    """Return the upper quantile of chi-square over its mean (Wilson and Hilferty)."""
+    spread = 2 / (9 * freedom)
+    return float((1 - spread + _GUARD * math.sqrt(spread)) ** 3)
+
+
+def _summed(of: Callable[[float], float], n: FloatArray, q: int, first: int) -> FloatArray:
+    """Return the sum of a function of ``n - j``, for q values of j from `first` on."""
+    own, place = np.unique(n, return_inverse=True)  # parts are of equal length
+    sums = [sum(of(each - j) for j in range(first, first + q)) for each in own.tolist()]
+    return np.array(sums)[place]
+
+
 def _mean_log(n: FloatArray, q: int, first: int = 0) -> FloatArray:
     """Return the mean of ``log det`` of a Wishart matrix of n averages over n, at identity."""
-    j = first + np.arange(q)
-    return np.asarray(psi(n[:, None] - j).sum(axis=1) - q * np.log(n))
+    return np.asarray(_summed(digamma, n, q, first) - q * np.log(n))
 
 
 def _change_by_chance(point: _Point, parts: _Parts, q: int) -> float:
@@ -718,7 +753,7 @@ def _change_by_chance(point: _Point, parts: _Parts, q: int) -> float:
     rest = point.contrasts.shape[-1]
     unit = expected / freedom
     freedom += 2 * n_freqs * q * rest
-    return float(chdtrc(freedom / parts.alike, found / unit / parts.alike))
+    return upper_tail(freedom / parts.alike, found / unit / parts.alike)
 
 
 def _change(point: _Point, parts: _Parts, q: int) -> FloatArray:
@@ -747,19 +782,18 @@ def _fit(
     given = point.contrasts - _adjoint(mixed) @ np.linalg.solve(point.motion, mixed)
     ratio = 2 * float((n * (_trace(point.contrasts) - rest - _logdet(given))).sum())
     ratio = max(ratio - promised, 0.0)
-    j = np.arange(rest)
-    curvature = polygamma(1, n[:, None] - q - j).sum(axis=1)
+    curvature = _summed(trigamma, n, rest, q)
     mean = -2 * n_freqs * float((n * _mean_log(n, rest, q)).sum())
     variance = 4 * n_freqs * alike * float((n**2 * curvature - n * rest).sum())
     whole = n_freqs * n_parts * (2 * q * rest + rest * rest)
     left = max(whole - 2 * q * rest * n_freqs - n_free, 1)
     expected, spread = mean - whole + left, variance * left / whole
     scale = 2 * expected / spread
-    p_value = float(chdtrc(scale * expected, scale * ratio)) if expected > 0 else 1.0
+    p_value = upper_tail(scale * expected, scale * ratio) if expected > 0 else 1.0
 
     responses = 2 * float((n * (_logdet(point.contrasts) - _logdet(given))).sum())
     of_mean = 2 * n_freqs * float((n * (_mean_log(n, rest) - _mean_log(n, rest, q))).sum())
-    less = polygamma(1, n[:, None] - j).sum(axis=1)
+    less = _summed(trigamma, n, rest, 0)
     of_variance = 4 * n_freqs * alike * float((n**2 * (curvature - less)).sum())
     share = (n_parts - 1) / n_parts
     z_responses = (responses - of_mean * share) / np.sqrt(of_variance * share)

@@ -44,6 +44,8 @@ class Flag(enum.IntFlag):
     """The bin alone does not resolve the motion: its directions are those of neighbouring bins."""
     UNIDENTIFIED = 2048
     """The motion does not tell noise from motion: the value is what others do not predict."""
+    CHANGING = 4096
+    """The value is that of motion that changes, which scatters less than the method's own."""
 
 
 class Refusal(enum.StrEnum):

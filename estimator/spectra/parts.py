@@ -89,6 +89,12 @@ class Part:
         before = None if self.before is None else self.before[some]
         return replace(self, before=before, after=self.after[some], scale=self.scale[some])
 
+    def psd(self) -> FloatArray:
+        """Return the PSD of every channel at the kept frequencies, shape (n_kept, n_channels)."""
+        total = np.einsum("fii->fi", self.after)
+        own = total if self.before is None else total - np.einsum("fii->fi", self.before)
+        return np.asarray(own * self.scale[:, None])
+
     def csm(self, some: slice | IntArray) -> ComplexArray:
         """Return the averages at some of the kept frequencies."""
         packed = self.after[some] if self.before is None else self.after[some] - self.before[some]

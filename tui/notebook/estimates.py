@@ -201,6 +201,9 @@ def estimate(
     gain_steadiness : float
         Change of a gain in percent, for motion of ten times the power, that the method multi-part
         allows for (default 0.1).
+    shared_noise : sequence of (str, str)
+        Pairs of three or more sensors whose noise may be shared (``[("A", "B")]``), for the method
+        multi-part.
     lean : mapping of str to (float, float)
         Known lean of a sensor with one or two channels, in degrees: of its axis or plane, towards
         two directions that all sensors have in common (``{"B": (0.3, -0.1)}``).

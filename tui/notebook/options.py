@@ -42,6 +42,7 @@ class EstimateOptions(TypedDict, total=False):
     axis_tolerance: float | Mapping[str, float]
     gain_steadiness: float
     linearise: bool
+    shared_noise: Sequence[tuple[str, str]]
     lean: Mapping[str, tuple[float, float]]
     unit: str
     band: tuple[float, float]

@@ -334,6 +334,10 @@ UNITS: Mapping[str, str] = (
     | {name: f"{name}_share" for name in _SHARES}
     | {
         "change": "change_db",
+        "difference": "difference_db",
+        "rotation": "rotation_deg",
+        "rotation_error": "rotation_error_deg",
+        "delay_error": "delay_error_s",
         "seconds": "constant_s",
         "amounts": "coherencies",
         "errors": "standard_errors",

@@ -19,6 +19,7 @@ from tui.report.figures.drift import drift_plot
 from tui.report.figures.model_test import model_test_plot
 from tui.report.parts import Items, Paragraph, Part, Section, Table
 from tui.wording.facts import MARKS, NOTHING_TO_DO, RANKS
+from tui.wording.findings import ANY_AXES
 from tui.wording.formatting import (
     NOTHING,
     plain_number,
@@ -143,7 +144,7 @@ def alignment_section(snapshot: Snapshot) -> Section:
     diagnosis = snapshot.diagnostics.diagnosis
     found = () if diagnosis is None else diagnosis.responses
     if not found:
-        text = "Not known: this takes three sensors and motion that they share."
+        text = "Not known: this takes two sensors and motion that they share."
         return Section(title, (Paragraph(text, "quiet"),))
     names = snapshot.sensor_names
     reference = min(response.first for response in found)
@@ -176,8 +177,7 @@ def alignment_section(snapshot: Snapshot) -> Section:
         Paragraph(
             f"Against sensor {names[reference]}, from the common motion at "
             f"{span(min(r.low for r in shown), max(r.high for r in shown))}. Gains are of like "
-            "channels. Rotation alone does not bias the three-sensor and maximum-likelihood "
-            "estimates.",
+            f"channels. Rotation alone does not bias a {ANY_AXES} estimate.",
             "quiet",
         ),
         Table(header, tuple(rows), left=frozenset({0, 7})),

@@ -40,15 +40,18 @@ from daq.results.facts import (
     LimitNotJudged,
     LimitUndecided,
     MethodRefused,
+    MethodsDiffer,
     ModelPasses,
     ModelUntested,
     NightsNotCompared,
     NoEstimateAbove,
     NoiseNotIdentified,
+    NoisePartShared,
     NoSegmentUsable,
     NotInLiveEstimate,
     NotLinear,
     OctaveSegments,
+    PairCompared,
     Rank,
     RatesNominal,
     ReadingsRepeat,
@@ -77,6 +80,7 @@ from daq.results.facts import (
 from daq.results.known_facts import facts_of_sensors, facts_of_verdict
 from estimator.checks.advice import Untested
 from estimator.decision.verdict import MIN_AVERAGES, Obstacle
+from estimator.levels.interval import NORMAL_95
 from estimator.self_noise.result import Refusal
 from estimator.spectra.segment_rejection import Reason
 from tui.wording.findings import Names, alert, explain, model, together
@@ -255,14 +259,72 @@ def _few_sensors(fact: FewSensors, names: Names) -> Wording:
     )
 
 
+@word.register(PairCompared)
+def _compared(fact: PairCompared, names: Names) -> Wording:
+    del names
+    first, second = fact.sensors
+    gains = zip(fact.gains, fact.gain_errors, strict=True)
+    parts = [
+        ("gain " + ", ".join(_measured(*each, 4) for each in gains), fact.gains[0]),
+        (f"rotation {_measured(fact.rotation, fact.rotation_error, 3)}°", fact.rotation),
+        (f"delay {_measured(1e6 * fact.delay, 1e6 * fact.delay_error, 2)} µs", fact.delay),
+        (f"coherence {_measured(fact.coherence, fact.coherence_error, 4)}", fact.coherence),
+    ]
+    known = ", ".join(text for text, value in parts if math.isfinite(value))
+    where = "" if fact.band is None else f" at {span(*fact.band)}"
+    return Wording(
+        f"{second} against {first}: {known}",
+        f"{second} against {first}{where}, with 95 % intervals: {known}.",
+    )
+
+
+def _measured(value: float, error: float, digits: int) -> str:
+    """Return a number with the half-width of its 95 % interval."""
+    reach = f" ±{NORMAL_95 * error:.{digits}f}" if math.isfinite(error) else ""
+    return f"{signed(value, f'.{digits}f')}{reach}"
+
+
 @word.register(SteadyGainsAssumed)
 def _steady_gains(fact: SteadyGainsAssumed, names: Names) -> Wording:
     del names
+    where, how = "Two sensors", "Two sensors tell noise from motion by"
+    if fact.band is not None:
+        where = span(*fact.band)
+        how = f"Motion that changes lowers the scatter at {where}, by"
     return Wording(
-        f"Two sensors: gains are assumed steady to {100 * fact.share:g} % for ten times the motion",
-        "Two sensors tell noise from motion by parts of the recording in which the motion differs."
+        f"{where}: gains are assumed steady to {100 * fact.share:g} % for ten times the motion",
+        f"{how} parts of the recording in which the motion differs."
         f" The intervals allow for gains that change by {100 * fact.share:g} % for motion of ten"
         " times the power; a larger change shifts the noise, and tests may not show it.",
+    )
+
+
+@word.register(NoisePartShared)
+def _shared_part(fact: NoisePartShared, names: Names) -> Wording:
+    del names
+    where = "" if fact.band is None else f" at {span(*fact.band)}"
+    who = " and ".join(fact.sensors)
+    most = f"{100 * fact.share:.0f} % ±{100 * NORMAL_95 * fact.share_error:.0f}"
+    remedy = f"Estimate with --shared-noise {':'.join(fact.sensors)}, and separate their cables."
+    return Wording(
+        f"{who} share noise{where}: up to {most}",
+        f"{who} share up to {most} of their noise{where}: this part does not follow the motion when"
+        " it changes.",
+        "" if fact.is_known else remedy,
+    )
+
+
+@word.register(MethodsDiffer)
+def _differ(fact: MethodsDiffer, names: Names) -> Wording:
+    del names
+    where = "" if fact.band is None else f" at {span(*fact.band)}"
+    by = f"up to {fact.difference:.1f} dB" if math.isfinite(fact.difference) else "any amount"
+    return Wording(
+        f"Parts of the recording contradict {fact.method}{where} by {by}",
+        f"{listed(fact.channels)}{where}: the noise by {fact.method} and by multi-part differ by"
+        f" {by}, beyond both intervals: the interval holds both. Noise or gains are not steady, or"
+        " sensors share noise.",
+        "Compare --method all with recordings of the same bench at other times.",
     )
 
 

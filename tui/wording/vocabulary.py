@@ -91,6 +91,9 @@ FLAG_WORDS: Mapping[Flag, FlagWords] = {
     Flag.POOLED: FlagWords(
         "pooled", "the directions of the motion are those of neighbouring frequencies"
     ),
+    Flag.CHANGING: FlagWords(
+        "by changes", "motion that changes gives the noise with the least scatter"
+    ),
     Flag.UNIDENTIFIED: FlagWords(
         "not identified", "the motion does not change enough, and the value is an upper bound"
     ),
@@ -116,6 +119,7 @@ SOURCE_WORDS: Mapping[Source, str] = {
     Source.DIMENSIONS: "the number of dimensions",
     Source.ROUNDING: "matrices in single precision",
     Source.CHANGES: "a response that changed",
+    Source.PARTS: "what parts of the recording contradict",
     Source.GAINS: "gains that may follow the loudness",
     Source.STEADY_MOTION: "motion that does not tell noise from motion",
     Source.LINEARITY: "squares and cubes of the motion",

@@ -12,7 +12,14 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
 from daq.results.band_summary import data_interval
-from daq.results.facts import FewSensors, NoiseNotIdentified, SteadyGainsAssumed
+from daq.results.facts import (
+    FewSensors,
+    MethodsDiffer,
+    NoiseNotIdentified,
+    NoisePartShared,
+    PairCompared,
+    SteadyGainsAssumed,
+)
 from daq.results.result import Result
 from estimator.self_noise.result import Flag, Refusal
 
@@ -27,23 +34,32 @@ NOISE = (1.0, 0.5)
 
 
 def samples(
-    rng: np.random.Generator, *, change: float, snr: float = 30.0, d: int = 3, gain: float = 0.0
+    rng: np.random.Generator,
+    *,
+    change: float,
+    snr: float = 30.0,
+    d: int = 3,
+    gain: float = 0.0,
+    every: float = 40.0,
+    variances: tuple[float, ...] = NOISE,
+    shared: float = 0.0,
 ) -> dict[str, np.ndarray]:
-    """Return two sensors in any direction; the level of their motion changes by so many dB.
+    """Return sensors in any direction; the level of their motion changes by so many dB.
 
-    The first one's gain follows the level: by `gain` for ten times the power.
+    The first one's gain follows the level: by `gain` for ten times the power. The first two share
+    noise of a variance of `shared`, beside their own.
     """
-    n, step = round(RATE * SECONDS), round(RATE * 40)
+    n, step = round(RATE * SECONDS), round(RATE * every)
     knots = np.arange(0, n + step, step)
     level = np.interp(np.arange(n), knots, change * rng.standard_normal(len(knots)))
     motion = np.sqrt(snr) * rng.standard_normal((n, d)) * 10 ** (level / 20)[:, None]
     found = {}
-    for number, (name, noise) in enumerate(zip("AB", NOISE, strict=True)):
+    alike = np.sqrt(shared) * rng.standard_normal((n, d))
+    for number, noise in enumerate(variances):
         turn = np.linalg.qr(rng.standard_normal((d, d)))[0]
         follows = 1 + gain * level / 10 * (number == 0)
-        found[name] = (motion @ turn.T) * follows[:, None] + np.sqrt(noise) * rng.standard_normal(
-            (n, d)
-        )
+        own = np.sqrt(noise) * rng.standard_normal((n, d)) + alike * (number < 2)
+        found["ABC"[number]] = (motion @ turn.T) * follows[:, None] + own
     return found
 
 
@@ -84,6 +100,7 @@ def test_steady_motion_leaves_an_upper_limit_and_says_what_is_missing() -> None:
     truth = 2 / RATE * np.repeat(NOISE, 3)
     for mean, true in zip(Result(snapshot, SETTINGS).means(noise.method, BAND), truth, strict=True):
         assert mean.low[0] <= 0 < true < mean.high[0]
+        assert mean.outside.all()  # no curve has it as a level
     (fact,) = (f for f in Result(snapshot, SETTINGS).facts if isinstance(f, NoiseNotIdentified))
     assert fact.refusal is Refusal.STEADY
     assert fact.change < 0.2
@@ -100,6 +117,64 @@ def test_a_gain_that_follows_the_loudness_by_a_percent_gives_no_noise() -> None:
         f.refusal for f in Result(snapshot, Settings()).facts if isinstance(f, NoiseNotIdentified)
     }
     assert Refusal.GAIN_FOLLOWS in causes
+
+
+def holds(
+    snapshot: Snapshot, method: str, variances: tuple[float, ...], settings: Settings = SETTINGS
+) -> list[bool]:
+    """Return which intervals hold the noise."""
+    means = Result(snapshot, settings).means(method, BAND)
+    d = len(means) // len(variances)
+    truth = 2 / RATE * np.repeat(variances, d)
+    return [bool(m.low[0] <= t <= m.high[0]) for m, t in zip(means, truth, strict=True)]
+
+
+def test_noise_that_two_of_three_sensors_share_is_found_and_given() -> None:
+    """One-channel sensors: no other method tells shared noise from motion."""
+    own, total = (0.5, 0.5, 1.0), (1.0, 1.0, 1.0)
+    rng = np.random.default_rng(11)
+    sensors = samples(rng, change=6.0, snr=3.0, d=1, every=150.0, variances=own, shared=0.5)
+    plain = estimated(sensors)
+    assert all(holds(plain, "three-sensor", total))  # by what the parts contradict
+    ends = plain.results["three-sensor"].noise_psd[4:40] * RATE / 2
+    assert np.all(ends.mean(axis=0) / total < [0.7, 0.7, 2.0])
+    found = {type(fact): fact for fact in Result(plain, SETTINGS).facts}
+    part, differ = found[NoisePartShared], found[MethodsDiffer]
+    assert isinstance(part, NoisePartShared)
+    assert isinstance(differ, MethodsDiffer)
+    assert part.sensors == ("A", "B")
+    assert not part.is_known
+    assert abs(part.share - 0.5) < 4 * part.share_error < 0.3
+    assert len(differ.channels) == 3
+    stated = replace(SETTINGS, shared_noise=(("A", "B"),))
+    snapshot = estimated(sensors, stated)
+    assert all(holds(snapshot, "multi-part", total, stated))
+    (known,) = (f for f in Result(snapshot, stated).facts if isinstance(f, NoisePartShared))
+    assert known.is_known
+    assert abs(known.share - 0.5) < 4 * known.share_error < 0.3
+
+
+def test_motion_that_changes_lowers_the_scatter_of_three_sensors() -> None:
+    narrower, held, n_used = [], [], 0
+    equal = (1.0, 1.0, 1.0)
+    for seed in range(4):
+        rng = np.random.default_rng([13, seed])
+        sensors = samples(rng, change=6.0, snr=0.4, every=150.0, variances=equal)
+        snapshot = estimated(sensors)
+        plain = estimated(sensors, replace(SETTINGS, methods=("three-sensor",)))
+        ours, before = (each.results["three-sensor"] for each in (snapshot, plain))
+        used = (ours.flags & Flag.CHANGING) != 0
+        n_used += used.any()
+        assert not (before.flags & Flag.CHANGING).any()
+        np.testing.assert_array_equal(ours.noise_psd[~used], before.noise_psd[~used])
+        narrower += (ours.cumulants[0][used] / before.cumulants[0][used]).tolist()
+        held += holds(snapshot, "three-sensor", equal)
+        kinds = {type(fact) for fact in Result(snapshot, SETTINGS).facts}
+        assert (SteadyGainsAssumed in kinds) == used.any()
+        assert MethodsDiffer not in kinds
+    assert n_used >= 2
+    assert np.median(narrower) < 0.8
+    assert np.mean(held) > 0.85  # 36 intervals of 95 %
 
 
 def test_one_sensor_shows_its_spectrum() -> None:
@@ -128,3 +203,15 @@ def test_parts_of_a_recording_hold_all_of_it() -> None:
     np.testing.assert_allclose(pair.gains, 1.03, atol=0.01)
     assert np.all(np.abs(pair.gains - 1.03) < 4 * pair.gain_errors)
     assert np.all(pair.gain_errors < 0.005)
+
+
+@pytest.mark.parametrize("d", [1, 3])
+def test_how_two_sensors_compare_is_a_fact_with_errors(d: int) -> None:
+    rng = np.random.default_rng(15)
+    snapshot = estimated(samples(rng, change=0.0, d=d, snr=8.0))  # no noise is identified
+    (fact,) = (each for each in Result(snapshot, SETTINGS).facts if isinstance(each, PairCompared))
+    truth = 64 / ((8 + NOISE[0]) * (8 + NOISE[1]))
+    assert abs(fact.coherence - truth) < 4 * fact.coherence_error < 0.02
+    assert np.all(np.abs(np.array(fact.gains) - 1) < 4 * np.array(fact.gain_errors))
+    assert abs(fact.delay) < 4 * fact.delay_error < 1e-3
+    assert np.isnan(fact.rotation) == (d == 1)

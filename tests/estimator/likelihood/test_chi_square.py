@@ -8,7 +8,7 @@ import sys
 import pytest
 from scipy import special
 
-from estimator.likelihood.goodness_of_fit import critical_value, digamma, upper_tail
+from estimator.likelihood.goodness_of_fit import critical_value, digamma, trigamma, upper_tail
 
 DEGREES = [0.3, 1.0, 2.0, 7.5, 27.0, 100.0, 433.3, 2000.0, 9000.0, 40000.0]
 
@@ -47,3 +47,4 @@ def test_critical_value_agrees_with_scipy(degrees: float) -> None:
 @pytest.mark.parametrize("x", [0.1, 1.0, 1.5, 4.2, 9.99, 10.0, 37.3, 1080.0, 1e6])
 def test_digamma_agrees_with_scipy(x: float) -> None:
     assert digamma(x) == pytest.approx(special.digamma(x), rel=1e-13, abs=1e-14)
+    assert trigamma(x) == pytest.approx(special.polygamma(1, x), rel=1e-13)

@@ -45,11 +45,12 @@ KEYS = (
     "gains",
     "axis_tolerance",
     "gain_steadiness",
+    "shared_noise",
     "lean",
     "target_cov_bin",
 )
 VALUES: dict[str, Any] = {
-    "methods": ("maximum-likelihood", "two-channel"),
+    "methods": ("maximum-likelihood", "two-channel", "multi-part"),
     "segment": 90.5,
     "overlap": 0.75,
     "window": "kaiser,8",
@@ -66,6 +67,7 @@ VALUES: dict[str, Any] = {
     "sampling_rates": {"B": 100.9},
     "axis_tolerance": {"": 0.5, "B": 0.25},
     "gain_steadiness": 0.02,
+    "shared_noise": (("A", "B"),),
     "lean": {"B": (0.3, -0.1)},
     "unit": "µg",
     "band": (1 / 3, 20.0),
@@ -73,13 +75,13 @@ VALUES: dict[str, Any] = {
     "target_cov_bin": 0.3,
 }
 ARGUMENTS = [
-    "--method=maximum-likelihood,two-channel", "--segment=90.5", "--overlap=0.75",
+    "--method=maximum-likelihood,two-channel,multi-part", "--segment=90.5", "--overlap=0.75",
     "--window=kaiser,8", "--detrend=linear", "--no-correction", "--clocks=arrivals",
     "--equalise=known", "--reject", "--bridge=0.25", "--linearise", "--octaves",
     "--dimension=2", "--gain=B=1.02",
     f"--gain=C.Z={0.1 + 0.2}", "--sampling-rate=B=100.9",
     "--axis-tolerance=0.5", "--axis-tolerance=B=0.25", "--gain-steadiness=0.02",
-    "--lean=B=0.3,-0.1",
+    "--lean=B=0.3,-0.1", "--shared-noise=A:B",
     "--unit=µg", f"--band={1 / 3}:20", "--target-cov=0.07",
     "--target-cov-bin=0.3",
 ]  # fmt: skip
@@ -222,6 +224,7 @@ def test_what_the_sensors_do_not_allow_is_refused_with_what_they_do() -> None:
             "--dimension 7: expected at most 6: 9 channels cannot separate",
         ),
         (Settings(gains={"Z": 1.0}), "--gain Z=1: expected one of A, B, C, A.X"),
+        (Settings(shared_noise=(("A", "Z"),)), "--shared-noise Z: expected one of A, B, C"),
     ):
         with pytest.raises(typer.BadParameter, match=said):
             check_fit(settings, sensors)
@@ -247,6 +250,7 @@ def test_an_estimate_without_options_does_what_the_recordings_bench_file_says(
         "three-channel",
         "three-sensor",
         "maximum-likelihood",
+        "multi-part",
     }
 
 

@@ -86,8 +86,9 @@ def test_what_is_not_known_is_left_out() -> None:
 
 
 DIMENSIONLESS = {
-    *("cov", "target", "gains", "shares", "share", "statistic", "worst_statistic", "p_value"),
-    *("snr", "condition", "ratio", "coherencies", "standard_errors", "share_of_frequencies"),
+    *("cov", "target", "gains", "gain_errors", "shares", "share", "share_error", "statistic"),
+    *("worst_statistic", "p_value", "coherence", "coherence_error", "coherencies"),
+    *("snr", "condition", "ratio", "standard_errors", "share_of_frequencies"),
     *("n_dimensions", "n_effective", "share_of_partners", "share_without", "inflation"),
     *("delay_samples", "ppm", "bits", "evidence"),
 }

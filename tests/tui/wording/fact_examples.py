@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 from daq.protocols.block import Uncounted
@@ -25,6 +26,19 @@ EXAMPLES: tuple[Fact, ...] = (
     facts.Finding(rank=Rank.INVALIDATES, findings=(MISFIT,)),
     facts.SensorsSimulated(rank=Rank.TO_KNOW),
     facts.FewSensors(rank=Rank.DELAYS, n_sensors=1),
+    facts.PairCompared(
+        rank=Rank.TO_KNOW,
+        sensors=("A", "B"),
+        band=(0.5, 40.0),
+        coherence=0.98,
+        coherence_error=0.001,
+        rotation=2.5,
+        rotation_error=0.01,
+        gains=(1.02, 0.99),
+        gain_errors=(0.001, 0.002),
+        delay=math.nan,
+        delay_error=math.nan,
+    ),
     facts.SteadyGainsAssumed(rank=Rank.TO_KNOW, method="multi-part", share=0.001),
     facts.NoiseNotIdentified(
         rank=Rank.DELAYS,
@@ -34,6 +48,21 @@ EXAMPLES: tuple[Fact, ...] = (
         refusal=Refusal.STEADY,
         change=0.4,
         axis="A.Z",
+    ),
+    facts.NoisePartShared(
+        rank=Rank.DELAYS,
+        sensors=("A", "B"),
+        band=(1.0, 3.0),
+        share=0.4,
+        share_error=0.02,
+        is_known=False,
+    ),
+    facts.MethodsDiffer(
+        rank=Rank.DELAYS,
+        method="three-sensor",
+        channels=("A.X",),
+        band=(1.0, 3.0),
+        difference=1.2,
     ),
     facts.MethodRefused(rank=Rank.DELAYS, method="two-channel", reason="channels differ"),
     facts.WithoutEstimate(
