@@ -13,6 +13,7 @@ from textual.widgets import Static
 from daq.bench.masks.mask import NOISE_MODELS
 from daq.bench.masks.mask_file import masks_named
 from daq.bench.model import Limit
+from daq.results.band_summary import BandMeans
 from daq.results.result import Result
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
 from tests.tui.application.test_app import NARROW, WIDE, running, shown, view
@@ -20,7 +21,16 @@ from tests.tui.example_snapshot import SETTINGS, ProgressCallback, demo_bench, m
 from tui.application.app import HuddleApp
 from tui.application.state import State
 from tui.application.test_view.braille import cells, joined
-from tui.application.test_view.plotted import Choice, curves, moved, panned, whole_span, zoomed
+from tui.application.test_view.curves import level_limits, noise_curve
+from tui.application.test_view.plotted import (
+    Choice,
+    curves,
+    moved,
+    panned,
+    reading,
+    whole_span,
+    zoomed,
+)
 from tui.application.test_view.units import GRAVITY, SpectrumUnit, units_of
 
 if TYPE_CHECKING:
@@ -39,6 +49,23 @@ def test_units_agree_with_their_definitions() -> None:
     assert by_name["g²/Hz"].value(level) == pytest.approx(1e-12 / GRAVITY**2)
     assert by_name["ng/√Hz"].value(level) == pytest.approx(1e-6 / GRAVITY * 1e9)
     assert [unit.name for unit in units_of("m/s")][2:] == ["m/s/√Hz"]
+
+
+def test_upper_bounds_are_within_the_plot_and_no_levels() -> None:
+    mean, high = np.full(3, 1e-9), np.full(3, 2e-9)
+    means = BandMeans(mean, mean, -mean, high, is_bound=np.ones(3, dtype=bool))
+    curve = noise_curve(
+        *(np.arange(1.0, 6.0), means),
+        edges=np.arange(4),
+        label="multi-part",
+        style="",
+        band_style="",
+        marker="",
+    )
+    assert np.isnan(curve.level_db).all()
+    low, highest = level_limits([curve])
+    assert low < 10 * np.log10(2e-9) < highest
+    assert reading(curve, 1, units_of("m/s²")[0]).startswith("below ")
 
 
 @pytest.mark.parametrize("unit", units_of("m/s²"), ids=lambda unit: unit.name)

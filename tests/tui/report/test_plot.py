@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import re
+from dataclasses import replace
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
@@ -17,6 +18,7 @@ from daq.bench.masks.mask import NOISE_MODELS, Mask
 from daq.bench.masks.mask_file import masks_named
 from daq.errors import WrongSettingError
 from daq.results.result import Result
+from estimator.self_noise.result import Flag
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
 from tests.tui.night_recording import record
 from tui.commands.main import app
@@ -85,6 +87,21 @@ def panels(
 def usual() -> list[Axes]:
     """Draw the example's noise by one method, once for all tests."""
     return panels()
+
+
+def test_a_bound_is_a_dashed_line_and_no_curve_of_noise() -> None:
+    (name, noise), *_ = SNAPSHOT.results.items()
+    flags = noise.flags.copy()
+    flags[: len(flags) // 2] |= Flag.UNIDENTIFIED
+    snapshot = replace(SNAPSHOT, results={name: replace(noise, flags=flags)})
+    for axes in drawn(noise_plots(Result(snapshot, SETTINGS))):
+        lines = {str(line.get_label()): line for line in axes.lines}
+        curve, bound = lines["self-noise"], lines["self-noise is below"]
+        known, limited = (np.isfinite(np.asarray(line.get_ydata())) for line in (curve, bound))
+        assert bound.is_dashed()
+        assert known.any()
+        assert limited.any()
+        assert not (known & limited).any()
 
 
 def test_curves_are_the_estimate() -> None:

@@ -164,8 +164,12 @@ def _centres(frequency: FloatArray, edges: NDArray[np.int64]) -> FloatArray:
 
 
 def level_limits(curves: Sequence[Curve]) -> tuple[float, float]:
-    """Return limits in dB, multiples of ten, that hold all curves but for lone outliers."""
-    levels = np.concatenate([curve.level_db for curve in curves] or [np.array([])])
+    """Return limits in dB, multiples of ten, that hold all curves but for lone outliers.
+
+    Of a curve of upper bounds alone these are shown.
+    """
+    shown = [c.level_db if np.isfinite(c.level_db).any() else c.high_db for c in curves]
+    levels = np.concatenate(shown or [np.array([])])
     levels = levels[np.isfinite(levels)]
     if levels.size == 0:
         return -150.0, -50.0

@@ -18,6 +18,7 @@ from daq.results.decision.limits import concerns, mask_psd
 from daq.whole_file import write_whole
 from estimator.errors import InsufficientDataError
 from estimator.levels.bands import log_edges
+from estimator.self_noise.result import Flag
 from tui.report.figures import drawing
 from tui.report.figures.drawing import look, stack, stack_height
 from tui.report.parts import Plot
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from daq.results.band_summary import BandMeans
     from daq.results.result import Result
+    from estimator.self_noise.result import SelfNoise
     from estimator.types import FloatArray
 
     BoolArray = NDArray[np.bool_]
@@ -86,7 +88,8 @@ class _NoisePanel:
         logarithmic(axes, (float(curve.edges[0]), float(curve.edges[-1])))
         axes.plot(frequency, levels_db(curve.data), color=drawing.DATA, lw=0.8, label="recorded")
         floor = 10 ** (scale[0] / 10)
-        high = np.where(curve.noise.high > 0, curve.noise.high, np.nan)
+        is_bound = curve.noise.is_bound
+        high = np.where((curve.noise.high > 0) & ~is_bound, curve.noise.high, np.nan)
         axes.fill_between(
             frequency,
             levels_db(np.where(curve.noise.low > floor, curve.noise.low, floor)),
@@ -98,11 +101,20 @@ class _NoisePanel:
         )
         axes.plot(
             frequency,
-            levels_db(curve.noise.mean),
+            levels_db(np.where(is_bound, np.nan, curve.noise.mean)),
             color=drawing.NOISE,
             lw=0.9,
             label=self.noise_label,
         )
+        if is_bound.any():
+            axes.plot(
+                frequency,
+                levels_db(np.where(is_bound, curve.noise.high, np.nan)),
+                color=drawing.NOISE,
+                lw=0.8,
+                dashes=(3, 2),
+                label=f"{self.noise_label} is below",
+            )
         for (label, psd), colour, dashes in zip(
             curve.others.items(), drawing.LINES[1:], drawing.DASHES, strict=False
         ):
@@ -223,7 +235,8 @@ def _key_rows(curves: list[_Curves], width: float) -> int:
     """Return the rows of a key of all that may be in a plot."""
     curve = curves[0]
     n_labels = 4 + len(curve.others) + len(curve.models)
-    n_labels += bool(curve.limits) + bool(np.isfinite(curve.quantisation).any())
+    n_labels += bool(curve.limits) + any(each.noise.is_bound.any() for each in curves)
+    n_labels += bool(np.isfinite(curve.quantisation).any())
     return math.ceil(n_labels / max(1, int(width / KEY_COLUMN)))
 
 
@@ -250,7 +263,7 @@ def _curves(result: Result, models: Sequence[Mask]) -> list[_Curves]:
                 _mean(data[:, column], edges, width),
                 means,
                 {
-                    name: _mean(snapshot.results[name].noise_psd[:, column], edges, width)
+                    name: _mean(_estimates(snapshot.results[name])[:, column], edges, width)
                     for name in others
                 },
                 tuple(masks),
@@ -263,6 +276,11 @@ def _curves(result: Result, models: Sequence[Mask]) -> list[_Curves]:
             )
         )
     return curves
+
+
+def _estimates(noise: SelfNoise) -> FloatArray:
+    """Return the noise of a method without bounds, shape (n_freqs, n_channels)."""
+    return np.where((noise.flags & Flag.UNIDENTIFIED) != 0, np.nan, noise.noise_psd)
 
 
 def _mean(psd: FloatArray, edges: NDArray[np.int64], width: FloatArray) -> FloatArray:
