@@ -51,7 +51,7 @@ numpydoc_class_members_toctree = False
 
 
 class Reference(SphinxDirective):
-    """A reference made of what the program declares: ``commands`` or ``bench_file``."""
+    """A reference made of what the program declares: see `docs.reference`."""
 
     required_arguments = 1
     option_spec: ClassVar[dict[str, object]] = {}
@@ -61,7 +61,11 @@ class Reference(SphinxDirective):
         sys.path.insert(0, str(ROOT))
         from docs import reference  # noqa: PLC0415 - needs the root on the path
 
-        make = {"commands": reference.commands, "bench_file": reference.bench_file}
+        make = {
+            "commands": reference.commands,
+            "bench_file": reference.bench_file,
+            "troubleshooting": reference.troubleshooting,
+        }
         found: list[nodes.Node] = self.parse_text_to_nodes(
             make[self.arguments[0]](), allow_section_headings=True
         )

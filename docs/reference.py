@@ -17,7 +17,12 @@ from pydantic_core import PydanticUndefined
 from daq.bench.durations import format_duration, parse_duration
 from daq.bench.estimate_settings import OPTIONS, EstimateSettings, table_keys
 from daq.bench.model import TABLES, Bench
+from daq.results.facts import RANK_OF_LEVEL, Finding, Rank
+from tests.tui.wording.advice_examples import EXAMPLES as ADVICE
+from tests.tui.wording.fact_examples import EXAMPLES as FACTS
 from tui.commands.help import PANELS, subcommand
+from tui.wording.facts import MARKS, RANKS, word
+from tui.wording.findings import Names
 
 _WRITTEN = {"[[schedule.runs]]": "[[schedule]]"}
 """Tables that a person writes by another name than that of their model."""
@@ -38,6 +43,23 @@ def commands() -> str:
                 context.info_name = f"huddle {name}"
                 text = command.get_help(context)
             parts.append(f"### huddle {name}\n\n```text\n{_STYLE.sub('', text).strip()}\n```\n")
+    return "\n".join(parts)
+
+
+def troubleshooting() -> str:
+    """Return each kind of fact with an example in words: what is seen, its effect, what to do."""
+    names = Names(("A", "B", "C"), tuple(f"{s}.{c}" for s in "ABC" for c in "XYZ"), (3, 3, 3))
+    examples = [
+        *(Finding(rank=RANK_OF_LEVEL[advice.level], findings=(advice,)) for advice, _ in ADVICE),
+        *(fact for fact in FACTS if not isinstance(fact, Finding)),
+    ]
+    parts = []
+    for rank in Rank:
+        parts.append(f"## {MARKS[rank]} {RANKS[rank].capitalize()}\n")
+        for fact in (each for each in examples if each.rank is rank):
+            words = word(fact, names)
+            kind = type(fact.findings[0] if isinstance(fact, Finding) else fact).__name__
+            parts.append(f"### {words.line}\n\n{words} (`{kind}`)\n")
     return "\n".join(parts)
 
 

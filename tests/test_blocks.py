@@ -1,0 +1,93 @@
+"""The blocks of README and how-tos: commands run, and print what is shown.
+
+In a block `console`, lines after `$ ` run in one folder for each page; `…` stands for lines that
+are not shown. Numbers may differ by `TOLERANCE`, which is far below the intervals that pages show.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from typer.testing import CliRunner
+
+from tui.commands.main import app
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs" / "examples").glob("*.md"))]
+TOLERANCE = 0.021
+"""Of numbers in dB and in %, of the last of two digits that are shown."""
+_BLOCK = re.compile(r"^( *)```console\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
+_NUMBER = re.compile(r"[−-]?\d+\.\d+")
+
+
+def sessions(page: Path) -> Iterator[tuple[str, list[str]]]:
+    """Yield each command of a page and the lines that it prints."""
+    for indent, block in _BLOCK.findall(page.read_text(encoding="utf-8")):
+        lines = [line.removeprefix(indent) for line in block.splitlines()]
+        starts = [n for n, line in enumerate(lines) if line.startswith("$ ")]
+        for start, end in zip(starts, [*starts[1:], len(lines)], strict=True):
+            yield lines[start][2:], lines[start + 1 : end]
+
+
+def is_alike(shown: str, printed: str) -> bool:
+    """Return whether lines are equal but for the last digit of their numbers."""
+    shown, printed = " ".join(shown.split()), " ".join(printed.split())
+    if _NUMBER.sub("#", shown) != _NUMBER.sub("#", printed):
+        return False
+    pairs = zip(_NUMBER.findall(shown), _NUMBER.findall(printed), strict=True)
+    return all(
+        abs(float(a.replace("−", "-")) - float(b.replace("−", "-"))) < TOLERANCE for a, b in pairs
+    )
+
+
+def assert_prints(shown: list[str], printed: str) -> None:
+    """Check that the lines of a page are printed, in their order."""
+    left = iter(printed.splitlines())
+    for line in shown:
+        if line.strip() != "…":
+            assert any(is_alike(line, each) for each in left), f"{line!r} is not in\n{printed}"
+
+
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if any(sessions(page))], ids=lambda page: page.name
+)
+def test_commands_print_what_is_shown(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for command, shown in sessions(page):
+        words = shlex.split(command)
+        assert words[0] == "huddle"
+        if any("TST" in word for word in words):
+            for file in request.getfixturevalue("usgs_recording").iterdir():
+                (tmp_path / file.name).symlink_to(file)
+        words = [
+            name
+            for word in words[1:]
+            for name in (sorted(map(str, Path().glob(word))) if "*." in word else [word])
+        ]
+        done = CliRunner().invoke(app, words, terminal_width=200)
+        assert done.exit_code == 0, done.output
+        assert_prints(shown, done.stdout)
+
+
+def test_the_python_of_the_readme_prints_what_is_shown() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    found = re.search(r"^```python\n(.*?)^```\n+```\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    assert found is not None
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        exec(found[1], {})  # noqa: S102 - the block of the page
+    assert_prints(found[2].splitlines(), printed.getvalue())
+
+
+def test_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 110
