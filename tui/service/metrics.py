@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import platform
 import threading
 from typing import TYPE_CHECKING, Any
 
 from daq.errors import HuddleError
+from estimator.decision.verdict import Verdict
+from tui import __version__
 from tui.output.extras import load
 from tui.service.records.run_state import Run, RunState
 
@@ -18,6 +21,12 @@ if TYPE_CHECKING:
     from tui.service.service import Service
 
 
+PYTHON = platform.python_version()
+_NOISE = {
+    "psd": "Mean noise",
+    "low": "Lower end of the 95 % interval of the mean noise",
+    "high": "Upper end of the 95 % interval of the mean noise",
+}
 PATIENCE, MAX_THREADS = 5.0, 64
 """Seconds for which a connection may be silent, and threads of the service with connections."""
 
@@ -127,8 +136,11 @@ class ServiceMetrics:
         status = None if window is None else window.status
         if status is not None:
             yield from _sensors(core, status)
+        yield core.InfoMetricFamily(
+            "huddle_build", "This copy of huddle.", {"version": __version__, "python": PYTHON}
+        )
         if self._done is not None:
-            yield _noise(core, self._done)
+            yield from _result(core, self._done)
 
 
 def _sensors(core: Any, status: dict[str, Any]) -> Iterator[Any]:  # noqa: ANN401 - a module
@@ -151,12 +163,21 @@ def _sensors(core: Any, status: dict[str, Any]) -> Iterator[Any]:  # noqa: ANN40
     yield state
 
 
-def _noise(core: Any, run: Run) -> Any:  # noqa: ANN401 - a module, and a class of it
+def _result(core: Any, run: Run) -> Iterator[Any]:  # noqa: ANN401 - a module
     labels = ["sensor", "channel", "serial_number", "unit", "low_hz", "high_hz"]
-    family = core.GaugeMetricFamily(
-        "huddle_noise_psd", "Mean noise of the last run in unit²/Hz.", labels=labels
+    for name, text in _NOISE.items():
+        family = core.GaugeMetricFamily(
+            f"huddle_noise_{name}", f"{text} of the last run in unit²/Hz.", labels=labels
+        )
+        for each in run.noise:
+            family.add_metric([str(getattr(each, label)) for label in labels], getattr(each, name))
+        yield family
+    verdict = core.GaugeMetricFamily(
+        "huddle_verdict", "1 for the verdict of the last run on its limits.", labels=["verdict"]
     )
-    for each in run.noise:
-        values = [str(getattr(each, name)) for name in labels]
-        family.add_metric(values, each.psd)
-    return family
+    for known in Verdict if run.verdict else ():
+        verdict.add_metric([known.value], known.value == run.verdict)
+    yield verdict
+    yield core.GaugeMetricFamily(
+        "huddle_simulated", "Whether a sensor of the last run was simulated.", value=run.simulated
+    )

@@ -3,27 +3,32 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
+import platform
+import re
 import socket
 import sys
 import urllib.request
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from daq.bench.tables.unattended import Metrics
+from estimator.decision.verdict import Verdict
 from tests.tui.service.bench_files import HOURLY, Place
 from tests.waiting import limit
+from tui import __version__
 from tui.commands.serve import is_alive, signs_of_life
 from tui.output.logs.lines import JournalHandler, fields_of
 from tui.service.hooks import HookRunner
 from tui.service.metrics import MetricsError, ServiceMetrics
 from tui.service.notify import Notifier, watchdog_interval
+from tui.service.records.run_state import BandNoise
 from tui.service.window import STALL
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
+ROOT = Path(__file__).parents[3]
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="sockets with names")
 
 
@@ -84,8 +89,9 @@ async def test_metrics_show_runs_sensors_and_disk(
     metrics = ServiceMetrics(service, hook_runner)
     task = asyncio.create_task(service.run())
     await asyncio.sleep(2 * 3600.0)  # 14:00:30
+    noise = BandNoise("a", "", "7", "X", "m/s²", "three-sensor", 1.0, 10.0, 4e-12, 3e-12, 5e-12)
     for run in place.changes:
-        metrics.note(run)
+        metrics.note(replace(run, noise=(noise,), verdict="not-decided", simulated=True))
     with metrics.served(Metrics(port=0)) as port:
         with pytest.raises(MetricsError, match=f"port {port}: Address already in use"):
             metrics.served(Metrics(port=port)).__enter__()
@@ -104,6 +110,42 @@ async def test_metrics_show_runs_sensors_and_disk(
     assert lines['huddle_sensor_samples{sensor="a"}'] == "7.0"
     assert lines['huddle_sensor_state{sensor="a",state="live"}'] == "1.0"
     assert float(lines["huddle_disk_free_bytes"]) > 0
+    of = '{channel="X",high_hz="10.0",low_hz="1.0",sensor="a",serial_number="7",unit="m/s²"}'
+    found = {name: lines[f"huddle_noise_{name}{of}"] for name in ("psd", "low", "high")}
+    assert found == {"psd": "4e-12", "low": "3e-12", "high": "5e-12"}
+    verdicts = {name: lines[f'huddle_verdict{{verdict="{name}"}}'] for name in Verdict}
+    assert verdicts == {"pass": "0.0", "fail": "0.0", "not-decided": "1.0"}
+    assert lines["huddle_simulated"] == "1.0"
+    build = f'huddle_build_info{{python="{platform.python_version()}",version="{__version__}"}}'
+    assert lines[build] == "1.0"
+    _check_dashboard(set(lines))
+
+
+def _check_dashboard(scraped: set[str]) -> None:
+    """Check that the dashboard of Grafana shows all metrics, by names and labels they have."""
+    labels = {line.partition("{")[0]: {*re.findall(r'(\w+)="', line)} for line in scraped}
+    dashboard = json.loads((ROOT / "deploy" / "grafana.json").read_text(encoding="utf-8"))
+    shown = set()
+    for panel in dashboard["panels"]:
+        for target in panel["targets"]:
+            (name,) = re.findall(r"huddle_\w+", target["expr"])
+            assert name in labels, target["expr"]
+            assert {*re.findall(r"{{(\w+)}}", target["legendFormat"])} <= labels[name]
+            shown.add(name)
+    assert shown == {name for name in labels if name.startswith("huddle_")}
+    variables = {each["name"]: each["query"] for each in dashboard["templating"]["list"]}
+    assert variables["instance"] == "label_values(huddle_build_info, instance)"
+    assert {panel["datasource"]["uid"] for panel in dashboard["panels"]} == {"${datasource}"}
+    assert "datasource" in variables
+    cells = [
+        (column, row)
+        for panel in dashboard["panels"]
+        for place in [panel["gridPos"]]
+        for column in range(place["x"], place["x"] + place["w"])
+        for row in range(place["y"], place["y"] + place["h"])
+    ]
+    assert len(cells) == len(set(cells)), "panels overlap"
+    assert max(column for column, _ in cells) < 24
 
 
 def _silent(port: int) -> bytes:
