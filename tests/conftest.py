@@ -196,6 +196,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.obj = _leaving_no_task(item.obj)
 
 
+@pytest.fixture
+def needs_obspy() -> None:
+    """Skip a test where ObsPy is not installed: it has no wheels for some machines."""
+    pytest.importorskip("obspy", reason="ObsPy is an extra")
+
+
 @pytest.fixture(scope="session")
 def usgs_recording() -> Path:
     """Folder of the real recording; its tests are skipped, saying so, where it is absent."""

@@ -192,6 +192,7 @@ def test_a_plan_is_that_of_the_command(tmp_path: Path) -> None:
             huddle.plan(snr=250, **wrong)
 
 
+@pytest.mark.usefixtures("needs_obspy")
 def test_commands_are_functions_with_their_numbers(tmp_path: Path) -> None:
     path = tmp_path / "fig9.h5"
     huddle.simulate("fig9", duration="40s").write(path)

@@ -113,6 +113,7 @@ def test_a_gap_stays_a_gap_of_its_length(tmp_path: Path) -> None:
         np.testing.assert_array_equal(samples[317:, 0], np.arange(317, 1000))
 
 
+@pytest.mark.usefixtures("needs_obspy")
 def test_a_response_assigned_to_all_channels(tmp_path: Path, usgs_recording: Path) -> None:
     write_npz(tmp_path / "a.npz", 100)
     response = usgs_recording / "T-compact_Q330HR_BH_40"

@@ -94,6 +94,7 @@ def snapshot(recording: Path) -> Snapshot:
         return estimate([opened], Settings.of(opened.bench))
 
 
+@pytest.mark.usefixtures("needs_obspy")
 def test_miniseed_and_back_in_obspy(tmp_path: Path) -> None:
     obspy = load_obspy()
     x = counts(5000, 1)
@@ -121,6 +122,7 @@ def test_miniseed_and_back_in_obspy(tmp_path: Path) -> None:
     assert sorted(inventory.get_contents()["channels"]) == sorted({trace.id for trace in ours})
 
 
+@pytest.mark.usefixtures("needs_obspy")
 def test_miniseed_of_any_recording_has_codes_and_responses(recording: Path, tmp_path: Path) -> None:
     obspy = load_obspy()
     out = tmp_path / "b.mseed"
@@ -150,6 +152,7 @@ def test_miniseed_of_any_recording_has_codes_and_responses(recording: Path, tmp_
 
 
 @pytest.mark.parametrize("dtype", ["f4", "f8", "i8"])
+@pytest.mark.usefixtures("needs_obspy")
 def test_miniseed_of_any_type_of_sample_is_read_as_it_was(tmp_path: Path, dtype: str) -> None:
     """HDF5 states the order of bytes of floats, which ObsPy took for the other one."""
     obspy = load_obspy()
@@ -163,6 +166,7 @@ def test_miniseed_of_any_type_of_sample_is_read_as_it_was(tmp_path: Path, dtype:
 
 
 @pytest.mark.parametrize("states_utc", [True, pytest.param(False, marks=pytest.mark.long)])
+@pytest.mark.usefixtures("needs_obspy")
 def test_miniseed_of_a_clock_off_its_rate_is_on_time(tmp_path: Path, *, states_utc: bool) -> None:
     obspy = load_obspy()
     rate, n = 100 * (1 + 80e-6), 8 * 4100
@@ -191,6 +195,7 @@ def test_miniseed_of_a_clock_off_its_rate_is_on_time(tmp_path: Path, *, states_u
     assert np.ptp(error) <= 0.005 / 100 + 2e-6  # times of miniSEED are whole microseconds
 
 
+@pytest.mark.usefixtures("needs_obspy")
 def test_public_recording_through_import_and_export(tmp_path: Path, usgs_recording: Path) -> None:
     obspy = load_obspy()
     sources = sorted(usgs_recording.glob("TST5_*_BH0.mseed"))
@@ -227,6 +232,7 @@ def test_public_recording_through_import_and_export(tmp_path: Path, usgs_recordi
         "WUQ.XJ.HHN.D.2008.285.first_record",
     ],
 )
+@pytest.mark.usefixtures("needs_obspy")
 def test_files_of_networks_through_import_and_export(tmp_path: Path, name: str) -> None:
     obspy = load_obspy()
     source = Path(obspy.__file__).parent / "io/mseed/tests/data" / name

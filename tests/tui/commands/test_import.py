@@ -6,6 +6,7 @@ import json
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pytest
 from typer.testing import CliRunner
 
 from daq.recording.reader import Recording
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
+@pytest.mark.usefixtures("needs_obspy")
 def test_the_rest_is_imported_and_what_is_not_is_listed(tmp_path: Path) -> None:
     for channel in ("HHZ", "VMZ"):
         write_records(tmp_path / "a", counts(600, 1), channel=channel)
