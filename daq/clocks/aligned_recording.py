@@ -17,6 +17,7 @@ of reads. Memory is proportional to the requested span.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -59,11 +60,15 @@ _OF_A_CLOCK = 2  # sensors that are compared: one may be broken
 def undoubted(sources: Sequence[SensorSource], reference: int | None) -> tuple[int, ...]:
     """Return sensors whose stated UTC is not doubted, some of each clock; the reference first.
 
-    Then those whose clocks were not set.
+    Then those whose clocks were not set, and restart least often.
     """
     seen: dict[str, int] = {}
     found = [] if reference is None else [reference]
-    for number, source in sorted(enumerate(sources), key=lambda each: each[1].arrivals.stepped > 0):
+
+    def doubts(each: tuple[int, SensorSource]) -> tuple[bool, int]:
+        return each[1].arrivals.stepped > 0, len(each[1].arrivals.restarts)
+
+    for number, source in sorted(enumerate(sources), key=doubts):
         taken = seen.get(source.clock_name, 0)
         if source.device_utc and not source.doubted and taken < _OF_A_CLOCK:
             seen[source.clock_name] = taken + 1
@@ -354,6 +359,26 @@ class AlignedRecording:
             self.set_clocks()
         return found
 
+    def distrust(self, *, followed: bool) -> bool:
+        """Take arrivals for the clocks of sensors whose stated UTC is wrong; return whether any.
+
+        Whose UTC is off by more than can be measured, and, once `followed` by the motion, whose
+        clocks are not understood.
+        """
+        found = [
+            source
+            for source in self._sources
+            if source.lost or (source.doubted and followed and not _is_understood(source))
+        ]
+        for source in found:
+            source.distrust()
+        if found:
+            self._measured_against = None
+            self.reset_delays()
+            self.set_clocks()
+            self._lay_grid()
+        return bool(found)
+
     def learn(
         self, at: FloatArray, delays: FloatArray, *, std: FloatArray, frame_delays: FrameDelays
     ) -> None:
@@ -500,8 +525,14 @@ class AlignedRecording:
             self._apart = True
             self._grid = Grid.laid(self._sources, self.sampling_rate, wanted=begin, apart=True)
 
-    def read(self, start: int, stop: int) -> tuple[FloatArray, BoolArray]:
+    def read(self, start: int, stop: int, *, is_final: bool = True) -> tuple[FloatArray, BoolArray]:
         """Return grid samples `start` to `stop` (not included).
+
+        Parameters
+        ----------
+        start, stop : int
+        is_final : bool
+            Whether epochs whose times are uncertain are left out.
 
         Returns
         -------
@@ -525,6 +556,7 @@ class AlignedRecording:
         samples = np.empty((len(self.channels), stop - start)).T
         valid = np.ones(stop - start, dtype=bool)
         edges = np.cumsum([0, *self.dims])
+        grid = replace(grid, is_final=is_final)
         for source, low, high in zip(self._sources, edges[:-1], edges[1:], strict=True):
             here = grid.read(source, start, samples[:, low:high])
             if not here.all():
@@ -572,6 +604,10 @@ class AlignedRecording:
     def _start(self) -> float:
         """Return the time from the recording's creation to grid sample 0, in s."""
         return 0.0 if self._grid is None else self._grid.start
+
+
+def _is_understood(source: SensorSource) -> bool:
+    return source.known_clock.state.refined and source.known_clock.state.is_understood
 
 
 def _check_rate(path: str | Path, source: SensorSource) -> None:

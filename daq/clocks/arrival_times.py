@@ -38,7 +38,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daq.clocks.clock_model import Clock, ClockSource, ClockState, Epoch, MeasuredDelays
+from daq.clocks.clock_model import (
+    Clock,
+    ClockSetting,
+    ClockSource,
+    ClockState,
+    Epoch,
+    MeasuredDelays,
+)
 from daq.clocks.departures import agreement
 from daq.clocks.device_utc import corrected, from_device_utc
 from daq.clocks.lower_envelope import least_of_each, levelled, scatter_of_least, supporting_line
@@ -288,6 +295,30 @@ class ArrivalTimes:
             last = self._stated[-1]
             last.latency = min(last.latency, float(latency[begin:end].min(initial=math.inf)))
 
+    def settings(self, clock: Clock) -> tuple[ClockSetting, ...]:
+        """Return when, and by how much, the clock that states UTC was set.
+
+        Seen by the driver while samples were counted, or between epochs by the motion, which gave
+        `clock`.
+        """
+        found = [
+            (after.first_sample, after.ahead - before.ahead)
+            for before, after in itertools.pairwise(self._stated)
+        ]
+        if clock.state.refined:
+            stated = self.solve(clock.state.sensor)
+            for start in self.restarts.tolist():
+                edge = np.array([start - 1.0, start])
+                before, after = (stated.at(edge) - clock.at(edge)).tolist()
+                found.append((start, after - before))
+        return tuple(
+            ClockSetting(
+                self.origin_utc_ns + round(float(clock.at(np.array([float(at)]))[0]) * 1e9), step
+            )
+            for at, step in sorted(found)
+            if abs(step) > _SET / self.sampling_rate
+        )
+
     @property
     def stepped(self) -> float:
         """Seconds between the extremes of what the clock was ahead, where it was set."""
@@ -434,10 +465,35 @@ class ArrivalTimes:
     def with_motion(self, sensor: str, measured: MeasuredDelays) -> Clock:
         """Return the clock that arrivals, or what is stated, and measured delays give together."""
         if not len(measured.restarts):
+            if self._device_utc and (placed := self._as_measured(measured)) is not self:
+                return placed.with_motion(sensor, measured)
             return self._filtered(sensor, *self._lines(), measured)
         once = replace(measured, restarts=measured.restarts[:0])
         clock = self._restarting(measured.restarts).with_motion(sensor, once)
         return replace(clock, state=replace(clock.state, n_epochs=len(self._epoch_starts)))
+
+    def _as_measured(self, measured: MeasuredDelays) -> ArrivalTimes:
+        """Return the same stated times, of which each epoch is as late as its measured delays.
+
+        Against the longest one: an epoch begins where the number of missing samples is an estimate,
+        and stated times of both sides need not agree.
+        """
+        known = np.isfinite(measured.std) & (measured.index >= self._epoch_starts[0])
+        index = measured.index[known]
+        apart = measured.seconds[known] - index / self.sampling_rate
+        which = np.searchsorted(self._epoch_starts, index, side="right") - 1
+        off: dict[int, float] = {}
+        for number, rows in enumerate(self._rows(self._epoch)):
+            if (mine := which == number).any():
+                late = np.interp(index[mine], self._index[rows], self._late[rows])
+                off[number] = median(apart[mine] - late)
+        if len(off) < 2:
+            return self
+        longest = off[max(off, key=lambda number: np.ptp(self._bounds()[number]))]
+        moved = [off.get(n, longest) - longest for n in range(len(self._epoch_starts))]
+        if max(map(abs, moved)) < _FLOOR:
+            return self
+        return replace(self, _late=self._late + np.array(moved)[self._epoch], _line=None)
 
     def _restarting(self, samples: IntArray) -> ArrivalTimes:
         """Return the same arrivals with epochs that begin at these samples besides.

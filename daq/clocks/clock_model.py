@@ -159,6 +159,22 @@ class RelativeTime(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class ClockSetting:
+    """A step of the times that a device states, while it sampled on.
+
+    Attributes
+    ----------
+    utc_ns : int
+        When, in ns since 1970.
+    step : float
+        By how much its clock was set forward, in s.
+    """
+
+    utc_ns: int
+    step: float
+
+
+@dataclass(frozen=True, slots=True)
 class ClockState:
     """What is known about one sensor's clock.
 
@@ -197,6 +213,8 @@ class ClockState:
         more than an oscillator's: `residual` is then what they scatter about it.
     slips : tuple of Uncounted
         Samples lost, or repeated, without being counted; the clock allows for them.
+    settings : tuple of ClockSetting
+        Steps of the stated UTC; the clock does not follow them.
     """
 
     sensor: str
@@ -215,6 +233,7 @@ class ClockState:
     unchecked: bool = False
     is_understood: bool = True
     slips: tuple[Uncounted, ...] = ()
+    settings: tuple[ClockSetting, ...] = ()
 
     def relative_time(self, other: ClockState) -> RelativeTime:
         """Return how the times of this sensor are known against those of another."""
@@ -233,7 +252,9 @@ class ClockState:
     def shared_by(self, sensor: str) -> ClockState:
         """Return the state of a sensor that is sampled by this clock."""
         name = self.shared_clock or self.sensor
-        state = replace(self, corrected=0.0, drifts=False, unchecked=False)  # it states no time
+        state = replace(
+            self, corrected=0.0, drifts=False, unchecked=False, settings=()
+        )  # it states no time
         return replace(state, sensor=sensor, source=ClockSource.SHARED_CLOCK, shared_clock=name)
 
 

@@ -47,10 +47,14 @@ class Grid:
         In Hz.
     start : float
         Seconds from the recording's creation to grid sample 0.
+    is_final : bool
+        Whether epochs whose times are uncertain are left out. While delays are measured they are
+        not: else they would remain uncertain.
     """
 
     sampling_rate: float
     start: float
+    is_final: bool = True
 
     @classmethod
     def laid(
@@ -121,7 +125,7 @@ class Grid:
         valid = np.zeros(len(samples), dtype=bool)
         end = second[0] + (len(samples) + 1) / self.sampling_rate
         for epoch in source.known_clock.between(second[0] - 1 / self.sampling_rate, end):
-            if not epoch.is_placed:
+            if self.is_final and not epoch.is_placed:
                 continue
             first = round(float(epoch.position(second)[0]))
             low = max(first, epoch.first_sample)
@@ -139,7 +143,7 @@ class Grid:
         valid = np.zeros(stop - start, dtype=bool)
         ratio = self._ratio(source)
         for epoch in source.known_clock.between(seconds[0], seconds[-1]):
-            if not epoch.is_placed:
+            if self.is_final and not epoch.is_placed:
                 continue
             positions = epoch.position(seconds)
             margin = reach(ratio)

@@ -19,7 +19,7 @@ from daq.clocks.clock_model import (
     MeasuredDelays,
     OffsetSource,
 )
-from daq.clocks.device_utc import UtcRate
+from daq.clocks.device_utc import UtcRate, corrected
 from daq.clocks.growing_rows import GrowingRows
 from daq.clocks.quantiles import median
 from daq.clocks.slips import Slips
@@ -127,6 +127,8 @@ class SensorSource:
     where nobody tried.
     """
     polled: bool = False
+    disproved: ArrivalTimes | None = None
+    """The UTC that it stated, where arrival times are its clock instead."""
     clock: Clock | None = None
     learnt: GrowingRows[np.float64] = field(default_factory=lambda: GrowingRows(np.float64, 4))
     """Measured delays: sample of this sensor, that of the reference, delay (s), its std (s)."""
@@ -326,27 +328,47 @@ class SensorSource:
     def utc_rate(self) -> UtcRate:
         """Return the rate of the UTC that it states, if any, against the computer's clock."""
         if self.device_utc and self._utc_rate[0] != self.n_blocks:
-            arrivals = self.arrivals
-            origin = arrivals.origin_monotonic_ns, arrivals.origin_utc_ns
-            heard = ArrivalTimes(self.record.sampling_rate, *origin)
-            for first in range(0, self.n_blocks, _CHUNK_BLOCKS):
-                stop = min(first + _CHUNK_BLOCKS, self.n_blocks)
-                blocks = np.array(self.record.blocks[first:stop])
-                blocks["flags"] &= ~int(BlockFlag.DEVICE_UTC)
-                heard.add(blocks)
-            states = (each.solve(self.record.name).state for each in (arrivals, heard))
+            both = (self.arrivals, self._arrived())
+            states = (each.solve(self.record.name).state for each in both)
             self._utc_rate = self.n_blocks, UtcRate.of(*states)
         return self._utc_rate[1]
+
+    def _arrived(self) -> ArrivalTimes:
+        """Return when its blocks arrived, whatever UTC it states."""
+        origin = self.arrivals.origin_monotonic_ns, self.arrivals.origin_utc_ns
+        heard = ArrivalTimes(self.record.sampling_rate, *origin)
+        for first in range(0, self.n_blocks, _CHUNK_BLOCKS):
+            stop = min(first + _CHUNK_BLOCKS, self.n_blocks)
+            blocks = np.array(self.record.blocks[first:stop])
+            blocks["flags"] &= ~int(BlockFlag.DEVICE_UTC)
+            heard.add(blocks)
+        return heard
+
+    def distrust(self) -> None:
+        """Take arrival times for its clock from now on: no step or drift explains what it states.
+
+        Rows may be lost in silence while it states times by its count.
+        """
+        self.disproved, self.arrivals = self.arrivals, self._arrived()
+        self.device_utc, self.drift = False, None
+        self._in_span = 0, self.arrivals
 
     def solved(self, measured: MeasuredDelays | None, utc: UtcRate) -> Clock:
         """Return the clock in the time of a reference with UTC, to which measured delays belong."""
         name = self.record.name
         if self.device_utc:
-            return self._judged(self.arrivals.solve(name, measured))
+            return self._with_settings(self._judged(self.arrivals.solve(name, measured)))
         measured = None if measured is None else utc.by_computer(measured)
         clock = utc.by_utc(self.heard.counting(self.slips).solve(name, measured))
         clock = clock.without(self.slips)
-        return replace(clock, state=replace(clock.state, slips=self._dated(clock)))
+        clock = replace(clock, state=replace(clock.state, slips=self._dated(clock)))
+        if self.disproved is None or not clock.state.refined:
+            return clock
+        return self._with_settings(corrected(self.disproved.solve(name), clock, moved=0.0))
+
+    def _with_settings(self, clock: Clock) -> Clock:
+        settings = (self.disproved or self.arrivals).settings(clock)
+        return replace(clock, state=replace(clock.state, settings=settings))
 
     def _dated(self, clock: Clock) -> tuple[Uncounted, ...]:
         found = []

@@ -54,7 +54,7 @@ def find_by_motion(reference: SensorSource, others: Sequence[SensorSource]) -> N
         With delays measured against it.
     """
     seen = [_seen(each, reference) for each in others if not (each.device_utc or each.polled)]
-    if not seen or len(seen) < len(others):
+    if not seen:
         return
 
     def of_reference(before: float, after: float) -> tuple[float, float]:

@@ -92,8 +92,11 @@ def compare(aligned: AlignedRecording, settings: Settings, welch: WelchSettings)
         found, against = _drifts(aligned, welch, sensors, most=settings.bridge, longest=short)
         if sum(not math.isfinite(each) for each in found.values()) < unknown:
             drift, reference, longest = found, against, short
-    if not aligned.compare_stated(drift, reference):
-        return False
+    drifts = aligned.compare_stated(drift, reference)
+    if drifts:
+        _follow(aligned, welch, most=settings.bridge, longest=longest)
+    if not aligned.distrust(followed=drifts):
+        return drifts
     _follow(aligned, welch, most=settings.bridge, longest=longest)
     return True
 
@@ -378,7 +381,9 @@ class _Pieces:
         begin = self.start + number * self._welch.hop
         if begin + self._welch.segment_length > self._aligned.n_available:
             return None  # clocks that have been set may end earlier
-        samples, valid = self._aligned.read(begin, begin + self._welch.segment_length)
+        samples, valid = self._aligned.read(
+            begin, begin + self._welch.segment_length, is_final=False
+        )
         valid &= np.isfinite(samples).all(axis=1)
         return around_gaps(self._aligned, self._welch, samples, valid, begin, most=self._most)
 

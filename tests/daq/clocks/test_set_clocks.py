@@ -5,6 +5,7 @@ The digitizers are those of `tests.peers.digitizer`, which share no code with th
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,7 @@ from daq.devices.seedlink.decoder import SeedLinkDecoder, Selection
 from daq.errors import CannotAlignError
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
-from daq.protocols.block import HostTime
+from daq.protocols.block import BlockFlag, HostTime
 from daq.recorder.block_writer import BlockWriter
 from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
@@ -129,3 +130,75 @@ def test_a_finished_recording_can_be_given_its_rate(tmp_path: Path) -> None:
         snapshot = estimate([recording], settings)
         assert [sensor.sampling_rate for sensor in recording.sensors] == rates != [100.0, 101.0]
     assert abs(snapshot.clocks[1].ppm) < 10
+
+
+def stating(path: Path, faults: dict[str, tuple[str, float]], *, seconds: float = SECONDS) -> Path:
+    """Write sensors that state UTC; half way rows or times of some are wrong, by name.
+
+    "gap": the time steps by so many seconds, and the driver takes it for missing rows; "loss": rows
+    of so many seconds are lost in silence, and times follow the count.
+    """
+    made, n = {}, round(seconds * RATE)
+    middle = n // 2
+    for name, samples in zip("ABC", counts(3, n), strict=True):
+        kind, size = faults.get(name, ("", 0.0))
+        lost = round(size * RATE) if kind == "loss" else 0
+        gone = slice(middle, middle + lost)
+        made[name] = Sensor(np.delete(samples, gone, axis=0), utc=True, restarts=(middle,))
+    writer = create(path, made)
+    for name, sensor in made.items():
+        kind, size = faults.get(name, ("", 0.0))
+        for block in blocks(name, sensor):
+            first, late, flags = block.first_sample, 0, block.flags
+            if first >= middle:
+                flags &= ~BlockFlag.CLOCK_RESTART
+                late = round(size * 1e9)
+            ahead = late if kind == "gap" else 0
+            if ahead and first == middle:
+                flags |= BlockFlag.MISSING_ESTIMATED
+            came = late - ahead
+            assert block.device_counter is not None
+            writer.append(
+                replace(
+                    block,
+                    first_sample=first + round(ahead * RATE / 1e9),
+                    flags=flags,
+                    device_counter=block.device_counter + ahead,
+                    received=HostTime(
+                        block.received.monotonic_ns + came, block.received.utc_ns + came
+                    ),
+                )
+            )
+    writer.close()
+    return path
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [
+        {"B": ("gap", 2.0)},
+        {"B": ("loss", 0.5)},
+        {"C": ("gap", 20.0)},
+        pytest.param({"A": ("gap", 0.3), "C": ("loss", 2.0)}, marks=pytest.mark.long),
+        pytest.param({"B": ("gap", 0.02)}, marks=pytest.mark.long),
+        pytest.param({"B": ("loss", 0.01)}, marks=pytest.mark.long),
+        pytest.param({"B": ("loss", 20.0)}, marks=pytest.mark.long),
+        pytest.param({"B": ("gap", 3600.0)}, marks=pytest.mark.long),
+    ],
+)
+def test_noise_is_right_where_stated_times_and_counts_contradict_the_motion(
+    tmp_path: Path, faults: dict[str, tuple[str, float]]
+) -> None:
+    settings = replace(SETTINGS, segment=2.0)
+    snapshot = estimate([stating(tmp_path / "r.h5", faults)], settings)
+    true = 2 * (30_000**2 / SNR) / RATE
+    for mean in channel_means(snapshot.results["three-sensor"], snapshot, settings, (1.0, 40.0)):
+        assert mean.low[0] < 1.1 * true
+        assert mean.high[0] > true / 1.1
+        assert mean.high[0] / mean.low[0] < 1.5
+    found = {clock.sensor: [one.step for one in clock.settings] for clock in snapshot.clocks}
+    set_by = {
+        name: [pytest.approx(size, abs=1e-3)] * (kind == "gap" and size < 3600)
+        for name, (kind, size) in faults.items()
+    }
+    assert found == {name: set_by.get(name, []) for name in "ABC"}
