@@ -225,6 +225,7 @@ def clock_states(passes: Sequence[Pass]) -> tuple[ClockState, ...]:
                 unchecked=any(each.unchecked for each in every),
                 is_understood=all(each.is_understood for each in every),
                 slips=tuple(slip for each in every for slip in each.slips),
+                settings=tuple(one for each in every for one in each.settings),
             )
         )
     return tuple(states)

@@ -16,6 +16,7 @@ from estimator.records import Record, record
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from daq.clocks.clock_model import ClockSetting
     from daq.protocols.block import Uncounted
     from daq.recording.sensor_state import SensorState
     from estimator.checks.advice import Advice, Untested
@@ -547,6 +548,14 @@ class StatedTimesUnchecked(Fact):
     """The UTC that sensors state could not be compared with the motion."""
 
     name: ClassVar[str] = "stated-times-unchecked"
+
+
+@record
+class ClockSet(Fact):
+    """The clock by which a sensor states UTC was set; its count is the clock."""
+
+    name: ClassVar[str] = "clock-set"
+    settings: tuple[ClockSetting, ...]
 
 
 @record

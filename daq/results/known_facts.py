@@ -22,6 +22,7 @@ from daq.results.facts import (
     ChannelsStuck,
     ChannelsWrap,
     ClockNotUnderstood,
+    ClockSet,
     ClocksFitted,
     ClocksMayExplain,
     CodesMissing,
@@ -382,6 +383,9 @@ def _nonlinear(snapshot: Snapshot) -> Iterator[NotLinear]:
         )
 
 
+_SURE = 3.0  # residuals of a clock, beyond which it drifts besides where it was set
+
+
 def _clocks(snapshot: Snapshot) -> Iterator[Fact]:
     """Yield how the times of samples are known, and where they are wrong or may be."""
     clocks, left = snapshot.clocks, snapshot.diagnostics.synchronisation.residual
@@ -393,7 +397,11 @@ def _clocks(snapshot: Snapshot) -> Iterator[Fact]:
             ppm=tuple(clock.ppm for clock in fitted),
             error=max(left.get(clock.sensor, math.nan) for clock in fitted),
         )
-    wrong = [clock for clock in clocks if clock.corrected and not clock.drifts]
+    wrong = [
+        clock
+        for clock in clocks
+        if clock.corrected > (_SURE * clock.residual if clock.settings else 0) and not clock.drifts
+    ]
     lost = [clock for clock in clocks if clock.drifts]
     if wrong or lost:
         after = [each.residual if lost else left.get(each.sensor, math.nan) for each in wrong]
@@ -408,6 +416,13 @@ def _clocks(snapshot: Snapshot) -> Iterator[Fact]:
     if unchecked := tuple(clock.sensor for clock in clocks if clock.unchecked):
         yield StatedTimesUnchecked(rank=Rank.DELAYS, sensors=unchecked)
     for clock in clocks:
+        if clock.settings:
+            yield ClockSet(
+                rank=Rank.TO_KNOW,
+                sensors=(clock.sensor,),
+                settings=clock.settings,
+                time_utc_ns=(clock.settings[0].utc_ns, clock.settings[-1].utc_ns),
+            )
         if clock.slips:
             yield SamplesUncounted(
                 rank=Rank.DELAYS,

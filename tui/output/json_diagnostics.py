@@ -10,7 +10,7 @@ from estimator.self_noise.result import Flag
 from tui.output.json_values import plain
 
 if TYPE_CHECKING:
-    from daq.clocks.clock_model import ClockState
+    from daq.clocks.clock_model import ClockSetting, ClockState
     from daq.estimation.snapshot import Octave, SensorTotals, Snapshot
     from daq.estimation.snapshot_diagnostics import (
         Diagnosis,
@@ -121,12 +121,18 @@ def _clock(each: ClockState) -> dict[str, Any]:
         "is_unchecked": each.unchecked,
         "is_understood": each.is_understood,
         "slips": [slip_document(slip) for slip in each.slips],
+        "settings": [setting_document(one) for one in each.settings],
     }
 
 
 def slip_document(slip: Uncounted) -> dict[str, Any]:
     """Return samples that were lost without being counted as JSON."""
     return {"utc_ns": slip.utc_ns, "within_s": slip.within, "samples": slip.n_samples}
+
+
+def setting_document(setting: ClockSetting) -> dict[str, Any]:
+    """Return a step of stated UTC as JSON."""
+    return {"utc_ns": setting.utc_ns, "step_s": setting.step}
 
 
 def _synchronisation(found: Synchronisation) -> dict[str, Any]:

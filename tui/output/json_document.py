@@ -20,7 +20,12 @@ from estimator.checks.advice import Advice
 from estimator.self_noise.result import Flag
 from tui import __version__
 from tui.output.calibration import channels_of
-from tui.output.json_diagnostics import diagnostics_document, dimension_document, slip_document
+from tui.output.json_diagnostics import (
+    diagnostics_document,
+    dimension_document,
+    setting_document,
+    slip_document,
+)
 from tui.output.json_values import plain
 from tui.output.noise_parameters import noise_parameters_document
 from tui.wording.facts import known
@@ -373,6 +378,7 @@ def _transients(octave: tuple[float, float, int]) -> dict[str, Any]:
 
 _PARTS: Mapping[str, Callable[[Any], dict[str, Any]]] = {
     "choices": dimension_document,
+    "settings": setting_document,
     "slips": slip_document,
     "transients_by_octave": _transients,
 }

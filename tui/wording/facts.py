@@ -24,6 +24,7 @@ from daq.results.facts import (
     ChannelsStuck,
     ChannelsWrap,
     ClockNotUnderstood,
+    ClockSet,
     ClocksFitted,
     ClocksMayExplain,
     CodesMissing,
@@ -662,6 +663,9 @@ def _unchecked(fact: StatedTimesUnchecked, names: Names) -> Wording:
     )
 
 
+_SETTINGS = 3  # named one by one
+
+
 @word.register(SamplesUncounted)
 def _uncounted(fact: SamplesUncounted, names: Names) -> Wording:
     del names
@@ -681,6 +685,20 @@ def _uncounted(fact: SamplesUncounted, names: Names) -> Wording:
         f"{text}: check the logger's buffers and cable",
         f"{text}. Its count was corrected, and the segments around are excluded.",
         f"{UNCOUNTED_CHECK[0].upper()}{UNCOUNTED_CHECK[1:]}.",
+    )
+
+
+@word.register(ClockSet)
+def _set(fact: ClockSet, names: Names) -> Wording:
+    del names
+    each = [(signed(one.step, "+.3f"), _time_of_day(one.utc_ns)) for one in fact.settings]
+    by = listed([f"{step} s at {at} UTC" for step, at in each[:_SETTINGS]])
+    more = f" and {several(len(each) - _SETTINGS, 'more time')}" if len(each) > _SETTINGS else ""
+    text = f"The clock of {listed(fact.sensors)} was set by {by}{more}"
+    return Wording(
+        f"{text}; samples count on",
+        f"{text}. The count of its samples is used there, and not its times.",
+        "Check its time service (GPS, NTP).",
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
+from daq.clocks.clock_model import ClockSetting
 from daq.protocols.block import Uncounted
 from daq.recording.sensor_state import SensorState
 from daq.results import facts
@@ -130,6 +131,12 @@ EXAMPLES: tuple[Fact, ...] = (
     ),
     facts.RoundedAlike(rank=Rank.DELAYS, channels=("A.X", "B.X"), share=0.24),
     facts.StatedTimesUnchecked(rank=Rank.DELAYS, sensors=A),
+    facts.ClockSet(
+        rank=Rank.TO_KNOW,
+        sensors=A,
+        settings=(ClockSetting(NOON, -0.5),),
+        time_utc_ns=(NOON, NOON),
+    ),
     facts.SamplesUncounted(
         rank=Rank.DELAYS,
         sensors=A,
