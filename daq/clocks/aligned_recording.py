@@ -372,12 +372,27 @@ class AlignedRecording:
         ]
         for source in found:
             source.distrust()
-        if found:
+        self._begin_anew(found)
+        return bool(found)
+
+    @property
+    def distrusted(self) -> tuple[int, ...]:
+        """Indices of sensors whose stated UTC is not their clock."""
+        return tuple(n for n, source in enumerate(self._sources) if source.disproved)
+
+    def give_up(self, numbers: Sequence[int]) -> None:
+        """State of sensors that their times are off by more than can be measured."""
+        for number in numbers:
+            self._sources[number].give_up()
+        self._begin_anew([self._sources[number] for number in numbers])
+
+    def _begin_anew(self, changed: Sequence[SensorSource]) -> None:
+        """Set the clocks of sensors whose kind of clock has changed, without measured delays."""
+        if changed:
             self._measured_against = None
             self.reset_delays()
             self.set_clocks()
             self._lay_grid()
-        return bool(found)
 
     def learn(
         self, at: FloatArray, delays: FloatArray, *, std: FloatArray, frame_delays: FrameDelays

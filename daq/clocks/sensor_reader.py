@@ -353,6 +353,12 @@ class SensorSource:
         self.device_utc, self.drift = False, None
         self._in_span = 0, self.arrivals
 
+    def give_up(self) -> None:
+        """Take the stated UTC again, which is off by more than can be measured."""
+        self.arrivals, self.disproved = self.disproved or self.arrivals, None
+        self.device_utc, self.drift, self.slips = True, math.inf, Slips()
+        self._in_span = 0, self.arrivals
+
     def solved(self, measured: MeasuredDelays | None, utc: UtcRate) -> Clock:
         """Return the clock in the time of a reference with UTC, to which measured delays belong."""
         name = self.record.name

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from daq.estimation.settings import Settings
 from daq.results.facts import (
     ClockNotUnderstood,
+    ClockSet,
     RatesNominal,
     SamplesUncounted,
     StatedTimesDrift,
@@ -20,7 +21,12 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
 
 _WRONG = (
-    ClockNotUnderstood | RatesNominal | SamplesUncounted | StatedTimesDrift | StatedTimesUnchecked
+    ClockNotUnderstood
+    | ClockSet
+    | RatesNominal
+    | SamplesUncounted
+    | StatedTimesDrift
+    | StatedTimesUnchecked
 )
 
 

@@ -98,7 +98,12 @@ def compare(aligned: AlignedRecording, settings: Settings, welch: WelchSettings)
     if not aligned.distrust(followed=drifts):
         return drifts
     _follow(aligned, welch, most=settings.bridge, longest=longest)
-    return True
+    suspects = aligned.distrusted
+    against = (reference, *suspects)
+    drift, _ = _drifts(aligned, welch, against, most=settings.bridge, longest=longest)
+    left = [n for n in suspects if not drift[n] < _COARSE / welch.sampling_rate]
+    aligned.give_up(left)
+    return drifts or len(left) < len(suspects)
 
 
 def agree(
