@@ -192,7 +192,7 @@ def test_noise_is_right_where_stated_times_and_counts_contradict_the_motion(
     settings = replace(SETTINGS, segment=2.0)
     snapshot = estimate([stating(tmp_path / "r.h5", faults)], settings)
     true = 2 * (30_000**2 / SNR) / RATE
-    for mean in channel_means(snapshot.results["three-sensor"], snapshot, settings, (1.0, 40.0)):
+    for mean in Result(snapshot, settings).means("three-sensor", (1.0, 40.0)):
         assert mean.low[0] < 1.1 * true
         assert mean.high[0] > true / 1.1
         assert mean.high[0] / mean.low[0] < 1.5
