@@ -210,7 +210,9 @@ def _rate(each: SensorPreview) -> Iterator[Finding]:
     rate, n_samples = each.sensor.sampling_rate, len(each.samples)
     if each.measured_rate is None:
         yield _of(Problem.UNEVEN, each, each.arrival_scatter)
-    elif abs(each.measured_rate / rate - 1) > max(RATE_ERROR, SIGNIFICANCE * each.rate_error):
+    elif _is_off(each) or (
+        abs(each.measured_rate / rate - 1) > max(RATE_ERROR, SIGNIFICANCE * each.rate_error)
+    ):
         yield replace(_of(Problem.RATE, each, each.measured_rate), wanted=rate)
     elif SIGNIFICANCE * each.rate_error > RATE_ERROR:
         yield _of(Problem.UNEVEN, each, each.arrival_scatter)
@@ -220,14 +222,25 @@ def _rate(each: SensorPreview) -> Iterator[Finding]:
         yield _of(Problem.UNCOUNTED, each)
 
 
+def _clock_error(each: SensorPreview) -> tuple[float, float]:
+    """Return by how much the clock is off, as a fraction, and the standard error of that."""
+    seconds = len(each.samples) / each.sensor.sampling_rate
+    off = (each.measured_rate or math.nan) / each.sensor.sampling_rate - 1
+    return off, max(each.rate_error, each.arrival_scatter / seconds)
+
+
+def _is_off(each: SensorPreview) -> bool:
+    """Whether the clock is off by more than that of any oscillator: the rate is another one."""
+    off, error = _clock_error(each)
+    return each.arrival_scatter <= UNEVEN and abs(off) > max(CLOCK_ERROR, SIGNIFICANCE * error)
+
+
 def _clock(each: SensorPreview) -> Iterator[Finding]:
     if each.measured_rate is None or each.arrival_scatter > UNEVEN:
         yield _of(Problem.UNEVEN, each, each.arrival_scatter)
         return
-    off = each.measured_rate / each.sensor.sampling_rate - 1
-    seconds = len(each.samples) / each.sensor.sampling_rate
-    error = max(each.rate_error, each.arrival_scatter / seconds)
-    if CLOCK_ERROR < abs(off) <= RATE_ERROR and abs(off) > SIGNIFICANCE * error:
+    off, error = _clock_error(each)
+    if _is_off(each) and abs(off) <= RATE_ERROR:
         yield _of(Problem.CLOCK, each, off * 1e6)
     elif SIGNIFICANCE * error > RATE_ERROR:
         yield _of(Problem.UNEVEN, each, each.arrival_scatter)

@@ -39,7 +39,7 @@ SENTENCES: Mapping[Problem, str] = {
     Problem.TROUBLE: "{text}",
     Problem.NO_SAMPLES: "{sensor} answers and sends no samples: check its settings",
     Problem.WRONG_DEVICE: "{text}",
-    Problem.RATE: "{sensor} sends {value:.1f} samples a second, expected {wanted:g}: correct"
+    Problem.RATE: "{sensor} sends {value:.5g} samples a second, expected {wanted:g}: correct"
     " sampling_rate",
     Problem.MISSING: "{sensor} misses {value:.0f} samples: check cable and port",
     Problem.CLIPPING: "{sensor} is clipping: reduce the motion, or check its mounting and range",

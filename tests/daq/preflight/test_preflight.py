@@ -232,8 +232,12 @@ def test_poor_clocks_are_found_and_uneven_ones_are_unknown() -> None:
             replace(c, measured_rate=199.9, rate_error=1e-3),
         ]
     )
-    assert [(f.problem, f.sensor) for f in found] == [(Problem.UNEVEN, "A"), (Problem.CLOCK, "B")]
-    assert found[1].value == pytest.approx(4000)
+    assert [(f.problem, f.sensor) for f in found] == [
+        (Problem.RATE, "B"),
+        (Problem.UNEVEN, "A"),
+        (Problem.CLOCK, "B"),
+    ]
+    assert found[2].value == pytest.approx(4000)
 
 
 def test_an_offset_is_neither_right_nor_wrong() -> None:
