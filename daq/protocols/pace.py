@@ -26,6 +26,7 @@ _KEPT = 3  # nodes: a host is not busy for so long
 _MIN_BASELINE = 20.0  # seconds between two nodes from which on they show the rate
 LOST = 1.0
 """Seconds for which samples must be late at least, to be missing where a clock was set."""
+_ODD = 1e-3  # share by which no oscillator is off: the rate is another one
 _MAX_DRIFT = 0.02  # share by which a rate may be off
 _GAIN = 0.2  # of the average that is the scatter
 _SURE = 4.0  # scatters
@@ -86,6 +87,16 @@ class Pace:
     def lost(self, late: float) -> int:
         """Return how many samples are missing before samples so late, if nothing else says it."""
         return round(late * self._rate) if late > LOST and self.is_sure(late) else 0
+
+    def odd_rate(self) -> float | None:
+        """Return the rate in Hz by which samples arrive, where no oscillator is so far off.
+
+        None where it may be the nominal one.
+        """
+        if self._first is None or self._node_since < self._first[0] + _MIN_BASELINE:
+            return None
+        error = _SURE * self.scatter / (self._node_since - self._first[0])
+        return self._rate * (1 - self.drift) if abs(self.drift) > max(_ODD, error) else None
 
     def take(self, index: float, at: HostTime) -> None:
         """Take the arrival of a sample; samples that arrive together have that of the last one."""

@@ -14,9 +14,11 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from daq.protocols.block import Block, Event, EventKind, Quantity, Reading, ReadingTimes
+from daq.protocols.pace import Pace
 from daq.recorder.connection import SensorLate, SensorLost
 from daq.recorder.late_blocks import REASON as LATE_FOR_GOOD
 from daq.recorder.late_blocks import LateBlocks
+from daq.recorder.repeated_rows import RepeatedRows
 from daq.recorder.sample_index import Gap, SampleIndexer
 from daq.recording.sensor_state import SensorState
 from daq.recording.writer import SensorCounts
@@ -71,6 +73,8 @@ class _Sensor:
         self.late = LateBlocks(sampling_rate, speed=speed)
         self.thermometer = thermometer
         self.indexer = SampleIndexer(sampling_rate)
+        self.pace = Pace(sampling_rate)
+        self.repeats = RepeatedRows(sampling_rate)
         self.state = SensorState.WAITING
         self.late_event: Event | None = None  # written only if the sensor is lost afterwards
         self.n_missing = 0
@@ -281,6 +285,12 @@ class BlockWriter:
                     self._write_gap(name, sensor, gap)
             if not sensor.state.is_lost:
                 sensor.state = SensorState.ENDED
+            if (rate := sensor.pace.odd_rate()) is not None:
+                text = (
+                    f"sent {rate:.5g} samples a second, expected {sensor.rate:g}: correct"
+                    f" sampling_rate, or estimate with --sampling-rate {name}={rate:.5g}"
+                )
+                self._record(Event(name, EventKind.STATUS, text, now), is_warning=True)
         for fold in [one for folds in self._folds.values() for one in folds.values()]:
             for event in fold.left_out():
                 self._record(event)
@@ -381,6 +391,16 @@ class BlockWriter:
                 self._record(Event(block.sensor, EventKind.OVERFLOW, text, block.received))
         if placed.block is not None:
             self._append(block.sensor, placed.block)
+            if (rate := sensor.repeats.refresh_rate(placed.block.counts)) is not None:
+                how = f"it refreshes at {rate:.3g} Hz, polled at {sensor.rate:g} Hz"
+                status = Event(
+                    block.sensor, EventKind.STATUS, f"repeats its values: {how}", block.received
+                )
+                self._record(status, is_warning=True)
+            if placed.gap is not None and placed.gap.estimated:
+                sensor.pace.restart()
+            if placed.block.instants_ns is None:
+                sensor.pace.take(placed.block.end_sample - 1, block.received)
             self._write_thermometer(sensor, placed.block)
 
     def _write_thermometer(self, sensor: _Sensor, block: Block) -> None:
@@ -405,11 +425,12 @@ class BlockWriter:
             text = f"{sensor.n_repeated} samples so far arrived twice and were recorded once"
             self._record(Event(block.sensor, EventKind.RESYNCHRONISED, text, at))
 
-    def _record(self, event: Event) -> None:
+    def _record(self, event: Event, *, is_warning: bool = False) -> None:
         """Write an event to the recording and to the log."""
         self._unsafe_events.append(event)
         self._writer.event(event)
-        level = logging.INFO if event.kind in _ROUTINE else logging.WARNING
+        is_routine = event.kind in _ROUTINE and not is_warning
+        level = logging.INFO if is_routine else logging.WARNING
         what = " ".join(part for part in (event.sensor, event.kind) if part)
         fields = {"sensor": event.sensor, "kind": event.kind}
         _LOGGER.log(level, "%s: %s", what, event.text, extra=fields)

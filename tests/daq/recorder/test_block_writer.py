@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
+import numpy as np
 import pytest
 
 from daq.protocols.block import Event, EventKind
@@ -41,6 +43,12 @@ class Run:
         self.clock.advance(1.0)
         self.blocks.write(items)
         self.blocks.commit()
+
+    def events(self) -> list[str]:
+        """End the run, and return the texts of the conditions that were recorded."""
+        self.blocks.close(self.clock.now(), "the end")
+        self._recording.refresh()
+        return [one.text for one in self._recording.events if one.kind == EventKind.STATUS]
 
     def event(self, kind: EventKind) -> Event:
         """Return an event that happens with the next items."""
@@ -132,3 +140,35 @@ def test_a_late_event_is_recorded_only_if_the_sensor_is_lost_afterwards(tmp_path
     with Recording.open(tmp_path / "r.h5") as recording:
         kinds = [event.kind for event in recording.events]
     assert kinds == [EventKind.LATE, EventKind.STALLED, EventKind.STOPPED]
+
+
+@pytest.mark.parametrize(
+    ("rate", "said"),
+    [
+        (1.009 * RATE, "sent 100.9 samples a second, expected 100: correct sampling_rate, or"),
+        (0.99 * RATE, "sent 99 samples a second, expected 100: correct sampling_rate, or"),
+        (1.0004 * RATE, ""),
+    ],
+)
+def test_an_odd_rate_is_named_at_the_end(tmp_path: Path, rate: float, said: str) -> None:
+    with running(tmp_path / "r.h5") as run:
+        for first in range(0, 80 * int(RATE), 100):
+            run.clock.advance(100 / rate)
+            run.blocks.write([block("a", first, 100, run.clock.now())])
+        found = run.events()
+    assert len(found) == bool(said)
+    assert all(text.startswith(said) and "--sampling-rate a=" in text for text in found)
+
+
+def test_rows_that_repeat_for_long_are_an_event_once(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    read = np.floor(np.arange(200 * int(RATE)) * 0.4).astype(int)  # at two fifths of the rate
+    with running(tmp_path / "r.h5") as run:
+        rows = rng.integers(-9000, 9000, (read[-1] + 1, 2)).astype(np.int32)[read]
+        for first in range(0, len(rows), 100):
+            run.clock.advance(100 / RATE)
+            now = run.clock.now()
+            run.blocks.write(
+                [replace(block("a", first, 100, now), counts=rows[first : first + 100])]
+            )
+        assert run.events() == ["repeats its values: it refreshes at 39.9 Hz, polled at 100 Hz"]
