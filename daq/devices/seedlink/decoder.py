@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 COMPONENTS = "ZNE123UVWXY"
 """Last characters of channel codes, in the order of the channels that match one pattern."""
+_SAME_RATE = 1e-6  # share by which rates may differ
 MAX_KEPT = 4096
 """Maximum number of records kept while a sensor's streams are not decided, and number of records
 that one stream may then be ahead of the others."""
@@ -58,6 +59,8 @@ class Selection:
     station: str
     patterns: tuple[tuple[str, str], ...]
     n_channels: int
+    sampling_rate: float | None = None
+    """That of the bench file in Hz; records of another rate are refused."""
 
     @property
     def station_id(self) -> str:
@@ -113,6 +116,8 @@ class _Sensor:
         self.heard: Counter[str] = Counter()
         self.kept: list[tuple[WaveRecord, HostTime]] = []
         self._dtype = dtype
+        self.refused = ""
+        """Why records were refused last; empty if none were."""
         self._refused: set[str] = set()
         self._hole_ns: int | None = None  # host time at which the hole was detected
 
@@ -123,8 +128,11 @@ class _Sensor:
 
         `in_turn`: see :meth:`daq.protocols.joined_streams.JoinedStreams.add`.
         """
-        if record.counts.dtype.kind != self._dtype.kind:
-            yield from self._refuse(record, at)
+        if text := self._unwanted(record):
+            self.refused = f"stream {record.stream_id} {text}"
+            if record.stream_id not in self._refused:
+                self._refused.add(record.stream_id)
+                yield Event(self.name, EventKind.REFUSED, self.refused, at)
             return
         if self.joined is None:
             self.heard[record.stream_id] += 1
@@ -167,14 +175,18 @@ class _Sensor:
             self._hole_ns = at.monotonic_ns
         return not joined.is_crowded and at.monotonic_ns - self._hole_ns < hold * 1e9
 
-    def _refuse(self, record: WaveRecord, at: HostTime) -> Iterator[Event]:
-        if record.stream_id not in self._refused:
-            self._refused.add(record.stream_id)
-            text = (
-                f"stream {record.stream_id} has samples of type {record.counts.dtype}; expected"
-                f" {self._dtype}: set settings.samples"
+    def _unwanted(self, record: WaveRecord) -> str:
+        """Return why a record cannot be recorded; empty if it can."""
+        if record.counts.dtype.kind != self._dtype.kind:
+            found = record.counts.dtype
+            return f"has samples of type {found}; expected {self._dtype}: set settings.samples"
+        wanted, rate = self.selection.sampling_rate, float(record.sampling_rate)
+        if wanted is not None and abs(rate / wanted - 1) > _SAME_RATE:
+            return (
+                f"has {rate:g} Hz; expected {wanted:g} Hz: correct sampling_rate, or select other"
+                " channels"
             )
-            yield Event(self.name, EventKind.REFUSED, text, at)
+        return ""
 
 
 class SeedLinkDecoder:
@@ -216,6 +228,12 @@ class SeedLinkDecoder:
     def silent(self) -> tuple[str, ...]:
         """Names of the sensors whose streams have not all been received."""
         return tuple(name for name, one in self._sensors.items() if one.joined is None)
+
+    @property
+    def refused(self) -> dict[str, str]:
+        """Why no record of a sensor can be used, by name."""
+        found = {name: self._sensors[name].refused for name in self.silent}
+        return {name: why for name, why in found.items() if why}
 
     def heard(self, sensor: str) -> tuple[str, ...]:
         """Return the received streams that match a sensor's selection."""

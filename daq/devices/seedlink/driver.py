@@ -142,7 +142,8 @@ class SeedLinkSettings(BaseModel):
             )
             raise BenchFileError(FileFault("settings.channels", expected, list(codes), sensor.name))
         patterns = tuple((self.location, code) for code in codes)
-        return Selection(self.network, self.station, patterns, n_channels)
+        rate = sensor.sampling_rate
+        return Selection(self.network, self.station, patterns, n_channels, rate)
 
 
 class SeedLinkSession:
@@ -467,7 +468,7 @@ async def _listen(link: _Link, buffered: list[Block | Event]) -> None:
     """Listen until the streams of every sensor are decided, for at most the patience."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(link.settings.patience / link.clock.speed):
-            while not set(link.decoder.silent) <= set(link.refused):
+            while not set(link.decoder.silent) <= {*link.refused, *link.decoder.refused}:
                 received, at = await link.server.stream.read()
                 buffered += link.decoder.receive(received, at)
 
@@ -477,6 +478,10 @@ def _information(sensors: Sequence[Sensor], link: _Link) -> tuple[DeviceInformat
     for sensor in sensors:
         if trouble := link.refused.get(sensor.name):
             found.append(DeviceInformation(sensor=sensor.name, trouble=trouble))
+            continue
+        if why := decoder.refused.get(sensor.name):
+            unusable = f"{label}: {sensor.name!r}: {why}"
+            found.append(DeviceInformation(sensor=sensor.name, trouble=unusable))
             continue
         if sensor.name in decoder.silent:
             there = ", ".join(decoder.heard(sensor.name)) or "none"
@@ -488,12 +493,6 @@ def _information(sensors: Sequence[Sensor], link: _Link) -> tuple[DeviceInformat
             )
             found.append(DeviceInformation(sensor=sensor.name, trouble=trouble))
             continue
-        rate = decoder.sampling_rate(sensor.name)
-        if rate is not None and abs(rate / sensor.sampling_rate - 1) > 1e-6:
-            raise WrongDeviceError(
-                f"{label}: {sensor.name!r}: expected {sensor.sampling_rate:g} Hz, got {rate:g} Hz;"
-                " correct sampling_rate, or select other channels"
-            )
         details = {
             "server": server.software[:80],
             "organisation": server.organisation[:80],
@@ -502,11 +501,15 @@ def _information(sensors: Sequence[Sensor], link: _Link) -> tuple[DeviceInformat
         }
         found.append(
             DeviceInformation(
-                sensor=sensor.name, model=sensor.model, sampling_rate=rate, details=details
+                sensor=sensor.name,
+                model=sensor.model,
+                sampling_rate=decoder.sampling_rate(sensor.name),
+                details=details,
             )
         )
     if all(one.trouble for one in found):
-        raise NoAnswerError(found[0].trouble)
+        error = WrongDeviceError if decoder.refused else NoAnswerError
+        raise error(found[0].trouble)
     return tuple(found)
 
 

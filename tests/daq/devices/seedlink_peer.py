@@ -15,7 +15,7 @@ def value(station: int, number: int) -> int:
     return (number * 7919 + station * 104729) % 100_003
 
 
-def record(name: str, station: int, turn: int, *, size: int = 256) -> bytes:
+def record(name: str, station: int, turn: int, *, size: int = 256, rate: int = RATE) -> bytes:
     """Return a miniSEED 2 record of 32-bit integers, big-endian, with blockette 1000."""
     begin = EPOCH.timestamp() + turn * PER_RECORD / RATE
     at = datetime.fromtimestamp(begin, UTC)
@@ -25,7 +25,7 @@ def record(name: str, station: int, turn: int, *, size: int = 256) -> bytes:
         round(at.microsecond / 100),
     )
     head = b"%06dD " % (turn % 10**6) + name.encode().ljust(5) + b"  HNZXX" + start
-    head += struct.pack(">HhhBBBBiHH", PER_RECORD, RATE, 1, 0, 0, 0, 1, 0, 64, 48)
+    head += struct.pack(">HhhBBBBiHH", PER_RECORD, rate, 1, 0, 0, 0, 1, 0, 64, 48)
     head += struct.pack(">HHBBBx", 1000, 0, 3, 1, size.bit_length() - 1)
     first = turn * PER_RECORD
     samples = [value(station, first + k) for k in range(PER_RECORD)]
@@ -35,12 +35,14 @@ def record(name: str, station: int, turn: int, *, size: int = 256) -> bytes:
 class Server:
     """Keeps all records that it made; ``make`` makes one more of each station.
 
-    ``refuses`` are stations that get ERROR; ``hang_up`` closes all connections.
+    ``refuses`` are stations that get ERROR, ``rates`` those whose records state another rate;
+    ``hang_up`` closes all connections.
     """
 
     def __init__(self, stations: list[str], *, size: int = 256, padded: bool = False) -> None:
         self.stations = stations
         self.refuses: set[str] = set()
+        self.rates: dict[str, int] = {}
         self.n_turns = 0
         self.n_connections = 0
         self._size, self._padded = size, padded
@@ -71,7 +73,9 @@ class Server:
     def _send(self, writer: asyncio.StreamWriter, following: dict[str, int]) -> None:
         for name, turn in following.items():
             for number in range(turn, self.n_turns):
-                payload = record(name, self.stations.index(name), number, size=self._size)
+                rate = self.rates.get(name, RATE)
+                station = self.stations.index(name)
+                payload = record(name, station, number, size=self._size, rate=rate)
                 if self._padded:
                     payload = payload.ljust(512, b"\0")
                 writer.write(b"SL%06X" % number + payload)

@@ -146,6 +146,42 @@ async def _opened(
     return session, stack, reader, asyncio.create_task(reader.run(session))
 
 
+async def test_a_station_of_another_rate_costs_the_others_nothing() -> None:
+    async with Server(NAMES) as server:
+        server.rates = {"BBB": 50}
+        opening = asyncio.create_task(_opened(server))
+        while not opening.done():
+            server.make()
+            await asyncio.wait([opening], timeout=0.05)
+        session, stack, reader, task = opening.result()
+        about = {one.sensor: one.trouble for one in session.information}
+        assert "has 50 Hz; expected 100 Hz: correct sampling_rate" in about["BBB"]
+        assert not about["AAA"]
+        assert not about["CCC"]
+        await reader.until(server, AAA=200, CCC=200)
+        assert reader.rows["BBB"] == 0
+        server.rates = {}
+        await reader.until(server, AAA=200, BBB=200, CCC=200)
+        for name in NAMES:
+            reader.check(name)
+        kinds = [(e.sensor, e.kind) for e in reader.items if isinstance(e, Event)]
+        assert kinds == [("BBB", EventKind.REFUSED)]
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        await stack.aclose()
+
+
+async def test_a_server_with_other_rates_only_is_named() -> None:
+    async with Server(NAMES) as server:
+        server.rates = dict.fromkeys(NAMES, 50)
+        opening = asyncio.create_task(_opened(server))
+        while not opening.done():
+            server.make()
+            await asyncio.wait([opening], timeout=0.05)
+        with pytest.raises(WrongDeviceError, match="has 50 Hz; expected 100 Hz"):
+            opening.result()
+
+
 async def test_a_server_that_refuses_all_stations_is_named() -> None:
     async with Server(NAMES) as server:
         server.refuses = set(NAMES)
