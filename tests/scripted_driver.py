@@ -65,6 +65,8 @@ class PlayedDevice:
     may_end: asyncio.Event | None = None
     """Until then it does not end, whoever cancels it."""
     sampling_rate: float | None = None
+    troubles: dict[str, str] = field(default_factory=dict)
+    """Of its sensors that do not answer."""
 
 
 @dataclass
@@ -118,7 +120,10 @@ class PlayedDriver:
         device.opened.set()
         information = tuple(
             DeviceInformation(
-                sensor.name, serial_number=device.serial_number, sampling_rate=device.sampling_rate
+                sensor.name,
+                serial_number=device.serial_number,
+                sampling_rate=device.sampling_rate,
+                trouble=device.troubles.get(sensor.name, ""),
             )
             for sensor in sensors
         )

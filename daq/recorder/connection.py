@@ -149,6 +149,8 @@ class Connection:
 
     Parameters
     ----------
+    anyway : bool
+        Whether to begin though some sensors of the port do not answer.
     find_ports : callable
         Returns the serial ports that are present.
     """
@@ -159,6 +161,7 @@ class Connection:
         sensors: Sequence[Sensor],
         clock: HostClock,
         *,
+        anyway: bool = False,
         find_ports: Callable[[], Sequence[SerialPort]] = serial_ports,
     ) -> None:
         self.driver = driver
@@ -171,6 +174,7 @@ class Connection:
         """Information of the devices when they were first connected."""
         self.connected: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         """Done when the first session is open or could not be opened."""
+        self._anyway = anyway
         self._is_connected = False
         self._back_off = BackOff()
         self._reported: tuple[EventKind | None, object] = None, None
@@ -357,8 +361,10 @@ class Connection:
             now = next((i for i in found if i.sensor == sensor.name), None)
             if now is None:
                 continue
-            if now.trouble and not known:
-                raise NoAnswerError(now.trouble)
+            if now.trouble and not known and not self._anyway:
+                raise NoAnswerError(
+                    f"{now.trouble}; --anyway records the other sensors of the port"
+                )
             before = known.get(sensor.name)
             if self._places.is_moved(self.port) and not now.serial_number:
                 raise WrongDeviceError(

@@ -90,6 +90,7 @@ def run(
     *,
     duration: float | None = None,
     attributes: Mapping[str, str] = MappingProxyType({}),
+    anyway: bool = False,
     clock: HostClock | None = None,
     loop_factory: Callable[[], asyncio.AbstractEventLoop] | None = None,
     acknowledged: Callable[[RecorderStatus], None] | None = None,
@@ -109,6 +110,7 @@ def run(
             path,
             duration=duration,
             attributes=attributes,
+            anyway=anyway,
             clock=clock,
             stop=stop,
             acknowledged=acknowledged,
@@ -129,6 +131,7 @@ async def record(
     *,
     duration: float | None = None,
     attributes: Mapping[str, str] = MappingProxyType({}),
+    anyway: bool = False,
     clock: HostClock | None = None,
     stop: asyncio.Event | None = None,
     acknowledged: Callable[[RecorderStatus], None] | None = None,
@@ -148,6 +151,8 @@ async def record(
     attributes : mapping of str to str
         Further attributes of the recording, such as what of the live estimate ends the run
         (``until``): the recorder only writes them.
+    anyway : bool
+        Whether to record though some sensors of a port that others answer on do not.
     clock : HostClock, optional
         Source of host times; default: the system's clock, at the bench's speed.
     stop : asyncio.Event, optional
@@ -174,7 +179,7 @@ async def record(
     recorder = _Recorder(
         bench, Path(path), clock, stop or asyncio.Event(), acknowledged, attributes=attributes
     )
-    return await recorder.run(duration, drivers)
+    return await recorder.run(duration, drivers, anyway=anyway)
 
 
 class _Recorder:
@@ -201,10 +206,10 @@ class _Recorder:
         self._status = RecorderStatus(str(path), 0.0, {})
 
     async def run(
-        self, duration: float | None, drivers: Callable[[str], DriverType]
+        self, duration: float | None, drivers: Callable[[str], DriverType], *, anyway: bool
     ) -> RecorderStatus:
         connections = [
-            Connection(drivers(sensors[0].driver), sensors, self._clock)
+            Connection(drivers(sensors[0].driver), sensors, self._clock, anyway=anyway)
             for sensors in self._bench.ports().values()
         ]
         start = asyncio.Event()

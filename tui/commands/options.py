@@ -140,7 +140,11 @@ EndOption: TypeAlias = Annotated[
 ]
 AnywayOption: TypeAlias = Annotated[
     bool,
-    typer.Option("--anyway", help="Record even where the check list fails (see huddle check)."),
+    typer.Option(
+        "--anyway",
+        help="Record even where the check list fails (see huddle check), or where some sensors of"
+        " a port do not answer.",
+    ),
 ]
 DiagnosticsOption: TypeAlias = Annotated[
     bool,

@@ -20,6 +20,7 @@ from daq.errors import HuddleError, WrongSettingError
 from daq.python_process import python_command
 from daq.recording.storage.names import recording_path
 from tui.commands.options import (
+    AnywayOption,
     BenchArgument,
     DurationOption,
     JsonOption,
@@ -68,6 +69,7 @@ def record(
         bool,
         typer.Option("--check", help="Make the check list first; record nothing if a check fails."),
     ] = False,
+    anyway: AnywayOption = False,
     wire_log: Annotated[
         Path | None,
         typer.Option(
@@ -109,7 +111,7 @@ def record(
     if check:
         from tui.commands.check import check_before_test
 
-        check_before_test(bench, duration=duration, anyway=False)
+        check_before_test(bench, duration=duration, anyway=anyway)
     clock, loop_factory = host_time(bench)
     attributes = {"until": condition.estimated.text, "estimate": estimate or ""}
     made = partial(
@@ -118,6 +120,7 @@ def record(
         out,
         duration=duration,
         attributes={name: text for name, text in attributes.items() if text},
+        anyway=anyway,
         clock=clock,
         loop_factory=loop_factory,
     )

@@ -127,7 +127,7 @@ def run(
     elif bench.recording.report is not None:
         report = out.with_suffix(f".{bench.recording.report}")
     check_before_test(bench, duration=end.duration, anyway=anyway)
-    recorder = RecorderProcess(path, out, end=end, settings=settings)
+    recorder = RecorderProcess(path, out, end=end, settings=settings, anyway=anyway)
     try:
         recorder.wait_for_file()
         hint("Ctrl-C stops the recording and shows the result")

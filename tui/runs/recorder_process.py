@@ -132,6 +132,8 @@ class RecorderProcess:
         Descriptor of a lock that the process holds as long as it lives (not on Windows).
     operator : str, optional
         In place of that of the bench file.
+    anyway : bool
+        Whether to record though some sensors of a port do not answer.
 
     Raises
     ------
@@ -148,6 +150,7 @@ class RecorderProcess:
         settings: EstimateSettings | None = None,
         lock: int | None = None,
         operator: str | None = None,
+        anyway: bool = False,
     ) -> None:
         if out.exists():
             raise RecordingError(f"{out}: exists already; expected a new file")
@@ -162,6 +165,8 @@ class RecorderProcess:
             arguments += ["--estimate", json.dumps(to_table(settings))]
         if operator is not None:
             arguments += ["--operator", operator]
+        if anyway:
+            arguments.append("--anyway")
         descriptor, name = tempfile.mkstemp(prefix="huddle-recorder-", suffix=".log")
         try:
             self._process = subprocess.Popen(

@@ -99,8 +99,8 @@ def compare(aligned: AlignedRecording, settings: Settings, welch: WelchSettings)
         return drifts
     _follow(aligned, welch, most=settings.bridge, longest=longest)
     suspects = aligned.distrusted
-    against = (reference, *suspects)
-    drift, _ = _drifts(aligned, welch, against, most=settings.bridge, longest=longest)
+    compared = (reference, *suspects)
+    drift, _ = _drifts(aligned, welch, compared, most=settings.bridge, longest=longest)
     left = [n for n in suspects if not drift[n] < _COARSE / welch.sampling_rate]
     aligned.give_up(left)
     return drifts or len(left) < len(suspects)

@@ -46,6 +46,7 @@ class Run:
         self.statuses: list[RecorderStatus] = []
         self.news = asyncio.Event()
         self.duration: float | None = None
+        self.anyway = False
 
     def device(self, port: str) -> PlayedDevice:
         """Return what is on a port."""
@@ -57,6 +58,7 @@ class Run:
             self.bench,
             self.path,
             duration=self.duration,
+            anyway=self.anyway,
             clock=self.clock,
             stop=self.stop,
             acknowledged=self._acknowledged,

@@ -15,6 +15,7 @@ from daq.errors import (
 )
 from daq.protocols.errors import RemoteProtocolError
 from daq.recording.reader import Recording
+from daq.recording.sensor_state import SensorState
 from daq.recording.storage.names import recording_path
 from tests.daq.recorder.test_recorder import Run
 from tests.scripted_driver import ManualClock, bench
@@ -36,6 +37,27 @@ async def test_all_failures_at_the_start_are_reported_together(tmp_path: Path) -
         await run.record()
     assert not run.path.exists()
     assert run.device("b").left_quiet
+
+
+async def test_a_silent_sensor_of_a_port_is_recorded_without_only_on_request(
+    tmp_path: Path,
+) -> None:
+    run = Run(tmp_path / "r.h5", "a", "b", a="bus", b="bus")
+    run.device("bus").troubles = {"b": "sensor 'b' on bus: no answer"}
+    with pytest.RaisesGroup(
+        pytest.RaisesExc(NoAnswerError, match="'b' on bus: no answer; --anyway records the other")
+    ):
+        await run.record()
+    assert not run.path.exists()
+    run.anyway = True
+    async with run.going():
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+        assert run.statuses[-1].sensors["b"].state is SensorState.STALLED
+        run.send("b", 0, 100)
+        await run.until("b", 100)
+    with Recording.open(run.path) as recording:
+        assert [sensor.n_samples for sensor in recording.sensors] == [100, 100]
 
 
 async def test_a_protocol_error_at_the_start_is_a_device_error(

@@ -179,6 +179,7 @@ class ProcessSteps:
                 out,
                 end=replace(until, duration=seconds),
                 lock=lock.descriptor,
+                anyway=self._anyway,
             )
             lock.name(process.pid)
         finally:
