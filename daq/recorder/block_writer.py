@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from daq.protocols.block import HostTime
     from daq.recorder.connection import Connected, Item
+    from daq.recorder.repeated_rows import ShareOfRepeats
     from daq.recording.writer import Committed, RecordingWriter
 
 _LOGGER = logging.getLogger(__name__)
@@ -66,15 +67,19 @@ class SensorProgress:
 
 class _Sensor:
     def __init__(
-        self, sampling_rate: float, thermometer: tuple[int, float] | None, speed: float
+        self,
+        sampling_rate: float,
+        thermometer: tuple[int, float] | None,
+        speed: float,
+        repeats: RepeatedRows | None,
     ) -> None:
+        self.repeats = repeats
         self.rate = sampling_rate
         self.speed = speed
         self.late = LateBlocks(sampling_rate, speed=speed)
         self.thermometer = thermometer
         self.indexer = SampleIndexer(sampling_rate)
         self.pace = Pace(sampling_rate)
-        self.repeats = RepeatedRows(sampling_rate)
         self.state = SensorState.WAITING
         self.late_event: Event | None = None  # written only if the sensor is lost afterwards
         self.n_missing = 0
@@ -179,6 +184,8 @@ class BlockWriter:
         Column and sensitivity of the channel that measures the temperature, by sensor.
     speed : float
         Of the host's clock against real time.
+    share_of_repeats : callable, optional
+        See :class:`daq.recorder.repeated_rows.RepeatedRows`; default: repeats are not looked for.
     """
 
     def __init__(
@@ -188,10 +195,15 @@ class BlockWriter:
         thermometers: Mapping[str, tuple[int, float]] = MappingProxyType({}),
         *,
         speed: float = 1.0,
+        share_of_repeats: ShareOfRepeats | None = None,
     ) -> None:
         self._writer = writer
+        judge = share_of_repeats
         self._sensors = {
-            name: _Sensor(rate, thermometers.get(name), speed)
+            name: _Sensor(
+                *(rate, thermometers.get(name), speed),
+                None if judge is None else RepeatedRows(rate, judge),
+            )
             for name, rate in sampling_rates.items()
         }
         self._folds: defaultdict[tuple[str, str], dict[str, _Fold]] = defaultdict(dict)
@@ -391,7 +403,9 @@ class BlockWriter:
                 self._record(Event(block.sensor, EventKind.OVERFLOW, text, block.received))
         if placed.block is not None:
             self._append(block.sensor, placed.block)
-            if (rate := sensor.repeats.refresh_rate(placed.block.counts)) is not None:
+            repeats = sensor.repeats
+            rate = None if repeats is None else repeats.refresh_rate(placed.block.counts)
+            if rate is not None:
                 how = f"it refreshes at {rate:.3g} Hz, polled at {sensor.rate:g} Hz"
                 status = Event(
                     block.sensor, EventKind.STATUS, f"repeats its values: {how}", block.received

@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from daq.devices.interface import DriverType
     from daq.host_clock import HostClock
     from daq.recorder.connection import Item
+    from daq.recorder.repeated_rows import ShareOfRepeats
     from daq.recording.writer import Committed
 
 _LOGGER = logging.getLogger(__name__)
@@ -91,6 +92,7 @@ def run(
     duration: float | None = None,
     attributes: Mapping[str, str] = MappingProxyType({}),
     anyway: bool = False,
+    share_of_repeats: ShareOfRepeats | None = None,
     clock: HostClock | None = None,
     loop_factory: Callable[[], asyncio.AbstractEventLoop] | None = None,
     acknowledged: Callable[[RecorderStatus], None] | None = None,
@@ -111,6 +113,7 @@ def run(
             duration=duration,
             attributes=attributes,
             anyway=anyway,
+            share_of_repeats=share_of_repeats,
             clock=clock,
             stop=stop,
             acknowledged=acknowledged,
@@ -132,6 +135,7 @@ async def record(
     duration: float | None = None,
     attributes: Mapping[str, str] = MappingProxyType({}),
     anyway: bool = False,
+    share_of_repeats: ShareOfRepeats | None = None,
     clock: HostClock | None = None,
     stop: asyncio.Event | None = None,
     acknowledged: Callable[[RecorderStatus], None] | None = None,
@@ -153,6 +157,8 @@ async def record(
         (``until``): the recorder only writes them.
     anyway : bool
         Whether to record though some sensors of a port that others answer on do not.
+    share_of_repeats : callable, optional
+        See :class:`daq.recorder.block_writer.BlockWriter`.
     clock : HostClock, optional
         Source of host times; default: the system's clock, at the bench's speed.
     stop : asyncio.Event, optional
@@ -177,7 +183,9 @@ async def record(
     """
     clock = SystemClock(bench.speed) if clock is None else clock
     recorder = _Recorder(
-        bench, Path(path), clock, stop or asyncio.Event(), acknowledged, attributes=attributes
+        *(bench, Path(path), clock, stop or asyncio.Event(), acknowledged),
+        attributes=attributes,
+        share_of_repeats=share_of_repeats,
     )
     return await recorder.run(duration, drivers, anyway=anyway)
 
@@ -192,8 +200,10 @@ class _Recorder:
         acknowledged: Callable[[RecorderStatus], None] | None,
         *,
         attributes: Mapping[str, str],
+        share_of_repeats: ShareOfRepeats | None,
     ) -> None:
         self._bench = bench
+        self._share_of_repeats = share_of_repeats
         self._attributes = attributes
         self._path = self._file = path
         self._clock = clock
@@ -314,7 +324,11 @@ class _Recorder:
         _LOGGER.info("recording to %s", self._path, extra={"recording": str(self._path)})
         self._report_space(ordered, duration)
         rates = {layout.name: layout.sampling_rate for layout in ordered}
-        rows = BlockWriter(writer, rates, thermometers, speed=self._clock.speed)
+        rows = BlockWriter(
+            *(writer, rates, thermometers),
+            speed=self._clock.speed,
+            share_of_repeats=self._share_of_repeats,
+        )
         rows.write(
             Reading(layout.name, Quantity.TEMPERATURE, layout.temperature, self._started)
             for layout in ordered

@@ -1,22 +1,24 @@
 """Finds devices that repeat their readings for long, while a run goes on.
 
 Rows are kept for some seconds at intervals, and judged as in a check list
-(:func:`estimator.checks.count_limits.share_of_repeats`). Readings that repeat three times in a row
+(``estimator.checks.count_limits.share_of_repeats``, which who runs the recorder gives: the recorder
+knows no estimator). Readings that repeat three times in a row
 are repeated for good: a quiet channel is not named by chance.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from estimator.checks.count_limits import share_of_repeats
-
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from typing import Any
 
     from numpy.typing import NDArray
+
+ShareOfRepeats: TypeAlias = "Callable[[NDArray[Any]], float]"
 
 ROWS = 1000
 """Rows that are judged together."""
@@ -32,10 +34,13 @@ class RepeatedRows:
     ----------
     sampling_rate : float
         In Hz.
+    share_of_repeats : callable
+        Returns the share of rows, shape (n_samples, n_channels), that repeat the row before.
     """
 
-    def __init__(self, sampling_rate: float) -> None:
+    def __init__(self, sampling_rate: float, share_of_repeats: ShareOfRepeats) -> None:
         self._rate = sampling_rate
+        self._share_of_repeats = share_of_repeats
         self._kept: list[NDArray[Any]] = []
         self._n_kept = self._n_waited = self._n_times = 0
 
@@ -48,7 +53,7 @@ class RepeatedRows:
         self._n_kept += len(counts)
         if self._n_kept < ROWS:
             return None
-        share = share_of_repeats(np.concatenate(self._kept))
+        share = self._share_of_repeats(np.concatenate(self._kept))
         self._kept.clear()
         self._n_kept, self._n_waited = 0, round(INTERVAL * self._rate)
         self._n_times = self._n_times + 1 if share else 0

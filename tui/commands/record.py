@@ -88,6 +88,7 @@ def record(
     from daq.host_clock import SystemClock
     from daq.recorder.recorder import run
     from daq.transport.wire_log import logging_to
+    from estimator.checks.count_limits import share_of_repeats
     from tui.output.console import notices, write_json
     from tui.simulation.host_time import host_time
 
@@ -121,6 +122,7 @@ def record(
         duration=duration,
         attributes={name: text for name, text in attributes.items() if text},
         anyway=anyway,
+        share_of_repeats=share_of_repeats,
         clock=clock,
         loop_factory=loop_factory,
     )

@@ -17,6 +17,7 @@ from daq.recording.monitor import RecordingMonitor
 from daq.recording.reader import Recording
 from daq.recording.sensor_state import SensorState
 from daq.recording.writer import RecordingWriter
+from estimator.checks.count_limits import share_of_repeats
 from tests.scripted_driver import RATE, ManualClock, PlayedDriver, bench, block
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ class Run:
     """A block writer with one sensor "a", its clock, and a monitor of its file."""
 
     def __init__(self, writer: RecordingWriter, recording: Recording, clock: ManualClock) -> None:
-        self.blocks = BlockWriter(writer, {"a": RATE})
+        self.blocks = BlockWriter(writer, {"a": RATE}, share_of_repeats=share_of_repeats)
         self.clock = clock
         self._recording = recording
         self._monitor = RecordingMonitor(recording)
