@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import re
 import shlex
 from pathlib import Path
@@ -87,6 +88,19 @@ def test_the_python_of_the_readme_prints_what_is_shown() -> None:
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         exec(found[1], {})  # noqa: S102 - the block of the page
     assert_prints(found[2].splitlines(), printed.getvalue())
+
+
+@pytest.mark.parametrize(
+    "notebook", sorted((ROOT / "examples").glob("*.ipynb")), ids=lambda p: p.name
+)
+def test_notebooks_run(notebook: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+    names: dict[str, object] = {}
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), names)  # noqa: S102 - a cell of the notebook
+    assert str(names["result"]).startswith("Self-noise, mean over ")
 
 
 def test_readme_is_short() -> None:
