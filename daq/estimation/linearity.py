@@ -41,10 +41,8 @@ def nonlinear_channels(
         n_apart = max(0, (each.n_seen - 1) * welch.hop // welch.segment_length + 1)
         wanted = min(n_apart, round(MOST_SEGMENTS * each.n_seen / max(total, 1)))
         last = max(each.n_seen - 1, 0) * welch.hop
-        for start in np.linspace(0, last, wanted).astype(np.int64).tolist():
-            samples = each.whole_segment(start)
-            if samples is not None:
-                tested.add(samples)
+        for samples in each.whole_segments(np.linspace(0, last, wanted).astype(np.int64)):
+            tested.add(samples)
     sensor = np.repeat(np.arange(len(passes[0].aligned.dims)), passes[0].aligned.dims)
     response = np.abs(responses(frequency, channels, unit)) ** 2
     found = []

@@ -190,7 +190,12 @@ def share_at_ends(counts: NDArray[Any]) -> float:
         if cut and _has_slopes(values, times, sum(cut)):
             return sum(cut) / len(counts)
     signal = counts.astype(np.float64)
-    return sum(max(_at_soft_end(side, parts) for parts in WIDTHS) for side in (signal, -signal))
+    unit = float(np.diff(_distinct(signal)[0]).min(initial=math.inf))
+    middle = float(median(signal))
+    return sum(
+        max(_at_soft_end(side * signal, parts, unit, side * middle) for parts in WIDTHS)
+        for side in (1, -1)
+    )
 
 
 def _distinct(values: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
@@ -208,11 +213,13 @@ def _has_slopes(values: NDArray[Any], times: NDArray[np.int64], n_cut: int) -> b
     return int(times[inner].sum()) >= MIN_ON_SLOPES * n_cut
 
 
-def _at_soft_end(values: FloatArray, parts: int) -> float:
-    """Return the share of values in the uppermost of ``parts`` of the range; 0 if not clipped."""
-    top, middle = values.max(), float(median(values))
+def _at_soft_end(values: FloatArray, parts: int, unit: float, middle: float) -> float:
+    """Return the share of values in the uppermost of ``parts`` of the range; 0 if not clipped.
+
+    `unit` is the least distance of two values, `middle` their median.
+    """
+    top = values.max()
     width = (top - values.min()) / parts
-    unit = np.diff(_distinct(values)[0]).min(initial=math.inf)
     if width < 2 * unit:
         return 0.0
     below = np.bincount(np.minimum((top - values) / width, parts - 1).astype(np.int64))

@@ -19,10 +19,10 @@ import numpy as np
 
 from estimator.checks.steadied import Steadied, steadied
 from estimator.checks.steadiness import (
-    BINS_AT_ONCE,
     FALSE_ALARM,
     MIN_DEGREES,
     MIN_PARTS,
+    VALUES_AT_ONCE,
     Levels,
     Regression,
     ResponseChange,
@@ -413,11 +413,11 @@ def _band(
     """Return what the parts show at some of their frequencies; None where that is too little."""
     if not len(places):
         return None
-    n_pieces = -(-len(places) // BINS_AT_ONCE)
+    at_once = max(1, VALUES_AT_ONCE // (len(parts.each) * sum(dims) ** 2))
     levels, of_runs, responses = [], [], []
     scores = _Scores(len(groups), sum(dims))
     within, whole_band = np.zeros((2, sum(dims)))
-    for some in np.array_split(places, n_pieces):
+    for some in np.array_split(places, -(-len(places) // at_once)):
         bins = parts.bins[some]
         lags = np.minimum(np.abs(bins[:, None] - bins), len(correlation) - 1)
         csm, at, own = parts.csm(some), maximum.take(bins), correlation[lags]
@@ -601,19 +601,15 @@ class _Scores:
         n_freqs = len(found.projector)
         at_once = max(1, PAIR_BYTES // (16 * n_freqs * self._n_channels))
         averages = 1 / np.mean(1 / found.averages)
-        own = np.einsum("fpp->fp", found.projector).real
-        inverse = fisher.covariance(np.abs(found.projector) ** 2)
-        covariance = found.covariance
-        noise = np.einsum("fpq,bfq->bfp", inverse, np.einsum("bfpp->bfp", covariance) - own)
         for low in range(0, len(self._i), at_once):
             some = slice(low, low + at_once)
             i, j = self._i[some], self._j[some]
             projector = found.projector
             with_noise = 2 * (projector[:, :, i].conj() * projector[:, :, j]).real
-            score = 2 * covariance[:, :, i, j]
-            score -= np.einsum("bfp,fpa->bfa", noise, with_noise)
+            score = 2 * found.covariance[:, :, i, j]
+            score -= (found.noise[:, :, None, :] @ with_noise)[:, :, 0]
             known = 2 * (projector[:, i, j] ** 2 + projector[:, i, i] * projector[:, j, j]).real
-            known -= np.einsum("fpa,fpq,fqa->fa", with_noise, inverse, with_noise)
+            known -= np.einsum("fpa,fpq,fqa->fa", with_noise, found.inverse, with_noise)
             root = np.sqrt(np.clip(known, 0.0, None))
             self.score[:, some] += score.sum(axis=1)
             self._theory[some] += np.einsum("fa,fg,ga->a", root, correlation, root) / averages

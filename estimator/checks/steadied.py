@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.checks.steadiness import BINS_AT_ONCE, ResponseScores, regression
+from estimator.checks.steadiness import VALUES_AT_ONCE, ResponseScores, regression
 from estimator.median import median
 from estimator.spectra.parts import grouped, joined_parts
 
@@ -98,7 +98,8 @@ def steadied(
     places = np.flatnonzero(parts.bins < len(good))
     places = places[fitted[parts.bins[places]]]
     scores = ResponseScores(dims, len(groups))
-    for some in _pieces(places[good[parts.bins[places]]]):
+    n_values = len(parts.each) * p**2
+    for some in _pieces(places[good[parts.bins[places]]], n_values):
         found = regression(joined_parts(parts.csm(some), n, groups), at.take(parts.bins[some]))
         scores.add(found, np.eye(len(some)))
     left, kept = _within(scores, dims, changed, np.array([n[some].sum() for some in groups]))
@@ -108,7 +109,7 @@ def steadied(
     csm = np.full((len(good), p, p), np.nan, np.complex128)
     averages = np.array([n[some].sum() for some in groups])
     more = float((averages - q).sum()) + q
-    for some in _pieces(places):
+    for some in _pieces(places, n_values):
         found = regression(joined_parts(parts.csm(some), n, groups), at.take(parts.bins[some]))
         U = found.directions
         motion = found.motion.sum(axis=0) / averages.sum()
@@ -119,8 +120,10 @@ def steadied(
     return Steadied(csm, more, left_out, np.repeat(below, dims), np.repeat(above, dims))
 
 
-def _pieces(places: IntArray) -> list[IntArray]:
-    return np.array_split(places, -(-len(places) // BINS_AT_ONCE)) if len(places) else []
+def _pieces(places: IntArray, n_values: int) -> list[IntArray]:
+    """Return frequencies that are regressed together, of so many values each."""
+    at_once = max(1, VALUES_AT_ONCE // n_values)
+    return np.array_split(places, -(-len(places) // at_once)) if len(places) else []
 
 
 def _within(

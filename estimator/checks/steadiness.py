@@ -38,7 +38,8 @@ if TYPE_CHECKING:
 MIN_PARTS = 3
 MIN_DEGREES = 2.0
 """Averages of a part beyond those that its regression takes, at least."""
-BINS_AT_ONCE = 24
+VALUES_AT_ONCE = 1 << 17
+"""Values of the matrices of all parts that are regressed together: 2 MB."""
 SMALLEST_LEVEL = 1e-3
 """Of the noise of a part: estimates of few averages may be negative."""
 SHARES = (0.0, 0.25, 0.5, 0.75)
@@ -59,6 +60,9 @@ class Regression:
     ----------
     left : complex128, shape (n_parts, n_bins, n_channels, n_channels)
         Averages of what the regression leaves.
+    covariance : float64, shape (n_parts, n_bins, n_channels, n_channels)
+        Its real part per degree of freedom, whose expectation is the projector if the noise is
+        steady.
     coefficients : complex128, shape (n_parts, n_bins, n_channels, n_factors)
         ``D_k``.
     motion : complex128, shape (n_parts, n_bins, n_factors, n_factors)
@@ -70,6 +74,10 @@ class Regression:
         Of each part, less those of its regression.
     scale : float64, shape (n_bins, n_channels)
         From units to whitened channels.
+    inverse : float64, shape (n_bins, n_channels, n_channels)
+        From squares of residuals to the noise of channels.
+    noise : float64, shape (n_parts, n_bins, n_channels)
+        Noise of each part less that of the fit, over that of the fit.
     """
 
     left: ComplexArray
@@ -79,12 +87,9 @@ class Regression:
     projector: ComplexArray
     averages: FloatArray
     scale: FloatArray
-
-    @property
-    def covariance(self) -> FloatArray:
-        """Real part of the noise's: its expectation is the projector if the noise is steady."""
-        n = self.averages[:, None, None, None]
-        return np.asarray(self.left.real * ((n + self.directions.shape[2]) / n))
+    covariance: FloatArray
+    inverse: FloatArray
+    noise: FloatArray
 
 
 def regression(parts: Divided, at: Maximum) -> Regression:
@@ -103,8 +108,15 @@ def regression(parts: Divided, at: Maximum) -> Regression:
     beside = at.projector
     PSU = beside @ SU
     D = np.linalg.solve(across.swapaxes(2, 3), PSU.swapaxes(2, 3)).swapaxes(2, 3)
+    left = beside @ S @ beside - D @ PSU.conj().swapaxes(2, 3)
+    covariance = left.real * (n / (n - q))[:, None, None, None]
+    inverse = fisher.covariance(np.abs(beside) ** 2)
+    excess = np.einsum("kfpp->kfp", covariance) - np.einsum("fpp->fp", beside).real
     return Regression(
-        left=beside @ S @ beside - D @ PSU.conj().swapaxes(2, 3),
+        left=left,
+        covariance=covariance,
+        inverse=inverse,
+        noise=(inverse @ excess[..., None])[..., 0],
         coefficients=D,
         motion=n[:, None, None, None] * across,
         directions=U,
@@ -157,13 +169,9 @@ class Levels:
 
 def noise_levels(found: Regression, correlation: FloatArray) -> Levels:
     """Return the noise of every part; `correlation` of bins has the shape (n_bins, n_bins)."""
-    inverse = fisher.covariance(np.abs(found.projector) ** 2)
-    own = np.einsum("fpp->fp", found.projector).real
-    excess = np.einsum("kfpp->kfp", found.covariance) - own
-    noise = np.einsum("fpq,kfq->kfp", inverse, excess)
-    root = np.sqrt(np.einsum("fpp->fp", inverse))
+    root = np.sqrt(np.einsum("fpp->fp", found.inverse))
     variance = np.einsum("fp,fg,gp->p", root, correlation, root) / len(root) ** 2
-    return Levels(1 + noise.mean(axis=1), found.averages[:, None] / variance)
+    return Levels(1 + found.noise.mean(axis=1), found.averages[:, None] / variance)
 
 
 class ResponseScores:

@@ -95,13 +95,10 @@ class Part:
         own = total if self.before is None else total - np.einsum("fii->fi", self.before)
         return np.asarray(own * self.scale[:, None])
 
-    def csm(self, some: slice | IntArray) -> ComplexArray:
-        """Return the averages at some of the kept frequencies."""
+    def packed(self, some: slice | IntArray) -> FloatArray:
+        """Return the averages at some of the kept frequencies, as sums are kept."""
         packed = self.after[some] if self.before is None else self.after[some] - self.before[some]
-        packed = packed * self.scale[some, None, None]
-        lower, upper = np.tril(packed), np.triu(packed, 1)
-        real = lower + np.tril(lower, -1).swapaxes(1, 2)
-        return np.asarray(real + 1j * (upper - upper.swapaxes(1, 2)))
+        return np.asarray(packed * self.scale[some, None, None])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,6 +131,8 @@ class Parts:
 
     def of_channels(self, channels: Sequence[int]) -> Parts:
         """Return the parts of some channels, in ascending order."""
+        if len(channels) == self.each[0].after.shape[1]:
+            return self
         own = np.ix_(channels, channels)
 
         def packed(total: FloatArray | None) -> FloatArray | None:
@@ -156,7 +155,12 @@ class Parts:
         complex128, shape (n_parts, n_some, n_channels, n_channels)
             In unit**2/Hz; NaN where a response is zero.
         """
-        found = np.stack([part.csm(some) for part in self.each])
+        packed = np.stack([part.packed(some) for part in self.each])
+        turned, lower = packed.swapaxes(2, 3), np.tri(packed.shape[-1], dtype=np.bool_)
+        found = np.empty(packed.shape, np.complex128)
+        found.real = np.where(lower, packed, turned)
+        found.imag = np.where(lower, -turned, packed)
+        found.imag[..., np.arange(len(lower)), np.arange(len(lower))] = 0.0
         if self.response is None:
             return found
         response = self.response[some]

@@ -149,6 +149,8 @@ class GapBridge:
 _VALUES_AT_ONCE = 1 << 18  # samples times channels read together: 2 MB
 OCTAVES = 12
 """Stages of the multi-resolution mode: those without segments cost nothing."""
+_NEIGHBOURS, _READ_AT_ONCE = 1.5, 8
+"""Lengths from which segments are read apart, and how many are read together at most."""
 _MOST_PASSES = 4
 _FINAL_TOLERANCE = 1e-7  # seconds rms that clocks may move before segments are taken again
 _SURVEYS, _SURVEYED = (4, 16), 80
@@ -617,14 +619,25 @@ class Pass:
 
         return in_clipped_blocks(self._sensors, times)
 
-    def whole_segment(self, start: int) -> FloatArray | None:
-        """Return the segment that begins at a grid sample; None if it has gaps or is clipped."""
+    def whole_segments(self, starts: NDArray[np.int64]) -> Iterator[FloatArray]:
+        """Yield the segments that begin at grid samples, but for those with gaps or clipped.
+
+        Neighbours are read together.
+        """
         length = self.welch.segment_length
-        samples, valid = self.aligned.read(start, start + length)
-        if len(samples) < length or not valid.all():
-            return None
-        clipped = self._clipped(start, length)
-        return None if clipped is not None and clipped.any() else samples
+        far = np.flatnonzero(np.diff(starts) > _NEIGHBOURS * length) + 1
+        every = range(_READ_AT_ONCE, len(starts), _READ_AT_ONCE)
+        for some in np.split(starts, sorted({*far.tolist(), *every})):
+            if not len(some):
+                continue
+            first, last = int(some[0]), int(some[-1]) + length
+            samples, valid = self.aligned.read(first, last)
+            clipped = self._clipped(first, len(samples))
+            usable = valid if clipped is None else valid & ~clipped
+            for begin in (some - first).tolist():
+                own = slice(begin, begin + length)
+                if len(samples[own]) == length and usable[own].all():
+                    yield samples[own]
 
     @property
     def awaited(self) -> int:
