@@ -37,7 +37,11 @@ def completion(
         typer.echo("\n".join(manual()))
         return
     script = import_module("typer.completion").get_completion_script
-    typer.echo(script(prog_name="huddle", complete_var=ASKED_BY_SHELL, shell=kind))
+    text = script(prog_name="huddle", complete_var=ASKED_BY_SHELL, shell=kind)
+    # zsh loads the text from its folder at the first Tab, which it must then complete.
+    ends = "compdef _huddle_completion huddle"
+    first = f"if [ $funcstack[1] = _huddle ]; then _huddle_completion; else {ends}; fi"
+    typer.echo(text.replace(ends, first))
 
 
 def manual() -> Iterator[str]:

@@ -31,11 +31,11 @@ _MASK = 0xFFFFFFFF
 def _way_in(path: Path) -> str:
     """Return which command takes a file that is no recording."""
     if path.suffix.lower() == ".toml":
-        return f"of a bench file: huddle run {shlex.quote(str(path))}"
+        return f"record by a bench file: huddle run {shlex.quote(str(path))}"
     if path.is_dir() or path.suffix in {".h5", ".hdf5"}:
         return "expected an HDF5 file"
     recording = shlex.quote(f"{path.stem}.h5")
-    return f"of another program: huddle import {shlex.quote(str(path))} --out {recording}"
+    return f"convert it: huddle import {shlex.quote(str(path))} --out {recording}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ import io
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -94,6 +95,34 @@ def test_shells_complete_commands_and_options() -> None:
         check=False,
     )
     assert done.stdout.split() == ["--segment"]
+
+
+IN_SHELLS = {
+    "bash": "source ./huddle; COMP_WORDS=(huddle estimate --segm); COMP_CWORD=2;"
+    " _huddle_completion huddle; echo ${COMPREPLY[@]}",
+    # as compinit loads it, which gives the words to the first call
+    "zsh": "mkdir f; mv huddle f/_huddle; fpath=(f); autoload -Uz _huddle; compdef() { }"
+    "; _arguments() { print -r -- $@ }; words=(huddle estimate --segm); CURRENT=3; _huddle",
+    "fish": "source ./huddle; complete -C 'huddle estimate --segm'",
+}
+
+
+@pytest.mark.parametrize("shell", IN_SHELLS)
+def test_the_shells_themselves_complete(tmp_path: Path, shell: str) -> None:
+    if shutil.which(shell) is None:
+        pytest.skip(f"no {shell} here")
+    (tmp_path / "huddle").write_text(huddle("completion", shell), encoding="utf-8")
+    own = os.environ | {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    options = {"bash": ["--norc"], "zsh": ["-f"], "fish": ["--no-config"]}[shell]
+    done = subprocess.run(
+        [shell, *options, "-c", IN_SHELLS[shell]],
+        cwd=tmp_path,
+        env=own,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "--segment" in done.stdout, done.stderr
 
 
 def test_the_manual_has_every_command() -> None:
