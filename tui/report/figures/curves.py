@@ -416,7 +416,10 @@ def write_figure(
     with look(), mpl.rc_context({"svg.fonttype": "path"}):
         plots = noise_plots(result, models, width=width)
         if not plots:
-            raise InsufficientDataError("no noise estimate by any method: nothing can be drawn")
+            raise InsufficientDataError(
+                "no noise estimate by any method: nothing can be drawn; the PSD is written by"
+                " huddle estimate FILE --csv psd.csv"
+            )
         figure = Figure(figsize=(width, stack_height(plots)), facecolor="white")
         stack(plots, figure)
         figure.savefig(content, format=kind, dpi=RESOLUTION, metadata=_ABOUT[kind])
