@@ -86,7 +86,7 @@ TAIL = """
 - *Clocks*: a service at 20 times real time, whose clock is set by −25 to 30 min once a minute.
 - *Starved recorder*: a busy process for each processor beside the recorder and the played devices.
 - *Accelerated day*: a service at 20 times real time, with a leap second as a run is due, the end of
-  summer time and six steps of the clock. It may grow by 50 kB a run, its database by 16 kB. Each
+  summer time and six steps of the clock. It may grow by 50 kB a run, its database by 4 kB. Each
   due time must have one row.
 """
 

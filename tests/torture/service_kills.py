@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 RATE = 20.0
 LEAK = 0.05
 """MB that the service may grow with each run that is done."""
-ROWS = 16.0
+ROWS = 4.0
 """kB that the database may grow with each run that is done: its row and those of its noise."""
 TREND = 1.0
 """Hours from which growth is judged: what happens for the first time loads modules."""
