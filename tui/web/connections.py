@@ -2,13 +2,14 @@
 
 Theory of operation
 -------------------
-Each connection is counted when it is accepted, before TLS and HTTP. A connection without a request
-in progress is idle. Where an address, or all of them, have as many connections as they may, the
-longest idle one gives way to the new one; without an idle one, the new one is closed. So who opens
-thousands and says nothing only pushes out connections of that kind, and a visitor who asks at once
-is answered.
+Each connection is counted when it is accepted, before TLS and HTTP; all addresses of version 6 that
+one person has are one. A connection is idle until all of a request has come, and after its answer.
+Where an address, or all of them, have as many connections as they may, the longest idle one gives
+way to the new one, or else the one whose peer has left its answer unread for longest; if all others
+are being answered, the new one is closed. So who opens thousands and says nothing only pushes out
+connections of that kind, and a visitor who asks at once is answered.
 
-An idle connection ends `HEAD` seconds after it began to be idle, however many bytes of a head came;
+An idle connection ends `HEAD` seconds after it began to be idle, however many bytes of it came;
 one whose peer does not read ends after `BLOCKED` seconds. A connection is ended by the shutdown of
 its socket, which every layer above takes as the end of the stream.
 """
@@ -26,11 +27,13 @@ from typing import TYPE_CHECKING, Any
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from tui.web.access import network_of
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
 
 HEAD = 10.0
-"""Seconds for the TLS handshake and the head of a request, and between two requests."""
+"""Seconds for the TLS handshake and a request, and between two requests."""
 BLOCKED = 60.0
 """Seconds for which a peer may leave a full buffer unread."""
 TOTAL, OF_ADDRESS = 512, 64
@@ -86,6 +89,7 @@ class Connections:
 
     def admit(self, raw: socket.socket, address: str) -> bool:
         """Count a new connection; return False if it must be closed."""
+        address = address if address in self._trusted else network_of(address)
         is_over = self._n_of[address] >= self._of_address and address not in self._trusted
         if (is_over or len(self._held) >= self._total) and not self._make_room(
             address if is_over else None
@@ -96,12 +100,15 @@ class Connections:
         return True
 
     def _make_room(self, address: str | None) -> bool:
-        """End the longest idle connection, of an address if one is given."""
-        for number, each in self._held.items():
-            if each.is_idle and address in {None, each.address}:
-                self._end(number)
-                return True
-        return False
+        """End the longest idle connection, or one that is not read; of an address if given."""
+        rank = {
+            number: (not each.is_idle, each.limit)
+            for number, each in self._held.items()
+            if address in {None, each.address} and each.limit < float("inf")
+        }
+        if rank:
+            self._end(min(rank, key=rank.__getitem__))
+        return bool(rank)
 
     def sweep(self) -> None:
         """End the connections whose time is over."""
@@ -173,7 +180,7 @@ class Connections:
 
             def handle_events(self) -> None:
                 super().handle_events()
-                if self._is_answering:
+                if self._is_answering and self.conn.their_state is not h11.SEND_BODY:
                     connections.busy(self._number)
 
             def on_response_complete(self) -> None:

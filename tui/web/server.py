@@ -413,7 +413,7 @@ class Server:
     async def _events(self, request: Request) -> Response:
         if request.method == "HEAD":
             return Response()
-        client = client_of(request)
+        client = network_of(client_of(request))
         if self._n_streams[client] >= STREAMS and client not in self._web.proxies:
             raise HTTPException(HTTPStatus.TOO_MANY_REQUESTS, "Too many pages are followed.")
 

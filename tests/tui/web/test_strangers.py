@@ -31,7 +31,7 @@ from tui.web.tests import Tests
 from tui.web.work import WAITING, LeftError, Piece, TooMuchWorkError, Work, check_wanted
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from tui.application.controls import Controls
@@ -72,22 +72,35 @@ def asked(server: Server, *lines: bytes, path: bytes = b"/tests") -> bytes:
 # ------------------------------------------------------------------------------- connections
 
 
-def hold(stack: ExitStack, server: Server, n: int) -> None:
-    """Hold connections that say nothing, or only a part of a head."""
+SAID = (
+    "",
+    "GET / HTTP/1.1\r\nHost: ",
+    (
+        "POST /login HTTP/1.1\r\nHost: {host}\r\nContent-Length: 99\r\n"
+        "Content-Type: application/x-www-form-urlencoded\r\n\r\nname="
+    ),
+)
+"""What connections say that are held: nothing, a part of a head, a part of a form."""
+
+
+def hold(stack: ExitStack, server: Server, n: int, said: Sequence[str] = SAID) -> None:
+    """Hold connections."""
     place = urlsplit(server.url)
     for number in range(n):
         held = socket.create_connection((place.hostname, place.port), timeout=limit(60))
         stack.enter_context(held)
-        if number % 2:
-            held.sendall(b"GET / HTTP/1.1\r\nHost: ")
+        held.sendall(said[number % len(said)].format(host=place.netloc).encode())
 
 
-def test_a_visitor_works_on_while_others_hold_connections(closed: Server) -> None:
+@pytest.mark.parametrize("said", SAID)
+def test_a_visitor_works_on_while_others_hold_connections(closed: Server, said: str) -> None:
     visit = closed.visit()
     visit.log_in(READER)
     with ExitStack() as stack:
-        hold(stack, closed, 3 * OF_ADDRESS)
-        assert visit.get("/tests").status == 200
+        for _ in range(4):
+            hold(stack, closed, OF_ADDRESS // 2, [said])
+            for _ in range(3):
+                assert visit.get("/tests").status == 200
         assert closed.visit().get("/login").status == 200
         descriptors = closed.descriptors()
         assert descriptors is None or descriptors < 2 * OF_ADDRESS
@@ -188,6 +201,20 @@ def test_the_longest_idle_connection_of_an_address_gives_way(
     assert not known.admit(pairs[4][0], "a")  # all are being answered
     assert known.admit(pairs[4][0], "b")
     assert len(known) == 4
+    known.busy(pairs[2][0].fileno(), 60.0)  # it does not read its answer
+    assert known.admit(pairs[5][0], "a")
+    assert [ended(peer) for _, peer in pairs[:4]] == [False, True, True, False]
+
+
+def test_all_addresses_that_one_person_has_are_one(
+    pairs: list[tuple[socket.socket, socket.socket]],
+) -> None:
+    known = Connections(total=20, of_address=3, trusted=["2001:db8::9"], now=Clock())
+    for n in range(4):
+        assert known.admit(pairs[n][0], f"2001:db8::{n}")
+        assert known.admit(pairs[n + 4][0], f"::ffff:192.0.2.{n}")
+        assert known.admit(pairs[n + 8][0], "2001:db8::9")
+    assert [ended(peer) for _, peer in pairs] == [True, *[False] * 11]
 
 
 def test_in_total_there_are_no_more_connections_than_the_process_may_hold(
