@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 
 from daq.errors import RecordingError
-from daq.recording.storage.refusals import check_stored, member
+from daq.recording.storage.refusals import check_names, check_stored, member
 from tui.output.extras import load
 
 if TYPE_CHECKING:
@@ -52,6 +52,7 @@ def loaded(path: Path) -> xr.Dataset:
 
 def _check_netcdf(path: Path) -> None:
     with h5py.File(path, "r") as file:
+        check_names(file)
         for name in file:
             if not isinstance(found := member(file, name), h5py.Dataset):
                 raise ValueError(f"{name}: a group")  # noqa: TRY004 - of the file's contents

@@ -22,7 +22,7 @@ import numpy as np
 
 from daq.errors import ImportFormatError, RecordingError
 from daq.formats.foreign_sensor import ForeignSensor, finite_stretches
-from daq.recording.storage.refusals import dataset
+from daq.recording.storage.refusals import check_names, dataset
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -187,6 +187,7 @@ def _mat73(path: Path) -> dict[str, NDArray[Any]]:
     total = 0
     try:
         with h5py.File(path, "r") as file:
+            check_names(file)
             for name in file:
                 link = file.get(name, getlink=True)
                 if name[0] == "#" or not isinstance(link, h5py.HardLink):  # no other file

@@ -22,10 +22,10 @@ import h5py
 from daq.errors import NotARecordingError
 from daq.recording.storage import trial
 from daq.recording.storage.locking import is_being_written
+from daq.recording.storage.refusals import hdf5_function
 from daq.recording.storage.superblock import ClearedFile, Superblock
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
 READ_ATTEMPTS = 30
@@ -102,19 +102,8 @@ def _register_driver() -> None:
 
 
 def _set_driver(access: Any, **_: object) -> None:  # noqa: ANN401 - h5py is untyped
-    """Limit the attempts in a file access list; h5py has no function for this."""
+    """Limit the attempts in a file access list."""
     access.set_fapl_sec2()
-    limit = _attempts_setter()
+    limit = hdf5_function("H5Pset_metadata_read_attempts", ctypes.c_int64, ctypes.c_uint)
     if limit is not None:
         limit(access.id, READ_ATTEMPTS)
-
-
-@cache
-def _attempts_setter() -> Callable[[int, int], int] | None:
-    """Return ``H5Pset_metadata_read_attempts`` of the HDF5 library loaded by h5py."""
-    try:
-        function = ctypes.CDLL(h5py.h5p.__file__).H5Pset_metadata_read_attempts
-    except (AttributeError, OSError):  # Windows does not search a library's dependencies
-        return None
-    function.argtypes, function.restype = (ctypes.c_int64, ctypes.c_uint), ctypes.c_int
-    return function

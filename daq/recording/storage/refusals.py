@@ -7,9 +7,11 @@ follow a link, open another file, load a filter, or allocate more memory than th
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import math
 import os
-from typing import TYPE_CHECKING, Any
+from functools import cache
+from typing import TYPE_CHECKING, Any, cast
 
 import h5py
 import numpy as np
@@ -18,7 +20,7 @@ from daq.errors import NotARecordingError, RecordingError
 from daq.recording.storage.packing import PIPELINE, check_chunks
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
 MAX_CHUNK = 1 << 28
@@ -42,6 +44,7 @@ def damage_named(path: Path) -> Iterator[None]:
 
 def member(group: h5py.Group, name: str) -> Any:  # noqa: ANN401 - h5py is untyped
     """Return a group or dataset stored in the file itself."""
+    check_names(group)
     if "/" in name or name in {"", ".", ".."}:
         raise NotARecordingError(f"{_place(group, name)}: not a name")
     link = group.get(name, getlink=True)
@@ -51,7 +54,34 @@ def member(group: h5py.Group, name: str) -> Any:  # noqa: ANN401 - h5py is untyp
         raise NotARecordingError(
             f"{_place(group, name)}: a link; a recording has none, and it is not followed"
         )
-    return group[name]
+    found = group[name]
+    if isinstance(found, h5py.Group):
+        check_names(found)
+    return found
+
+
+def check_names(group: h5py.Group) -> None:
+    """Refuse a group whose names are packed: HDF5 inflates them however many they become.
+
+    Raises
+    ------
+    NotARecordingError
+    """
+    count = hdf5_function("H5Pget_nfilters", ctypes.c_int64)
+    created = group["/" if group.name == "/" else "."].id.get_create_plist()  # not of the file
+    if count is not None and count(created.id):
+        raise NotARecordingError(f"{group.file.filename}: {group.name}: its names are packed")
+
+
+@cache
+def hdf5_function(name: str, *arguments: Any) -> Callable[..., int] | None:  # noqa: ANN401 - of ctypes
+    """Return a function of the HDF5 library loaded by h5py that h5py has not."""
+    try:
+        function: Any = getattr(ctypes.CDLL(h5py.h5p.__file__), name)
+    except (AttributeError, OSError):  # Windows does not search a library's dependencies
+        return None
+    function.argtypes, function.restype = arguments, ctypes.c_int
+    return cast("Callable[..., int]", function)
 
 
 def _place(group: h5py.Group, name: str) -> str:
@@ -110,6 +140,7 @@ def check_all(group: h5py.Group) -> None:
     NotARecordingError, OSError
         Naming the first dataset that is none of ours.
     """
+    check_names(group)
     for name in group:
         if isinstance(found := member(group, name), h5py.Group):
             check_all(found)

@@ -7,9 +7,10 @@ damage crashes it. Neither can be caught in the process itself. So a file at res
 a child (:mod:`daq.recording.repair`), which is ended if it makes no progress for `LIMIT`
 seconds. Only if the child lives does this process open the file; errors are then its own to report.
 
-A file is tried once. An extended attribute has the size and the time of change with which it was
-opened, and a recorder sets it on the recordings that it closes. Copies and changed files are tried
-again. Where a file system has no such attributes, each process tries a file once.
+A file is tried once. An extended attribute has the inode, the size and the time of change with
+which it was opened, and a recorder sets it on the recordings that it closes. Copies and changed
+files are tried again: who sends a file can send attribute and time with it, but not the inode.
+Where a file system has no such attributes, each process tries a file once.
 """
 
 from __future__ import annotations
@@ -121,8 +122,8 @@ def _state(path: Path) -> tuple[int, int, int, int]:
 
 
 def _text(path: Path) -> bytes:
-    *_, size, changed = _state(path)
-    return f"{size} {changed}".encode()
+    _, *state = _state(path)
+    return " ".join(map(str, state)).encode()
 
 
 def _marked(path: Path) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import io
 import json
 import struct
@@ -16,7 +17,7 @@ from daq.errors import NotARecordingError
 from daq.recording.chunks.chunk_reader import ChunkedRows
 from daq.recording.storage.journal import journal_path, read_journal
 from daq.recording.storage.packing import PIPELINE, InflationError
-from daq.recording.storage.refusals import dataset
+from daq.recording.storage.refusals import check_all, dataset, hdf5_function, member
 from daq.recording.storage.whole_hdf5 import contents_sha256
 from estimator.errors import EstimatorError
 from estimator.spectra.welch import CrossSpectra
@@ -136,6 +137,29 @@ def test_a_table_inflates_to_no_more_than_its_rows(
             contents_sha256(dataset(file, "table", in_parts=True))
 
     assert peak_of(read) < 4 << 20
+
+
+def test_names_of_groups_are_not_packed(tmp_path: Path) -> None:
+    pack = hdf5_function("H5Pset_deflate", ctypes.c_int64, ctypes.c_uint)
+    if pack is None:
+        pytest.skip("the library of HDF5 is not found")
+    of_group, of_link = (
+        h5py.h5p.create(each) for each in (h5py.h5p.GROUP_CREATE, h5py.h5p.LINK_CREATE)
+    )
+    pack(of_group.id, 9)
+    path = tmp_path / "r.h5"
+    with h5py.File(path, "w", libver="latest") as file:
+        group = h5py.Group(h5py.h5g.create(file.id, b"results", of_link, of_group))
+        made = file.create_dataset("table", data=1)
+        for number in range(20):
+            group[f"{number}" + "a" * 60_000] = made
+    assert path.stat().st_size < 50_000
+    with h5py.File(path) as file:
+        assert member(file, "table")[()] == 1
+        with pytest.raises(NotARecordingError, match="/results: its names are packed"):
+            member(file, "results")
+        with pytest.raises(NotARecordingError, match="its names are packed"):
+            check_all(file)
 
 
 def test_sums_of_another_computer_are_not_packed() -> None:

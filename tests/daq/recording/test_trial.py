@@ -85,6 +85,25 @@ def test_a_file_is_tried_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.skipif(not hasattr(os, "setxattr"), reason="no extended attributes")
+def test_a_mark_that_came_with_a_file_is_not_believed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    marks: dict[Path, bytes] = {}
+    monkeypatch.setattr(os, "setxattr", lambda path, _, text: marks.update({path: text}))
+    monkeypatch.setattr(os, "getxattr", lambda path, _: marks[path])
+    path, copy = tmp_path / "a.h5", tmp_path / "b.h5"
+    write_recording(path)
+    trial.remember(path)
+    shutil.copy2(path, copy)
+    marks[copy] = marks[path]
+    monkeypatch.setattr(trial, "_OPENED", set())
+    monkeypatch.setattr(trial, "_CHILD", "no.such.module")
+    Recording.open(path).close()
+    with pytest.raises(NotARecordingError, match="crashes"):
+        Recording.open(copy)
+
+
+@pytest.mark.skipif(not hasattr(os, "setxattr"), reason="no extended attributes")
 def test_another_process_knows_that_a_file_was_opened(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
