@@ -34,11 +34,12 @@ peers:  ## compile the program in Rust that the tests talk to; kept in the user'
 	cargo build --quiet --manifest-path $(PEER)/Cargo.toml --target-dir $(PEER_CACHE)
 	touch $(PEER_CACHE)/debug/async_labjack_peer
 
-check: $(VENV)/.installed-dev  ## formatting, rules, types, who may import whom
+check: $(VENV)/.installed-dev  ## formatting, rules, types, who may import whom; lines by room
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python -m benchmarks.lines
 
 check-all:  ## the same with every Python that is supported and present, in .venv-3.11, .venv-3.12, ...
 	set -e; for version in 3.11 3.12 3.13; do if python$$version -c "" 2>/dev/null; then \

@@ -8,12 +8,6 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 from rich.text import Text
 
-from estimator.checks.advice import (
-    Delay,
-    Gain,
-    ModelMisfit,
-    NoSharedMotion,
-)
 from estimator.spectra.segment_rejection import Reason
 from tui.wording.facts import RANKS
 from tui.wording.findings import Names
@@ -38,9 +32,6 @@ _LEGEND = (
     "statistic over its expectation, 1 if one common motion explains the averages; p: "
     "probability of a statistic this large by chance."
 )
-_LIKE_A_CLOCK = Delay | Gain | ModelMisfit | NoSharedMotion
-"""Advice that unknown clocks alone can bring about."""
-_TURN = 0.3  # rad at the highest frequency: 9 % of the motion is taken for noise there
 
 
 def details(snapshot: Snapshot, facts: Sequence[Known]) -> list[RenderableType]:
