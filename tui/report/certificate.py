@@ -258,7 +258,7 @@ def notices(
         lines.append(Paragraph("DRAFT: not a certificate. huddle issue makes one.", "doubtful"))
         left = missing(bench, found[0])
         if left:
-            text = "; ".join(f"{each.what} ({each.key})" for each in left)
+            text = ", ".join(each.what for each in left)
             lines.append(Paragraph(f"Not given: {text}.", "doubtful"))
     elif issue.is_specimen:
         text = "SPECIMEN: not a certificate. It has no number and is in no ledger."
@@ -330,7 +330,7 @@ def parties_section(found: Sequence[Source], bench: Bench | None, issue: Issue |
         ("Customer", _joined(customer.name, customer.address, customer.email)),
         ("Order", customer.order or _NONE),
         ("Place of the test", place or _NONE),
-        ("Received", "not given" if table.received is None else table.received.isoformat()),
+        ("Received", _NONE if table.received is None else table.received.isoformat()),
         ("Condition", table.condition or _NONE),
         ("Tested", f"{utc_time(first.started)} to {utc_time(last.last)}"),
         ("Procedure", table.procedure or _NONE),
@@ -343,8 +343,16 @@ def parties_section(found: Sequence[Source], bench: Bench | None, issue: Issue |
     ]
     if issue is not None and issue.entry:
         rows.append(("Entry of the ledger", issue.entry))
-    parts = (
-        Facts(tuple(rows)),
+    keys = {} if issue is not None else {e.what: e.key for e in missing(bench, found[0])}
+    absent = [name for name, value in rows if value == _NONE]
+    parts: tuple[Part, ...] = (
+        Facts(tuple(row for row in rows if row[1] != _NONE)),
+        *([Paragraph(f"Not given: {', '.join(absent)}.")] if absent else []),
+        *(
+            [Paragraph("Keys of the bench file: " + "; ".join(map(" = ".join, keys.items())) + ".")]
+            if keys
+            else []
+        ),
         Paragraph(
             "Given by the customer or user, and not verified: data of the sensors and of the"
             " parties, sensitivities without a certificate.",

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from importlib.metadata import version
+from itertools import groupby
 from typing import TYPE_CHECKING
 
 from daq.bench.durations import format_duration
 from daq.bench.estimate_settings import OPTIONS, table_keys
+from daq.estimation.settings import Settings
 from daq.results.calibration import calibrate
 from daq.results.decision.conformity import conformity, with_rule
 from estimator.errors import InsufficientDataError
@@ -44,7 +46,7 @@ from tui.wording.facts import known
 from tui.wording.formatting import is_known, local_time, span, utc_time
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from daq.bench.channel import Channel
     from daq.bench.estimate_settings import Option
@@ -55,7 +57,7 @@ if TYPE_CHECKING:
     from daq.results.calibration import Calibration
     from daq.results.result import Result
     from daq.results.sources import RecordedSensor, Source
-    from tui.report.parts import Part
+    from tui.report.parts import Part, Tone
 
 
 def calibration_section(result: Result) -> Section | None:
@@ -102,6 +104,8 @@ def _certificates(found: Calibration, snapshot: Snapshot) -> Facts:
     )
 
 
+LONG_NAME = 8
+"""Letters of a channel with its sensor, up to which a table has both in a cell."""
 _STATES = {
     "closed": "closed",
     "growing": "still being written",
@@ -144,12 +148,7 @@ def report_of(
     about = bench if about is None else about
     by_rule = with_rule(bench, about)
     facts = known(result)
-    sections = [
-        parties_section(found, about, issue),
-        _test_section(found),
-        facts_section(facts),
-        _sensors_section(snapshot, found, about),
-        conditions_section(found, about, result.settings),
+    sections = [  # the result comes first; what it rests on follows
         limits_section(
             snapshot,
             judged,
@@ -157,6 +156,7 @@ def report_of(
             None if by_rule is None else by_rule.certificate,
         ),
         noise_section(result, models),
+        facts_section(facts),
         uncertainty_section(result, about),
         parameters_section(result),
         calibration_section(result),
@@ -164,6 +164,10 @@ def report_of(
         alignment_section(snapshot),
         clocks_section(result),
         events_section(snapshot, found),
+        parties_section(found, about, issue),
+        _test_section(found),
+        _sensors_section(snapshot, found, about),
+        conditions_section(found, about, result.settings),
         _settings_section(result),
         Section(
             "Signed off",
@@ -176,11 +180,43 @@ def report_of(
         title="Calibration certificate: self-noise" if issue else "Calibration report: self-noise",
         subtitle=f"Huddle test {name}" + (f", {utc_time(start)}" if is_known(start) else ""),
         verdict=sentence,
-        sections=tuple(section for section in sections if section is not None),
+        sections=tuple(by_sensor(section, snapshot) for section in sections if section is not None),
         notices=(*notices(found, result, about, issue), *invalidating(facts)),
         watermark=watermark(found, issue),
         number="" if issue is None else issue.name,
     )
+
+
+def by_sensor(section: Section, snapshot: Snapshot) -> Section:
+    """Return a section in whose tables long names of sensors have rows of their own."""
+    sensors = {label.name: (label.sensor, label.channel) for label in snapshot.channels}
+    if max(map(len, sensors)) <= LONG_NAME:
+        return section
+    parts = (
+        _grouped(part, sensors) if isinstance(part, Table) and part.header[0] == "channel" else part
+        for part in section.parts
+    )
+    return replace(section, parts=tuple(parts))
+
+
+def _grouped(table: Table, sensors: Mapping[str, tuple[str, str]]) -> Table:
+    """Return a table of channels, those of one sensor that follow each other under its name."""
+    order = [
+        sensor for sensor, _ in groupby(sensors.get(row[0], ("", ""))[0] for row in table.rows)
+    ]
+    if len(order) > len(set(order)):  # sorted by something else
+        return table
+    rows: list[tuple[str, ...]] = []
+    tones: dict[tuple[int, int], Tone] = {}
+    before = ""
+    for number, (name, *cells) in enumerate(table.rows):
+        sensor, channel = sensors.get(name, ("", name))
+        if sensor != before:
+            rows.append((sensor, *[""] * len(cells)))
+        before = sensor
+        tones |= {(len(rows), c): tone for (row, c), tone in table.tones.items() if row == number}
+        rows.append((channel, *cells))
+    return replace(table, rows=tuple(rows), tones=tones)
 
 
 def _test_section(found: Sequence[Source]) -> Section:
@@ -284,11 +320,20 @@ def _settings_section(result: Result) -> Section:
         ("Band of the tables", span(*result.band)),
         ("Unit", f"{snapshot.unit}; PSD one-sided, in ({snapshot.unit})²/Hz"),
     ]
-    rows += [
-        (f"[estimate] {key}", _option(OPTIONS[name], getattr(settings, name)))
+    usual = Settings()
+    options = {
+        key: (_option(OPTIONS[name], getattr(settings, name)), getattr(usual, name))
         for key, name in table_keys().items()
-    ]
-    parts: list[Part] = [Facts(tuple(rows))]
+    }
+    same = {
+        key: text
+        for key, name in table_keys().items()
+        if getattr(settings, name) == options[key][1]
+        for text in [options[key][0]]
+    }
+    rows += [(f"[estimate] {key}", text) for key, (text, _) in options.items() if key not in same]
+    defaults = ", ".join(f"{key} {text}" for key, text in same.items())
+    parts: list[Part] = [Facts(tuple(rows)), Paragraph(f"[estimate], as by default: {defaults}.")]
     if snapshot.octaves:
         parts.append(
             Table(

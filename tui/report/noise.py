@@ -74,6 +74,8 @@ def limits_section(
         return None
     rows: list[tuple[str, ...]] = []
     tones: dict[tuple[int, int], Tone] = {}
+    # without a certificate of any sensitivity nothing is stated, and no rule matters
+    is_stated = any(each.is_traceable for each in statements)
     by_rule = {(each.limit, each.sensor, each.channel): each for each in statements}
     order = list(dict.fromkeys(each.limit for each in found.limits))
     ranks = list(_TONES)
@@ -94,27 +96,31 @@ def limits_section(
         )
         if by_rule:
             stated = by_rule[each.limit, each.sensor, each.channel]
-            rows[-1] += (STATEMENTS[stated.statement], _risk(stated.risk))
+            rows[-1] += (STATEMENTS[stated.statement],) * is_stated + (_risk(stated.risk),)
     method = next((each.method for each in found.limits), "")
     header: tuple[str, ...] = (
         "channel", "limit", "at (Hz)", "noise (dB)", "limit (dB)", "margin (dB)", "verdict",
     )  # fmt: skip
     if by_rule:
-        header += ("conformity", "risk")
+        header += ("conformity", "risk") if is_stated else ("risk",)
     note = (
-        f"By the {method} estimate, in bands a third of an octave wide, divided at notches and "
-        "steps of the limit; shown is the band where the channel does worst. "
-        f"dB re 1 ({snapshot.unit})²/Hz. A channel passes where the whole "
-        "interval of its margin is above zero in every band, and fails where it is below zero in "
-        "one. The intervals hold for all channels and bands together with a probability of 95 %, "
-        "and include all that widens them."
+        f"By the {method} estimate, dB re 1 ({snapshot.unit})²/Hz, in the worst band a third of an "
+        "octave wide, or less at notches and steps. PASS: the whole interval of the margin is "
+        "above zero in every band; FAIL: below zero in one. Intervals: 95 % for all channels and "
+        "bands together, with all that widens them."
+        + ("" if is_stated else " Risk: probability of noise above the limit in any band.")
     )
-    shown = Table(header, tuple(rows), left=frozenset({0, 1, 6, 7}), tones=tones)
+    shown = Table(
+        header, tuple(rows), left=frozenset({0, 1, 6, *([7] if is_stated else [])}), tones=tones
+    )
     parts: list[Part] = [shown, Paragraph(note, "quiet")]
     if by_rule and table is not None:
         parts[1:1] = [
             Paragraph(text)
-            for text in (decision_rule(table, statements[0].k), _untraceable(statements))
+            for text in (
+                decision_rule(table, statements[0].k) if is_stated else "",
+                _untraceable(statements),
+            )
             if text
         ]
     return Section("Verdict against the limits", tuple(parts))
@@ -125,8 +131,10 @@ def _untraceable(statements: Sequence[Conformity]) -> str:
     names = dict.fromkeys(f"{e.sensor}.{e.channel}" for e in statements if not e.is_traceable)
     if not names:
         return ""
+    n = len(dict.fromkeys(f"{e.sensor}.{e.channel}" for e in statements))
+    who = "any channel" if len(names) == n else ", ".join(names)
     return (
-        f"No statement of conformity of {', '.join(names)}: their sensitivity has no certificate in"
+        f"No statement of conformity of {who}: their sensitivity has no certificate in"
         " the bench file, so the result is not traceable to the SI."
     )
 
@@ -168,31 +176,25 @@ def noise_section(result: Result, models: Sequence[Mask] = ()) -> Section:
     snapshot = result.snapshot
     if not snapshot.results:
         return Section("Self-noise", (Paragraph("Nothing can be said yet.", "doubtful"),))
-    parts: list[Part] = [_band_table(result)]
-    parts += [
+    parts: list[Part] = [
+        _band_table(result),
+        *noise_plots(result, models),
         Paragraph(
             "The 95 % interval is that of the mean over the band, with all that widens it (see "
             "the facts, from 1 % of the noise on), sensitivities included. SNR: power of the "
-            "motion over that of the noise.",
+            "motion over that of the noise. Curves: one-sided power spectral density in dB re 1 "
+            f"({snapshot.unit})²/Hz (left) and its root in ({snapshot.unit})/√Hz (right). Each "
+            "point is a mean over its share of the axis. Dotted: the band of the table. Where the "
+            "interval reaches the bottom, the noise is known only to be below its upper end. "
+            "Shaded: nothing can be said." + _about_models(models),
             "quiet",
-        )
+        ),
     ]
+    if len(snapshot.results) > 1:
+        parts.append(_methods_table(result))
     octaves = _octave_table(result)
     if octaves is not None:
         parts.append(octaves)
-    if len(snapshot.results) > 1:
-        parts.append(_methods_table(result))
-    parts.append(
-        Paragraph(
-            f"Below: one-sided power spectral density in dB re 1 ({snapshot.unit})²/Hz (left) and "
-            f"its root in ({snapshot.unit})/√Hz (right). Each point is a mean over its share of "
-            "the axis. Dotted: the band of the table. Where the interval reaches the bottom, the "
-            "noise is known only to be below its upper end. Shaded: nothing can be said."
-            + _about_models(models),
-            "quiet",
-        )
-    )
-    parts += noise_plots(result, models)
     return Section("Self-noise", tuple(parts))
 
 
@@ -229,7 +231,7 @@ def _band_table(result: Result) -> Table:
         )
     header = (
         "channel", "recorded (dB)", "self-noise (dB)", "95 % interval (dB)",
-        f"({snapshot.unit})/√Hz", "c.o.v. in the worst ⅓ octave", "c.o.v. of mean", "SNR (dB)",
+        f"({snapshot.unit})/√Hz", "c.o.v., worst ⅓ octave", "c.o.v., mean", "SNR (dB)",
     )  # fmt: skip
     title = f"Mean over {span(*band)} by the {method} method, dB re 1 ({snapshot.unit})²/Hz"
     return Table(header, tuple(rows), title=title)

@@ -170,13 +170,14 @@ class _Paper(FPDF):
         title.s = "/H1"
         self.lines(report.subtitle, TEXT, "quiet")
         self.ln(0.12)
-        for notice in report.notices:
-            self.lines(notice.text, TEXT, notice.tone, bold=notice.tone in {"bad", "doubtful"})
-            self.ln(0.06)
         top = self.y
         self.lines(report.verdict.text, 10.0, report.verdict.tone, bold=True, indent=0.14)
         with self.local_context(fill_color=_COLOURS[report.verdict.tone]):
             self.rect(MARGIN, top, 0.05, self.y - top, style="F")
+        self.ln(0.08)
+        for notice in report.notices:
+            self.lines(notice.text, TEXT, notice.tone, bold=notice.tone in {"bad", "doubtful"})
+            self.ln(0.06)
 
     def section(self, title: str, parts: Sequence[Part]) -> None:
         """Set a section; its title is an entry of the outline."""
@@ -343,13 +344,15 @@ class _Paper(FPDF):
             self._style(TABLE, bold=bold)
             return float(self.get_string_width(text)) + 2 * GAP + 0.01
 
-        widths = []
+        widths: list[float] = []
         for column, word in enumerate(table.header):
             head = max(width(part, bold=True) for part in word.split() or [""])
             bold = any(place == column for _, place in table.tones)
             widths.append(max([head, *(width(row[column], bold=bold) for row in table.rows)]))
         if sum(widths) > INNER:
-            give = [c for c in range(len(widths)) if c in table.left] or list(range(len(widths)))
+            # names are read first: their column gives way only if it is the only one of words
+            words = [c for c in range(len(widths)) if c in table.left]
+            give = [c for c in words if c] or words or list(range(len(widths)))
             fixed = sum(width for column, width in enumerate(widths) if column not in give)
             left = max(INNER - fixed, 0.4 * len(give))
             for column in sorted(give, key=lambda c: widths[c]):  # narrow ones keep their width

@@ -85,6 +85,12 @@ def uncertainty_section(result: Result, about: Bench | None) -> Section | None:
         for row in each.components
         if row.source in _NAMES or row.relative > LEAST_SHARE
     )  # fmt: skip
+    dof = [d for each in found if math.isfinite(d := each.components[0].dof)]
+    only = Paragraph(
+        "Uncertainty budget (JCGM 100 and 101): finite averages alone, chi-squared (skewed), with"
+        f" {min(dof, default=0):.0f} to {max(dof, default=0):.0f} degrees of freedom; no other"
+        f" contribution reaches {100 * LEAST_SHARE:g} % of the level.",
+    )
     parts: list[Part] = [
         Table(
             header,
@@ -98,7 +104,9 @@ def uncertainty_section(result: Result, about: Bench | None) -> Section | None:
             "section of this report, its JSON and its DCC state this U." + _not_stated(snapshot),
             "quiet",
         ),
-        Table(
+        only
+        if dof and len(budget) == len(found)
+        else Table(
             (
                 "channel", "contribution", "distribution", "−", "+", "standard uncertainty",
                 "degrees of freedom",

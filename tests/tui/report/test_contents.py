@@ -17,12 +17,13 @@ from daq.estimation.settings import Settings
 from daq.results.result import Result
 from daq.results.sources import sources
 from tests.tui.night_recording import HOSTILE, N_SAMPLES, RATE, record
-from tests.tui.report.written_report import Reported, Words, tables, texts_of
+from tests.tui.report.written_report import Reported, Words, by_channel, tables, texts_of
 from tui.commands.main import app
 from tui.output.json_document import result_document
-from tui.report.contents import report_of
+from tui.report.contents import by_sensor, report_of
 from tui.report.evidence import facts_section
 from tui.report.figures.drift import without_line
+from tui.report.parts import Plot, Section, Table
 from tui.wording.facts import known
 
 if TYPE_CHECKING:
@@ -35,8 +36,8 @@ def test_it_says_what_was_tested_on_what_by_whom_and_when(reported: Reported) ->
     for word in (
         "pier & <floor>", "Ada <ada@lab>", "cellar", "night.h5", digest, "SN-0", "SN-2", "M-1",
         "X (east), Y", "1000000", "2016-07-14 01:00:00 UTC", "2016-07-14 03:00:00 UTC+0200",
-        "Duration1m", "three-sensor", "[estimate] segment1s", "hann", "0.5", "Signature",
-        "[estimate] correctyes",
+        "Duration1m", "three-sensor", "[estimate] segment1s", "hann", "overlap 0.5", "Signature",
+        "correct yes",
     ):  # fmt: skip
         assert word in text
 
@@ -44,7 +45,7 @@ def test_it_says_what_was_tested_on_what_by_whom_and_when(reported: Reported) ->
 def test_noise_is_that_of_the_estimate(reported: Reported) -> None:
     # 100 counts of white noise at 100 Hz, 1e6 counts per m/s²: 2e-10 (m/s²)²/Hz, −97 dB
     table, *_ = tables(reported.report, "Self-noise")
-    rows = {row[0]: row for row in table.rows}
+    rows = by_channel(table)
     assert float(rows["A.X"][2].replace("−", "-")) == pytest.approx(-96.99, abs=0.5)
     low, high = (float(end.replace("−", "-")) for end in rows["A.X"][3].split(" … "))
     assert low < -96.99 < high
@@ -59,7 +60,7 @@ def test_limits_are_judged_with_their_margin(reported: Reported, tmp_path: Path)
     assert f"{HOSTILE}.Y: no noise estimate at some frequencies" in text
     assert "Record for" not in text  # time does not bring the dead channel back
     (table,) = tables(reported.report, "Verdict")
-    rows = {row[0]: row for row in table.rows}
+    rows = by_channel(table)
     assert rows["A.X"][6] == "PASS"
     margin, low, high = re.findall(r"[+−-][\d.]+", rows["A.X"][5])
     assert float(margin) == pytest.approx(10, abs=2)
@@ -85,7 +86,7 @@ def test_by_all_methods_it_is_the_one_that_needs_no_alignment_that_judges(
             examined=tuple(sources([reported.recording])),
         )
     )
-    table, _, methods = tables(report, "Self-noise")
+    table, methods, _ = tables(report, "Self-noise")
     assert "by the three-sensor method" in table.title
     assert set(methods.header) >= {"three-sensor", "three-channel", "maximum-likelihood"}
     assert report.verdict.text == reported.report.verdict.text
@@ -190,3 +191,30 @@ def test_the_report_and_json_say_that_shared_noise_was_not_searched_for(
         ]
         is False
     )
+
+
+def test_the_result_comes_first(reported: Reported) -> None:
+    """The first curve was on page 3, after twelve lines of what is not given."""
+    titles = [each.title for each in reported.report.sections]
+    assert titles[:3] == ["Verdict against the limits", "Self-noise", "Facts"]
+    table, plot, *_ = reported.report.sections[1].parts
+    assert isinstance(table, Table)
+    assert isinstance(plot, Plot)
+    text = Words(reported.page).text
+    assert text.index("NOT DECIDED") < text.index("DRAFT: not a certificate")
+    assert sum("not given" in each.text for each in reported.report.notices) == 0
+    assert sum(each.text.startswith("Not given: ") for each in reported.report.notices) == 1
+
+
+def test_long_names_of_sensors_have_rows_of_their_own(reported: Reported) -> None:
+    rows = tuple((label.name, "1") for label in reported.snapshot.channels)
+    section = Section("a", (Table(("channel", "x"), rows, tones={(2, 1): "bad"}),))
+    (table,) = by_sensor(section, reported.snapshot).parts
+    assert isinstance(table, Table)
+    assert table.rows[:5] == (("A", ""), ("X", "1"), ("Y", "1"), ("B", ""), ("X", "1"))
+    assert table.tones == {(4, 1): "bad"}
+    assert list(by_channel(table)) == [label.name for label in reported.snapshot.channels]
+    mixed = Section("a", (Table(("channel", "x"), (rows[0], rows[2], rows[1])),))
+    assert by_sensor(mixed, reported.snapshot) == mixed
+    short = replace(reported.snapshot, channels=reported.snapshot.channels[:4])
+    assert by_sensor(section, short) is section

@@ -15,8 +15,8 @@ from daq.recording.reader import Recording
 from daq.results.result import Result
 from daq.results.uncertainty_budget import band_budgets
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
-from tests.tui.report.written_report import tables
-from tui.report.parts import Plot, Table
+from tests.tui.report.written_report import by_channel, tables
+from tui.report.parts import Paragraph, Plot, Table
 from tui.report.uncertainty import half_octaves, uncertainty_section
 
 if TYPE_CHECKING:
@@ -48,13 +48,15 @@ def test_no_total_is_narrower_than_its_statistical_part(n_effective: float, shar
 
 def test_noise_is_stated_in_the_units_of_the_trade(reported: Reported) -> None:
     """100 counts rms of white noise at 100 Hz, 1e6 counts per m/s²: 2e-10 (m/s²)²/Hz."""
-    summary, budget, rms, *_ = tables(reported.report, "Uncertainty")
-    row = next(row for row in summary.rows if row[0] == "A.X")
+    summary, rms, *_ = tables(reported.report, "Uncertainty")
+    row = by_channel(summary)["A.X"]
     assert number(row[7]) == pytest.approx(math.sqrt(2e-10), rel=0.05)
     assert summary.header[7:] == ("(m/s²)/√Hz", "g/√Hz", "µg/√Hz")
     assert number(row[8]) == pytest.approx(math.sqrt(2e-10) / 9.80665, rel=0.05)
     assert number(row[9]) == pytest.approx(math.sqrt(2e-10) / 9.80665e-6, rel=0.05)
-    assert next(r[1] for r in budget.rows if r[0] == "A.X") == "finite averages"
+    (section,) = (each for each in reported.report.sections if each.title == "Uncertainty")
+    said = [part.text for part in section.parts if isinstance(part, Paragraph)]
+    assert any("finite averages alone, chi-squared (skewed), with" in each for each in said)
     column = rms.header.index("A.X")
     for each in rms.rows:
         centre = float(each[0])
@@ -93,7 +95,7 @@ def test_the_range_reaches_from_the_noise_to_a_sine_of_full_scale(reported: Repo
     section = uncertainty_section(Result(reported.snapshot, reported.settings), about)
     assert section is not None
     assert any(isinstance(part, Plot) for part in section.parts)
-    rms, reach = [part for part in section.parts if isinstance(part, Table)][2:4]
+    rms, reach = [part for part in section.parts if isinstance(part, Table)][1:3]
     column = rms.header.index("A.X")
     for noise, range_db in zip(rms.rows, reach.rows, strict=True):
         expected = 20 * math.log10(2 * 9.80665 / math.sqrt(2) / number(noise[column]))

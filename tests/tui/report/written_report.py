@@ -99,6 +99,17 @@ def tables(report: Report, section: str) -> list[Table]:
     return [part for part in found.parts if isinstance(part, Table)]
 
 
+def by_channel(table: Table) -> dict[str, tuple[str, ...]]:
+    """Return the rows of a table by the name of their channel, whether sensors have own rows."""
+    found, sensor = {}, ""
+    for row in table.rows:
+        if not any(row[1:]):
+            sensor = f"{row[0]}."
+        else:
+            found[sensor + row[0]] = row
+    return found
+
+
 def paper_of(report: Report) -> io.BytesIO:
     """Write a report as PDF."""
     file = io.BytesIO()
