@@ -216,6 +216,8 @@ class SeedLinkDecoder:
         self._finder = PacketFinder(3)
         self._n_unreadable = 0
         self._name = next(iter(selections)) if len(selections) == 1 else ""
+        self._n_jumps: Counter[str] = Counter()  # of the numbers of a station's packets
+        self._n_jumps_at: dict[str, int] = {}  # at the latest record of a stream
         self.last: dict[str, tuple[int, int]] = {}
         """Last packet of each station, by ``NET_STA``: its number, UTC of its first sample in
         ns."""
@@ -278,8 +280,13 @@ class SeedLinkDecoder:
         station = f"{record.network}_{record.station}"
         # Some servers number the packets of all stations together: a jump need not be a loss.
         before = self.last.get(station, (-2, 0))[0]
-        in_turn = True if packet.sequence in {before + 1, (before + 1) % WRAP} else None
+        if packet.sequence not in {before + 1, (before + 1) % WRAP}:
+            self._n_jumps[station] += 1
+        # The lost packet may be one of this stream, though the jump was seen in another one.
+        jumps, stream_id = self._n_jumps[station], record.stream_id
+        in_turn = True if self._n_jumps_at.get(stream_id) == jumps else None
         self.last[station] = packet.sequence, record.start_ns
         for sensor in self._sensors.values():
             if sensor.selection.matches(record):
+                self._n_jumps_at[stream_id] = jumps
                 yield from sensor.add(record, at, hold=self._hold, in_turn=in_turn)

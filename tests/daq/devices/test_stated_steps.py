@@ -183,3 +183,18 @@ def test_a_clock_may_be_set_several_times_while_records_are_lost() -> None:
     assert [event.kind for event in events] == [EventKind.RESET] * 4
     restarts = [b.first_sample for b in blocks[1:] if BlockFlag.CLOCK_RESTART in b.flags]
     assert restarts == [5000, 9000, 13000, 18000]
+
+
+@pytest.mark.parametrize("jitter", [0.04, 0.16, 0.64])
+def test_lost_packets_are_gaps_however_unsteady_the_link(jitter: float) -> None:
+    """The number of a lost packet is missed by the next one, which may be of another stream."""
+    lost = tuple((30.3 + 20 * k, 31.5 + 20 * k) for k in range(12))
+    digitizer = Digitizer(300.0, lost=lost, jitter=jitter, seed=3)
+    index, rows, blocks, events = recorded(by_seedlink(digitizer))
+    truth = true_index(rows, digitizer)  # raises where channels are not of one time
+    assert not events
+    assert np.ptp(index - truth) == 0
+    assert np.count_nonzero(np.diff(truth) > 1) == len(lost)
+    assert not any(BlockFlag.CLOCK_RESTART in b.flags for b in blocks[1:])
+    n_estimated = sum(BlockFlag.MISSING_ESTIMATED in b.flags for b in blocks)
+    assert (n_estimated == 0) == (jitter < 0.1)
