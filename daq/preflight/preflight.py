@@ -208,17 +208,18 @@ def _identity(each: SensorPreview) -> Iterator[Finding]:
 
 def _rate(each: SensorPreview) -> Iterator[Finding]:
     rate, n_samples = each.sensor.sampling_rate, len(each.samples)
-    if each.measured_rate is None:
-        yield _of(Problem.UNEVEN, each, each.arrival_scatter)
-    elif _is_off(each) or (
-        abs(each.measured_rate / rate - 1) > max(RATE_ERROR, SIGNIFICANCE * each.rate_error)
-    ):
+    if each.trouble or not n_samples:
+        yield _of(Problem.TOO_FEW_SAMPLES, each)
+        return
+    off = abs((each.measured_rate or math.nan) / rate - 1)
+    is_another = _is_off(each) or off > max(RATE_ERROR, SIGNIFICANCE * each.rate_error)
+    if is_another and each.measured_rate is not None:
         yield replace(_of(Problem.RATE, each, each.measured_rate), wanted=rate)
-    elif SIGNIFICANCE * each.rate_error > RATE_ERROR:
+    elif each.measured_rate is None or SIGNIFICANCE * each.rate_error > RATE_ERROR:
         yield _of(Problem.UNEVEN, each, each.arrival_scatter)
     if each.n_missing > MISSING_SHARE * (n_samples + each.n_missing):
         yield _of(Problem.MISSING, each, each.n_missing)
-    elif not each.is_counted:
+    elif not each.is_counted and not is_another:
         yield _of(Problem.UNCOUNTED, each)
 
 
