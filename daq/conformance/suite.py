@@ -113,6 +113,8 @@ class Served:
         number it sends its last samples again and counts them as new ones.
     restart : callable or None
         Restarts the device: nothing is sampled for a second, then its counter begins again.
+    away : callable or None
+        Takes the name of a sensor of a shared port, and whether its device does not answer.
     """
 
     sensors: Sequence[Sensor]
@@ -122,6 +124,7 @@ class Served:
     pause: Callable[[], object] | None = None
     slip: Callable[[int], object] | None = None
     restart: Callable[[], object] | None = None
+    away: Callable[[str, bool], object] | None = None
 
 
 class DriverConformance:
@@ -297,6 +300,33 @@ class DriverConformance:
                 sensors = _at(served.sensors, number)
                 with pytest.raises((DeviceError, RemoteProtocolError)):
                     await self._read(sensors)
+
+        _run(run())
+
+    def test_a_device_that_is_away_costs_the_others_nothing(self) -> None:
+        """It is named when the port is opened, tried again, and recorded when it answers."""
+
+        async def run() -> None:
+            async with self.serve() as served:
+                if served.away is None:
+                    pytest.skip("the simulated devices of a port cannot be away one by one")
+                gone, *others = (sensor.name for sensor in served.sensors)
+                wanted = {one.name: self.seconds * one.sampling_rate for one in served.sensors}
+                served.away(gone, True)
+                async with self.driver.open(served.sensors, SystemClock()) as session:
+                    troubled = [one.sensor for one in session.information if one.trouble]
+                    assert troubled == [gone], "`trouble` of the device that is away, only"
+                    rows = dict.fromkeys(wanted, 0)
+                    async for item in session.read():
+                        if not isinstance(item, Block):
+                            continue
+                        name = item.sensor
+                        assert name == gone or item.first_sample == rows[name], "a gap of another"
+                        rows[name] += item.n_samples
+                        if not rows[gone] and all(rows[one] >= wanted[one] for one in others):
+                            served.away(gone, False)
+                        if rows[gone] >= wanted[gone]:
+                            break
 
         _run(run())
 

@@ -12,17 +12,21 @@ import pytest
 
 from daq.bench.channel import Channel
 from daq.bench.model import Sensor
+from daq.conformance import suite
+from daq.conformance.suite import DriverConformance, Served
 from daq.devices import shared_port
 from daq.devices.interface import Resuming
 from daq.devices.registry import driver_type
+from daq.devices.seedlink import driver
 from daq.devices.seedlink.packets import PacketFinder
 from daq.errors import NotConnectedError, WrongDeviceError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, Event, EventKind
-from tests.daq.devices.seedlink_peer import RATE, Server, record, value
+from tests.daq.devices.seedlink_peer import PER_RECORD, RATE, Server, record, value
 from tests.waiting import limit
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
     from contextlib import AbstractAsyncContextManager
 
     from daq.devices.interface import Session
@@ -199,3 +203,47 @@ def test_records_have_the_length_that_they_state(size: int, padded: bool, step: 
     found = [p for k in range(0, len(line), step) for p in finder.receive(line[k : k + step])]
     assert [one.sequence for one in found] == list(range(5))
     assert [one.payload[:size] for one in found] == records
+
+
+class Shared(DriverConformance):
+    """The suite on this server; its clock is that of the test."""
+
+    driver = DRIVER
+
+    @contextlib.asynccontextmanager
+    async def serve(self) -> AsyncIterator[Served]:
+        """Serve stations, of which one may be refused."""
+
+        async def make() -> None:
+            while True:
+                server.make()
+                await asyncio.sleep(PER_RECORD / RATE)
+
+        async with Server(NAMES) as server:
+            task = asyncio.create_task(make())
+
+            def away(name: str, is_away: bool) -> None:
+                server.refuses = {name} if is_away else set()
+
+            try:
+                yield Served(sensors(server.port), away=away)
+            finally:
+                task.cancel()
+                await asyncio.wait([task])
+
+
+def test_the_suite_holds_for_stations_that_are_away() -> None:
+    Shared().test_a_device_that_is_away_costs_the_others_nothing()
+
+
+def test_the_suite_sees_a_device_that_is_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shared_port, "FIRST_RETRY", 1000.0)
+    monkeypatch.setattr(suite, "LIMIT", 6.0)
+    with pytest.raises(TimeoutError):
+        Shared().test_a_device_that_is_away_costs_the_others_nothing()
+
+
+def test_the_suite_sees_a_driver_that_names_no_trouble(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(driver, "_information", lambda *_: ())
+    with pytest.raises(AssertionError, match="`trouble` of the device that is away, only"):
+        Shared().test_a_device_that_is_away_costs_the_others_nothing()
