@@ -16,6 +16,7 @@ from estimator.levels.bands import bin_correlation
 from estimator.levels.pooled import blocks_of
 from estimator.likelihood.dimension import BandDimension, choose_dimension
 from estimator.likelihood.goodness_of_fit import neighbour_correlation
+from estimator.median import median
 from estimator.methods import METHODS, self_noise
 from estimator.self_noise.result import Flag, SelfNoise, combined, joined
 from estimator.spectra.multiresolution import Band, MultiResolution
@@ -618,7 +619,7 @@ def beside_changes(
         )
         data = np.einsum("fii->fi", band.csm).real
         with np.errstate(invalid="ignore", divide="ignore"):
-            motion = np.median(data / own.noise_psd - 1, axis=1)
+            motion = median((data / own.noise_psd - 1).T)
         motion[band.settings.real(band.frequencies)] = np.nan
         found.append(
             beside(
