@@ -56,15 +56,18 @@ def figure(result: results.Result, *, models: Sequence[Mask], width: float) -> F
 
 
 def draw(axes: Axes, snapshot: Snapshot, models: Sequence[Mask]) -> None:
-    """Draw the noise of every channel, with its interval, and noise models on axes that exist."""
-    noise = next(iter(snapshot.results.values()))
+    """Draw the noise of every channel, with its interval, and noise models on axes that exist.
+
+    Without noise, as of one sensor, the PSD of the samples.
+    """
+    noise = next(iter(snapshot.results.values()), None)
+    psd = snapshot.data_psd if noise is None else noise.noise_psd
     frequency = snapshot.frequency[1:]  # the axis is logarithmic
     for column, label in enumerate(snapshot.channels):
-        psd, low, high = (
-            levels_db(each[1:, column]) for each in (noise.noise_psd, noise.low, noise.high)
-        )
-        (line,) = axes.plot(frequency, psd, label=label.name)
-        axes.fill_between(frequency, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
+        (line,) = axes.plot(frequency, levels_db(psd[1:, column]), label=label.name)
+        if noise is not None:
+            low, high = (levels_db(each[1:, column]) for each in (noise.low, noise.high))
+            axes.fill_between(frequency, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
     for mask in models:
         at = mask.points(frequency)
         at = at[(at >= frequency[0]) & (at <= frequency[-1])]

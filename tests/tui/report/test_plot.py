@@ -13,6 +13,7 @@ import pytest
 from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
+import huddle
 from daq.bench.loading import parse
 from daq.bench.masks.mask import NOISE_MODELS, Mask
 from daq.bench.masks.mask_file import masks_named
@@ -222,3 +223,17 @@ def test_what_cannot_be_drawn_is_refused_before_the_estimate(
     result = CliRunner().invoke(app, ["plot", "absent.h5", *options], terminal_width=300)
     assert result.exit_code == 2
     assert re.search(said, result.stderr)
+
+
+def test_of_one_sensor_the_psd_is_drawn() -> None:
+    alone = huddle.self_noise(
+        {"A": np.random.default_rng(1).standard_normal((3000, 2))}, fs=100.0, segment="1s"
+    )
+    axes = drawn(noise_plots(Result(alone.snapshot, alone.settings)))
+    assert len(axes) >= 2
+    labels = {str(line.get_label()) for each in axes for line in each.lines if each.lines}
+    assert "recorded" in labels
+    assert not [label for label in labels if "noise" in label]
+    shared = Figure().subplots()
+    alone.plot(ax=shared)
+    assert [line.get_label() for line in shared.lines] == ["A.1", "A.2"]

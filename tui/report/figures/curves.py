@@ -62,7 +62,7 @@ class _Curves:
     edges: FloatArray
     frequency: FloatArray
     data: FloatArray
-    noise: BandMeans
+    noise: BandMeans | None
     others: Mapping[str, FloatArray]
     limits: tuple[tuple[FloatArray, FloatArray], ...]
     models: Mapping[str, tuple[FloatArray, FloatArray]]
@@ -88,33 +88,8 @@ class _NoisePanel:
         logarithmic(axes, (float(curve.edges[0]), float(curve.edges[-1])))
         axes.plot(frequency, levels_db(curve.data), color=drawing.DATA, lw=0.8, label="recorded")
         floor = 10 ** (scale[0] / 10)
-        is_bound = curve.noise.is_bound
-        high = np.where((curve.noise.high > 0) & ~is_bound, curve.noise.high, np.nan)
-        axes.fill_between(
-            frequency,
-            levels_db(np.where(curve.noise.low > floor, curve.noise.low, floor)),
-            levels_db(high),
-            color=drawing.NOISE,
-            alpha=0.25,
-            lw=0,
-            label="95 % interval",
-        )
-        axes.plot(
-            frequency,
-            levels_db(np.where(is_bound, np.nan, curve.noise.mean)),
-            color=drawing.NOISE,
-            lw=0.9,
-            label=self.noise_label,
-        )
-        if is_bound.any():
-            axes.plot(
-                frequency,
-                levels_db(np.where(is_bound, curve.noise.high, np.nan)),
-                color=drawing.NOISE,
-                lw=0.8,
-                dashes=(3, 2),
-                label=f"{self.noise_label} is below",
-            )
+        if curve.noise is not None:
+            self._draw_noise(axes, curve.noise, floor)
         for (label, psd), colour, dashes in zip(
             curve.others.items(), drawing.LINES[1:], drawing.DASHES, strict=False
         ):
@@ -142,7 +117,8 @@ class _NoisePanel:
             )
         for edge in self.band or ():
             axes.axvline(edge, color=drawing.INK, lw=0.5, dashes=(1, 2))
-        _nothing(axes, curve)
+        if curve.noise is not None:
+            _nothing(axes, curve.edges, curve.noise)
         axes.set_ylim(scale)
         axes.yaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 2, 5, 10], integer=True))
         axes.yaxis.set_major_formatter(
@@ -151,6 +127,36 @@ class _NoisePanel:
         axes.set_ylabel(f"dB re 1 ({self.unit})²/Hz")
         if self.with_amplitude:
             _amplitude_scale(axes, scale, self.unit)
+
+    def _draw_noise(self, axes: Axes, noise: BandMeans, floor: float) -> None:
+        frequency = self.curve.frequency
+        is_bound = noise.is_bound
+        high = np.where((noise.high > 0) & ~is_bound, noise.high, np.nan)
+        axes.fill_between(
+            frequency,
+            levels_db(np.where(noise.low > floor, noise.low, floor)),
+            levels_db(high),
+            color=drawing.NOISE,
+            alpha=0.25,
+            lw=0,
+            label="95 % interval",
+        )
+        axes.plot(
+            frequency,
+            levels_db(np.where(is_bound, np.nan, noise.mean)),
+            color=drawing.NOISE,
+            lw=0.9,
+            label=self.noise_label,
+        )
+        if is_bound.any():
+            axes.plot(
+                frequency,
+                levels_db(np.where(is_bound, noise.high, np.nan)),
+                color=drawing.NOISE,
+                lw=0.8,
+                dashes=(3, 2),
+                label=f"{self.noise_label} is below",
+            )
 
 
 def noise_plots(
@@ -179,11 +185,11 @@ def noise_plots(
         If a model cannot be turned into the unit of the snapshot.
     """
     snapshot = result.snapshot
-    if not snapshot.results:
+    if not snapshot.results and len(snapshot.dims) >= _LEAST_SENSORS:
         return ()
     curves = _curves(result, models)
     scale = _scale(curves)
-    first = next(iter(snapshot.results))
+    first = next(iter(snapshot.results), "")
     noise_label = "self-noise" if len(snapshot.results) == 1 else f"self-noise, {first}"
     band = result.settings.band
     groups = list(_groups(snapshot))
@@ -235,22 +241,24 @@ def _key_rows(curves: list[_Curves], width: float) -> int:
     """Return the rows of a key of all that may be in a plot."""
     curve = curves[0]
     n_labels = 4 + len(curve.others) + len(curve.models)
-    n_labels += bool(curve.limits) + any(each.noise.is_bound.any() for each in curves)
+    n_labels += bool(curve.limits) + any(
+        each.noise is not None and each.noise.is_bound.any() for each in curves
+    )
     n_labels += bool(np.isfinite(curve.quantisation).any())
     return math.ceil(n_labels / max(1, int(width / KEY_COLUMN)))
 
 
 def _curves(result: Result, models: Sequence[Mask]) -> list[_Curves]:
     snapshot, bench = result.snapshot, result.bench
-    method, *others = snapshot.results
+    method, *others = snapshot.results or [None]
     frequency, data = snapshot.frequency, snapshot.data_psd
     edges = log_edges(frequency, POINTS)
     centre = centres(frequency, edges)
     width = np.gradient(frequency)
-    found = result.spectrum(method).levels(edges)
+    found = None if method is None else result.spectrum(method).levels(edges)
     curves = []
     for column, label in enumerate(snapshot.channels):
-        means = found.of_channel(column)
+        means = None if found is None else found.of_channel(column)
         limits = [] if bench is None else [lim for lim in bench.limits if concerns(lim, label)]
         masks = []
         for limit in limits:
@@ -265,6 +273,7 @@ def _curves(result: Result, models: Sequence[Mask]) -> list[_Curves]:
                 {
                     name: _mean(_estimates(snapshot.results[name])[:, column], edges, width)
                     for name in others
+                    if name is not None
                 },
                 tuple(masks),
                 {
@@ -314,7 +323,8 @@ def _scale(curves: list[_Curves]) -> tuple[float, float]:
     """Return the range in dB that holds all curves, in steps of ten."""
     values = []
     for curve in curves:
-        values += [curve.data, curve.noise.mean, *curve.others.values()]
+        values += [curve.data, *curve.others.values()]
+        values += [] if curve.noise is None else [curve.noise.mean]
         values += [mask for _, mask in curve.limits]
     level = levels_db(np.concatenate(values))
     level = level[np.isfinite(level)]
@@ -343,13 +353,13 @@ def _amplitude_scale(axes: Axes, scale: tuple[float, float], unit: str) -> None:
     other.set_ylabel(f"({unit})/√Hz")
 
 
-def _nothing(axes: Axes, curve: _Curves) -> None:
+def _nothing(axes: Axes, edges: FloatArray, noise: BandMeans) -> None:
     """Shade where nothing can be said: no number, or all of its interval below zero."""
-    unknown = ~(np.isfinite(curve.noise.mean) & (curve.noise.high > 0))
+    unknown = ~(np.isfinite(noise.mean) & (noise.high > 0))
     for start, stop in _runs(unknown):
         axes.axvspan(
-            float(curve.edges[start]),
-            float(curve.edges[stop]),
+            float(edges[start]),
+            float(edges[stop]),
             color=drawing.NOTHING,
             alpha=0.4,
             lw=0,
@@ -374,6 +384,8 @@ def logarithmic(axes: Axes, span: tuple[float, float]) -> None:
     axes.set_xlabel("frequency (Hz)")
 
 
+_LEAST_SENSORS = 2
+"""Sensors of which there may be noise: of one alone, the PSD is drawn."""
 RESOLUTION = 300
 """Dots per inch of a PNG, as journals ask for."""
 
@@ -405,7 +417,7 @@ def write_figure(
     Raises
     ------
     InsufficientDataError
-        If there is no estimate by any method.
+        If there is no estimate of two sensors or more by any method.
     WrongSettingError
         If a noise model cannot be turned into the unit of the estimate.
     OSError
