@@ -202,8 +202,10 @@ def _method_faults(estimate: EstimateSettings) -> Iterator[FileFault]:
     for key, value, method in (
         ("dimension", estimate.dimension, "maximum-likelihood"),
         ("gains", estimate.gains or None, "two-channel"),
+        ("shared_noise", estimate.shared_noise or None, "multi-part"),
     ):
-        if value is not None and not {method, "all"} & set(estimate.methods):
+        takes = {method, "all"} | ({"auto"} if method == "multi-part" else set())
+        if value is not None and not takes & set(estimate.methods):
             chosen = ", ".join(estimate.methods)
             expected = f'expected with method = "{method}" or "all" only, not "{chosen}"'
             yield FileFault(f"estimate.{key}", expected, value)

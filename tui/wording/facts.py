@@ -288,7 +288,7 @@ def _measured(value: float, error: float, digits: int) -> str:
 @word.register(SteadyGainsAssumed)
 def _steady_gains(fact: SteadyGainsAssumed, names: Names) -> Wording:
     del names
-    where, how = "Two sensors", "Two sensors tell noise from motion by"
+    where, how = fact.method, f"{fact.method} tells noise from motion by"
     if fact.band is not None:
         where = span(*fact.band)
         how = f"Motion that changes lowers the scatter at {where}, by"

@@ -83,8 +83,10 @@ def style_of(found: TestVerdict, *, grows: bool) -> str:
 
 def headline(found: TestVerdict) -> str:
     """Return the verdict in a sentence or two."""
-    two = any(each.method == "multi-part" for each in found.limits)
-    return _headline(found) + (" Two sensors: steady gains are assumed." if two else "")
+    if not any(each.method == "multi-part" for each in found.limits):
+        return _headline(found)
+    who = "Two sensors" if len({each.sensor for each in found.limits}) < 3 else "multi-part"
+    return f"{_headline(found)} {who}: steady gains are assumed."
 
 
 def _headline(found: TestVerdict) -> str:

@@ -188,6 +188,14 @@ psd = [[1, 2], [3, 4]]
             'expected with method = "two-channel" or "all" only, not "auto"',
         ),
         (
+            '[estimate]\nmethod = "three-sensor"\nshared_noise = [["a", "b"]]\n',
+            'expected with method = "multi-part" or "all" only, not "three-sensor"',
+        ),
+        (
+            '[estimate]\nshared_noise = [["a", "d"]]\n',
+            'estimate.shared_noise = "d": expected one of a, b, c',
+        ),
+        (
             '[estimate]\nmethod = "two-channel"\ngains = {b = 0}\n',
             "expected a number other than 0, such as 1.02, for b",
         ),

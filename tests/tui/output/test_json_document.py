@@ -20,7 +20,7 @@ from tests.tui.example_snapshot import SETTINGS, diagnosed, judged, made_snapsho
 from tests.tui.wording.fact_examples import EXAMPLES, kinds
 from tui.output.console import finite
 from tui.output.json_document import UNITS, document, result_document
-from tui.wording.verdict_text import what_to_do
+from tui.wording.verdict_text import headline, what_to_do
 
 
 def test_advice_has_its_kind_its_numbers_and_its_words() -> None:
@@ -129,3 +129,7 @@ def test_a_verdict_has_its_facts_in_the_document() -> None:
     assert facts["limit-not-judged"]["numbers"]["judged_hz"] == [0.2, 90.0]
     assert [each["channel"] for each in written["sensitivities"]] == ["X", "Y"]
     assert " ".join(what_to_do(found)).count("C reads 0.102 of A and B") == 1
+    assert "steady gains" not in headline(found)
+    for names, who in (("AB", "Two sensors"), ("ABC", "multi-part")):
+        each = tuple(replace(limit, sensor=name, method="multi-part") for name in names)
+        assert headline(replace(found, limits=each)).endswith(f"{who}: steady gains are assumed.")
