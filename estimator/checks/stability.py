@@ -61,6 +61,8 @@ PAIR_BYTES = 1 << 24
 """Bytes of products of pairs of channels with all others that exist together: 16 MB."""
 SIGNIFICANCE = 3.0
 """Standard errors by which scatter must exceed its expectation to be significant."""
+LONG_TAILS = 100.0
+"""By which alarms of several ranges of frequencies are rarer: parts have few averages in each."""
 DOUBT = 4.0
 """By which a doubtful noise may be wrong as the scale of a test."""
 SECOND_ORDER = 4.0
@@ -213,7 +215,7 @@ class Stability:
         found = [each for each in ranges if each is not None]
         if len(ranges) < 2 or not found:
             return found[0] if found else None
-        alarm = FALSE_ALARM / (n_sensors * len(found))
+        alarm = FALSE_ALARM / (LONG_TAILS * n_sensors * len(found))
         clearest: dict[int, ResponseChange] = {}
         second_order = 0.0
         for each in sorted((c for one in found for c in one.changes), key=lambda c: -c.statistic):
