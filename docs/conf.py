@@ -65,6 +65,7 @@ class Reference(SphinxDirective):
             "commands": reference.commands,
             "bench_file": reference.bench_file,
             "troubleshooting": reference.troubleshooting,
+            "result": reference.result,
         }
         found: list[nodes.Node] = self.parse_text_to_nodes(
             make[self.arguments[0]](), allow_section_headings=True

@@ -6,10 +6,12 @@ from __future__ import annotations
 
 import ast
 import inspect
+import json
 import re
 import textwrap
+from importlib import resources
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel, BeforeValidator
 from pydantic_core import PydanticUndefined
@@ -23,6 +25,9 @@ from tests.tui.wording.fact_examples import EXAMPLES as FACTS
 from tui.commands.help import PANELS, subcommand
 from tui.wording.facts import MARKS, RANKS, word
 from tui.wording.findings import Names
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 _WRITTEN = {"[[schedule.runs]]": "[[schedule]]"}
 """Tables that a person writes by another name than that of their model."""
@@ -69,6 +74,30 @@ def bench_file() -> str:
     _collect("", Bench, tables)
     del tables["[schedule]"]
     return "\n".join(_section(path, model) for path, model in tables.items())
+
+
+def result() -> str:
+    """Return a table for each object of the JSON of a result, made of its schema."""
+    text = (resources.files("tui.resources") / "result-2.schema.json").read_text("utf-8")
+    schema = json.loads(text)
+    parts = []
+    for name, each in {"document": schema, **schema["$defs"]}.items():
+        rows = [f"| `{key}` | {meaning} |" for key, meaning in _keys(each, "")]
+        about = "" if each is schema else each.get("description", "") + _BLANK
+        table = "\n".join(["| key | meaning |", "|---|---|", *rows])
+        parts.append(f"#### `{name}`\n\n{about}{table}\n")
+    return "\n".join(parts)
+
+
+def _keys(schema: dict[str, Any], before: str) -> Iterator[tuple[str, str]]:
+    """Yield each key of an object and of the objects in it, with what it means."""
+    for key, part in schema.get("properties", {}).items():
+        links = re.findall(r'"#/\$defs/(\w+)"', json.dumps(part))
+        link = "".join(f" See `{each}`." for each in dict.fromkeys(links))
+        yield before + key, _plain(part.get("description", "") + link).replace("|", "\\|")
+        for option in (part, *part.get("anyOf", ()), *part.get("oneOf", ())):
+            for inner in (option, option.get("items", {})):
+                yield from _keys(inner, f"{before}{key}.")
 
 
 def _collect(path: str, model: type[BaseModel], tables: dict[str, type[BaseModel]]) -> None:

@@ -44,6 +44,19 @@ def test_noise_from_arrays(tmp_path: Path) -> None:
     assert (tmp_path / "noise.svg").stat().st_size > 10_000
 
 
+def test_added_noise_is_found_in_its_channel_alone(tmp_path: Path) -> None:
+    printed = run("proof_by_added_noise.py", tmp_path).splitlines()
+    levels = {
+        name: [float(word) for word in values.strip(" []").split()]
+        for name, _, values in (line.partition(":") for line in printed)
+    }
+    assert levels["three-sensor"] == pytest.approx([-130.0] * 3, abs=0.3)
+    assert levels["rotated first"] != pytest.approx([-130.0] * 3, abs=3.0, nan_ok=True)
+    risen = levels["7.0 dB more noise in A.X"]
+    assert risen[0] - levels["three-sensor"][0] == pytest.approx(7.0, abs=0.3)
+    assert risen[1:] == pytest.approx(levels["three-sensor"][1:], abs=0.1)
+
+
 @pytest.mark.long
 def test_miniseed_to_noise(tmp_path: Path) -> None:
     pytest.importorskip("obspy")

@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 from daq.devices.interface import DeviceInformation
 from daq.preflight.device_check import SensorCheck
 from daq.python_process import python_command
+from docs import reference
 from sim_devices.world.paper_scenarios import SCENARIOS
 from tui.commands.check import remarks
 from tui.commands.help import COMMANDS, PANELS, subcommand
@@ -470,7 +471,7 @@ def test_plan_says_how_long_to_record(tmp_path: Path) -> None:
 
 def test_what_is_written_as_json_is_documented(tmp_path: Path) -> None:
     bench, out = str(tmp_path / "lab.toml"), str(tmp_path / "model.h5")
-    said = (ROOT / "docs" / "json.md").read_text(encoding="utf-8")
+    said = (ROOT / "docs" / "json.md").read_text(encoding="utf-8") + reference.result()
     huddle("init", "--out", bench)
     for command in (
         ("check", bench, "--no-devices"),
