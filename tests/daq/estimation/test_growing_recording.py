@@ -49,10 +49,12 @@ class Spans(AlignedRecording):
         self.spans: list[tuple[int, int]] = []
         super().__init__(recording)
 
-    def read(self, start: int, stop: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    def read(
+        self, start: int, stop: int, *, is_final: bool = True
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Read it."""
         self.spans.append((start, stop))
-        return super().read(start, stop)
+        return super().read(start, stop, is_final=is_final)
 
 
 def test_what_overlaps_is_read_once_as_long_as_clocks_stay(tmp_path: Path) -> None:
