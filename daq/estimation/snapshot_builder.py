@@ -678,6 +678,12 @@ def why_nothing(
 ) -> str:
     """Return the reason why no channel has an estimate."""
     names = ", ".join(str(recording.path) for recording in recordings)
+    silent = [one.name for one in recordings[-1].sensors if one.n_samples == 0]
+    if snapshot.n_segments == 0 and silent:
+        return (
+            f"{names}: no samples of {', '.join(silent)}, and an estimate needs samples of every"
+            " sensor: correct the connection, or remove it from the bench file, and record again"
+        )
     if snapshot.n_segments == 0:
         available = sum(each.aligned.n_available for each in passes)
         seconds = available / passes[0].welch.sampling_rate

@@ -16,7 +16,7 @@ from daq.estimation.snapshot import NoResultError
 from daq.recording.reader import Recording
 from daq.recording.sensor_record import SensorRecord
 from tests.daq.clocks.recordings import Sensor as FreeRunning
-from tests.daq.clocks.recordings import counts, write, write_polled
+from tests.daq.clocks.recordings import blocks, counts, create, write, write_polled
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -124,6 +124,17 @@ def test_loss_of_half_of_all_samples_is_reported_immediately(tmp_path: Path) -> 
     path = write_polled(tmp_path / "r.h5", lost)
     with pytest.raises(NoResultError, match="not one whole segment"):
         estimate([path], Settings(segment=4.0))
+
+
+def test_a_sensor_that_never_sent_is_named(tmp_path: Path) -> None:
+    sensors = {name: FreeRunning(counts(3000, 3, ord(name))) for name in "ABC"}
+    writer = create(tmp_path / "r.h5", sensors | {"D": FreeRunning(counts(1, 3, 1))})
+    for name, sensor in sensors.items():
+        for block in blocks(name, sensor):
+            writer.append(block)
+    writer.close()
+    with pytest.raises(NoResultError, match="no samples of D, and an estimate needs"):
+        estimate([tmp_path / "r.h5"], Settings(segment=4.0))
 
 
 def test_many_gaps_of_free_running_sensors_do_not_increase_the_reads(
