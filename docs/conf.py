@@ -11,6 +11,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from importlib.metadata import version as installed
 from pathlib import Path
 from shutil import copyfile
 from typing import TYPE_CHECKING, ClassVar
@@ -27,6 +28,7 @@ FIGURES = "_figures"
 
 project = "huddle"
 author = "the huddle project"
+release = version = installed("huddle-bench")
 extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc"]
 exclude_patterns = ["images/**", FIGURES]
 html_theme = "pydata_sphinx_theme"
