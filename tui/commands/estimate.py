@@ -167,7 +167,7 @@ def show_result(
 
     snapshot, screen = result.snapshot, for_people(json, csv)
     table = result_table(result)  # refuses a band without frequencies
-    decision = None if result.verdict is None else Decision.of(result.verdict)
+    decision = Decision.of(result)
     if decision is not None:
         screen.print(str(decision), style=STYLES[decision.state])
     screen.print(result_title(result))

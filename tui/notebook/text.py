@@ -49,7 +49,7 @@ def text(result: Result) -> str:
 
 def _decision(result: Result) -> list[str]:
     """Return the first line of a test with limits."""
-    return [] if result.verdict is None else [str(Decision.of(result.verdict))]
+    return [] if (decision := Decision.of(result)) is None else [str(decision)]
 
 
 def html(result: Result) -> str:

@@ -136,7 +136,7 @@ def report_of(
     """
     snapshot, found, judged = result.snapshot, result.sources, result.verdict
     bench = found[0].bench
-    sentence = verdict(judged)
+    sentence = verdict(result)
     states = {source.state for source in found}
     if "growing" in states or (not snapshot.closed and states == {"closed"}):
         sentence = Paragraph(f"Still running, preliminary. {sentence.text}", "doubtful")

@@ -55,12 +55,12 @@ _TONES: Mapping[Verdict, Tone] = {
 """Worst first."""
 
 
-def verdict(found: TestVerdict | None) -> Paragraph:
+def verdict(result: Result) -> Paragraph:
     """Return what it all comes to, in a sentence or two."""
-    if found is None:
+    decision = Decision.of(result)
+    if decision is None:
         return Paragraph("No verdict: the bench file has no limits.", "quiet")
-    decision = Decision.of(found)
-    return Paragraph(" ".join([str(decision), *decision.remarks]), _TONES[found.verdict])
+    return Paragraph(" ".join([str(decision), *decision.remarks]), _TONES[decision.state])
 
 
 def limits_section(

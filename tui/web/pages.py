@@ -27,7 +27,7 @@ def about_test(state: State, settings_table: Mapping[str, Any]) -> dict[str, Any
     if result is None:
         raise ValueError("not estimated")
     snapshot, verdict = result.snapshot, result.verdict
-    decision = None if verdict is None else Decision.of(verdict)
+    decision = Decision.of(result)
     has_noise = bool(snapshot.results) and snapshot.n_segments > 0
     differences = None if state.reference is None else _differences(state)
     return {

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from daq.results.decision.end import Goal
 from daq.results.facts import LimitUndecided, WrongSensitivity
 from estimator.decision.verdict import REMOVED_BY_TIME, Verdict
-from tui.wording.facts import NOTHING_TO_DO, known_of_verdict
+from tui.wording.facts import NOTHING_TO_DO, known, known_of_verdict
 from tui.wording.formatting import level, listed, percent, roughly, several, signed
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from daq.results.decision.end import Remaining
     from daq.results.decision.verdict import LimitResult, TestVerdict
+    from daq.results.result import Result
 
 WORDS: Mapping[Verdict, str] = {
     Verdict.PASS: "PASS",
@@ -32,6 +33,7 @@ STYLES: Mapping[Verdict, str] = {
 MARKS: Mapping[Verdict, str] = {Verdict.PASS: "✓", Verdict.FAIL: "✗", Verdict.NOT_DECIDED: "?"}
 YOUNG = "#9aa5b8"
 """Style of a test that only lacks time: nothing is wrong."""
+SEE_FACTS = "The facts below need action."
 REPAIR = "Repair or replace these sensors, or correct the limit."
 """After a limit that is not met."""
 TOO_EARLY: Mapping[Goal, str] = {
@@ -65,12 +67,18 @@ class Decision:
         return f"{self.reason} {self.next_step}"
 
     @classmethod
-    def of(cls, found: TestVerdict) -> Decision:
-        """Return the decision on limits: the next step is the one that decides."""
+    def of(cls, result: Result) -> Decision | None:
+        """Return the decision on limits: the next step is the one that decides; None without."""
+        found = result.verdict
+        if found is None:
+            return None
         steps = what_to_do(found)
         if record_for(found):  # by time alone: nothing else is missing
             steps = [steps[-1], *steps[:-1]]
-        usual = NOTHING_TO_DO if found.verdict is Verdict.PASS else REPAIR
+        usual = REPAIR
+        if found.verdict is Verdict.PASS:
+            needed = any(each.needs_action for each in known(result))
+            usual = SEE_FACTS if needed else NOTHING_TO_DO
         remarks = (*steps[1:], *not_judged(found))
         return cls(found.verdict, headline(found), steps[0] if steps else usual, remarks)
 

@@ -59,7 +59,8 @@ def test_the_first_line_answers_is_it_good_and_what_next(
     show_result(result, json=None, csv=None)
     lines = capsys.readouterr().out.splitlines()
     assert result.verdict is not None
-    decision = Decision.of(result.verdict)
+    decision = Decision.of(result)
+    assert decision is not None
     word = {Verdict.PASS: "PASS", Verdict.FAIL: "FAIL", Verdict.NOT_DECIDED: "NOT DECIDED"}
     assert lines[0] == str(decision)
     assert lines[0].startswith(f"{word[decision.state]}: ")
@@ -71,7 +72,9 @@ def test_the_first_line_answers_is_it_good_and_what_next(
         NOTHING_TO_DO in "".join(lines[1:])
     )
     assert text.text(result).splitlines()[0].startswith(lines[0][:90])
-    assert verdict(result.verdict).text.startswith(lines[0])
+    assert verdict(result).text.startswith(lines[0])
+    needed = any(each.needs_action for each in known(result))
+    assert (decision.next_step == NOTHING_TO_DO) == (is_good and not needed)
 
 
 def test_the_tests_above_have_all_verdicts() -> None:

@@ -79,17 +79,16 @@ def item(text: str, mark: str = "·", style: str = "#9aa5b8") -> Table:
 
 
 def _verdict(result: Result) -> Iterator[Text]:
-    found = result.verdict
+    found, decision = result.verdict, Decision.of(result)
     if not result.snapshot.results:
         yield Text("No result: nothing can be said of the sensors' noise.", BAD)
         for method, why in result.snapshot.refused.items():
             yield Text(f"{method}: {why}", BAD)
         return
-    if found is None:
+    if found is None or decision is None:
         yield Text("No limits in the bench file: neither passed nor failed.", MUTED)
     else:
-        decision, style = Decision.of(found), STYLES[found.verdict]
-        yield Text(f"{MARKS[found.verdict]} {decision}", style)
+        yield Text(f"{MARKS[found.verdict]} {decision}", STYLES[found.verdict])
         yield from map(Text, decision.remarks)
         known = [each for each in found.limits if math.isfinite(each.margin_low_db)]
         if known:
