@@ -63,31 +63,25 @@ database, a clock that is set and a long history. The table is the outcome of on
 |---|---:|---:|---|
 """
 TAIL = """
-- *Kills*: SIGKILL after 0 to 40 commits. Half of the repairs are killed too, and repeated.
-- *Power cuts*: a preloaded library records all writes and fsyncs of the recorder. They are replayed
-  up to a random one. Of what was written after the last fsync of a file the disk then has nothing
-  (synced), everything (prefix), some whole writes, some 4 KiB pages of them, or some 512-byte
-  sectors.
-- *Disk errors*: from a random call on, once or permanently, `pwrite`, `fsync`, `write` or
-  `ftruncate` fails with ENOSPC or EIO. One `pwrite` or `write` that fails must not end the
-  recording; otherwise the recorder must end with an error message.
-- *Faults of commands*: of a command, the n-th call that writes, truncates, syncs, renames or
-  closes a file fails with EIO, once or from there on, or with ENOSPC from there on. The result must
-  be that of a run without faults, or the command must end with a message and exit code 3; a file
-  that has its name is complete; no signal ends a process; the next run gives the result.
-- *Flipped bits*: one bit of a closed recording, in 80 % of the cases outside of the samples; one
-  bit of a row of a table of blocks; or one of the headers in the global heap of a recording of
-  version 1. *Changed sectors*: 512 bytes that become zero, random, or those of another sector.
-  Reader and `huddle verify` may take ten seconds at most; whatever they call intact, a program with
-  plain h5py must be able to read. Where HDF5 hangs or crashes, `huddle verify` must name it.
-- *Database*: one bit or page of 300 runs with their noise, or the end, is changed. The next start
-  must have all runs. SQLite has no checksums, so a bit of a number changes it unseen.
+- *Kills*: SIGKILL after 0 to 40 commits; half of the repairs are killed, too.
+- *Power cuts*: recorded writes and fsyncs are replayed up to a random one. Of what came after the
+  last fsync the disk has nothing (synced), everything (prefix), some whole writes, some 4 KiB pages
+  or some 512-byte sectors.
+- *Disk errors*: `pwrite`, `fsync`, `write` or `ftruncate` fails with ENOSPC or EIO, once or for
+  good. One failed write must not end the recording; else the recorder ends with a message.
+- *Faults of commands*: the n-th call that writes, truncates, syncs, renames or closes fails. The
+  result is right, or the command ends with a message and exit code 3; no partial file has its
+  name, no signal ends a process, and the next run gives the result.
+- *Flipped bits*, *changed sectors*: of a closed recording (80 % outside of the samples), its block
+  tables, its global heaps (version 1); 512 bytes that are zero, random or another sector's. What
+  `huddle verify` calls intact, plain h5py must read. Ten seconds at most.
+- *Database*: one bit or page of 300 runs, or the end, is changed. The next start must have all
+  runs. SQLite has no checksums: a bit of a number changes it unseen.
 - *Bench files*: one to three lines lost, repeated, exchanged, or with another value or byte.
-- *Clocks*: a service at 20 times real time, whose clock is set by −25 to 30 min once a minute.
-- *Starved recorder*: a busy process for each processor beside the recorder and the played devices.
-- *Accelerated day*: a service at 20 times real time, with a leap second as a run is due, the end of
-  summer time and six steps of the clock. It may grow by 50 kB a run, its database by 4 kB. Each
-  due time must have one row.
+- *Clocks*: at 20 times real time, the clock is set by −25 to 30 min once a minute.
+- *Starved recorder*: a busy process for each processor beside recorder and played devices.
+- *Accelerated day*: 20 times real time, a leap second, the end of summer time, six steps of the
+  clock. Growth of 50 kB a run at most, of the database 4 kB. Each due time has one row.
 """
 
 
