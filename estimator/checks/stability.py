@@ -11,6 +11,7 @@ import copy
 import functools
 import math
 import operator
+from collections import Counter
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TYPE_CHECKING
@@ -210,17 +211,20 @@ class Stability:
     def joined(cls, ranges: Sequence[Stability | None], n_sensors: int) -> Stability | None:
         """Return what neighbouring ranges of frequencies show, rising, as one; None of none.
 
-        Of each sensor the clearest change of all counts, where it is clear among as many tests.
+        Of each sensor the clearest change of all counts, where it is clear among as many tests and
+        a second range of frequencies shows one: a burst of motion can disturb one range alone.
         """
         found = [each for each in ranges if each is not None]
         if len(ranges) < 2 or not found:
             return found[0] if found else None
         alarm = FALSE_ALARM / (LONG_TAILS * n_sensors * len(found))
+        seen = Counter(change.sensor for each in found for change in each.changes)
         clearest: dict[int, ResponseChange] = {}
         second_order = 0.0
         for each in sorted((c for one in found for c in one.changes), key=lambda c: -c.statistic):
             most = critical_value(each.degrees, alarm) + second_order
-            if each.sensor not in clearest and each.statistic > most:
+            is_confirmed = seen[each.sensor] > 1 or len(found) == 1
+            if each.sensor not in clearest and is_confirmed and each.statistic > most:
                 clearest[each.sensor] = each
                 second_order += each.statistic * each.size**2
         runs = [each.runs for each in found if each.runs is not None]
