@@ -39,7 +39,7 @@ check: $(VENV)/.installed-dev  ## formatting, rules, types, who may import whom;
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m benchmarks.lines
+	$(BIN)/python -m tests.lines
 
 check-all:  ## the same with every Python that is supported and present, in .venv-3.11, .venv-3.12, ...
 	set -e; for version in 3.11 3.12 3.13; do if python$$version -c "" 2>/dev/null; then \

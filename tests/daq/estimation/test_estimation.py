@@ -230,7 +230,7 @@ def test_a_start_beyond_the_end_is_told_with_what_the_recordings_cover(tmp_path:
         with pytest.raises(WrongSettingError, match=covers):
             estimate([path], between)
     create(tmp_path / "empty.h5", huddle()).close()
-    with pytest.raises(InsufficientDataError, match="record longer"):
+    with pytest.raises(InsufficientDataError, match="no samples of a, b, c"):
         estimate([tmp_path / "empty.h5"], replace(SETTINGS, start=origin))
 
 

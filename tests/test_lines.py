@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from benchmarks.lines import code_lines, lines_by_room
+from tests.lines import code_lines, lines_by_room
 
 if TYPE_CHECKING:
     from pathlib import Path
