@@ -18,10 +18,11 @@ if TYPE_CHECKING:
 
     from benchmarks.row import Row
 
-LONG = {"application", "command_start", "estimate_file", "following", "recorder"}
-"""Benchmarks that run whole processes."""
+STUDIES = {"application", "command_start", "recorder"}
+"""Benchmarks that run whole processes for most of a minute."""
+LONG = {"estimate_file", "following"}
 LONG |= {"gaps", "likelihood", "resampler", "spectra"}
-"""Also those that take half a second and more."""
+"""Those that take half a second and more."""
 NAMES = sorted(
     {module.name for module in pkgutil.iter_modules(benchmarks.__path__) if not module.ispkg}
 )
@@ -30,7 +31,10 @@ NAMES = sorted(
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.long if name in LONG else ())
+        pytest.param(
+            name,
+            marks=[pytest.mark.long] * (name in LONG) + [pytest.mark.study] * (name in STUDIES),
+        )
         for name in NAMES
         if name not in {"__main__", "row"}
     ],

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daq.results.result import Result
+from daq.results.sources import sources
 from tui.report.paper import write_paper
 from tui.report.parts import Facts, Items, Paragraph, Plot, Report, Table
 from tui.report.writing import page
@@ -35,7 +36,8 @@ class Reported:
     @property
     def result(self) -> Result:
         """What the report is of."""
-        return Result(self.snapshot, self.settings, recordings=(self.recording,))
+        found = tuple(sources([self.recording]))
+        return Result(self.snapshot, self.settings, found[0].bench, recordings=(self.recording,))
 
     @cached_property
     def page(self) -> str:
