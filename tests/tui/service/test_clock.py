@@ -194,7 +194,7 @@ def test_a_clock_that_jumps_within_a_run(tmp_path: Path, devices: Bench, step: t
     with Recording.open(recordings / run.parts[0]) as recording:
         first, *_, last = recording.events
         length = (last.received.utc_ns - first.received.utc_ns) * 1e-9
-        assert length == pytest.approx(SECONDS, abs=SECONDS / 2)
+        assert SECONDS / 2 < length < SECONDS + 60  # a busy computer ends it late
         assert recording.closed
         said = [event.text for event in recording.events if event.kind == EventKind.CLOCK]
     (stated,) = re.findall(r"set by ([+-][\d.]+) s", "".join(said))
