@@ -156,7 +156,7 @@ def _changes(snapshot: Snapshot, psd: FloatArray) -> list[Contribution]:
     """Return what responses that change leave of the motion in the noise."""
     found = snapshot.diagnostics.diagnosis
     steady = None if found is None else found.stability
-    if steady is None or not steady.changes:
+    if steady is None or not steady.added.any():
         return []
     motion = np.maximum(np.nan_to_num(snapshot.data_psd) - psd, 0.0)
     if within := [each for each in steady.steadied if each is not None]:
@@ -164,9 +164,8 @@ def _changes(snapshot: Snapshot, psd: FloatArray) -> list[Contribution]:
         above = np.max([each.above for each in within], axis=0) * motion
         return [contribution(Source.CHANGES, psd.shape, below=np.minimum(below, psd), above=above)]
     most = np.maximum.reduceat(steady.added, np.cumsum([0, *snapshot.dims[:-1]]))
-    less, more = (
-        np.repeat(each, snapshot.dims) * motion for each in bounds(most, len(steady.changes))
-    )
+    n_changed = int(np.count_nonzero(most))
+    less, more = (np.repeat(e, snapshot.dims) * motion for e in bounds(most, n_changed))
     less = np.where(less > MUCH_CHANGED * psd, psd, less)
     return [contribution(Source.CHANGES, psd.shape, below=less, above=more)]
 

@@ -213,6 +213,7 @@ class Stability:
 
         Of each sensor the clearest change of all counts, where it is clear among as many tests and
         a second range of frequencies shows one: a burst of motion can disturb one range alone.
+        What one range alone shows is in `added`, so that intervals have it, and is no change.
         """
         found = [each for each in ranges if each is not None]
         if len(ranges) < 2 or not found:
@@ -220,11 +221,13 @@ class Stability:
         alarm = FALSE_ALARM / (LONG_TAILS * n_sensors * len(found))
         seen = Counter(change.sensor for each in found for change in each.changes)
         clearest: dict[int, ResponseChange] = {}
-        second_order = 0.0
+        is_added, second_order = False, 0.0
         for each in sorted((c for one in found for c in one.changes), key=lambda c: -c.statistic):
             most = critical_value(each.degrees, alarm) + second_order
-            is_confirmed = seen[each.sensor] > 1 or len(found) == 1
-            if each.sensor not in clearest and is_confirmed and each.statistic > most:
+            if each.sensor in clearest or each.statistic <= most:
+                continue
+            is_added = True
+            if seen[each.sensor] > 1 or len(found) == 1:
                 clearest[each.sensor] = each
                 second_order += each.statistic * each.size**2
         runs = [each.runs for each in found if each.runs is not None]
@@ -236,10 +239,12 @@ class Stability:
             runs=Scatter.joined(runs) if len(runs) == len(found) else None,
             inflations=np.concatenate([each.inflations for each in found]),
             changes=tuple(clearest.values()),
-            added=np.max([each.added for each in found], axis=0) * bool(clearest),
+            added=np.max([each.added for each in found], axis=0) * is_added,
             steadied=tuple(
                 None if each is None or not each.steadied else each.steadied[0] for each in ranges
-            ),
+            )
+            if clearest
+            else (),
         )
 
     def inflation_at(self, frequency: FloatArray) -> FloatArray:

@@ -19,7 +19,7 @@ from daq.formats.importer import import_files
 from daq.recording.reader import Recording
 from daq.results.facts import ChannelsAbsent, SpanShortened
 from daq.results.result import Result
-from estimator.checks.advice import Untested
+from estimator.checks.advice import ResponseChanges, Untested
 from estimator.checks.count_limits import CountLimits
 from estimator.levels.pooled import blocks_of
 from estimator.self_noise.result import Flag, SelfNoise, combined
@@ -130,6 +130,8 @@ def test_octaves_have_the_channels_that_are_there() -> None:
     octaves = replace(SETTINGS, octaves=True)
     whole = estimated("ABC", {}, settings=octaves)
     lost = estimated("ABC", {"A2": [1]}, settings=octaves)
+    # Bursts of motion disturb one octave: that is no change of a response.
+    assert not any(isinstance(each, ResponseChanges) for each in whole.diagnostics.advice)
     assert len(lost.octaves) >= len(whole.octaves) - 1 > 2
     assert lost.octaves[0].low == 0
     left_out = [sum(octave.left_out.values()) for octave in lost.octaves]
