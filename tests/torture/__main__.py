@@ -53,35 +53,28 @@ KEPT = PAGE.parents[2] / "build" / "torture"
 """Folder of the files in which something was not seen."""
 HEAD = """# Recordings and the service under torture
 
-`make torture` records with the writer of the product, and lets the process be killed, the power be
-cut, the disk fail, or a bit of the file flip. After each crash the recording is repaired. It must
-then have every acknowledged row, with the right samples, and open in plain HDF5. A damaged file
-must be refused, have its damage named, or be read as it was. A service must live on with a damaged
-database, a clock that is set and a long history. The table is the outcome of one complete run.
+Is anything acknowledged lost, or any number wrong, after kills, power cuts, disk errors or flipped
+bits? `make torture` takes the writer of the product. A recording is repaired after each crash; it
+must then have every acknowledged row and open in plain HDF5. A damaged file must be refused, have
+its damage named, or be read unchanged.
 
 | torture | cases | good | faults |
 |---|---:|---:|---|
 """
 TAIL = """
 - *Kills*: SIGKILL after 0 to 40 commits; half of the repairs are killed, too.
-- *Power cuts*: recorded writes and fsyncs are replayed up to a random one. Of what came after the
-  last fsync the disk has nothing (synced), everything (prefix), some whole writes, some 4 KiB pages
-  or some 512-byte sectors.
+- *Power cuts*: recorded writes and fsyncs are replayed up to a random one. After the last fsync the
+  disk has nothing, everything, some whole writes, some 4 KiB pages or some 512-byte sectors.
 - *Disk errors*: `pwrite`, `fsync`, `write` or `ftruncate` fails with ENOSPC or EIO, once or for
   good. One failed write must not end the recording; else the recorder ends with a message.
-- *Faults of commands*: the n-th call that writes, truncates, syncs, renames or closes fails. The
-  result is right, or the command ends with a message and exit code 3; no partial file has its
-  name, no signal ends a process, and the next run gives the result.
-- *Flipped bits*, *changed sectors*: of a closed recording (80 % outside of the samples), its block
-  tables, its global heaps (version 1); 512 bytes that are zero, random or another sector's. What
-  `huddle verify` calls intact, plain h5py must read. Ten seconds at most.
+- *Flipped bits*, *changed sectors*: of a closed recording (80 % outside of the samples). What
+  `huddle verify` calls intact, plain h5py must read, within ten seconds.
 - *Database*: one bit or page of 300 runs, or the end, is changed. The next start must have all
-  runs. SQLite has no checksums: a bit of a number changes it unseen.
-- *Bench files*: one to three lines lost, repeated, exchanged, or with another value or byte.
-- *Clocks*: at 20 times real time, the clock is set by −25 to 30 min once a minute.
+  runs. SQLite has no checksums: a changed bit of a number is not seen.
+- *Bench files*: one to three lines are lost, repeated, exchanged, or get another value or byte.
+- *Clocks*, *day*: at 20 times real time the clock is set by −25 to 30 min; the day has a leap
+  second and the end of summer time. Each due time has one row; growth is at most 50 kB a run.
 - *Starved recorder*: a busy process for each processor beside recorder and played devices.
-- *Accelerated day*: 20 times real time, a leap second, the end of summer time, six steps of the
-  clock. Growth of 50 kB a run at most, of the database 4 kB. Each due time has one row.
 """
 
 
