@@ -5,20 +5,24 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import BaseModel
 
 from daq.bench.channel import Channel
 from daq.bench.model import Bench, Sensor
-from daq.devices.interface import DEFAULT_PATIENCE, DeviceInformation
+from daq.devices.interface import (
+    DEFAULT_PATIENCE,
+    DeviceInformation,
+    Driver,
+    DriverSettings,
+    Session,
+)
 from daq.protocols.block import Block, HostTime
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
 
-    from daq.devices.interface import DriverType
     from daq.host_clock import HostClock
     from daq.protocols.block import DeviceItem
 
@@ -46,10 +50,6 @@ class ManualClock:
         self.ns += round(seconds * 1e9)
 
 
-class NoSettings(BaseModel):
-    """A driver without options."""
-
-
 @dataclass
 class PlayedDevice:
     """What is on one port."""
@@ -70,7 +70,7 @@ class PlayedDevice:
 
 
 @dataclass
-class PlayedSession:
+class PlayedSession(Session):
     """A session on a played device."""
 
     device: PlayedDevice
@@ -87,23 +87,18 @@ class PlayedSession:
 
 
 @dataclass
-class PlayedDriver:
+class PlayedDriver(Driver[DriverSettings]):
     """A driver for played devices, by port."""
 
     devices: dict[str, PlayedDevice] = field(default_factory=dict)
     name: str = "played"
     summary: str = ""
-    settings: type[BaseModel] = NoSettings
-    shares_clock: bool = False
+    settings: type[DriverSettings] = DriverSettings
 
-    def counts_dtype(self, sensor: Sensor) -> np.dtype[Any]:  # noqa: ARG002  (of the seam)
-        """Return int32."""
-        return np.dtype(np.int32)
-
-    def find(self, name: str) -> DriverType:
+    def find(self, name: str) -> PlayedDriver:
         """Return itself, as the registry would."""
         assert name == self.name
-        return cast("DriverType", self)
+        return self
 
     @contextlib.asynccontextmanager
     async def open(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -14,7 +14,10 @@ if TYPE_CHECKING:
 
 
 class DriverRules(Protocol):
-    """Used by the validation of a bench file and by the layout of a recording."""
+    """Used by the validation of a bench file, the check list and the layout of a recording.
+
+    :class:`daq.devices.interface.Driver` has the defaults.
+    """
 
     @property
     def settings(self) -> type[BaseModel]:
@@ -30,12 +33,7 @@ class DriverRules(Protocol):
         """Type of the raw counts in the blocks of a sensor."""
         ...
 
-
-@runtime_checkable
-class Checking(Protocol):
-    """A driver with further checks of the bench file."""
-
-    def check(self, sensors: Sequence[Sensor]) -> None:
+    def check(self, sensors: Sequence[Sensor]) -> object:
         """Refuse settings that no such device accepts; ``sensors`` are all those of one port.
 
         Raises
@@ -45,11 +43,6 @@ class Checking(Protocol):
         """
         ...
 
-
-@runtime_checkable
-class Ranged(Protocol):
-    """A driver that knows the full scale of a sensor before the port is opened."""
-
     def full_scale(self, sensor: Sensor) -> float | None:
-        """Return the largest count of the sensor's channels; None if unknown."""
+        """Return the largest count of the sensor's channels, before the port is opened, or None."""
         ...

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from daq.bench.driver_rules import Checking
 from daq.bench.durations import format_duration
 from daq.bench.estimate_settings import OPTIONS, EstimateSettings
 from daq.bench.field_faults import field_faults, one_of
@@ -140,11 +139,10 @@ def _device_faults(
         driver = drivers.get(name)
         if driver is None or any(_valid(driver.settings, s.settings) is None for s in group):
             continue  # reported before
-        if isinstance(driver, Checking):
-            try:
-                driver.check(group)
-            except BenchFileError as error:
-                yield from error.faults
+        try:
+            driver.check(group)
+        except BenchFileError as error:
+            yield from error.faults
 
 
 def _set_faults(

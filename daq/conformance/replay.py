@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.bench.model import Sensor
-    from daq.devices.interface import DriverType
+    from daq.devices.interface import AnyDriver
     from daq.protocols.block import DeviceItem
 
 LIMIT = 60.0
@@ -22,7 +22,7 @@ LIMIT = 60.0
 
 
 async def replay(
-    path: str | Path, driver: DriverType, sensors: Sequence[Sensor], *, limit: float = LIMIT
+    path: str | Path, driver: AnyDriver, sensors: Sequence[Sensor], *, limit: float = LIMIT
 ) -> list[DeviceItem]:
     """Return the blocks and events of the first session on the port of some sensors.
 

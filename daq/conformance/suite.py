@@ -35,7 +35,6 @@ from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, Event, EventKind
 from daq.protocols.errors import RemoteProtocolError
 from daq.recorder.block_checks import BlockValidator
-from daq.recorder.connection import patience_of
 from daq.transport.address import host_and_port
 
 if TYPE_CHECKING:
@@ -45,7 +44,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.model import Sensor
-    from daq.devices.interface import DriverType
+    from daq.devices.interface import AnyDriver
     from daq.host_clock import HostClock
     from daq.protocols.block import DeviceItem, HostTime
 
@@ -130,7 +129,7 @@ class Served:
 class DriverConformance:
     """The tests; a subclass names the driver and serves its simulated device."""
 
-    driver: ClassVar[DriverType]
+    driver: ClassVar[AnyDriver]
     seconds: ClassVar[float] = 2.0
     """How much is read of every sensor, in seconds of its sampling rate."""
 
@@ -366,7 +365,7 @@ class DriverConformance:
             assert [one.sensor for one in session.information] == list(wanted)
             for one, sensor in zip(session.information, sensors, strict=True):
                 check_rate(sensor, one.sampling_rate)
-            patience = patience_of(session)
+            patience = session.patience
             assert patience > 0
             items = cast("AsyncGenerator[DeviceItem]", session.read())
             async with contextlib.aclosing(items):
@@ -390,9 +389,7 @@ class DriverConformance:
         return found
 
 
-def check_blocks(
-    driver: DriverType, sensors: Sequence[Sensor], found: Sequence[DeviceItem]
-) -> None:
+def check_blocks(driver: AnyDriver, sensors: Sequence[Sensor], found: Sequence[DeviceItem]) -> None:
     """See that the blocks of a session follow one another, and that nothing was wrong."""
     wrong = [item for item in found if isinstance(item, Event) and item.kind not in NORMAL_EVENTS]
     assert not wrong

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from daq.bench import loading
-from daq.devices.interface import DriverType
+from daq.devices.interface import AnyDriver
 from daq.devices.registry import driver_names, driver_type
 from daq.transport.ports import is_simulated as is_simulated_port
 
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
 
 
-class InstalledDrivers(Mapping[str, DriverType]):
+class InstalledDrivers(Mapping[str, AnyDriver]):
     """The installed drivers by name, each imported when it is looked up."""
 
-    def __getitem__(self, name: str) -> DriverType:
+    def __getitem__(self, name: str) -> AnyDriver:
         if name not in driver_names():
             raise KeyError(name)
         return driver_type(name)

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daq.devices.interface import Session
 from daq.devices.port_rules import port_label
 from daq.errors import DeviceError, NotConnectedError
 from daq.protocols.block import Block, BlockFlag
@@ -75,7 +76,7 @@ class Samples:
     received: HostTime | None = None
 
 
-class BlockingSource:
+class BlockingSource(Session):
     """A session (:class:`daq.devices.interface.Session`) on a library whose calls block.
 
     Parameters

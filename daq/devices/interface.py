@@ -7,19 +7,31 @@ keeps indices across sessions, and writes files (``daq.recorder.recorder``,
 ``daq.recorder.sample_index``).
 
 A third-party package adds a driver by an entry point in the group ``huddle.drivers`` that names a
-:class:`DriverType`. A driver that can check its part of the bench file also has the method
-``check`` (:class:`daq.bench.driver_rules.Checking`).
+:class:`Driver`. :class:`Driver` and :class:`Session` have the defaults: a driver states only what
+is particular to its device.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Generic,
+    Protocol,
+    TypeAlias,
+    TypeVar,
+    runtime_checkable,
+)
 
-from daq.bench.driver_rules import DriverRules
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from daq.devices.port_rules import require_alike
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Sequence
+    from collections.abc import AsyncIterator, Collection, Sequence
     from contextlib import AbstractAsyncContextManager
 
     from daq.bench.model import Sensor
@@ -28,7 +40,7 @@ if TYPE_CHECKING:
 
 
 DEFAULT_PATIENCE = 10.0
-"""Default of :attr:`PatientSession.patience`, in s."""
+"""Default of :attr:`Session.patience`, in s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,14 +61,41 @@ class DeviceInformation:
     driver keeps polling; a run does not start without the device."""
 
 
-class Session(Protocol):
-    """An open, identified device, configured and ready to sample."""
+class Session(ABC):
+    """An open, identified device, configured and ready to sample.
+
+    Only the recorder decides that a silent port is lost; :meth:`read` has no time limit. A sensor
+    is *late* two block periods after its last block. Its port is *lost*, and opened again, after
+    the longest of ``patience``, twice the longest recent interval between blocks, and the interval
+    learned from earlier sessions on the port. A device that pauses for less and then delivers all
+    samples causes no gap.
+
+    If the driver can distinguish a silent device from one that stopped (one that replies that it
+    does not sample), it ends the session immediately with ``NoAnswerError``.
+    """
+
+    information: tuple[DeviceInformation, ...]
+    """One entry per sensor, read when the session was opened."""
+    patience: float = DEFAULT_PATIENCE
+    """Seconds of the device without a block after which the port is lost.
+
+    Use the user's setting, else the length of the device's buffer if that is longer than
+    ``DEFAULT_PATIENCE``.
+    """
+    resumed: bool = False
+    """Whether the blocks continue the index of the session before (:meth:`Driver.resume`)."""
 
     @property
-    def information(self) -> tuple[DeviceInformation, ...]:
-        """One entry per sensor, read when the session was opened."""
-        ...
+    def hint(self) -> str:
+        """Advice if no block arrives; ends the error message."""
+        return ""
 
+    @property
+    def recovers(self) -> bool:
+        """Whether the device is recovering from an overflow, and not stalled."""
+        return False
+
+    @abstractmethod
     def read(self) -> AsyncIterator[DeviceItem]:
         """Start sampling and yield blocks, events and readings, until closed.
 
@@ -69,26 +108,76 @@ class Session(Protocol):
         RemoteProtocolError
             If the device violates its protocol.
         """
-        ...
 
 
-class DriverType(DriverRules, Protocol):
-    """A driver, the target of an entry point in ``huddle.drivers``.
+class DriverSettings(BaseModel):
+    """Base of the table ``[sensors.settings]`` of a driver: unknown keys are errors."""
 
-    A driver whose sessions yield the temperature as readings has ``states_temperature = True``. Of
-    other drivers, an auxiliary channel in °C is recorded as the temperature of its sensor.
-    """
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
-    @property
-    def name(self) -> str:
-        """Name in the bench file: ``driver = "…"``."""
-        ...
 
-    @property
-    def summary(self) -> str:
-        """One line for ``huddle init`` and ``--help``."""
-        ...
+SettingsT = TypeVar("SettingsT", bound=BaseModel)
 
+
+class Driver(ABC, Generic[SettingsT]):
+    """A driver, the target of an entry point in ``huddle.drivers``."""
+
+    name: str
+    """Name in the bench file: ``driver = "…"``."""
+    summary: str
+    """One line for ``huddle init`` and ``--help``."""
+    settings: type[SettingsT]
+    """Model of the sensor's ``settings`` table in the bench file."""
+    of_the_port: Collection[str] = ()
+    """Settings that all sensors of a port have in common."""
+    shares_clock: bool = False
+    """Whether all sensors on one port are sampled by one clock."""
+    states_temperature: bool = False
+    """Whether sessions yield the temperature as readings. Of other drivers, an auxiliary channel in
+    °C is recorded as the temperature of its sensor."""
+    dtype: type[np.generic] = np.int32
+    """Type of the raw counts in the blocks, if it is the same for all sensors."""
+
+    def typed(self, sensors: Sequence[Sensor]) -> dict[str, SettingsT]:
+        """Return the settings of each sensor of a port, by its name.
+
+        Raises
+        ------
+        BenchFileError
+            If sensors differ in a setting of :attr:`of_the_port`.
+        """
+        found = {one.name: self.settings.model_validate(one.settings) for one in sensors}
+        require_alike(sensors, found, self.of_the_port)
+        return found
+
+    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:
+        """Return the type of the raw counts in the blocks of a sensor."""
+        del sensor
+        return np.dtype(self.dtype)
+
+    def full_scale(self, sensor: Sensor) -> float | None:
+        """Return the largest count of the sensor's channels before its port is opened.
+
+        None if unknown; by default the largest of :class:`numpy.int16`, if counts have this type.
+        """
+        return float(np.iinfo(np.int16).max) if self.counts_dtype(sensor) == np.int16 else None
+
+    def check(self, sensors: Sequence[Sensor]) -> object:
+        """Refuse settings that no such device accepts; return what :meth:`open` makes of them.
+
+        Parameters
+        ----------
+        sensors : sequence of Sensor
+            All sensors of one port, each with valid ``settings``.
+
+        Raises
+        ------
+        BenchFileError
+            Naming the sensor, its key, the value and what was expected.
+        """
+        return self.typed(sensors)
+
+    @abstractmethod
     def open(
         self, sensors: Sequence[Sensor], clock: HostClock
     ) -> AbstractAsyncContextManager[Session]:
@@ -99,7 +188,22 @@ class DriverType(DriverRules, Protocol):
         NotConnectedError, NoAnswerError, WrongDeviceError
             With sensor, port, expected and received values.
         """
-        ...
+
+    def resume(
+        self, sensors: Sequence[Sensor], clock: HostClock, before: Session
+    ) -> AbstractAsyncContextManager[Session]:
+        """Open a port again, as :meth:`open`; ``before`` is its last session, lost and ended.
+
+        For devices that continue to count while disconnected: the counter then gives the exact
+        number of missing samples. The driver decides whether the count continued
+        (:attr:`Session.resumed`): if the device was restarted, or may have been, the driver opens
+        it as at the start, which is the default.
+        """
+        del before
+        return self.open(sensors, clock)
+
+
+AnyDriver: TypeAlias = Driver[Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +216,7 @@ class PresentPort:
 
 @runtime_checkable
 class Listing(Protocol):
-    """A driver (:class:`DriverType`) whose ports the system can list without opening them."""
+    """A driver whose ports the system can list without opening them."""
 
     def ports(self) -> list[PresentPort]:
         """Return the ports that are present; may take seconds.
@@ -121,65 +225,5 @@ class Listing(Protocol):
         ------
         NotConnectedError
             If the library is not installed.
-        """
-        ...
-
-
-class PatientSession(Session, Protocol):
-    """A session that states how long its device may be silent before it counts as lost.
-
-    Only the recorder decides that a silent port is lost; :meth:`Session.read` has no time limit. A
-    sensor is *late* two block periods after its last block. Its port is *lost*, and opened again,
-    after the longest of ``patience``, twice the longest recent interval between blocks, and the
-    interval learned from earlier sessions on the port. A device that pauses for less and then
-    delivers all samples causes no gap.
-
-    If the driver can distinguish a silent device from one that stopped (one that replies that it
-    does not sample), it ends the session immediately with ``NoAnswerError``.
-    """
-
-    @property
-    def patience(self) -> float:
-        """Seconds without a block after which the port is lost; ``DEFAULT_PATIENCE`` if missing.
-
-        Use the user's setting, else the length of the device's buffer if that is longer than
-        ``DEFAULT_PATIENCE``.
-        """
-        ...
-
-    @property
-    def hint(self) -> str:
-        """Advice if no block arrives; ends the error message. Optional."""
-        ...
-
-    @property
-    def recovers(self) -> bool:
-        """Whether the device is recovering from an overflow, and not stalled. Optional."""
-        ...
-
-
-class ResumedSession(Session, Protocol):
-    """A session that may continue an earlier one."""
-
-    @property
-    def resumed(self) -> bool:
-        """Whether its blocks continue the index of the session before."""
-        ...
-
-
-@runtime_checkable
-class Resuming(Protocol):
-    """A driver (:class:`DriverType`) of devices that continue to count while disconnected.
-
-    The counter then gives the exact number of missing samples. The driver decides whether the count
-    continued: if the device was restarted, or may have been, the driver opens it as at the start.
-    """
-
-    def resume(
-        self, sensors: Sequence[Sensor], clock: HostClock, before: Session
-    ) -> AbstractAsyncContextManager[ResumedSession]:
-        """Open a port again, as :meth:`DriverType.open`.
-
-        ``before`` is the last session on the port; it was lost and has ended.
         """
         ...

@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, Strict
+from pydantic import Field, PositiveFloat, Strict
 
 from daq.devices.blocking import BlockingSource, Samples
-from daq.devices.interface import DeviceInformation, PresentPort
+from daq.devices.interface import DeviceInformation, Driver, DriverSettings, PresentPort
 from daq.devices.port_rules import inputs_of, package, port_label
 from daq.errors import BenchFileError, FileFault, NotConnectedError
 from daq.protocols.block import BlockFlag
@@ -48,10 +48,8 @@ TERMINALS = {
 }
 
 
-class NiSettings(BaseModel):
+class NiSettings(DriverSettings, strict=True):
     """``[sensors.settings]`` of a sensor on analog inputs of National Instruments."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     inputs: Annotated[tuple[str, ...], Strict(strict=False)] | None = None
     """Input of each channel: ``["ai0", "ai1"]`` of a device, ``["Mod1/ai0", "Mod2/ai3"]`` of a
@@ -140,22 +138,33 @@ class Acquisition:
         self._stream.offset, self._is_behind = behind - self._stream.input_buf_size // 2, True
 
 
-class NiDriver:
-    """See :class:`daq.devices.interface.DriverType`."""
+class NiDriver(Driver[NiSettings]):
+    """See :class:`daq.devices.interface.Driver`. Counts are volts."""
 
     name = "nidaqmx"
     summary = "analog inputs of National Instruments (NI-DAQmx), several sensors in one task"
     settings = NiSettings
     shares_clock = True
+    dtype = np.float64
 
-    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:
-        """Return float64: volts."""
-        del sensor
-        return np.dtype(np.float64)
+    def check(self, sensors: Sequence[Sensor]) -> dict[str, _Inputs]:
+        """Return the inputs of each sensor."""
+        settings = self.typed(sensors)
 
-    def check(self, sensors: Sequence[Sensor]) -> None:
-        """See :meth:`daq.devices.interface.Checking.check`."""
-        _inputs(sensors)
+        def given(sensor: Sensor, used: Collection[str]) -> Sequence[str]:
+            device = sensor.port.removeprefix(SCHEME)
+            if not sensor.port.startswith(SCHEME) or not device or "/" in device:
+                expected = (
+                    "expected ni:// and the name of a device or chassis in NI MAX, such as"
+                    " ni://cDAQ1"
+                )
+                raise BenchFileError(FileFault("port", expected, sensor.port, sensor.name))
+            names = settings[sensor.name].inputs
+            names = names or tuple(f"ai{len(used) + k}" for k in range(len(sensor.channels)))
+            return [f"{device}{'' if '/' in name else '/'}{name}" for name in names]
+
+        names = inputs_of(sensors, given)
+        return {name: _Inputs(names[name], one) for name, one in settings.items()}
 
     def ports(self) -> list[PresentPort]:
         """See :class:`daq.devices.interface.Listing`."""
@@ -170,7 +179,7 @@ class NiDriver:
         self, sensors: Sequence[Sensor], clock: HostClock
     ) -> AsyncIterator[BlockingSource]:
         """Make the task; the calls of the library are made in threads."""
-        inputs, label = _inputs(sensors), port_label(sensors)
+        inputs, label = self.check(sensors), port_label(sensors)
         with _errors(label):
             opened = await asyncio.to_thread(_opened, inputs, sensors[0].sampling_rate)
         task, ends, information = opened
@@ -261,24 +270,6 @@ def _quietly(call: Any) -> None:  # noqa: ANN401
 
     with contextlib.suppress(DaqError):
         call()
-
-
-def _inputs(sensors: Sequence[Sensor]) -> dict[str, _Inputs]:
-    """Return the inputs of each sensor."""
-
-    def given(sensor: Sensor, used: Collection[str]) -> Sequence[str]:
-        device = sensor.port.removeprefix(SCHEME)
-        if not sensor.port.startswith(SCHEME) or not device or "/" in device:
-            expected = (
-                "expected ni:// and the name of a device or chassis in NI MAX, such as ni://cDAQ1"
-            )
-            raise BenchFileError(FileFault("port", expected, sensor.port, sensor.name))
-        names = NiSettings.model_validate(sensor.settings).inputs
-        names = names or tuple(f"ai{len(used) + k}" for k in range(len(sensor.channels)))
-        return [f"{device}{'' if '/' in name else '/'}{name}" for name in names]
-
-    names = inputs_of(sensors, given)
-    return {s.name: _Inputs(names[s.name], NiSettings.model_validate(s.settings)) for s in sensors}
 
 
 DRIVER = NiDriver()

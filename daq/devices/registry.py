@@ -1,6 +1,6 @@
 """The installed drivers: entry points in the group ``huddle.drivers``.
 
-A third-party package adds a driver by naming a :class:`~daq.devices.interface.DriverType` in its
+A third-party package adds a driver by naming a :class:`~daq.devices.interface.Driver` in its
 metadata:
 
 .. code-block:: toml
@@ -16,16 +16,15 @@ from __future__ import annotations
 
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
-from daq.devices.interface import Listing
+from daq.devices.interface import AnyDriver, Driver, Listing
 from daq.errors import DriverError, NotConnectedError
 
 if TYPE_CHECKING:
-    from daq.devices.interface import DriverType, PresentPort
+    from daq.devices.interface import PresentPort
 
 GROUP = "huddle.drivers"
-_SEAM = ("name", "summary", "settings", "shares_clock", "counts_dtype", "open")
 
 
 @cache
@@ -39,7 +38,7 @@ def driver_names() -> tuple[str, ...]:
 
 
 @cache
-def driver_type(name: str) -> DriverType:
+def driver_type(name: str) -> AnyDriver:
     """Return the driver called ``name``.
 
     Raises
@@ -63,10 +62,14 @@ def driver_type(name: str) -> DriverType:
             f"{which} cannot be imported: {type(error).__name__}: {error};"
             " reinstall or remove that package"
         ) from error
-    absent = [part for part in _SEAM if not hasattr(driver, part)]
+    if not isinstance(driver, Driver):
+        raise DriverError(
+            f"{which} is no driver: it does not derive from {Driver.__module__}.Driver"
+        )
+    absent = [part for part in ("name", "summary", "settings") if not hasattr(driver, part)]
     if absent:
         raise DriverError(f"{which} is no driver: it has no {', '.join(absent)}")
-    return cast("DriverType", driver)
+    return driver
 
 
 def present_ports() -> tuple[list[tuple[str, PresentPort]], dict[str, str]]:

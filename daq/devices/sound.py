@@ -18,11 +18,10 @@ import queue
 import threading
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from daq.devices.blocking import BlockingSource, Samples
-from daq.devices.interface import DeviceInformation, PresentPort
+from daq.devices.interface import DeviceInformation, Driver, DriverSettings, PresentPort
 from daq.devices.port_rules import inputs_of, package, port_label
 from daq.errors import BenchFileError, FileFault, NotConnectedError, WrongDeviceError
 from daq.protocols.block import BlockFlag
@@ -30,6 +29,7 @@ from daq.protocols.block import BlockFlag
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Collection, Sequence
 
+    import numpy as np
     from numpy.typing import NDArray
 
     from daq.bench.model import Sensor
@@ -47,10 +47,8 @@ FULL_SCALE = 2**31 - 2**8
 """Counts at the end of the range of a card of 24 bits."""
 
 
-class SoundSettings(BaseModel):
+class SoundSettings(DriverSettings):
     """``[sensors.settings]`` of a sensor on a sound card."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     inputs: tuple[Annotated[int, Field(ge=1, le=128)], ...] | None = None
     """The input of each channel, from 1; default: the inputs after those of the port's previous
@@ -119,26 +117,33 @@ class Capture:
             return None
 
 
-class SoundDriver:
-    """See :class:`daq.devices.interface.DriverType`."""
+class SoundDriver(Driver[SoundSettings]):
+    """See :class:`daq.devices.interface.Driver`."""
 
     name = "sound"
     summary = "sound cards and IEPE interfaces that are sound cards, several sensors on one"
     settings = SoundSettings
     shares_clock = True
 
-    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:
-        """Return int32."""
-        del sensor
-        return np.dtype(np.int32)
-
     def full_scale(self, sensor: Sensor) -> float | None:  # noqa: ARG002 -- interface
-        """See :meth:`daq.bench.driver_rules.Ranged.full_scale`."""
+        """See :meth:`daq.bench.driver_rules.DriverRules.full_scale`."""
         return FULL_SCALE
 
-    def check(self, sensors: Sequence[Sensor]) -> None:
-        """See :meth:`daq.devices.interface.Checking.check`."""
-        _inputs(sensors)
+    def check(self, sensors: Sequence[Sensor]) -> dict[str, tuple[int, ...]]:
+        """Return the inputs of each sensor."""
+        settings = self.typed(sensors)
+
+        def given(sensor: Sensor, used: Collection[int]) -> Sequence[int]:
+            if not sensor.port.startswith(SCHEME):
+                expected = (
+                    "expected audio:// and a part of the card's name; audio:// is the default"
+                )
+                raise BenchFileError(FileFault("port", expected, sensor.port, sensor.name))
+            first = max(used, default=0) + 1
+            following = range(first, first + len(sensor.channels))
+            return settings[sensor.name].inputs or following
+
+        return inputs_of(sensors, given)
 
     def ports(self) -> list[PresentPort]:
         """See :class:`daq.devices.interface.Listing`."""
@@ -157,7 +162,7 @@ class SoundDriver:
         self, sensors: Sequence[Sensor], clock: HostClock
     ) -> AsyncIterator[BlockingSource]:
         """Find the card by its name, and open its inputs."""
-        inputs, label = _inputs(sensors), port_label(sensors)
+        inputs, label = self.check(sensors), port_label(sensors)
         rate, numbers = sensors[0].sampling_rate, [n for some in inputs.values() for n in some]
         capture = Capture(clock, rate, [number - 1 for number in numbers])
         wanted = sensors[0].port.removeprefix(SCHEME)
@@ -264,20 +269,6 @@ def _card(library: Any, wanted: str, n_inputs: int, label: str) -> dict[str, Any
         )
     card: dict[str, Any] = found[0]
     return card
-
-
-def _inputs(sensors: Sequence[Sensor]) -> dict[str, tuple[int, ...]]:
-    """Return the inputs of each sensor."""
-
-    def given(sensor: Sensor, used: Collection[int]) -> Sequence[int]:
-        if not sensor.port.startswith(SCHEME):
-            expected = "expected audio:// and a part of the card's name; audio:// is the default"
-            raise BenchFileError(FileFault("port", expected, sensor.port, sensor.name))
-        first = max(used, default=0) + 1
-        following = range(first, first + len(sensor.channels))
-        return SoundSettings.model_validate(sensor.settings).inputs or following
-
-    return inputs_of(sensors, given)
 
 
 DRIVER = SoundDriver()

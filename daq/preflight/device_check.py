@@ -23,7 +23,6 @@ from daq.preflight.preflight import check_list
 from daq.preflight.preview import LENGTH, SensorPreview
 from daq.protocols.block import Block, BlockFlag, Event
 from daq.protocols.errors import RemoteProtocolError
-from daq.recorder.connection import patience_of
 from daq.recorder.device_identity import check_identity, with_owner
 from daq.transport.address import USUAL_NUMBERS
 from daq.transport.ports import open_port
@@ -123,7 +122,7 @@ async def _probe(
     wanted = {s.name: max(MIN_SAMPLES, round(duration * s.sampling_rate)) for s in sensors}
     longest = max(wanted[s.name] / s.sampling_rate for s in sensors) / clock.speed
     async with driver_type(sensors[0].driver).open(sensors, clock) as session:
-        patience, hint = patience_of(session), getattr(session, "hint", "")
+        patience, hint = session.patience, session.hint
         information = {one.sensor: one for one in session.information}
         troubles = dict(_identity_errors(sensors, information))
         awaited = {name: n for name, n in wanted.items() if not information[name].trouble}

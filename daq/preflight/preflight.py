@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.bench.driver_rules import Ranged
 from daq.bench.units import in_acceleration
 from daq.devices.registry import driver_type
 from daq.errors import WrongDeviceError
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daq.bench.model import Bench, Sensor
+    from daq.bench.model import Bench
     from daq.preflight.preview import SensorPreview
 
 MIN_SECONDS = 4.0
@@ -269,7 +268,8 @@ def _levels(each: SensorPreview) -> Iterator[Finding]:
     if each.is_clipping:
         yield _of(Problem.CLIPPING, each)
         return
-    sheet, counts = each.sensor.data_sheet, _full_scale(each.sensor)
+    counts = driver_type(each.sensor.driver).full_scale(each.sensor)
+    sheet = each.sensor.data_sheet
     if counts is None and (sheet is None or sheet.full_scale is None):
         yield _of(Problem.NO_FULL_SCALE, each)
         return
@@ -288,14 +288,6 @@ def _levels(each: SensorPreview) -> Iterator[Finding]:
             share = max(share, most * scale / sheet.full_scale)
         if share > NEAR:
             yield Finding(Problem.NEAR_FULL_SCALE, each.sensor.name, channel.name, value=share)
-
-
-def _full_scale(sensor: Sensor) -> float | None:
-    """Return the largest count, if the driver or the type of the counts states one."""
-    driver = driver_type(sensor.driver)
-    if isinstance(driver, Ranged):
-        return driver.full_scale(sensor)
-    return float(np.iinfo(np.int16).max) if driver.counts_dtype(sensor) == np.int16 else None
 
 
 def _hum(able: Sequence[SensorPreview]) -> Iterator[Finding]:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from daq.bench.model import Sensor
-    from daq.devices.interface import DriverType
+    from daq.devices.interface import AnyDriver
     from daq.protocols.block import DeviceItem, HostTime
 
 _MIN_INT64, _MAX_INT64 = -(1 << 63), (1 << 63) - 1
@@ -36,12 +36,12 @@ class BlockValidator:
 
     Parameters
     ----------
-    driver : DriverType
+    driver : AnyDriver
     sensors : sequence of Sensor
         All sensors on the port.
     """
 
-    def __init__(self, driver: DriverType, sensors: Sequence[Sensor]) -> None:
+    def __init__(self, driver: AnyDriver, sensors: Sequence[Sensor]) -> None:
         self._driver = driver.name
         self._port = sensors[0].port
         self._n_channels = {sensor.name: len(sensor.channels) for sensor in sensors}

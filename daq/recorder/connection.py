@@ -13,7 +13,6 @@ import contextlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from daq.devices.interface import DEFAULT_PATIENCE, Resuming
 from daq.errors import DeviceError, NoAnswerError, NotConnectedError, WrongDeviceError
 from daq.protocols.block import Block, DeviceItem, Event, EventKind
 from daq.recorder.block_checks import BlockValidator
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
     from contextlib import AbstractAsyncContextManager
 
     from daq.bench.model import Sensor
-    from daq.devices.interface import DeviceInformation, DriverType, Session
+    from daq.devices.interface import AnyDriver, DeviceInformation, Session
     from daq.host_clock import HostClock
     from daq.recorder.stall_detector import OverdueState
     from daq.transport.serial_ports import SerialPort
@@ -157,7 +156,7 @@ class Connection:
 
     def __init__(
         self,
-        driver: DriverType,
+        driver: AnyDriver,
         sensors: Sequence[Sensor],
         clock: HostClock,
         *,
@@ -193,7 +192,7 @@ class Connection:
                     if not self.connected.done():
                         self.connected.set_result(None)
                         await start.wait()
-                    resumed = self._last_session is not None and getattr(session, "resumed", False)
+                    resumed = self._last_session is not None and session.resumed
                     await queue.put(Connected(self.names, reason, resumed))
                     for name in self.names:
                         await queue.put(self._first_item(session, name))
@@ -229,7 +228,7 @@ class Connection:
             self.sensors = tuple(s.model_copy(update={"port": port}) for s in self.sensors)
 
     def _open(self) -> AbstractAsyncContextManager[Session]:
-        if self._last_session is not None and isinstance(self.driver, Resuming):
+        if self._last_session is not None:
             return self.driver.resume(self.sensors, self._clock, self._last_session)
         return self.driver.open(self.sensors, self._clock)
 
@@ -301,9 +300,9 @@ class Connection:
         detector = StallDetector(
             {s.name: s.sampling_rate * speed for s in self.sensors},
             report,
-            patience=patience_of(session) / speed,
+            patience=session.patience / speed,
             before=self._detector,
-            is_recovering=lambda: getattr(session, "recovers", False),
+            is_recovering=lambda: session.recovers,
         )
         self._detector = detector
         validator = BlockValidator(self.driver, self.sensors)
@@ -327,7 +326,7 @@ class Connection:
             except TimeoutError as error:
                 if isinstance(error, DeviceError):
                     raise
-                hint = getattr(session, "hint", "")
+                hint = session.hint
                 raise NoAnswerError(
                     f"{self.port}: stalled: no block for {detector.seconds:.2g} s"
                     f"{'; ' if hint else ''}{hint}"
@@ -383,11 +382,6 @@ class Connection:
         parts = (found.model, found.serial_number, found.firmware) if found else ()
         text = " ".join(("on", self.port, *(part for part in parts if part)))
         return Event(name, EventKind.CONNECTED, text, now)
-
-
-def patience_of(session: Session) -> float:
-    """Return the time without a block, in s of the device, after which a port is lost."""
-    return float(getattr(session, "patience", DEFAULT_PATIENCE))
 
 
 async def _generator(session: Session) -> AsyncGenerator[DeviceItem, None]:

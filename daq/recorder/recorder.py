@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from daq.bench.model import Bench, Sensor
-    from daq.devices.interface import DriverType
+    from daq.devices.interface import AnyDriver
     from daq.host_clock import HostClock
     from daq.recorder.connection import Item
     from daq.recorder.repeated_rows import ShareOfRepeats
@@ -139,7 +139,7 @@ async def record(
     clock: HostClock | None = None,
     stop: asyncio.Event | None = None,
     acknowledged: Callable[[RecorderStatus], None] | None = None,
-    drivers: Callable[[str], DriverType] = driver_type,
+    drivers: Callable[[str], AnyDriver] = driver_type,
 ) -> RecorderStatus:
     """Record a bench.
 
@@ -216,7 +216,7 @@ class _Recorder:
         self._status = RecorderStatus(str(path), 0.0, {})
 
     async def run(
-        self, duration: float | None, drivers: Callable[[str], DriverType], *, anyway: bool
+        self, duration: float | None, drivers: Callable[[str], AnyDriver], *, anyway: bool
     ) -> RecorderStatus:
         connections = [
             Connection(drivers(sensors[0].driver), sensors, self._clock, anyway=anyway)
@@ -307,7 +307,7 @@ class _Recorder:
                         temperature=found.temperature,
                     )
                 layouts[sensor.name] = layout
-                states = getattr(connection.driver, "states_temperature", False)
+                states = connection.driver.states_temperature
                 if layout.temperature is None and not states:
                     thermometers |= _thermometer(sensor)
         ordered = [layouts[sensor.name] for sensor in self._bench.sensors]

@@ -14,7 +14,7 @@ comes from the host's clock and is marked as an estimate. The block after such a
 ``CLOCK_RESTART``, because the phase of the sampling is new.
 
 A session may also continue the index of the previous session, if the device kept counting
-(``daq.devices.interface``, ``Resuming``). Then only the reason of the gap changes.
+(``daq.devices.interface.Driver.resume``). Then only the reason of the gap changes.
 
 Samples that were recorded before (in late or repeated blocks) are not recorded again.
 """

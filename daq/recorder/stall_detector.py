@@ -6,7 +6,7 @@ The *block period* of a sensor is the duration of its blocks' samples: the longe
 A sensor is **late** when its next block has not arrived two block periods after the last one, and
 not before ``MIN_LATE_AFTER``. A timer reports this at that instant. One lost block makes a sensor
 late, so lateness alone has no consequence. The sensor is **stalled** after the time that the
-session states (``daq.devices.interface``, ``PatientSession``), and never sooner than two of the
+session states (``daq.devices.interface.Session``), and never sooner than two of the
 longest recent intervals between blocks and a margin. Then, if no other sensor on the port delivers,
 the task that waits for the port is interrupted; otherwise the stall is only reported.
 

@@ -19,6 +19,7 @@ import dataclasses
 import time
 
 import huddle_ax3.driver
+from daq.devices import interface
 from daq.errors import NoAnswerError
 from daq.protocols.block import Block, BlockFlag, HostTime
 from tests_of_the_example import TestAX3 as Sound
@@ -33,7 +34,7 @@ def _at(block, offset_ns):
     return _changed(block, received=HostTime(at.monotonic_ns + offset_ns, at.utc_ns + offset_ns))
 
 
-class Session:
+class Session(interface.Session):
     def __init__(self, session):
         self._session = session
         self.information = tuple(map(self.stated, session.information))

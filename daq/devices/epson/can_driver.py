@@ -17,13 +17,18 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
+from pydantic import Field, PositiveFloat, PositiveInt
 
 from daq.devices.epson import canopen as protocol
 from daq.devices.epson.commands import COUNTS_PER_G, FILTERS, USUAL_FILTER, temperature
-from daq.devices.interface import DeviceInformation, PresentPort
-from daq.devices.port_rules import package, port_label, require_alike
+from daq.devices.interface import (
+    DeviceInformation,
+    Driver,
+    DriverSettings,
+    PresentPort,
+    Session,
+)
+from daq.devices.port_rules import package, port_label
 from daq.devices.shared_port import Presence, answering
 from daq.errors import (
     BenchFileError,
@@ -48,7 +53,6 @@ ARPHRD_CAN = 280
 """Type of a network that is a CAN bus, in Linux."""
 ADAPTERS = ("pcan", "kvaser", "vector", "ixxat")
 """Kinds of adapters that libraries of their vendors list."""
-OF_THE_BUS = ("interface", "bitrate", "filter")
 NOTIFIER_CYCLE = 0.1
 """Seconds after which the thread of the adapter looks whether it is to end."""
 NMT_OPERATIONAL, NMT_PRE_OPERATIONAL = 1, 128
@@ -57,10 +61,8 @@ SILENT = 1.0
 HEARTBEAT_MS = 500
 
 
-class EpsonCanSettings(BaseModel):
+class EpsonCanSettings(DriverSettings):
     """``[sensors.settings]`` of an M-A552."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     node_id: Annotated[int, Field(ge=1, le=127)] = 1
     """CANopen node ID; each device of a bus has its own."""
@@ -74,8 +76,10 @@ class EpsonCanSettings(BaseModel):
     """In g; samples beyond are flagged as clipped."""
 
 
-class EpsonCanSession:
+class EpsonCanSession(Session):
     """The devices of one bus, configured and quiet."""
+
+    hint = "expected SYNC and TPDO messages; check power, termination and bitrate"
 
     def __init__(
         self,
@@ -88,8 +92,6 @@ class EpsonCanSession:
         n_messages: int,
     ) -> None:
         self.information = information
-        self.hint = "expected SYNC and TPDO messages; check power, termination and bitrate"
-        self.patience = 10.0
         self._bus, self._devices, self._decoder = bus, devices, decoder
         self._clock = clock
         self._n_messages = n_messages
@@ -291,27 +293,25 @@ class _Bus:
                 await asyncio.to_thread(self._network.disconnect)
 
 
-class EpsonCanDriver:
-    """See :class:`daq.devices.interface.DriverType`."""
+class EpsonCanDriver(Driver[EpsonCanSettings]):
+    """See :class:`daq.devices.interface.Driver`."""
 
     name = "epson-can"
     summary = "Epson M-A552 quartz accelerometers on a CAN bus (CANopen), one clock for all"
     settings = EpsonCanSettings
+    of_the_port = ("interface", "bitrate", "filter")
     shares_clock = True
     states_temperature = True
 
-    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:
-        """Return int32."""
-        del sensor
-        return np.dtype(np.int32)
-
     def full_scale(self, sensor: Sensor) -> float | None:
-        """See :meth:`daq.bench.driver_rules.Ranged.full_scale`."""
-        return EpsonCanSettings.model_validate(sensor.settings).full_scale * COUNTS_PER_G
+        """See :meth:`daq.bench.driver_rules.DriverRules.full_scale`."""
+        return self.typed([sensor])[sensor.name].full_scale * COUNTS_PER_G
 
-    def check(self, sensors: Sequence[Sensor]) -> None:
-        """See :meth:`daq.devices.interface.Checking.check`."""
-        _settings(sensors)
+    def check(self, sensors: Sequence[Sensor]) -> dict[str, EpsonCanSettings]:
+        """Return the settings of each sensor."""
+        settings = self.typed(sensors)
+        _check_devices(sensors, settings)
+        return settings
 
     def ports(self, *, folder: Path = Path("/sys/class/net")) -> list[PresentPort]:
         """See :class:`daq.devices.interface.Listing`; ``folder`` is where Linux lists networks."""
@@ -338,7 +338,7 @@ class EpsonCanDriver:
         self, sensors: Sequence[Sensor], clock: HostClock
     ) -> AsyncIterator[EpsonCanSession]:
         """Open the bus, identify and configure all devices."""
-        settings = _settings(sensors)
+        settings = self.check(sensors)
         first, common = sensors[0], settings[sensors[0].name]
         nodes = {name: one.node_id for name, one in settings.items()}
         bus = _Bus(port_label(sensors), clock, tuple(nodes.values()))
@@ -412,9 +412,8 @@ class _Device:
             await bus.set(node, protocol.HEARTBEAT_TIME, 0, HEARTBEAT_MS, 2)
 
 
-def _settings(sensors: Sequence[Sensor]) -> dict[str, EpsonCanSettings]:
-    settings = {s.name: EpsonCanSettings.model_validate(s.settings) for s in sensors}
-    require_alike(sensors, settings, OF_THE_BUS)
+def _check_devices(sensors: Sequence[Sensor], settings: Mapping[str, EpsonCanSettings]) -> None:
+    """Raise BenchFileError for what no M-A552 accepts, and nodes that are used twice."""
     seen: dict[int, str] = {}
     for sensor in sensors:
         one = settings[sensor.name]
@@ -434,7 +433,6 @@ def _settings(sensors: Sequence[Sensor]) -> dict[str, EpsonCanSettings]:
         seen[one.node_id] = sensor.name
         if faults:
             raise BenchFileError(*(FileFault(k, e, v, sensor.name) for k, e, v in faults))
-    return settings
 
 
 DRIVER = EpsonCanDriver()

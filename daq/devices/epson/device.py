@@ -8,12 +8,12 @@ import re
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, PositiveFloat, Strict, field_validator
+from pydantic import PositiveFloat, Strict, field_validator
 
 from daq.devices.epson import commands
 from daq.devices.epson.burst import BurstDecoder
 from daq.devices.epson.commands import BurstFormat, Register
-from daq.devices.interface import DEFAULT_PATIENCE, DeviceInformation
+from daq.devices.interface import DEFAULT_PATIENCE, DeviceInformation, DriverSettings
 from daq.errors import BenchFileError, FileFault, NoAnswerError, WrongDeviceError
 
 if TYPE_CHECKING:
@@ -44,10 +44,8 @@ EXTERNAL = {
 }
 
 
-class EpsonSettings(BaseModel):
+class EpsonSettings(DriverSettings, strict=True):
     """``[sensors.settings]`` of an Epson accelerometer."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     baud_rate: Literal[460800, 230400, 115200] = 460800
     """Baud rate of the device (460800 by default)."""
@@ -92,8 +90,8 @@ class Configuration:
     is_a370: bool
 
     @classmethod
-    def of(cls, sensor: Sensor, model: str = "") -> Configuration:
-        """Return the configuration of a sensor.
+    def of(cls, sensor: Sensor, settings: EpsonSettings, model: str = "") -> Configuration:
+        """Return the configuration of a sensor with these settings.
 
         ``model`` is the model that the device reports; if empty, the bench file's model applies.
 
@@ -102,7 +100,6 @@ class Configuration:
         BenchFileError
             If the device lacks a setting.
         """
-        settings = EpsonSettings.model_validate(sensor.settings)
         model = (model or sensor.model).upper()
         rate = round(sensor.sampling_rate)
         if rate not in commands.RATES or rate != sensor.sampling_rate:

@@ -21,13 +21,12 @@ import contextlib
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.devices.epson import commands
 from daq.devices.epson.device import Configuration, Device, EpsonSettings
-from daq.devices.port_rules import only
+from daq.devices.interface import Driver, Session
+from daq.devices.port_rules import only, port_label
 from daq.errors import (
     BenchFileError,
     DeviceError,
@@ -42,7 +41,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
 
     from daq.devices.epson.burst import BurstDecoder
-    from daq.devices.interface import DeviceInformation, Session
+    from daq.devices.interface import DeviceInformation
     from daq.host_clock import HostClock
     from daq.protocols.block import DeviceItem
     from daq.transport.byte_stream import ByteStream
@@ -57,7 +56,7 @@ LISTEN = 0.5
 """Time in s to listen for a lost device, and again after the first bytes."""
 
 
-class EpsonSession:
+class EpsonSession(Session):
     """An accelerometer, configured and idle until :meth:`read`, or still streaming.
 
     Parameters
@@ -77,17 +76,14 @@ class EpsonSession:
         heard: tuple[bytes, HostTime] | None = None,
     ) -> None:
         self.information = (information,)
+        self.patience = configuration.settings.patience
+        self.resumed = heard is not None
         self.decoder = decoder
         self._device = device
         self._clock = clock
         self._stream = device.stream
         self._configuration = configuration
         self._heard = heard
-
-    @property
-    def resumed(self) -> bool:
-        """Whether blocks continue the index of the session before."""
-        return self._heard is not None
 
     async def read(self) -> AsyncIterator[DeviceItem]:
         """Start sampling and yield blocks, events, and the temperature once a minute."""
@@ -119,13 +115,8 @@ class EpsonSession:
                 yield item
 
     @property
-    def patience(self) -> float:
-        """See :class:`daq.devices.interface.PatientSession`."""
-        return self._configuration.settings.patience
-
-    @property
     def hint(self) -> str:
-        """See :class:`daq.devices.interface.PatientSession`."""
+        """Expected number of frames, and the trigger to check."""
         configuration = self._configuration
         return f"expected {configuration.sampling_rate} frames a second{configuration.hint}"
 
@@ -192,37 +183,33 @@ async def identify(port: str, clock: HostClock, *, baud_rate: int) -> DeviceInfo
         return replace(information, sampling_rate=await device.sampling_rate())
 
 
-class EpsonDriver:
-    """See :class:`daq.devices.interface.DriverType`."""
+class EpsonDriver(Driver[EpsonSettings]):
+    """See :class:`daq.devices.interface.Driver`. Counts of all fields are int32."""
 
     name = "epson"
     summary = "Epson M-A352 or M-A370 quartz accelerometer on a UART"
     settings = EpsonSettings
-    shares_clock = False
     states_temperature = True
 
-    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:  # noqa: ARG002 -- interface
-        """Return int32, for all fields including temperature."""
-        return np.dtype(np.int32)
-
     def full_scale(self, sensor: Sensor) -> float | None:
-        """See :meth:`daq.bench.driver_rules.Ranged.full_scale`."""
-        settings = EpsonSettings.model_validate(sensor.settings)
+        """See :meth:`daq.bench.driver_rules.DriverRules.full_scale`."""
+        settings = self.typed([sensor])[sensor.name]
         return None if settings.tilt else settings.full_scale * commands.COUNTS_PER_G
 
-    def check(self, sensors: Sequence[Sensor]) -> None:
-        """See :meth:`daq.devices.interface.Checking.check`."""
-        _configured(sensors)
+    def check(self, sensors: Sequence[Sensor]) -> tuple[Sensor, Configuration]:
+        """Return the only sensor and its configuration."""
+        sensor = only(sensors, "an Epson has its own")
+        return sensor, Configuration.of(sensor, self.typed(sensors)[sensor.name])
 
     @contextlib.asynccontextmanager
     async def open(
         self, sensors: Sequence[Sensor], clock: HostClock
     ) -> AsyncIterator[EpsonSession]:
         """Open the port, identify and configure the accelerometer."""
-        sensor, configuration = _configured(sensors)
+        sensor, configuration = self.check(sensors)
         async with (
             _port(sensor, configuration, clock) as stream,
-            _set_up(sensor, stream, clock) as session,
+            _set_up(sensor, configuration.settings, stream, clock) as session,
         ):
             yield session
 
@@ -231,7 +218,7 @@ class EpsonDriver:
         self, sensors: Sequence[Sensor], clock: HostClock, before: Session
     ) -> AsyncIterator[EpsonSession]:
         """Open the port and continue the device's stream; configure it if it does not stream."""
-        sensor, configuration = _configured(sensors)
+        sensor, configuration = self.check(sensors)
         async with _port(sensor, configuration, clock) as stream:
             device = Device(sensor, stream)
             if isinstance(before, EpsonSession):
@@ -251,32 +238,27 @@ class EpsonDriver:
                             heard=heard,
                         )
                     return
-            async with _set_up(sensor, stream, clock) as session:
+            async with _set_up(sensor, configuration.settings, stream, clock) as session:
                 yield session
-
-
-def _configured(sensors: Sequence[Sensor]) -> tuple[Sensor, Configuration]:
-    sensor = only(sensors, "an Epson has its own")
-    return sensor, Configuration.of(sensor)
 
 
 def _port(
     sensor: Sensor, configuration: Configuration, clock: HostClock
 ) -> contextlib.AbstractAsyncContextManager[ByteStream]:
-    label = f"sensor {sensor.name!r} on {sensor.port}"
-    return open_port(sensor.port, clock, label=label, baud_rate=configuration.settings.baud_rate)
+    baud_rate = configuration.settings.baud_rate
+    return open_port(sensor.port, clock, label=port_label([sensor]), baud_rate=baud_rate)
 
 
 @contextlib.asynccontextmanager
 async def _set_up(
-    sensor: Sensor, stream: ByteStream, clock: HostClock
+    sensor: Sensor, settings: EpsonSettings, stream: ByteStream, clock: HostClock
 ) -> AsyncIterator[EpsonSession]:
     device = Device(sensor, stream)
     await device.identify()
     async with _left_quiet(device, stream):
         information = await device.information()
         try:
-            configuration = Configuration.of(sensor, information.model)
+            configuration = Configuration.of(sensor, settings, information.model)
         except BenchFileError as error:
             raise WrongDeviceError(f"port {sensor.port}: {error}") from error
         await device.configure(configuration)  # reads registers back

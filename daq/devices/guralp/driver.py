@@ -22,13 +22,11 @@ import contextlib
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from daq.devices.guralp.gcf import component, serial_number
 from daq.devices.guralp.links import GuralpSettings, open_link
 from daq.devices.guralp.streams import FULL_SCALE_COUNTS
-from daq.devices.interface import DeviceInformation
-from daq.devices.port_rules import port_label, require_address, require_alike
+from daq.devices.interface import DeviceInformation, Driver, Session
+from daq.devices.port_rules import port_label, require_address
 from daq.errors import (
     ABSENT,
     BenchFileError,
@@ -40,7 +38,7 @@ from daq.errors import (
 from daq.protocols.block import Block, DeviceItem, Event, EventKind
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, AsyncIterator, Callable, Sequence
+    from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping, Sequence
 
     from daq.bench.model import Sensor
     from daq.devices.guralp.links import Link
@@ -50,8 +48,10 @@ if TYPE_CHECKING:
 COMPONENTS = "ZNEX1234"
 
 
-class GuralpSession:
+class GuralpSession(Session):
     """A session in which every stream has been received once."""
+
+    hint = "check the digitizer's terminal, cable and power"
 
     def __init__(
         self,
@@ -64,8 +64,6 @@ class GuralpSession:
     ) -> None:
         self.information = information
         self.patience = patience
-        """See :class:`daq.devices.interface.PatientSession`."""
-        self.hint = "check the digitizer's terminal, cable and power"
         self._link = link
         self._buffered = buffered
         self._identify = identify
@@ -109,25 +107,25 @@ class GuralpSession:
         return Event(first.sensor, EventKind.CONNECTED, "its streams come now", first.received)
 
 
-class GuralpDriver:
-    """See :class:`daq.devices.interface.DriverType`."""
+class GuralpDriver(Driver[GuralpSettings]):
+    """See :class:`daq.devices.interface.Driver`."""
 
     name = "guralp"
     summary = "Güralp digitizer: GCF over a serial line, or from a Scream server (UDP, TCP)"
     settings = GuralpSettings
-    shares_clock = False
-
-    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:  # noqa: ARG002 -- interface
-        """Return int32."""
-        return np.dtype(np.int32)
+    of_the_port = GuralpSettings.model_fields.keys() - {"streams", "system_id"}
 
     def full_scale(self, sensor: Sensor) -> float | None:  # noqa: ARG002 -- interface
-        """See :meth:`daq.bench.driver_rules.Ranged.full_scale`."""
+        """See :meth:`daq.bench.driver_rules.DriverRules.full_scale`."""
         return FULL_SCALE_COUNTS
 
-    def check(self, sensors: Sequence[Sensor]) -> None:
-        """See :meth:`daq.devices.interface.Checking.check`."""
-        _configured(sensors)
+    def check(
+        self, sensors: Sequence[Sensor]
+    ) -> tuple[dict[str, GuralpSettings], dict[str, tuple[str, ...]]]:
+        """Return settings and stream IDs of each sensor; a single one may have none yet."""
+        every = self.typed(sensors)
+        require_address(sensors[0])
+        return every, _stream_ids(sensors, every)
 
     @contextlib.asynccontextmanager
     async def open(
@@ -135,9 +133,8 @@ class GuralpDriver:
     ) -> AsyncIterator[GuralpSession]:
         """Open the port and listen until every stream has been received."""
         first = sensors[0]
-        settings = GuralpSettings.model_validate(first.settings)
-        label = port_label(sensors)
-        ids = _configured(sensors)
+        every, ids = self.check(sensors)
+        settings, label = every[first.name], port_label(sensors)
         async with open_link(first.port, settings, clock, ids, label=label) as link:
             buffered: list[DeviceItem] = []
             if not ids[first.name]:
@@ -146,17 +143,18 @@ class GuralpDriver:
             yield GuralpSession(
                 link,
                 patience=settings.patience,
-                information=await _listen(link, sensors, settings, label, buffered),
+                information=await _listen(link, sensors, every, label, buffered),
                 buffered=buffered,
-                identify=lambda name: _identity(link.streams, by_name[name], label),
+                identify=lambda name: _identity(
+                    link.streams, by_name[name], every[name].system_id, label
+                ),
             )
 
 
-def _configured(sensors: Sequence[Sensor]) -> dict[str, tuple[str, ...]]:
+def _stream_ids(
+    sensors: Sequence[Sensor], every: Mapping[str, GuralpSettings]
+) -> dict[str, tuple[str, ...]]:
     """Return the stream IDs of each sensor; a single sensor may have none, to be discovered."""
-    every = {s.name: GuralpSettings.model_validate(s.settings) for s in sensors}
-    require_address(sensors[0])
-    require_alike(sensors, every, GuralpSettings.model_fields.keys() - {"streams", "system_id"})
     ids: dict[str, tuple[str, ...]] = {}
     taken: dict[str, str] = {}
     for sensor in sensors:
@@ -221,7 +219,7 @@ def _component(stream: str) -> tuple[int, str]:
 async def _listen(
     link: Link,
     sensors: Sequence[Sensor],
-    settings: GuralpSettings,
+    every: Mapping[str, GuralpSettings],
     label: str,
     buffered: list[DeviceItem],
 ) -> tuple[DeviceInformation, ...]:
@@ -229,8 +227,9 @@ async def _listen(
 
     If only some of several sensors send, the session starts with them: the others may follow.
     """
+    patience = every[sensors[0].name].patience
     with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(settings.patience):
+        async with asyncio.timeout(patience):
             while link.streams.silent:
                 buffered += await link.receive()
                 buffered += await link.respond()
@@ -238,12 +237,13 @@ async def _listen(
     for sensor in sensors:
         silent = set(link.streams.stream_ids(sensor.name)).intersection(link.streams.silent)
         if not silent:
-            information.append(_identity(link.streams, sensor, label))
+            wanted = every[sensor.name].system_id
+            information.append(_identity(link.streams, sensor, wanted, label))
             continue
         others = ", ".join(sorted(link.streams.unknown)) or "no other"
         trouble = (
             f"{label}: streams {', '.join(sorted(silent))} of {sensor.name!r} not received within"
-            f" {settings.patience:g} s; received {others}"
+            f" {patience:g} s; received {others}"
         )
         information.append(DeviceInformation(sensor=sensor.name, trouble=trouble))
     if all(one.trouble for one in information):
@@ -251,14 +251,13 @@ async def _listen(
     return tuple(information)
 
 
-def _identity(streams: Streams, sensor: Sensor, label: str) -> DeviceInformation:
+def _identity(streams: Streams, sensor: Sensor, system_id: str, label: str) -> DeviceInformation:
     ids = streams.stream_ids(sensor.name)
     rate = streams.sampling_rate(sensor.name)
     system = streams.system(sensor.name)
-    wanted = GuralpSettings.model_validate(sensor.settings).system_id
     for what, expected, found in (
         ("serial number", sensor.serial_number, serial_number(ids[0])),
-        ("system ID", wanted, system),
+        ("system ID", system_id, system),
     ):
         if expected and expected != found:
             raise WrongDeviceError(

@@ -10,11 +10,12 @@ import asyncio
 import contextlib
 from typing import TYPE_CHECKING, Annotated, Literal, Protocol
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveFloat
+from pydantic import AfterValidator, Field, PositiveFloat
 
 from daq.devices.guralp import scream
 from daq.devices.guralp.decoders import ScreamDecoder, SerialDecoder
 from daq.devices.guralp.gcf import BLOCK_SIZE
+from daq.devices.interface import DriverSettings
 from daq.errors import NotConnectedError
 from daq.protocols.block import DeviceItem, Event, EventKind
 from daq.transport.address import host_and_port
@@ -36,10 +37,8 @@ StreamId = Annotated[
 """A stream ID without leading zeros, which blocks do not preserve."""
 
 
-class GuralpSettings(BaseModel):
+class GuralpSettings(DriverSettings):
     """``[sensors.settings]`` of a Güralp digitizer."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     streams: tuple[StreamId, ...] | None = None
     """Stream ID of each channel, such as ``("DEMOZ2", "DEMON2", "DEMOE2")``. Default: the streams

@@ -14,10 +14,16 @@ import math
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, PositiveFloat
+from pydantic import PositiveFloat
 
 from daq.devices.iio import protocol
-from daq.devices.interface import DeviceInformation
+from daq.devices.interface import (
+    DEFAULT_PATIENCE,
+    DeviceInformation,
+    Driver,
+    DriverSettings,
+    Session,
+)
 from daq.devices.port_rules import only, port_label
 from daq.errors import BenchFileError, FileFault, NoAnswerError, WrongDeviceError
 from daq.protocols.block import Block, BlockFlag, Event, EventKind, Quantity, Reading, ReadingTimes
@@ -44,10 +50,8 @@ BLOCK_SECONDS = 0.1
 """Seconds of samples in one buffer."""
 
 
-class IioSettings(BaseModel):
+class IioSettings(DriverSettings):
     """``[sensors.settings]`` of an IIO device."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     device: str = ""
     """Name or id of the device, as ``iio_info`` prints it; default: the only one with buffers."""
@@ -55,7 +59,7 @@ class IioSettings(BaseModel):
     """IIO channel of each channel, as ``accel_x``; default: the device's first ones."""
     trigger: str = ""
     """Name of the trigger to use; default: the one that is set."""
-    patience: PositiveFloat = 10.0
+    patience: PositiveFloat = DEFAULT_PATIENCE
     """Seconds without samples after which the device is lost and reconnected."""
 
 
@@ -118,8 +122,10 @@ class _Iiod:
         self._buffer += received
 
 
-class IioSession:
+class IioSession(Session):
     """One device, ready to fill buffers."""
+
+    hint = "expected buffers from IIOD; check the trigger of the device"
 
     def __init__(
         self,
@@ -133,7 +139,6 @@ class IioSession:
     ) -> None:
         self.information = (information,)
         self.patience = patience
-        self.hint = "expected buffers from IIOD; check the trigger of the device"
         self._iiod, self._sensor, self._device = iiod, sensor, device
         self._inputs = tuple(inputs)
         names = [one.channel for one in device.elements]
@@ -276,30 +281,26 @@ class IioSession:
         return rows, [0, *map(int, each)], flags, False
 
 
-class IioDriver:
-    """See :class:`daq.devices.interface.DriverType`."""
+class IioDriver(Driver[IioSettings]):
+    """See :class:`daq.devices.interface.Driver`."""
 
     name = "iio"
     summary = "Linux IIO devices over the network (iiod): ADXL355, ADXL357, converters"
     settings = IioSettings
-    shares_clock = False
 
-    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:
-        """Return int32."""
-        del sensor
-        return np.dtype(np.int32)
-
-    def check(self, sensors: Sequence[Sensor]) -> None:
-        """See :meth:`daq.devices.interface.Checking.check`."""
-        _address(only_sensor(sensors))
+    def check(self, sensors: Sequence[Sensor]) -> tuple[Sensor, str, IioSettings]:
+        """Return the only sensor, host and port of its board, and its settings."""
+        sensor = sensors[0]
+        if len(sensors) > 1:
+            sensor = only(sensors, "each IIO device needs a port of its own, as iio://host/2")
+        return sensor, _address(sensor), self.typed(sensors)[sensor.name]
 
     @contextlib.asynccontextmanager
     async def open(self, sensors: Sequence[Sensor], clock: HostClock) -> AsyncIterator[IioSession]:
         """Connect, find the device and set its rate."""
-        sensor = only_sensor(sensors)
-        settings = IioSettings.model_validate(sensor.settings)
+        sensor, address, settings = self.check(sensors)
         label = port_label(sensors)
-        async with open_port(f"socket://{_address(sensor)}", clock, label=label) as stream:
+        async with open_port(f"socket://{address}", clock, label=label) as stream:
             iiod = _Iiod(stream)
             device = _device(protocol.parse_context(await iiod.text("PRINT")), settings, label)
             inputs = _inputs(device, settings, sensor, label)
@@ -376,13 +377,6 @@ def _inputs(
             f" {len(sensor.channels)} of them, got {', '.join(inputs)}"
         )
     return inputs
-
-
-def only_sensor(sensors: Sequence[Sensor]) -> Sensor:
-    """Return the only sensor of a port."""
-    if len(sensors) == 1:
-        return sensors[0]
-    return only(sensors, "each IIO device needs a port of its own, as iio://host/2")
 
 
 def _address(sensor: Sensor) -> str:

@@ -15,7 +15,6 @@ from daq.devices.labjack import stream as labjack
 from daq.devices.labjack.packets import MAX_SAMPLES
 from daq.devices.labjack.registers import Adu, AduFinder, Calibration, Read, Write
 from daq.devices.labjack.settings import RANGES, LabJackSettings, lacking, range_of
-from daq.devices.port_rules import require_alike
 from daq.errors import BenchFileError, FileFault, NoAnswerError, WrongDeviceError
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.sample_counter import CLOCK_TOLERANCE, SLACK
@@ -33,8 +32,6 @@ REPLY_TIMEOUT = 2.0
 PACKETS_PER_SECOND = 10
 PRODUCTS = {7.0: "T7", 8.0: "T8"}
 (MODBUS_PORT,) = USUAL_NUMBERS["modbus-tcp"]
-SENSOR_SETTINGS = ("inputs", "range", "negative_inputs")
-"""Settings of each sensor; all others belong to the stream and to the port's first sensor."""
 BUFFERS = {"T7": 32768, "T8": 262144}
 
 
@@ -133,10 +130,8 @@ def inputs_of(
     Raises
     ------
     BenchFileError
-        If an input appears twice, or the number of inputs and channels differ, or sensors differ in
-        common settings.
+        If an input appears twice, or the number of inputs and channels differ.
     """
-    require_alike(sensors, settings, LabJackSettings.model_fields.keys() - SENSOR_SETTINGS)
     inputs: dict[str, tuple[int, ...]] = {}
     taken: dict[int, str] = {}
     for sensor in sensors:

@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.devices.interface import Driver, Session
 from daq.devices.labjack import device as setup
 from daq.devices.labjack import registers as reg
 from daq.devices.labjack import stream as labjack
@@ -46,7 +47,7 @@ if TYPE_CHECKING:
     from contextlib import AbstractAsyncContextManager
 
     from daq.bench.model import Sensor
-    from daq.devices.interface import DeviceInformation, Session
+    from daq.devices.interface import DeviceInformation
     from daq.host_clock import HostClock
     from daq.protocols.block import Block, DeviceItem, Event
 
@@ -58,7 +59,7 @@ MAX_RESTARTS = 3
 """Maximum number of restarts of a stream that ends with its first packet."""
 
 
-class LabJackSession:
+class LabJackSession(Session):
     """A digitizer with a configured scan list."""
 
     def __init__(
@@ -79,15 +80,17 @@ class LabJackSession:
         self.decoder = decoder
         self.uptime = uptime
         self.resumed = resumed
-        """Whether blocks continue the index of the session before."""
         self._registers = registers
         self._settings = settings
         self._clock = clock
         self._stream_address = stream_address
         self.patience = patience
-        """See :class:`daq.devices.interface.PatientSession`."""
-        self.hint = f"expected samples from {stream_address}"
         self._ask_after = ASK_AFTER + 2 * packet_seconds
+
+    @property
+    def hint(self) -> str:
+        """Where samples are expected."""
+        return f"expected samples from {self._stream_address}"
 
     @property
     def recovers(self) -> bool:
@@ -182,34 +185,41 @@ class LabJackSession:
                 await asyncio.sleep(POLL_INTERVAL)
 
 
-class LabJackDriver:
-    """See :class:`daq.devices.interface.DriverType`."""
+class LabJackDriver(Driver[LabJackSettings]):
+    """See :class:`daq.devices.interface.Driver`."""
 
     name = "labjack"
     summary = "LabJack T7 or T8: analog inputs streamed over Ethernet, several sensors on one"
     settings = LabJackSettings
+    of_the_port = LabJackSettings.model_fields.keys() - {"inputs", "range", "negative_inputs"}
     shares_clock = True
     states_temperature = True
+    dtype = np.uint16
 
-    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:  # noqa: ARG002 -- interface
-        """Return uint16."""
-        return np.dtype(np.uint16)
-
-    def check(self, sensors: Sequence[Sensor]) -> None:
-        """See :meth:`daq.devices.interface.Checking.check`."""
-        _Planned.of(sensors)
+    def check(self, sensors: Sequence[Sensor]) -> _Planned:
+        """Return the plan of the device; raise BenchFileError if it lacks a setting."""
+        first, settings = sensors[0], self.typed(sensors)
+        inputs = setup.inputs_of(sensors, settings)
+        for sensor in sensors:
+            product = next((p for p in RANGES if p in sensor.model.upper()), None)
+            fault = product and lacking(settings[sensor.name], inputs[sensor.name], product)
+            if fault:
+                raise BenchFileError(replace(fault, sensor=sensor.name))
+        stream = setup.plan(settings[first.name], inputs, first.sampling_rate)
+        return _Planned(settings, inputs, stream, setup.address_of(first))
 
     def open(
         self, sensors: Sequence[Sensor], clock: HostClock
     ) -> AbstractAsyncContextManager[LabJackSession]:
         """Connect, identify, read the calibration and configure the stream."""
-        return _opened(sensors, clock, None)
+        return _opened(self.check(sensors), sensors, clock, None)
 
     def resume(
         self, sensors: Sequence[Sensor], clock: HostClock, before: Session
     ) -> AbstractAsyncContextManager[LabJackSession]:
         """Open; continue the index of ``before`` if the device was not restarted."""
-        return _opened(sensors, clock, before if isinstance(before, LabJackSession) else None)
+        last = before if isinstance(before, LabJackSession) else None
+        return _opened(self.check(sensors), sensors, clock, last)
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,28 +231,13 @@ class _Planned:
     stream: StreamPlan
     address: tuple[str, int]
 
-    @classmethod
-    def of(cls, sensors: Sequence[Sensor]) -> _Planned:
-        first = sensors[0]
-        settings = {s.name: LabJackSettings.model_validate(s.settings) for s in sensors}
-        inputs = setup.inputs_of(sensors, settings)
-        for sensor in sensors:
-            product = next((p for p in RANGES if p in sensor.model.upper()), None)
-            fault = product and lacking(settings[sensor.name], inputs[sensor.name], product)
-            if fault:
-                raise BenchFileError(replace(fault, sensor=sensor.name))
-        stream = setup.plan(settings[first.name], inputs, first.sampling_rate)
-        return cls(settings, inputs, stream, setup.address_of(first))
-
 
 @contextlib.asynccontextmanager
 async def _opened(
-    sensors: Sequence[Sensor], clock: HostClock, before: LabJackSession | None
+    planned: _Planned, sensors: Sequence[Sensor], clock: HostClock, before: LabJackSession | None
 ) -> AsyncIterator[LabJackSession]:
-    first = sensors[0]
-    planned = _Planned.of(sensors)
     settings, inputs, stream_plan = planned.settings, planned.inputs, planned.stream
-    common, (host, number) = settings[first.name], planned.address
+    common, (host, number) = settings[sensors[0].name], planned.address
     address = f"socket://{host}:{number}"
     async with open_port(address, clock, label=port_label(sensors)) as stream:
         registers = Registers(stream)

@@ -6,15 +6,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import (
     AfterValidator,
-    BaseModel,
     BeforeValidator,
-    ConfigDict,
     Field,
     NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
 )
 
+from daq.devices.interface import DriverSettings
 from daq.devices.labjack import registers as reg
 from daq.errors import FileFault
 
@@ -51,13 +50,11 @@ def _power_of_two(value: int) -> int:
 Input = Annotated[int, BeforeValidator(_input_number), Field(ge=0, le=254)]
 
 
-class LabJackSettings(BaseModel):
+class LabJackSettings(DriverSettings):
     """``[sensors.settings]`` of a sensor on a LabJack.
 
     Inputs and range belong to each sensor; all other settings to the port's first sensor.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     inputs: tuple[Input, ...] | None = None
     """The analog input of each channel, such as ``["AIN0", "AIN1", "AIN2"]``; default: the inputs

@@ -18,13 +18,19 @@ import math
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
+from pydantic import Field, PositiveFloat, PositiveInt
 
-from daq.devices.interface import DEFAULT_PATIENCE, DeviceInformation
+from daq.devices.interface import (
+    DEFAULT_PATIENCE,
+    DeviceInformation,
+    Driver,
+    DriverSettings,
+    Session,
+)
 from daq.devices.modbus import rtu
 from daq.devices.modbus.fifo_protocol import MAX_WORDS, RATE_REGISTER, READ_OVERHEAD, FifoDecoder
 from daq.devices.modbus.rtu import ReplyFinder
-from daq.devices.port_rules import only
+from daq.devices.port_rules import only, port_label
 from daq.errors import BenchFileError, DeviceError, FileFault, NoAnswerError, WrongDeviceError
 from daq.transport.ports import open_port
 
@@ -44,10 +50,8 @@ MAX_FILLING_TIME = 3.0
 """Time without a decrease of the level, in s, after which the link is too slow."""
 
 
-class FifoSettings(BaseModel):
+class FifoSettings(DriverSettings, strict=True):
     """``[sensors.settings]`` of a device with a block FIFO."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     baud_rate: PositiveInt = 3_000_000
     parity: Literal["N", "E", "O"] = "N"
@@ -67,8 +71,10 @@ class FifoSettings(BaseModel):
     of the FIFO (``capacity``), at least 10 s."""
 
 
-class FifoSession:
+class FifoSession(Session):
     """A device that samples into its FIFO."""
+
+    hint = "the device does not answer; check cable and power"
 
     def __init__(
         self,
@@ -82,8 +88,6 @@ class FifoSession:
     ) -> None:
         self.information = (information,)
         self.patience = patience
-        """See :class:`daq.devices.interface.PatientSession`."""
-        self.hint = "the device does not answer; check cable and power"
         self._stream = stream
         self._settings = settings
         self._decoder = decoder
@@ -144,30 +148,29 @@ class FifoSession:
         return items, True
 
 
-class FifoDriver:
-    """See :class:`daq.devices.interface.DriverType`."""
+class FifoDriver(Driver[FifoSettings]):
+    """See :class:`daq.devices.interface.Driver`."""
 
     name = "fifo"
     summary = "Block FIFO behind Modbus RTU registers (ProWaveDAQ, PWRVT vibration units)"
     settings = FifoSettings
-    shares_clock = False
+    dtype = np.int16
 
-    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:  # noqa: ARG002 -- interface
-        """Return int16."""
-        return np.dtype(np.int16)
-
-    def check(self, sensors: Sequence[Sensor]) -> None:
-        """See :meth:`daq.devices.interface.Checking.check`."""
-        _checked(sensors)
+    def check(self, sensors: Sequence[Sensor]) -> tuple[Sensor, FifoSettings]:
+        """Return the sensor and its settings; raise BenchFileError if they are invalid."""
+        sensor = only(sensors, "reading one FIFO takes all of a line")
+        settings = self.typed(sensors)[sensor.name]
+        _check_rate(sensor, settings)
+        return sensor, settings
 
     @contextlib.asynccontextmanager
     async def open(self, sensors: Sequence[Sensor], clock: HostClock) -> AsyncIterator[FifoSession]:
         """Open the port, test that the device replies, and set its sampling rate."""
-        sensor, settings = _checked(sensors)
+        sensor, settings = self.check(sensors)
         async with open_port(
             sensor.port,
             clock,
-            label=f"sensor {sensor.name!r} on {sensor.port}",
+            label=port_label(sensors),
             baud_rate=settings.baud_rate,
             parity=settings.parity,
         ) as stream:
@@ -197,10 +200,8 @@ class FifoDriver:
             )
 
 
-def _checked(sensors: Sequence[Sensor]) -> tuple[Sensor, FifoSettings]:
-    """Return the sensor and its settings; raise BenchFileError if they are invalid."""
-    sensor = only(sensors, "reading one FIFO takes all of a line")
-    settings = FifoSettings.model_validate(sensor.settings)
+def _check_rate(sensor: Sensor, settings: FifoSettings) -> None:
+    """Raise BenchFileError if device or line are too slow for the sampling rate."""
     rate = sensor.sampling_rate
     if settings.set_rate and not 1 <= rate == round(rate) <= HIGHEST_RATE:
         expected = (
@@ -222,7 +223,6 @@ def _checked(sensors: Sequence[Sensor]) -> tuple[Sensor, FifoSettings]:
         raise BenchFileError(
             FileFault("settings.baud_rate", expected, settings.baud_rate, sensor.name)
         )
-    return sensor, settings
 
 
 async def _set_up(stream: ByteStream, sensor: Sensor, settings: FifoSettings) -> None:

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
+from pydantic import Field, PositiveFloat, PositiveInt
 
-from daq.devices.interface import DeviceInformation
+from daq.devices.interface import DeviceInformation, Driver, DriverSettings, Session
 from daq.devices.modbus import registers_protocol as protocol
 from daq.devices.modbus.bus import DamagedReplyError, ModbusBus, RefusedError, Reply, open_bus
 from daq.devices.modbus.registers_protocol import (
@@ -28,7 +28,7 @@ from daq.devices.modbus.registers_protocol import (
     TimeFormat,
     WordOrder,
 )
-from daq.devices.port_rules import port_label, require_address, require_alike
+from daq.devices.port_rules import port_label, require_address
 from daq.devices.shared_port import Presence, answering
 from daq.errors import (
     ABSENT,
@@ -59,16 +59,11 @@ GATEWAY_CODES = {10, 11}
 ATTEMPTS = 3
 """Number of requests to a device during configuration; one must succeed."""
 
-OF_THE_BUS = ("timeout", "baud_rate", "parity", "stop_bits", "echo")
-"""Settings that the port's first sensor determines for all sensors of the port."""
-
 Address = Annotated[int, Field(ge=0, le=65535)]
 
 
-class RegisterSettings(BaseModel):
+class RegisterSettings(DriverSettings):
     """``[sensors.settings]`` of the register poller."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     preset: Literal["witmotion", "labjack-ain"] | None = None
     """Settings of a known device; explicit settings override them."""
@@ -110,8 +105,7 @@ class _Polled:
     """Whether the device refuses unused registers between the needed ones."""
 
     @classmethod
-    def of(cls, sensor: Sensor) -> _Polled:
-        settings = RegisterSettings.model_validate(sensor.settings)
+    def of(cls, sensor: Sensor, settings: RegisterSettings) -> _Polled:
         given = settings.model_dump(exclude_none=True)
         try:
             registers = RegisterMap.of(given, len(sensor.channels))
@@ -269,7 +263,7 @@ class _Poller:
         self._due_ns += (late + 1) * self._period_ns
 
 
-class RegisterSession:
+class RegisterSession(Session):
     """A bus with devices that reply, idle until :meth:`read`."""
 
     def __init__(
@@ -310,28 +304,30 @@ class RegisterSession:
                 )
 
 
-class RegisterDriver:
-    """See :class:`daq.devices.interface.DriverType`."""
+class RegisterDriver(Driver[RegisterSettings]):
+    """See :class:`daq.devices.interface.Driver`."""
 
     name = "registers"
     summary = "samples in Modbus registers, RTU or TCP (WitMotion, LabJack AIN, any other)"
     settings = RegisterSettings
-    shares_clock = False
+    of_the_port = ("timeout", "baud_rate", "parity", "stop_bits", "echo")
 
     def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:
         """Return the type of the values in the registers."""
-        return _Polled.of(sensor).registers.dtype
+        return self.check([sensor])[0].registers.dtype
 
-    def check(self, sensors: Sequence[Sensor]) -> None:
-        """See :meth:`daq.devices.interface.Checking.check`."""
-        _configured(sensors)
+    def check(self, sensors: Sequence[Sensor]) -> list[_Polled]:
+        """Return what is polled for each sensor."""
+        settings = self.typed(sensors)
+        require_address(sensors[0])
+        return [_Polled.of(sensor, settings[sensor.name]) for sensor in sensors]
 
     @contextlib.asynccontextmanager
     async def open(
         self, sensors: Sequence[Sensor], clock: HostClock
     ) -> AsyncIterator[RegisterSession]:
         """Open the bus and test which of its devices reply."""
-        polled = _configured(sensors)
+        polled = self.check(sensors)
         first = polled[0].settings
         async with open_bus(
             sensors[0].port,
@@ -347,13 +343,6 @@ class RegisterDriver:
                 {one.sensor.name: partial(one.prepare, bus) for one in polled}
             )
             yield RegisterSession(bus, clock, polled, information)
-
-
-def _configured(sensors: Sequence[Sensor]) -> list[_Polled]:
-    polled = [_Polled.of(sensor) for sensor in sensors]
-    require_address(sensors[0])
-    require_alike(sensors, {one.sensor.name: one.settings for one in polled}, OF_THE_BUS)
-    return polled
 
 
 DRIVER = RegisterDriver()

@@ -18,16 +18,17 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ssl
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 from urllib.parse import urlsplit
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, Strict
+from pydantic import Field, PositiveFloat, Strict
 
-from daq.devices.interface import DeviceInformation
-from daq.devices.port_rules import port_label, require_alike
+from daq.devices.interface import DeviceInformation, Driver, DriverSettings, Session
+from daq.devices.port_rules import port_label
 from daq.devices.seedlink import packets
 from daq.devices.seedlink.decoder import SeedLinkDecoder, Selection
 from daq.devices.shared_port import Presence
@@ -47,7 +48,6 @@ if TYPE_CHECKING:
     from contextlib import AbstractAsyncContextManager
 
     from daq.bench.model import Sensor
-    from daq.devices.interface import Session
     from daq.devices.seedlink.packets import Version
     from daq.host_clock import HostClock
     from daq.protocols.block import Block, Event, HostTime
@@ -56,17 +56,13 @@ if TYPE_CHECKING:
 PORT, TLS_PORT = USUAL_NUMBERS["seedlink"]
 SCHEME = "seedlink"
 REPLY_TIMEOUT = 10.0
-OF_THE_SERVER = ("protocol", "tls", "ca_file", "credentials", "late", "patience")
-"""Settings that all sensors of a port share."""
 
 Code = Annotated[str, Field(pattern=r"^[A-Z0-9]{1,8}$")]
 ChannelPattern = Annotated[str, Field(pattern=r"^[A-Z0-9?]{3}$")]
 
 
-class SeedLinkSettings(BaseModel):
+class SeedLinkSettings(DriverSettings, strict=True):
     """``[sensors.settings]`` of a station on a SeedLink server."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     network: Code
     """Code of the network, such as ``"GE"``."""
@@ -146,8 +142,10 @@ class SeedLinkSettings(BaseModel):
         return Selection(self.network, self.station, patterns, n_channels, rate)
 
 
-class SeedLinkSession:
+class SeedLinkSession(Session):
     """A server that sends; all streams of at least one sensor have been received."""
+
+    hint = "the server sends no records; check its digitizer"
 
     def __init__(
         self,
@@ -160,10 +158,7 @@ class SeedLinkSession:
         self.information = information
         self.decoder = link.decoder
         self.resumed = resumed
-        """Whether blocks continue the index of the session before."""
         self.patience = link.settings.patience
-        """See :class:`daq.devices.interface.PatientSession`."""
-        self.hint = "the server sends no records; check its digitizer"
         self._link = link
         self._buffered = buffered
 
@@ -193,17 +188,21 @@ class _Link:
     """The connection to a server, which is replaced when the server has a refused station."""
 
     def __init__(
-        self, sensors: Sequence[Sensor], clock: HostClock, decoder: SeedLinkDecoder
+        self,
+        planned: _Planned,
+        sensors: Sequence[Sensor],
+        clock: HostClock,
+        decoder: SeedLinkDecoder,
     ) -> None:
         self.clock = clock
         self.decoder = decoder
         self.label = port_label(sensors)
-        self.settings = SeedLinkSettings.model_validate(sensors[0].settings)
+        self.settings = planned.settings[sensors[0].name]
         self.refused: dict[str, str] = {}
         """Why the server refused the station of a sensor."""
         self.server: _Server
         self._first = sensors[0]
-        self._selections = _selections(sensors)
+        self._planned = planned
         self._found: list[Block | Event] = []
         self._stack = contextlib.AsyncExitStack()
 
@@ -254,7 +253,7 @@ class _Link:
     ) -> tuple[contextlib.AsyncExitStack, _Server, dict[str, str]]:
         """Connect; raise WrongDeviceError if the server refuses ``wanted``, or all stations."""
         settings, label = self.settings, self.label
-        host, number = _address(self._first)
+        host, number = self._planned.address
         tls = None
         if settings.is_encrypted(number):
             try:
@@ -270,56 +269,64 @@ class _Link:
             await server.greet(settings.protocol)
             if settings.credentials is not None:
                 await server.authenticate(settings.read_credentials(self._first))
-            refused = await server.choose(self._selections, self.decoder.last, wanted=wanted)
+            refused = await server.choose(
+                self._planned.selections, self.decoder.last, wanted=wanted
+            )
             return stack.pop_all(), server, refused
 
 
-class SeedLinkDriver:
-    """See :class:`daq.devices.interface.DriverType`."""
+class SeedLinkDriver(Driver[SeedLinkSettings]):
+    """See :class:`daq.devices.interface.Driver`."""
 
     name = "seedlink"
     summary = "SeedLink server: seismic digitizers (Centaur, Q330, Raspberry Shake, SeisComP)"
     settings = SeedLinkSettings
-    shares_clock = False
+    of_the_port = ("protocol", "tls", "ca_file", "credentials", "late", "patience")
 
     def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:
         """Return the type of the samples in the records."""
-        return np.dtype(SeedLinkSettings.model_validate(sensor.settings).samples)
+        return np.dtype(self.typed([sensor])[sensor.name].samples)
 
-    def check(self, sensors: Sequence[Sensor]) -> None:
-        """See :meth:`daq.devices.interface.Checking.check`."""
-        _selections(sensors)
+    def check(self, sensors: Sequence[Sensor]) -> _Planned:
+        """Return the plan of the server; raise BenchFileError if it is impossible."""
+        first, settings = sensors[0], self.typed(sensors)
+        common = settings[first.name]
+        host, number = _address(first, TLS_PORT if common.tls else PORT)
+        common.check_credentials(first, number)
+        selections = {one.name: settings[one.name].selection(one) for one in sensors}
+        return _Planned(settings, selections, (host, number))
 
     def open(
         self, sensors: Sequence[Sensor], clock: HostClock
     ) -> AbstractAsyncContextManager[SeedLinkSession]:
         """Connect, select stations, and listen until every stream has been received."""
-        return _opened(sensors, clock, None)
+        return _opened(self.check(sensors), sensors, clock, None)
 
     def resume(
         self, sensors: Sequence[Sensor], clock: HostClock, before: Session
     ) -> AbstractAsyncContextManager[SeedLinkSession]:
         """Open, and continue after the last received packets."""
-        return _opened(sensors, clock, before if isinstance(before, SeedLinkSession) else None)
+        last = before if isinstance(before, SeedLinkSession) else None
+        return _opened(self.check(sensors), sensors, clock, last)
 
 
-def _selections(sensors: Sequence[Sensor]) -> dict[str, Selection]:
-    settings = {s.name: SeedLinkSettings.model_validate(s.settings) for s in sensors}
-    require_alike(sensors, settings, OF_THE_SERVER)
-    _, number = _address(sensors[0])
-    settings[sensors[0].name].check_credentials(sensors[0], number)
-    return {s.name: settings[s.name].selection(s) for s in sensors}
+@dataclass(frozen=True, slots=True)
+class _Planned:
+    """Settings of one server in the bench file."""
+
+    settings: dict[str, SeedLinkSettings]
+    selections: dict[str, Selection]
+    address: tuple[str, int]
 
 
-def _address(sensor: Sensor) -> tuple[str, int]:
+def _address(sensor: Sensor, default: int) -> tuple[str, int]:
+    """Return host and number of a sensor's port, ``default`` if it has no number."""
     expected = "expected seedlink://host, or seedlink://host:port"
     fault = FileFault("port", expected, sensor.port, sensor.name)
     port = sensor.port.rstrip("/")
     if not port.startswith(f"{SCHEME}://"):
         raise BenchFileError(fault)
     try:
-        tls = SeedLinkSettings.model_validate(sensor.settings).tls
-        default = TLS_PORT if tls else PORT
         host, number = host_and_port(port if urlsplit(port).port else f"{port}:{default}")
     except ValueError as error:
         raise BenchFileError(fault) from error
@@ -328,21 +335,21 @@ def _address(sensor: Sensor) -> tuple[str, int]:
 
 @contextlib.asynccontextmanager
 async def _opened(
-    sensors: Sequence[Sensor], clock: HostClock, before: SeedLinkSession | None
+    planned: _Planned, sensors: Sequence[Sensor], clock: HostClock, before: SeedLinkSession | None
 ) -> AsyncIterator[SeedLinkSession]:
     decoder = before.decoder if before is not None else None
     if decoder is None:
-        dtypes = {s.name: SeedLinkDriver().counts_dtype(s) for s in sensors}
-        late = SeedLinkSettings.model_validate(sensors[0].settings).late
-        decoder = SeedLinkDecoder(_selections(sensors), dtypes, hold=late)
-    link = _Link(sensors, clock, decoder)
+        dtypes = {name: np.dtype(one.samples) for name, one in planned.settings.items()}
+        late = planned.settings[sensors[0].name].late
+        decoder = SeedLinkDecoder(planned.selections, dtypes, hold=late)
+    link = _Link(planned, sensors, clock, decoder)
     async with contextlib.aclosing(link):
         await link.open()
         buffered = link.taken()
         await _listen(link, buffered)
         yield SeedLinkSession(
             link,
-            information=_information(sensors, link),
+            information=_information(planned, sensors, link),
             buffered=buffered,
             resumed=before is not None,
         )
@@ -473,7 +480,9 @@ async def _listen(link: _Link, buffered: list[Block | Event]) -> None:
                 buffered += link.decoder.receive(received, at)
 
 
-def _information(sensors: Sequence[Sensor], link: _Link) -> tuple[DeviceInformation, ...]:
+def _information(
+    planned: _Planned, sensors: Sequence[Sensor], link: _Link
+) -> tuple[DeviceInformation, ...]:
     found, decoder, server, label = [], link.decoder, link.server, link.label
     for sensor in sensors:
         if trouble := link.refused.get(sensor.name):
@@ -485,7 +494,7 @@ def _information(sensors: Sequence[Sensor], link: _Link) -> tuple[DeviceInformat
             continue
         if sensor.name in decoder.silent:
             there = ", ".join(decoder.heard(sensor.name)) or "none"
-            settings = SeedLinkSettings.model_validate(sensor.settings)
+            settings = planned.settings[sensor.name]
             trouble = (
                 f"{label}: the {len(sensor.channels)} streams of {sensor.name!r} not received in"
                 f" {settings.patience:g} s; of {settings.network}.{settings.station} that match:"

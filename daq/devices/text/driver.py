@@ -15,18 +15,16 @@ from dataclasses import fields, replace
 from ipaddress import ip_address
 from typing import TYPE_CHECKING, Annotated, Literal, Protocol
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    PositiveFloat,
-    PositiveInt,
-    Strict,
-    field_validator,
-)
+from pydantic import Field, PositiveFloat, PositiveInt, Strict, field_validator
 
-from daq.devices.interface import DEFAULT_PATIENCE, DeviceInformation
-from daq.devices.port_rules import only
+from daq.devices.interface import (
+    DEFAULT_PATIENCE,
+    DeviceInformation,
+    Driver,
+    DriverSettings,
+    Session,
+)
+from daq.devices.port_rules import only, port_label
 from daq.devices.text.decoder import TextDecoder
 from daq.devices.text.format import (
     LILY,
@@ -54,10 +52,8 @@ if TYPE_CHECKING:
 PRESETS = {"raspberry-shake": RASPBERRY_SHAKE, "lily": LILY, "none": TextFormat()}
 
 
-class TextSettings(BaseModel):
+class TextSettings(DriverSettings, strict=True):
     """``[sensors.settings]`` of a device that sends text."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     preset: Literal["none", "raspberry-shake", "lily"] = "none"
     layout: Literal["row", "labelled", "json", "channel"] | None = None
@@ -237,7 +233,7 @@ class _DatagramSource:
         self._stream.discard()
 
 
-class TextSession:
+class TextSession(Session):
     """An open port; the device sends by itself or after the start command."""
 
     def __init__(
@@ -250,7 +246,6 @@ class TextSession:
     ) -> None:
         self.information = (information,)
         self.patience = settings.patience
-        """See :class:`daq.devices.interface.PatientSession`."""
         self._source = source
         self._settings = settings
         self._decoder = decoder
@@ -283,27 +278,28 @@ class TextSession:
                 yield item
 
 
-class TextDriver:
-    """See :class:`daq.devices.interface.DriverType`."""
+class TextDriver(Driver[TextSettings]):
+    """See :class:`daq.devices.interface.Driver`."""
 
     name = "text"
     summary = "Delimited text over serial, TCP or UDP (Raspberry Shake, LILY, any format)"
     settings = TextSettings
-    shares_clock = False
 
     def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:
         """Return int32 for integers, else float64."""
-        return TextSettings.model_validate(sensor.settings).format_for(sensor).dtype
+        return self.typed([sensor])[sensor.name].format_for(sensor).dtype
 
-    def check(self, sensors: Sequence[Sensor]) -> None:
-        """See :meth:`daq.devices.interface.Checking.check`."""
-        _checked(sensors)
+    def check(self, sensors: Sequence[Sensor]) -> tuple[Sensor, TextSettings, TextFormat]:
+        """Return the sensor, its settings and format; raise BenchFileError if they are invalid."""
+        sensor = only(sensors, "text comes from one")
+        settings = self.typed(sensors)[sensor.name]
+        _check_port(sensor, settings)
+        return sensor, settings, settings.format_for(sensor)
 
     @contextlib.asynccontextmanager
     async def open(self, sensors: Sequence[Sensor], clock: HostClock) -> AsyncIterator[TextSession]:
         """Open the port."""
-        sensor, settings, format_ = _checked(sensors)
-        label = f"sensor {sensor.name!r} on {sensor.port}"
+        sensor, settings, format_ = self.check(sensors)
         decoder = TextDecoder(
             sensor.name, format_, sampling_rate=sensor.sampling_rate, joins=not settings.start
         )
@@ -312,7 +308,7 @@ class TextDriver:
             model=sensor.model,
             details={"format": settings.preset if settings.preset != "none" else format_.layout},
         )
-        async with _opened(sensor, clock, settings, decoder, label=label) as source:
+        async with _opened(sensor, clock, settings, decoder, label=port_label(sensors)) as source:
             try:
                 yield TextSession(source, settings, information=information, decoder=decoder)
             finally:
@@ -321,10 +317,8 @@ class TextDriver:
                         await source.send(settings.stop.encode())
 
 
-def _checked(sensors: Sequence[Sensor]) -> tuple[Sensor, TextSettings, TextFormat]:
-    """Return the sensor, its settings and format; raise BenchFileError if they are invalid."""
-    sensor = only(sensors, "text comes from one")
-    settings = TextSettings.model_validate(sensor.settings)
+def _check_port(sensor: Sensor, settings: TextSettings) -> None:
+    """Raise BenchFileError for settings that do not apply to the port."""
     if settings.from_ is not None and not sensor.port.startswith("udp://"):
         expected = f"is for ports udp://…, not {sensor.port}: leave it out"
         raise BenchFileError(FileFault("settings.from", expected, settings.from_, sensor.name))
@@ -332,7 +326,6 @@ def _checked(sensors: Sequence[Sensor]) -> tuple[Sensor, TextSettings, TextForma
         if sensor.port.startswith("udp://") and (value := getattr(settings, key)):
             expected = f"nothing can be sent to {sensor.port}: leave it out"
             raise BenchFileError(FileFault(f"settings.{key}", expected, value, sensor.name))
-    return sensor, settings, settings.format_for(sensor)
 
 
 @contextlib.asynccontextmanager

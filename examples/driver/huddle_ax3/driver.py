@@ -7,11 +7,10 @@ import contextlib
 import re
 from typing import TYPE_CHECKING
 
-import numpy as np
-from pydantic import BaseModel, ConfigDict, PositiveInt
+from pydantic import PositiveInt
 
-from daq.devices.interface import DeviceInformation
-from daq.devices.port_rules import only
+from daq.devices.interface import DeviceInformation, Driver, DriverSettings, Session
+from daq.devices.port_rules import only, port_label
 from daq.errors import BenchFileError, DeviceError, FileFault, NoAnswerError, WrongDeviceError
 from daq.transport.ports import open_port
 from huddle_ax3.protocol import FRAME, RATES, Decoder
@@ -31,16 +30,14 @@ BLOCK_SECONDS = 0.1
 """Seconds of samples that are read together."""
 
 
-class AX3Settings(BaseModel):
+class AX3Settings(DriverSettings, strict=True):
     """``[sensors.settings]`` of an AX3."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     baud_rate: PositiveInt = 115200
     """Of the serial port."""
 
 
-class AX3Session:
+class AX3Session(Session):
     """An AX3 that has been identified and set up. It is quiet until `read`."""
 
     def __init__(
@@ -68,21 +65,15 @@ class AX3Session:
                 yield item
 
 
-class AX3Driver:
-    """See `daq.devices.interface.DriverType`."""
+class AX3Driver(Driver[AX3Settings]):
+    """See `daq.devices.interface.Driver`."""
 
     name = "ax3"
     summary = "AX3 triaxial accelerometers on a serial port or TCP (an example)"
     settings = AX3Settings
-    shares_clock = False
 
-    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:
-        """Return the type of the recorded counts."""
-        del sensor
-        return np.dtype(np.int32)
-
-    def check(self, sensors: Sequence[Sensor]) -> None:
-        """Refuse what no AX3 does; see `daq.bench.driver_rules.Checking`."""
+    def check(self, sensors: Sequence[Sensor]) -> tuple[Sensor, AX3Settings]:
+        """Refuse what no AX3 does; return the only sensor and its settings."""
         sensor = only(sensors, "an AX3 needs a port of its own")
         if sensor.sampling_rate not in RATES:
             expected = f"expected one of {', '.join(map(str, RATES))} Hz"
@@ -94,14 +85,13 @@ class AX3Driver:
             raise BenchFileError(
                 FileFault("channels", expected, f"{len(sensor.channels)} channels", sensor.name)
             )
+        return sensor, self.typed(sensors)[sensor.name]
 
     @contextlib.asynccontextmanager
     async def open(self, sensors: Sequence[Sensor], clock: HostClock) -> AsyncIterator[AX3Session]:
         """Open the port, identify the device and set its rate; stop it on exit."""
-        self.check(sensors)
-        sensor = sensors[0]
-        settings = AX3Settings.model_validate(sensor.settings)
-        label = f"sensor {sensor.name!r} on {sensor.port}"
+        sensor, settings = self.check(sensors)
+        label = port_label(sensors)
         async with open_port(
             sensor.port, clock, label=label, baud_rate=settings.baud_rate
         ) as stream:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class SdkDriver(AX3Driver):
-    """See `daq.devices.interface.DriverType`."""
+    """See `daq.devices.interface.Driver`."""
 
     name = "ax3-sdk"
     summary = "AX3 through its SDK (an example of a library that blocks)"

@@ -16,13 +16,13 @@ from daq.conformance.suite import DriverConformance, Sent, Served
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from daq.devices.interface import DriverType
+    from daq.devices.interface import AnyDriver
 
 
 class TestAX3(DriverConformance):
     """Every test of the suite."""
 
-    driver: ClassVar[DriverType] = DRIVER
+    driver: ClassVar[AnyDriver] = DRIVER
     seconds: ClassVar[float] = 1.0
 
     @contextlib.asynccontextmanager

@@ -18,10 +18,11 @@ from daq.devices import bench_file
 from daq.errors import BenchFileError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
-    from daq.bench.model import Bench
-    from daq.devices.interface import DriverType
+    from daq.bench.model import Bench, Sensor
+    from daq.devices.interface import AnyDriver
 
 
 class _Settings(BaseModel):
@@ -32,16 +33,17 @@ class _Settings(BaseModel):
 
 @dataclass(frozen=True)
 class _Driver:
-    """As much of a DriverType as a bench file needs."""
+    """As much of a driver as a bench file needs."""
 
     name: str
     shares_clock: bool = False
     settings: type[BaseModel] = _Settings
 
+    def check(self, sensors: Sequence[Sensor]) -> None:
+        """Accept all sensors."""
 
-DRIVERS = cast(
-    "dict[str, DriverType]", {"serial": _Driver("serial"), "scan": _Driver("scan", True)}
-)
+
+DRIVERS = cast("dict[str, AnyDriver]", {"serial": _Driver("serial"), "scan": _Driver("scan", True)})
 
 HEAD = """\
 name = "floor"

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, cast
 
 from daq.errors import NoAnswerError
 from daq.protocols.block import Block, Event
-from daq.recorder.connection import patience_of
 from tests.devices import host_clock
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterator, Sequence
 
     from daq.bench.model import Sensor
-    from daq.devices.interface import DriverType, Session
+    from daq.devices.interface import AnyDriver, Session
     from daq.protocols.block import DeviceItem
 
 
@@ -25,7 +24,7 @@ LEAST_PATIENCE = 5.0
 
 @contextlib.asynccontextmanager
 async def reading(
-    driver: DriverType, sensors: Sequence[Sensor], *, speed: float = 1.0
+    driver: AnyDriver, sensors: Sequence[Sensor], *, speed: float = 1.0
 ) -> AsyncIterator[AsyncIterator[DeviceItem]]:
     """Open a session and its reading; both are closed on exit."""
     async with (
@@ -37,7 +36,7 @@ async def reading(
 
 async def _patiently(session: Session, speed: float) -> AsyncGenerator[DeviceItem]:
     """Yield what the session yields, until nothing has come for as long as it states."""
-    patience = max(LEAST_PATIENCE, patience_of(session) / speed)
+    patience = max(LEAST_PATIENCE, session.patience / speed)
     loop = asyncio.get_running_loop()
     async with contextlib.aclosing(cast("AsyncGenerator[DeviceItem]", session.read())) as items:
         deadline = loop.time() + patience
@@ -48,16 +47,17 @@ async def _patiently(session: Session, speed: float) -> AsyncGenerator[DeviceIte
             except TimeoutError as error:
                 if isinstance(error, NoAnswerError):
                     raise
-                hint = getattr(session, "hint", "")
                 sensor = session.information[0].sensor
-                raise NoAnswerError(f"{sensor!r}: nothing for {patience:g} s; {hint}") from error
+                raise NoAnswerError(
+                    f"{sensor!r}: nothing for {patience:g} s; {session.hint}"
+                ) from error
             if isinstance(item, Block):
                 deadline = loop.time() + patience
             yield item
 
 
 async def record(
-    driver: DriverType, sensor: Sensor, n_samples: int, *, speed: float = 1.0
+    driver: AnyDriver, sensor: Sensor, n_samples: int, *, speed: float = 1.0
 ) -> tuple[list[Block], list[Event]]:
     """Return the blocks of one sensor up to a sample, and the events until then."""
     blocks: list[Block] = []

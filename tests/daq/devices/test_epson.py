@@ -12,7 +12,7 @@ from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.devices.epson import commands
 from daq.devices.epson.commands import CommandDecoder, Read, Write
-from daq.devices.epson.device import Configuration, Device
+from daq.devices.epson.device import Configuration, Device, EpsonSettings
 from daq.devices.epson.driver import EpsonSession
 from daq.devices.interface import DeviceInformation
 from daq.errors import NoAnswerError
@@ -85,7 +85,7 @@ async def test_window_and_command_are_separate_writes_with_the_required_interval
     strict = StrictDevice()
     device = Device(SENSOR, cast("ByteStream", strict))
     assert await device.read(commands.ID) == commands.DEVICE_ID
-    await device.configure(Configuration.of(SENSOR))
+    await device.configure(Configuration.of(SENSOR, EpsonSettings(**SENSOR.settings)))
     assert await device.sampling_rate() == 200.0
     assert strict.n_ignored == 0
 
@@ -157,7 +157,7 @@ async def test_frames_before_a_restart_have_their_arrival_time(
 ) -> None:
     """Seven of fifty wait in the kernel until the device is found to be silent."""
     monkeypatch.setattr("daq.devices.epson.driver.ASK_AFTER", 0.3)
-    configuration = Configuration.of(SENSOR)
+    configuration = Configuration.of(SENSOR, EpsonSettings(**SENSOR.settings))
     zeros = np.zeros(57, np.int32)
     frames = commands.encode_bursts(configuration.burst, x=zeros, count=np.arange(57))
     stream = cast("ByteStream", Restarted(frames, configuration.burst.size, n_lost))

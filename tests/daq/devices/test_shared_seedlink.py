@@ -15,7 +15,6 @@ from daq.bench.model import Sensor
 from daq.conformance import suite
 from daq.conformance.suite import DriverConformance, Served
 from daq.devices import shared_port
-from daq.devices.interface import Resuming
 from daq.devices.registry import driver_type
 from daq.devices.seedlink import driver
 from daq.devices.seedlink.packets import PacketFinder
@@ -139,7 +138,6 @@ async def _opened(
 ) -> tuple[Session, contextlib.AsyncExitStack, Reader, asyncio.Task[None]]:
     stack = contextlib.AsyncExitStack()
     bench = sensors(server.port)
-    assert isinstance(DRIVER, Resuming)
     opened: AbstractAsyncContextManager[Session] = (
         DRIVER.open(bench, SystemClock())
         if before is None

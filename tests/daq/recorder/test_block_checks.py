@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -12,9 +12,6 @@ import pytest
 from daq.protocols.block import Event, HostTime, Reading
 from daq.recorder.block_checks import BlockValidator, FaultyDriverError
 from tests.scripted_driver import PlayedDriver, bench, block
-
-if TYPE_CHECKING:
-    from daq.devices.interface import DriverType
 
 NOW = HostTime(10**9, 10**18)
 FAULTY: dict[str, tuple[dict[str, Any], str]] = {
@@ -39,9 +36,7 @@ FAULTY: dict[str, tuple[dict[str, Any], str]] = {
 
 
 def checked() -> BlockValidator:
-    return BlockValidator(
-        cast("DriverType", PlayedDriver()), bench("a", "b", a="bus", b="bus").sensors
-    )
+    return BlockValidator(PlayedDriver(), bench("a", "b", a="bus", b="bus").sensors)
 
 
 @pytest.mark.parametrize("case", FAULTY)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from daq.devices.interface import DriverType
     from daq.recorder.connection import Item
 
 LOST_BY = (EventKind.STALLED, EventKind.DISCONNECTED, EventKind.REFUSED)
@@ -72,7 +71,7 @@ class Run:
 def running(path: Path) -> Iterator[Run]:
     clock = ManualClock()
     (sensor,) = bench("a").sensors
-    layout = SensorLayout.of(sensor, cast("DriverType", PlayedDriver()))
+    layout = SensorLayout.of(sensor, PlayedDriver())
     writer = RecordingWriter.create(path, sensors=[layout], created=clock.now())
     try:
         with Recording.open(path) as recording:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
 
     from daq.bench.model import Sensor
-    from daq.devices.interface import DriverType
     from daq.host_clock import HostClock
     from daq.recorder.connection import Item
 
@@ -68,7 +67,7 @@ async def test_a_stall_is_reported_before_the_driver_closes_its_session() -> Non
     """A LabJack is told to stop its stream, and one that is gone takes 2 s not to answer."""
     device = PlayedDevice()
     driver = SlowToLeave({"A": device})
-    connection = Connection(cast("DriverType", driver), bench("A").sensors, ManualClock())
+    connection = Connection(driver, bench("A").sensors, ManualClock())
     queue: asyncio.Queue[Item] = asyncio.Queue()
     go = asyncio.Event()
     go.set()
@@ -103,7 +102,7 @@ async def test_delays_grow_for_a_device_that_connects_only_briefly() -> None:
     """One block is no success: it would be set up anew five times a second, for weeks."""
     device, clock = PlayedDevice(), ManualClock()
     driver = PlayedDriver({"A": device})
-    connection = Connection(cast("DriverType", driver), bench("A").sensors, clock)
+    connection = Connection(driver, bench("A").sensors, clock)
     queue: asyncio.Queue[Item] = asyncio.Queue()
     go = asyncio.Event()
     go.set()
@@ -148,7 +147,7 @@ async def kinds_of(
     driver: PlayedDriver, device: PlayedDevice, clock: ManualClock, pauses: Sequence[float]
 ) -> list[str]:
     """Return what is said of a device that sends a block after each pause, connected or not."""
-    connection = Connection(cast("DriverType", driver), bench("A").sensors, clock)
+    connection = Connection(driver, bench("A").sensors, clock)
     queue: asyncio.Queue[Item] = asyncio.Queue()
     go = asyncio.Event()
     go.set()
@@ -209,7 +208,7 @@ async def test_learned_intervals_are_passed_to_the_next_session() -> None:
     device = PlayedDevice()
     driver = driver_with(device, 1.0)
     clock = ManualClock()
-    connection = Connection(cast("DriverType", driver), bench("A").sensors, clock)
+    connection = Connection(driver, bench("A").sensors, clock)
     queue: asyncio.Queue[Item] = asyncio.Queue()
     go = asyncio.Event()
     go.set()
@@ -239,7 +238,7 @@ async def test_a_suspended_computer_ends_the_session_of_a_device_that_does_not_c
     device = PlayedDevice()
     clock = ManualClock()
     driver = PlayedDriver({"A": device})
-    connection = Connection(cast("DriverType", driver), bench("A").sensors, clock)
+    connection = Connection(driver, bench("A").sensors, clock)
     clock.suspended = -0.2  # a busy computer was held up between its two clocks
     queue: asyncio.Queue[Item] = asyncio.Queue()
     go = asyncio.Event()

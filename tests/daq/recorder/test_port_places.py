@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -14,7 +14,6 @@ from daq.transport.serial_ports import SerialPort
 from tests.scripted_driver import ManualClock, PlayedDevice, PlayedDriver, bench, block
 
 if TYPE_CHECKING:
-    from daq.devices.interface import DriverType
     from daq.recorder.connection import Item
 
 pytestmark = pytest.mark.virtual_time
@@ -62,9 +61,7 @@ async def run(usb: Usb, serial_number: str = "1") -> tuple[Connection, asyncio.Q
     device = PlayedDevice(serial_number=serial_number)
     usb.plug("/dev/ttyUSB0", usb.ports.get("/dev/ttyUSB0", FTDI_1), device)
     sensors = bench("A", A="/dev/ttyUSB0").sensors
-    connection = Connection(
-        cast("DriverType", usb.driver), sensors, ManualClock(), find_ports=usb.find
-    )
+    connection = Connection(usb.driver, sensors, ManualClock(), find_ports=usb.find)
     return connection, asyncio.Queue()
 
 

@@ -17,7 +17,7 @@ import pytest
 from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.devices.epson import commands
-from daq.devices.epson.device import Configuration, Device
+from daq.devices.epson.device import Configuration, Device, EpsonSettings
 from daq.devices.epson.driver import EpsonSession
 from daq.devices.interface import DeviceInformation
 from daq.devices.registry import driver_type
@@ -219,7 +219,7 @@ async def test_reads_of_an_epson_return_to_the_ends_of_frames() -> None:
     """Else every block's time is late by most of a sample period, until the host is late once."""
     channels = tuple(Channel(name=axis, sensitivity=1.0) for axis in "xyz")
     sensor = Sensor(name="A", driver="epson", port="x", sampling_rate=50.0, channels=channels)
-    configuration = Configuration.of(sensor)
+    configuration = Configuration.of(sensor, EpsonSettings())
     zeros = np.zeros(20, np.int32)
     sent = commands.encode_bursts(
         configuration.burst, x=zeros, y=zeros, z=zeros, count=np.arange(20)
