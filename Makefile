@@ -24,6 +24,9 @@ $(VENV)/.installed-docs: $(VENV)/.installed
 demo: $(VENV)/.installed  ## the whole huddle test on a simulated bench, over its real protocols
 	$(BIN)/huddle demo
 
+# The workers share the cores: threads of linear algebra would wait for each other in loops.
+test test-long: export OPENBLAS_NUM_THREADS := 1
+
 test: $(VENV)/.installed-dev  ## the tests but the long ones; three at a time on two cores, for many wait for their devices
 	$(BIN)/pytest -n 3
 
