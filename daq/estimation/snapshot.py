@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from daq.recording.interface import ReadableSensor
     from estimator.self_noise.result import SelfNoise
     from estimator.spectra.multiresolution import Band
+    from estimator.spectra.parts import Parts
     from estimator.spectra.segment_rejection import Reason
 
     FloatArray = NDArray[np.float64]
@@ -258,6 +259,8 @@ class Snapshot:
     shortened : mapping of str to (float, float)
         By how many seconds sensors that begin late, and that end early, shorten the span, by name
         of the sensor. Of all recordings together.
+    parts : Parts or None
+        The same averages in parts of time. Of a finished estimate; None where they are not kept.
     """
 
     frequency: FloatArray
@@ -292,6 +295,7 @@ class Snapshot:
     simulated: bool = False
     channel_segments: tuple[int, ...] = ()
     shortened: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    parts: Parts | None = None
 
     @property
     def sensor_names(self) -> tuple[str, ...]:

@@ -345,6 +345,7 @@ class SnapshotBuilder:
             channel_segments=_segments_of(sets, n_segments if raw else 0, first.n_channels),
             octaves=_octaves(bands, sets) if self._settings.octaves else (),
             shortened=_shortened(passes),
+            parts=bands[0].parts if final and len(bands) == 1 else None,
             diagnostics=replace(diagnostics, beside=estimates.beside),
             no_segment=None if sets else _no_segment(passes, self._settings.segment),
             nonlinear=nonlinear,

@@ -9,7 +9,7 @@ from daq.recording.storage.journal import journal_path
 if TYPE_CHECKING:
     from pathlib import Path
 
-RUN_SUFFIXES = (".json", ".csv", ".csv-metadata.json", ".html", ".pdf", ".sig")
+RUN_SUFFIXES = (".json", ".csv", ".csv-metadata.json", ".html", ".pdf", ".sig", ".extremes")
 """Suffixes of the other files of a recording, which are also removed."""
 
 

@@ -27,6 +27,7 @@ SUFFIXES = (".svg", ".png", ".pdf")
     "huddle plot night.h5 -o noise.svg",
     "huddle plot night.h5 -o noise.pdf --models nlnm,nhnm --width 85",
     "huddle plot night.h5 -o noise.png --method all --models brochure.csv",
+    "huddle plot night.h5 -o night.png --signal --start 2h --end 2h30min",
 )
 @with_estimate_options
 def plot(
@@ -46,6 +47,14 @@ def plot(
         float,
         typer.Option("--width", metavar="MM", min=80, max=500, help="Width of the figure in mm."),
     ] = 180.0,
+    signal: Annotated[
+        bool,
+        typer.Option(
+            "--signal",
+            help="Draw the waveforms of all channels with marks, events and gaps, and spectrograms"
+            " of the recorded PSD and of the noise, from --start to --end.",
+        ),
+    ] = False,
     start: StartOption = None,
     end: EndOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
@@ -65,9 +74,48 @@ def plot(
         raise typer.BadParameter(f"{out}: expected a file name that ends in .svg, .png or .pdf")
     check_places(str(out))
     masks = masks_named(models)
+    if signal:
+        _plot_signal(files, out, width=width / 25.4, start=start, end=end, **wanted)
+        return
     result = estimated(files, start=start, end=end, whole=True, **wanted)
     from tui.report.figures.curves import write_figure
 
     with notices().status("drawing"):
         write_figure(result, out, models=masks, width=width / 25.4)
+    console().print(f"{out} written", soft_wrap=True)
+
+
+def _plot_signal(
+    files: list[Path],
+    out: Path,
+    *,
+    width: float,
+    start: str | None,
+    end: str | None,
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
+) -> None:
+    """Draw the first recording against time; without spectra of the noise if there is no noise."""
+    from daq.estimation.snapshot import NoResultError
+    from daq.recording.reader import Recording
+    from daq.results.signal import Signal
+    from estimator.errors import EstimatorError
+    from tui.output.console import console, notices
+    from tui.report.figures.curves import write_plots
+    from tui.report.figures.signal import signal_plots
+    from tui.runs.estimate_settings import settings_of
+
+    snapshot = None
+    try:
+        snapshot = estimated(files, start=start, end=end, **wanted).snapshot
+    except NoResultError as error:
+        snapshot = error.snapshot
+    except EstimatorError:
+        pass
+    with Recording.open(files[0]) as recording, notices().status("drawing"):
+        settings = settings_of(recording, start=start, end=end)
+        signal = Signal(recording)
+        ends = zip((settings.start, settings.end), signal.span, strict=True)
+        begin, last = (each if given is None else given.timestamp() for given, each in ends)
+        plots = signal_plots(signal, snapshot, (begin, last))
+        write_plots(plots, out, width=width, title=f"{files[0].name} against time")
     console().print(f"{out} written", soft_wrap=True)

@@ -18,13 +18,18 @@ from daq.bench.loading import parse
 from daq.bench.masks.mask import NOISE_MODELS, Mask
 from daq.bench.masks.mask_file import masks_named
 from daq.errors import WrongSettingError
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.recording.reader import Recording
 from daq.results.result import Result
+from daq.results.signal import Signal
 from estimator.self_noise.result import Flag
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
 from tests.tui.night_recording import record
 from tui.commands.main import app
 from tui.report.figures import drawing
 from tui.report.figures.curves import MODEL_RANGE_DB, noise_plots, write_figure
+from tui.report.figures.signal import signal_plots
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -237,3 +242,23 @@ def test_of_one_sensor_the_psd_is_drawn() -> None:
     shared = Figure().subplots()
     alone.plot(ax=shared)
     assert [line.get_label() for line in shared.lines] == ["A.1", "A.2"]
+
+
+def test_a_recording_against_time(tmp_path: Path) -> None:
+    """The same file each time, with every channel and times of UTC; spectra if they are known."""
+    path = record(tmp_path / "night.h5")
+    files = []
+    for name in ("a.svg", "b.svg"):
+        arguments = ["plot", str(path), "--signal", "-o", str(tmp_path / name)]
+        assert CliRunner().invoke(app, arguments).exit_code == 0
+        files.append((tmp_path / name).read_bytes())
+    assert files[0] == files[1]
+    with Recording.open(path) as recording, drawing.look():
+        signal = Signal(recording)
+        snapshot = estimate([path], Settings(segment=1.0))
+        waveforms, *spectra = signal_plots(signal, snapshot)
+        (axes,) = drawing.alone(waveforms, 7.1).axes
+        titles = [each.get_title(loc="left") for each in drawing.alone(spectra[0], 7.1).axes]
+    assert [label.get_text() for label in axes.get_yticklabels()][:2] == ["A.X", "A.Y"]
+    assert axes.get_xlabel() == "UTC, from 2016-07-14"
+    assert [each.partition(", ")[2][:5] for each in titles] == ["recor", "noise"]

@@ -423,25 +423,37 @@ def write_figure(
     OSError
         If the file cannot be written; an earlier one stays.
     """
+    plots = noise_plots(result, models, width=width)
+    if not plots:
+        raise InsufficientDataError(
+            "no noise estimate by any method: nothing can be drawn; the PSD is written by"
+            " huddle estimate FILE --csv psd.csv"
+        )
+    write_plots(plots, path, width=width, title=_TITLE)
+
+
+def write_plots(plots: Sequence[Plot], path: Path, *, width: float, title: str) -> None:
+    """Write plots below each other as a figure with a title; as `write_figure`.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written; an earlier one stays.
+    """
     kind = path.suffix.lower().removeprefix(".")
+    about: dict[str, str | None] = {"Title": title, **_ABOUT[kind]}
     content = io.BytesIO()
     with look(), mpl.rc_context({"svg.fonttype": "path"}):
-        plots = noise_plots(result, models, width=width)
-        if not plots:
-            raise InsufficientDataError(
-                "no noise estimate by any method: nothing can be drawn; the PSD is written by"
-                " huddle estimate FILE --csv psd.csv"
-            )
         figure = Figure(figsize=(width, stack_height(plots)), facecolor="white")
         stack(plots, figure)
-        figure.savefig(content, format=kind, dpi=RESOLUTION, metadata=_ABOUT[kind])
+        figure.savefig(content, format=kind, dpi=RESOLUTION, metadata=about)
     write_whole(path, content.getvalue())
 
 
 _TITLE = "Self-noise of every channel, one-sided power spectral density"
 _ABOUT: dict[str, dict[str, str | None]] = {
-    "svg": {"Title": _TITLE, "Creator": "huddle", "Date": None},
-    "png": {"Title": _TITLE, "Software": "huddle"},
-    "pdf": {"Title": _TITLE, "Creator": "huddle", "Producer": None, "CreationDate": None},
+    "svg": {"Creator": "huddle", "Date": None},
+    "png": {"Software": "huddle"},
+    "pdf": {"Creator": "huddle", "Producer": None, "CreationDate": None},
 }
 """What a file says of itself; no date, so that the same estimate gives the same file."""

@@ -1,0 +1,157 @@
+"""A recording against time: waveforms of all channels, marks, and spectrograms, as a figure."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+from daq.protocols.block import EventKind
+from daq.results.signal import CLIPPED, EXCLUDED, GAP
+from tui.report.figures import drawing
+from tui.report.parts import Plot
+from tui.wording.signal import extent, moment, time_ticks, title
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from matplotlib.axes import Axes
+
+    from daq.estimation.snapshot import Snapshot
+    from daq.results.signal import Mark, Signal, SignalView, Spectrogram, Trace
+
+COLUMNS, TIMES, BANDS, TICKS = 1200, 160, 60, 6
+TRACE_HEIGHT, SPECTRUM_HEIGHT = 0.36, 0.7
+"""Of each waveform and each spectrogram, in inches."""
+_COLOURS = {GAP: drawing.LIMIT, CLIPPED: drawing.LINES[1], EXCLUDED: drawing.QUANTISATION}
+_MOST_REMARKS = 12
+_CYCLE = 0.42
+"""Half height of a waveform, of the distance from one to the next."""
+
+
+def signal_plots(
+    signal: Signal, snapshot: Snapshot | None, span: tuple[float, float] | None = None
+) -> list[Plot]:
+    """Return waveforms with marks, then the PSD of every channel and of its noise by time.
+
+    Parameters
+    ----------
+    signal : Signal
+    snapshot : Snapshot, optional
+        Without it there are no spectrograms of longer recordings, nor of the noise.
+    span : (float, float), optional
+        UTC in s since 1970; default: all.
+
+    Raises
+    ------
+    RecordingError
+        If the file is damaged.
+    """
+    begin, end = span or signal.span
+    view = signal.view(begin, end, COLUMNS)
+    height = TRACE_HEIGHT * (len(view.traces) + 0.7)
+    alt = f"Waveforms of {len(view.traces)} channels, {title(view)}"
+    draw = partial(_draw_waveforms, view)
+    plots = [Plot(f"Recorded, {title(view)}", (draw,), 1, height, alt)]
+    for number, trace in enumerate(view.traces):
+        if not trace.is_auxiliary:
+            plots.extend(_spectra(signal, snapshot, number, trace, (begin, end)))
+    return plots
+
+
+def _spectra(
+    signal: Signal,
+    snapshot: Snapshot | None,
+    number: int,
+    trace: Trace,
+    span: tuple[float, float],
+) -> Iterator[Plot]:
+    panels = []
+    for noise, name in ((False, "recorded"), (True, "noise")):
+        found = signal.spectrogram(number, span, TIMES, BANDS, snapshot=snapshot, noise=noise)
+        if found is not None:
+            panels.append(_Spectrum(found, span, f"{trace.name}, {name}"))
+    if panels:
+        alt = f"Power spectral density of {trace.name} against time and frequency"
+        yield Plot("", tuple(panels), 2, SPECTRUM_HEIGHT, alt, titled=True)
+
+
+def _time_axis(axes: Axes, span: tuple[float, float], most: int = TICKS) -> None:
+    ticks = dict(time_ticks(*span, most))
+    axes.set_xlim(*span)
+    axes.xaxis.set_major_locator(FixedLocator(list(ticks)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda at, _: ticks.get(at, "")))
+
+
+def _draw_waveforms(view: SignalView, axes: Axes) -> None:
+    times = np.linspace(view.begin, view.end, 2 * view.n_columns + 1)[1::2]
+    for row, trace in enumerate(view.traces):
+        low, high = trace.scaled
+        axes.fill_between(
+            times,
+            _CYCLE * low - row,
+            _CYCLE * high - row,
+            color=drawing.NOISE if not trace.is_auxiliary else drawing.DATA,
+            linewidth=0.4,
+        )
+    for row, trace in enumerate(view.traces):
+        place = 0.998, _CYCLE - row
+        across = "axes fraction", "data"
+        axes.annotate(extent(trace), place, xycoords=across, ha="right", va="bottom", size=5)
+    for mark in view.marks:
+        _draw_mark(axes, mark, (view.end - view.begin) / view.n_columns)
+    remarks = [mark for mark in view.marks if mark.kind == EventKind.MARK]
+    for number, mark in enumerate(remarks[:_MOST_REMARKS]):
+        axes.annotate(f" {mark.text}", (mark.begin, 0.95 - 0.22 * (number % 2)), va="top", size=5.5)
+    axes.set_ylim(-len(view.traces) + 0.5, 1.0)
+    axes.yaxis.set_major_locator(FixedLocator([-row for row in range(len(view.traces))]))
+    names = [trace.name for trace in view.traces]
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda at, _: names[round(-at)]))
+    axes.grid(visible=False, axis="y")
+    _time_axis(axes, (view.begin, view.end), 2 * TICKS)
+    axes.set_xlabel(f"UTC, from {moment(view.begin)[:10]}")
+
+
+def _draw_mark(axes: Axes, mark: Mark, column: float) -> None:
+    colour = _COLOURS.get(mark.kind)
+    if colour is not None:
+        axes.axvspan(mark.begin, max(mark.end, mark.begin + column), color=colour, alpha=0.35, lw=0)
+    else:
+        is_remark = mark.kind == EventKind.MARK
+        width, dashes = (0.7, (4, 2)) if is_remark else (0.4, (1, 2))
+        axes.axvline(mark.begin, color=drawing.INK, lw=width, dashes=dashes)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Spectrum:
+    """Draws a spectrogram."""
+
+    found: Spectrogram
+    span: tuple[float, float]
+    name: str
+
+    def __call__(self, axes: Axes) -> None:
+        found, (low, high) = self.found, self.found.range_db
+        axes.set_title(f"{self.name}, {low:.0f} to {high:.0f} dB".replace("-", "−"))
+        axes.pcolormesh(
+            found.times,
+            np.log10(found.frequency),
+            found.level_db.T,
+            cmap="viridis",
+            vmin=low,
+            vmax=high,
+            rasterized=True,
+        )
+        axes.grid(visible=False)
+        ends = np.log10(found.frequency[[0, -1]])
+        decades = range(math.ceil(ends[0]), math.floor(ends[1]) + 1)
+        axes.set_ylim(*ends)
+        axes.yaxis.set_major_locator(FixedLocator(list(decades)))
+        axes.yaxis.set_minor_locator(NullLocator())
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda at, _: f"{10**at:g}"))
+        axes.set_ylabel("Hz")
+        _time_axis(axes, self.span, TICKS // 2)
