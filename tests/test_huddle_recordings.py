@@ -13,8 +13,8 @@ import huddle
 from daq.errors import ArrayError, WrongSettingError
 from tests.daq.archive.day_files import write_station
 from tests.test_huddle import RATE, command, imported, triaxial
-from tui.output.console import finite
 from tui.output.json_document import calibration_document
+from tui.output.json_values import json_text
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -202,8 +202,7 @@ def test_commands_are_functions_with_their_numbers(tmp_path: Path) -> None:
     assert found.reference == 0
     again = huddle.calibrate(path, segment="1s", confidence=0.99)
     assert again.confidence == 0.99
-    stated = finite(calibration_document(found, result.snapshot))
-    assert json.loads(json.dumps(stated)) == told
+    assert json.loads(json_text(calibration_document(found, result.snapshot))) == told
     for suffix in (".csv", ".npz", ".nc"):
         huddle.export(result, tmp_path / f"a{suffix}")
         kind = "netcdf" if suffix == ".nc" else suffix[1:]

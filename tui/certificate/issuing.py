@@ -21,8 +21,8 @@ from tui.certificate.dcc import NAME as DCC_NAME
 from tui.certificate.dcc import dcc
 from tui.certificate.ledger import HeadSigner
 from tui.certificate.verification import JSON_NAME, verified
-from tui.output.console import finite
 from tui.output.json_document import document
+from tui.output.json_values import json_text
 from tui.report.certificate import SPECIMEN, Issue, changes, missing
 from tui.report.contents import report_of
 from tui.report.evidence import invalidating
@@ -396,7 +396,7 @@ def _result(
                 for each in stated
             ],
         }
-    return json.dumps(finite(text), ensure_ascii=False, allow_nan=False).encode()
+    return json_text(text).encode()
 
 
 def _pdf(report: Report, result: bytes, xml: bytes, at: datetime) -> bytes:

@@ -94,7 +94,6 @@ def check_bench(path: Path, *, devices: bool, write: bool = False, json: str | N
     from daq.devices.bench_file import is_simulated, load
     from daq.preflight.device_check import Examination
     from tui.output.console import for_people, write_json
-    from tui.output.json_values import plain
     from tui.wording.facts import SIMULATED
 
     bench = load(path)
@@ -125,7 +124,7 @@ def check_bench(path: Path, *, devices: bool, write: bool = False, json: str | N
         {
             "bench": bench.name,
             "simulated": simulated,
-            "sensors": plain(found),
+            "sensors": found,
             "checks": check_list.document(examined.rows),
             "errors": [str(error) for error in examined.errors],
         },
@@ -208,12 +207,11 @@ def check_port(port: str, *, json: str | None) -> None:
     from daq.preflight.device_check import discover, search_description
     from daq.transport.ports import is_simulated
     from tui.output.console import for_people, write_json
-    from tui.output.json_values import plain
     from tui.wording.facts import SIMULATED
 
     found = asyncio.run(discover(port, SystemClock()))
     simulated = is_simulated(port)
-    write_json(json, {"port": port, "simulated": simulated, "devices": plain(found)})
+    write_json(json, {"port": port, "simulated": simulated, "devices": found})
     if not found:
         raise NoAnswerError(
             f"port {port}: no reply as {search_description(port)}; check power and cable; for other"

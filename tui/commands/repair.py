@@ -23,11 +23,12 @@ def repair(
 
     All acknowledged samples are kept. Samples not acknowledged are removed.
     """
+    from dataclasses import asdict
+
     from rich.table import Table
 
     from daq.recording.repair import repair, verify
     from tui.output.console import for_people, write_json
-    from tui.output.json_values import plain
 
     report = verify(path) if check else repair(path)
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
@@ -47,6 +48,6 @@ def repair(
     screen.print(table)
     state = "being written" if report.being_written else "closed" if report.closed else "not closed"
     screen.print(f"{path}: {state}")
-    write_json(json, plain(report) | {"path": str(path)})
+    write_json(json, asdict(report) | {"path": str(path)})
     if not report.intact:
         raise RecordingError(f"{path}: acknowledged blocks are damaged")

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json as json_text
 import math
 import sys
 from typing import TYPE_CHECKING, Any
@@ -100,7 +99,6 @@ class _Lines:
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
         from daq.results.result import Result
         from tui.output.console import console
-        from tui.output.json_values import plain
         from tui.wording.facts import why_no_estimate
         from tui.wording.formatting import clock_time
 
@@ -112,7 +110,7 @@ class _Lines:
             if self._json is None:
                 console().print(f"{clock_time(snapshot.elapsed)}  {reason}", soft_wrap=True)
             else:
-                self._write({"no_segment": plain(snapshot.no_segment), "text": reason})
+                self._write({"no_segment": snapshot.no_segment, "text": reason})
         if (
             before is not None
             and not snapshot.closed
@@ -131,11 +129,11 @@ class _Lines:
         pass
 
     def _write(self, document: dict[str, Any]) -> None:
-        from tui.output.console import finite, write_text
+        from tui.output.console import write_text
+        from tui.output.json_values import json_text
 
         if self._json is not None:
-            line = json_text.dumps(finite(document), ensure_ascii=False) + "\n"
-            write_text(self._json, line, append=True)
+            write_text(self._json, json_text(document) + "\n", append=True)
 
 
 def _line(result: Result, now: RecordingStatus | None) -> str:
@@ -155,7 +153,6 @@ def _update(result: Result, now: RecordingStatus | None) -> dict[str, Any]:
     """Return the update for programs: states, noise in the band, verdict."""
     from daq.bench.end_condition import NEVER
     from tui.output.json_document import verdict_document
-    from tui.output.json_values import plain
 
     snapshot, until = result.snapshot, NEVER if now is None else now.until
     elapsed = snapshot.elapsed if now is None else now.elapsed
@@ -181,8 +178,8 @@ def _update(result: Result, now: RecordingStatus | None) -> dict[str, Any]:
             }
             for sensor in (() if now is None else now.sensors)
         },
-        "left_out": plain(snapshot.left_out),
-        **plain(verdict_document(result.verdict)),
+        "left_out": snapshot.left_out,
+        **verdict_document(result.verdict),
     }
     if snapshot.results:
         document["band_hz"] = result.band

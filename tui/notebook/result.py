@@ -465,8 +465,10 @@ class Result:
             If a recording cannot be read any more.
         """
         from tui.output.json_document import document  # noqa: PLC0415 - seldom needed
+        from tui.output.json_values import plain  # noqa: PLC0415
 
-        return document(self.result)
+        found: dict[str, Any] = plain(document(self.result))
+        return found
 
 
 def _quantile(confidence: float) -> float:

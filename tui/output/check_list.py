@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 from rich.text import Text
 
 from daq.preflight.findings import Check, Outcome, Problem
-from tui.output.json_values import plain
 from tui.wording.formatting import listed
 from tui.wording.vocabulary import CAUSES
 
@@ -144,10 +143,10 @@ def document(rows: Iterable[CheckRow]) -> list[dict[str, Any]]:
         text = PASSED[row.check] if row.finding is None else sentence(row.finding)
         found.append(
             {
-                "check": row.check.value,
-                "outcome": row.outcome.value,
+                "check": row.check,
+                "outcome": row.outcome,
                 "text": text,
-                "finding": plain(row.finding),
+                "finding": row.finding,
             }
         )
     return found

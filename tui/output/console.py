@@ -6,11 +6,9 @@ otherwise be taken for markup and emoji. Colour is asked for with ``style=`` or 
 
 from __future__ import annotations
 
-import json
-import math
 import os
 import sys
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -204,69 +202,12 @@ def growing(file: str | None, *, append: bool = False) -> Iterator[Callable[[str
         raise
 
 
-_ENCODER = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
-
-
-def json_text(document: Any) -> str:  # noqa: ANN401 - any JSON value
-    """Return a document as one line of JSON; infinite numbers become null."""
-    return _ENCODER.encode(finite(document))
-
-
 def write_json(file: str | None, document: Mapping[str, Any]) -> None:
     """Write a document as one line of JSON, if a file is given; infinite numbers become null."""
     if file is None:
         return
+    from tui.output.json_values import json_text  # noqa: PLC0415 - loads numpy and pydantic
+
     with growing(file) as write:
-        for part in _json_parts(document, depth=_IN_PARTS):
-            write(part)
+        write(json_text(document))
         write("\n")
-
-
-_IN_PARTS = 4  # depth to which JSON is written in parts: by frequency in tables of all pairs
-_TOGETHER = 1 << 12  # numbers of a part, about, where entries are alike
-
-
-def _json_parts(value: Any, *, depth: int) -> Iterator[str]:  # noqa: ANN401 - any JSON value
-    """Yield `json_text` in parts: of many sensors all of it takes more memory than the numbers."""
-    is_list = isinstance(value, list)
-    first = value[0] if is_list and value else None
-    if not (depth and value and (isinstance(value, dict) or isinstance(first, (dict, list)))):
-        yield json_text(value)
-        return
-    n_together = _TOGETHER // _n_values(first) if is_list else 1
-    if n_together > 1:
-        for begin in range(0, len(value), n_together):
-            text = json_text(value[begin : begin + n_together])
-            yield (", " if begin else "[") + text[1:-1]
-        yield "]"
-        return
-    for number, entry in enumerate(value):
-        yield (", " if number else "[" if is_list else "{")
-        if not is_list:
-            yield f"{json_text(str(entry))}: "
-        yield from _json_parts(entry if is_list else value[entry], depth=depth - 1)
-    yield "]" if is_list else "}"
-
-
-def _n_values(value: Any) -> int:  # noqa: ANN401 - any JSON value
-    """Return about how many values there are, where entries of a list are alike."""
-    if isinstance(value, dict):
-        return 1 + sum(map(_n_values, value.values()))
-    return 1 + len(value) * _n_values(value[0]) if isinstance(value, list) and value else 1
-
-
-def finite(value: Any) -> Any:  # noqa: ANN401 - any JSON value
-    """Return a JSON value with null for every number that is not finite."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {key: finite(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):  # of numbers, mostly: no call for each
-        with suppress(TypeError, OverflowError):  # texts, nulls, lists; large integers
-            if all(map(math.isfinite, value)):
-                return value
-        return [
-            (entry if math.isfinite(entry) else None) if type(entry) is float else finite(entry)
-            for entry in value
-        ]
-    return value

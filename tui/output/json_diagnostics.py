@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 from daq.results.sources import uncounted_events
 from estimator.checks.shared_noise import MAX_CHANNELS
 from estimator.self_noise.result import Flag
-from tui.output.json_values import plain
 
 if TYPE_CHECKING:
     from daq.clocks.clock_model import ClockSetting, ClockState
@@ -75,7 +74,7 @@ def diagnostics_document(snapshot: Snapshot) -> dict[str, Any]:
     ):
         if by_column:
             document[key] = {snapshot.channels[n].name: value for n, value in by_column.items()}
-    return {key: plain(value) for key, value in document.items()}
+    return document
 
 
 def _octave(each: Octave) -> dict[str, Any]:

@@ -55,18 +55,18 @@ def result_document(snapshot: Snapshot, method: str) -> dict[str, Any]:
         "method": method,
         "segments": snapshot.n_segments,
         "effective_averages": snapshot.n_effective,
-        "frequency_hz": snapshot.frequency.tolist(),
+        "frequency_hz": snapshot.frequency,
         "channels": [
             {
                 "sensor": label.sensor,
                 "channel": label.channel,
                 "unit": label.unit,
-                "data_psd": data[:, column].tolist(),
-                "noise_psd": noise.noise_psd[:, column].tolist(),
-                "noise_psd_low": noise.low[:, column].tolist(),
-                "noise_psd_high": noise.high[:, column].tolist(),
-                "cov": noise.cov[:, column].tolist(),
-                "flags": noise.flags[:, column].tolist(),
+                "data_psd": data[:, column],
+                "noise_psd": noise.noise_psd[:, column],
+                "noise_psd_low": noise.low[:, column],
+                "noise_psd_high": noise.high[:, column],
+                "cov": noise.cov[:, column],
+                "flags": noise.flags[:, column],
             }
             for column, label in enumerate(snapshot.channels)
         ],
@@ -100,7 +100,7 @@ def document(
     whole["facts"] = facts_document(known(result, with_verdict=True))
     whole["band_means"] = _band_means(result)
     if noise_parameters is not None:
-        whole["noise_parameters"] = plain(noise_parameters_document(noise_parameters))
+        whole["noise_parameters"] = noise_parameters_document(noise_parameters)
     return whole
 
 
@@ -402,7 +402,7 @@ def calibration_document(found: Calibration, snapshot: Snapshot) -> dict[str, An
     """Return a calibration as JSON (docs/json.md)."""
     names = snapshot.sensor_names
     curves = {each.sensor: each for each in found.curves}
-    document = {
+    return {
         "reference": names[found.reference],
         "is_absolute": bool(found.certificates),
         "certificates": [
@@ -430,14 +430,14 @@ def calibration_document(found: Calibration, snapshot: Snapshot) -> dict[str, An
                     snapshot, names[each.sensor], names[found.reference]
                 ),
                 **{
-                    key: {"value": value.value.tolist(), "standard_error": value.error.tolist()}
+                    key: {"value": value.value, "standard_error": value.error}
                     for key, value in _calibrated(each).items()
                 },
                 "curve": {
-                    "frequency_hz": curves[each.sensor].frequency.tolist(),
-                    "real": curves[each.sensor].matrix.real.tolist(),
-                    "imag": curves[each.sensor].matrix.imag.tolist(),
-                    "standard_error": curves[each.sensor].error.tolist(),
+                    "frequency_hz": curves[each.sensor].frequency,
+                    "real": curves[each.sensor].matrix.real,
+                    "imag": curves[each.sensor].matrix.imag,
+                    "standard_error": curves[each.sensor].error,
                 },
             }
             for each in found.sensors
@@ -468,7 +468,6 @@ def calibration_document(found: Calibration, snapshot: Snapshot) -> dict[str, An
             for each in found.budgets
         ],
     }
-    return {key: plain(value) for key, value in document.items()}
 
 
 def _calibrated(each: SensorCalibration) -> dict[str, Value]:

@@ -8,6 +8,7 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
+from pydantic_core import to_json
 
 
 def plain(value: Any) -> Any:  # noqa: ANN401 - any result
@@ -26,3 +27,22 @@ def plain(value: Any) -> Any:  # noqa: ANN401 - any result
     if isinstance(value, list | tuple):
         return [plain(entry) for entry in value]
     return value
+
+
+def json_text(document: Any) -> str:  # noqa: ANN401 - any result
+    """Return a result as one line of JSON; numbers that are not finite become null.
+
+    Every number is read back as it was. Arrays become lists row by row: of many sensors, lists take
+    more memory than all else.
+
+    Raises
+    ------
+    PydanticSerializationError
+        The document holds what is no result, or a text that is not Unicode.
+    """
+    return to_json(document, inf_nan_mode="null", fallback=_by_row).decode()
+
+
+def _by_row(value: Any) -> Any:  # noqa: ANN401 - any result
+    is_table = isinstance(value, np.ndarray) and value.ndim > 1 and not np.iscomplexobj(value)
+    return list(value) if is_table else plain(value)

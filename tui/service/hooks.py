@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import logging
 import os
 import re
@@ -16,8 +15,7 @@ import signal
 import sys
 from typing import TYPE_CHECKING, Any
 
-from tui.output.console import finite
-from tui.output.json_values import plain
+from tui.output.json_values import json_text
 from tui.service.records.run_state import Run, RunState
 from tui.service.records.store import StoreError
 
@@ -54,7 +52,7 @@ def hook_document(run: Run, event: str, folder: Path) -> dict[str, Any]:
     document["recordings"] = [str(folder / part) for part in run.parts]
     result = (folder / run.parts[-1]).with_suffix(".json") if run.parts else None
     document["result"] = str(result) if result is not None and result.exists() else None
-    document["noise"] = plain(run.noise)
+    document["noise"] = run.noise
     return document
 
 
@@ -103,7 +101,7 @@ class HookRunner:
         command: tuple[str, ...] | None = getattr(hooks, event, None)
         if command is None:  # no longer in the bench file
             return
-        document = json.dumps(finite(hook_document(run, event, self._folder))).encode() + b"\n"
+        document = json_text(hook_document(run, event, self._folder)).encode() + b"\n"
         for attempt in range(hooks.retries + 1):
             problem = await run_hook(command, document, hooks.timeout)
             if not problem:

@@ -42,7 +42,7 @@ from estimator.errors import EstimatorError
 from tui.application.plan import TestPlan
 from tui.application.test_view.units import units_of
 from tui.certificate.ledger import LedgerError
-from tui.output.console import finite
+from tui.output.json_values import json_text
 from tui.output.results import averages_line, curves_csv
 from tui.service.records.places import file_name
 from tui.web.access import (
@@ -593,7 +593,7 @@ class Server:
             request,
             self._tests.reading,
             None,
-            lambda: json.dumps(finite(self._tests.document(state)), ensure_ascii=False),
+            lambda: json_text(self._tests.document(state)),
         )
         return _download(found.encode(), "application/json", f"{state.name}.json")
 

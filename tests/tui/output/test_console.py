@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 import subprocess
 from pathlib import Path
 
@@ -20,11 +18,9 @@ from tui.commands.main import app
 from tui.commands.record import progress_line
 from tui.output.console import (
     console,
-    json_text,
     notices,
     progress,
     reserve_standard_error,
-    write_json,
     write_text,
 )
 
@@ -46,14 +42,6 @@ def test_a_recorder_on_a_terminal_says_when_it_ends() -> None:
     for state in SensorState:
         status = RecorderStatus("a.h5", 20.0, {"A": SensorProgress(state, 4000, 0, 0)})
         assert (f"A 4000 {state}" in progress_line(status)) is state.is_overdue
-
-
-def test_json_in_parts_is_that_of_the_whole(tmp_path: Path) -> None:
-    out, deep = tmp_path / "one.json", [[[[[1.0, math.inf], "é"]], []], {"a": {"b": {"c": {}}}}]
-    document = {"deep": deep, "rows": [[0.5, None], (2, True)], "none": {}}
-    write_json(str(out), document)
-    assert out.read_text(encoding="utf-8") == json_text(document) + "\n"
-    assert json.loads(json_text(document))["rows"] == [[0.5, None], [2, True]]
 
 
 def test_lines_are_appended(tmp_path: Path) -> None:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import fields, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
+import pytest
 
 from daq.results.decision.verdict import LimitResult, TestVerdict
 from daq.results.facts import Fact, WrongSensitivity
@@ -18,15 +21,19 @@ from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
 from tests.tui.example_snapshot import SETTINGS, diagnosed, judged, made_snapshot
 from tests.tui.wording.fact_examples import EXAMPLES, kinds
-from tui.output.console import finite
+from tui.output.console import write_json
 from tui.output.json_document import UNITS, document, result_document
+from tui.output.json_values import json_text
 from tui.wording.verdict_text import headline, what_to_do
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 def test_advice_has_its_kind_its_numbers_and_its_words() -> None:
     change = np.eye(9)
     change[5, 5] = -1
-    found = json.loads(json.dumps(finite(document(Result(diagnosed(change), SETTINGS)))))
+    found = json.loads(json_text(document(Result(diagnosed(change), SETTINGS))))
     diagnostics = found["results"][0]["diagnostics"]
     by_kind = {
         fact["numbers"]["findings"][0]["kind"]: fact
@@ -71,7 +78,7 @@ def test_what_is_not_known_is_left_out() -> None:
             untested=Untested.TOO_FEW_SENSORS,
         ),
     )
-    told = json.loads(json.dumps(finite(result_document(faulty, "three-sensor"))))["diagnostics"]
+    told = json.loads(json_text(result_document(faulty, "three-sensor")))["diagnostics"]
     assert told["clipped_share"] == {"B.Y": 0.25}
     assert told["stood_still_s"] == {"A.X": 3.0}
     assert told["excluded_by_reason"] == {"gap": 2, "transient": 0}
@@ -83,6 +90,28 @@ def test_what_is_not_known_is_left_out() -> None:
         "reference",
     }
     assert told["synchronisation"]["residual_s"]["C"] == 0.6e-6
+
+
+def test_every_number_is_read_as_it_was(tmp_path: Path) -> None:
+    bits = np.random.default_rng(0).integers(0, 1 << 64, 5000, dtype=np.uint64)
+    of_any_size, file = bits.view(float), tmp_path / "numbers.json"
+    single = np.array([[0.1, math.inf]], dtype=np.float32)
+    write_json(
+        str(file),
+        {"any": of_any_size, "two": (single, 1j * single[:, :1]), "é": {Reason.GAP: None}},
+    )
+    text = file.read_text(encoding="utf-8")
+    found = json.loads(text, parse_constant=pytest.fail)
+    assert text.endswith("}\n")
+    read = np.array(found.pop("any"), float)
+    finite = np.isfinite(of_any_size)
+    np.testing.assert_array_equal(read[finite].view(np.uint64), bits[finite])
+    assert np.all(np.isnan(read[~finite]))
+    tenth = float(single[0, 0])
+    turned = {"real": [[0.0]], "imag": [[tenth]]}
+    assert found == {"two": [[[tenth, None]], turned], "é": {"gap": None}}
+    with pytest.raises(ValueError, match="serial"):
+        json_text({"of no result": object()})
 
 
 DIMENSIONLESS = {

@@ -27,9 +27,9 @@ from tests.tui.wording.fact_examples import EXAMPLES, kinds
 from tui.application.result_view.result_text import result
 from tui.application.state import State
 from tui.application.test_view.panels import findings
-from tui.output.console import finite
 from tui.output.diagnosis import details
 from tui.output.json_document import document
+from tui.output.json_values import json_text
 from tui.report.contents import report_of
 from tui.wording.facts import MOST_LINES, Known, brief, known, word
 from tui.wording.findings import Names
@@ -94,7 +94,7 @@ def test_every_renderer_shows_every_kind(recorded: Path, monkeypatch: pytest.Mon
         ),
         "notebook": " ".join(map(str, known(Result(snapshot, Settings())))),
     }
-    entries = json.loads(json.dumps(finite(document(Result(snapshot, SETTINGS))["facts"])))
+    entries = json.loads(json_text(document(Result(snapshot, SETTINGS))["facts"]))
     words_of = {fact.name: word(fact, Names.of(snapshot)) for fact in EXAMPLES}
     for renderer, text in shown.items():
         for words in words_of.values():

@@ -16,10 +16,10 @@ import numpy as np
 from daq.archive.answers import facts_of_archive
 from daq.archive.density import LOWEST_DB
 from tui.output.archive.tables import day_text
-from tui.output.console import growing, json_text
+from tui.output.console import growing
 from tui.output.csv_text import csv_text
 from tui.output.json_document import document, facts_document
-from tui.output.json_values import plain
+from tui.output.json_values import json_text
 from tui.wording.facts import worded
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def archive_json(answer: Answer, store: Store, n_recordings: int, wrong: Sequenc
     }
     of_days = {
         "date": [day_text(int(day)) for day in answer.days_utc_ns],
-        "segments": plain(answer.n_segments),
+        "segments": answer.n_segments,
     }
     levels = answer.levels
     arrays = {
@@ -173,10 +173,10 @@ def _segments(course: Course, answer: Answer) -> list[dict[str, Any]]:
         {
             "first_day": day_text(int(answer.days_utc_ns[each.begin])),
             "last_day": day_text(int(answer.days_utc_ns[each.end - 1])),
-            "change_db": None if step is None else plain(step),
-            "noise_psd": plain(each.mean),
-            "drift_db_per_year": plain(each.drift),
-            "work_minus_night_db": plain(each.contrast),
+            "change_db": step,
+            "noise_psd": each.mean,
+            "drift_db_per_year": each.drift,
+            "work_minus_night_db": each.contrast,
             "work_minus_night_days": each.contrast_days,
         }
         for step, each in zip((None, *course.steps), course.segments, strict=True)
@@ -187,9 +187,9 @@ def _density(density: Density) -> dict[str, Any]:
     return {
         "stretches": density.n_stretches,
         "short_stretches": density.n_short,
-        "frequency_hz": plain(density.frequency),
+        "frequency_hz": density.frequency,
         "lowest_db": LOWEST_DB,
-        "counts": plain(density.counts),
-        "not_positive": plain(density.not_positive),
-        "percentile_db": {str(p): plain(density.percentile(p / 100)) for p in PERCENTILES},
+        "counts": density.counts,
+        "not_positive": density.not_positive,
+        "percentile_db": {str(p): density.percentile(p / 100) for p in PERCENTILES},
     }

@@ -61,10 +61,8 @@ class JsonFormatter(logging.Formatter):
             "logger": record.name,
             "message": record.getMessage(),
         }
-        entry |= fields_of(record)
-        from tui.output.console import finite
-
-        return json.dumps(finite(entry), default=str)
+        text = json.dumps(entry | fields_of(record), default=str)
+        return json.dumps(json.loads(text, parse_constant=lambda _: None))  # NaN is no JSON
 
 
 def fields_of(record: logging.LogRecord) -> dict[str, Any]:

@@ -31,8 +31,9 @@ from daq.results.result import Result
 from daq.results.store import store_results
 from daq.whole_file import remove_parts
 from estimator.errors import EstimatorError
-from tui.output.console import finite, write_json
+from tui.output.console import write_json
 from tui.output.json_document import document
+from tui.output.json_values import json_text
 from tui.output.logs.lines import configure
 from tui.output.logs.options import LogFormat
 from tui.runs.estimate_settings import chosen
@@ -198,7 +199,7 @@ def _finished(request: Request, progress: Callable[[], object]) -> Outcome:
             "verdict": verdict,
             "noise": [asdict(each) for each in noise],
         }
-        about_run = {RUN: json.dumps(finite(record))}
+        about_run = {RUN: json_text(record)}
     try:  # first into the recording, whatever becomes of other files
         store_results(last, snapshot, about=about_run)
     except HuddleError as error:
@@ -329,7 +330,7 @@ def main() -> None:
     configure(style=LogFormat.JSON)
     found = json.loads(sys.argv[1])
     request = Request(**found | {"bands": tuple((low, high) for low, high in found["bands"])})
-    sys.stdout.write(json.dumps(finite(asdict(finish(request, _Heartbeat())))))
+    sys.stdout.buffer.write(json_text(asdict(finish(request, _Heartbeat()))).encode())
 
 
 if __name__ == "__main__":
