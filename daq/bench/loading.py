@@ -19,6 +19,7 @@ from daq.bench.model import Bench
 from daq.bench.tables.toml_text import checked_table
 from daq.bench.validation import cross_faults
 from daq.errors import BenchFileError, FileFault
+from daq.foreign_files import SUFFIXES, import_command, is_foreign
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -44,13 +45,23 @@ def load(path: str | Path, drivers: Mapping[str, DriverRules] | None = None) -> 
         problem = f"cannot be read: {error.strerror or error}; expected a bench file"
         raise BenchFileError(FileFault("", problem), source=source) from None
     except UnicodeDecodeError as error:
-        if source.suffix.lower() in {".h5", ".hdf5"}:
-            found = "is a recording"
-        else:
-            found = f"byte {error.start} is not UTF-8 text"
-        fault = FileFault("", f"{found}; expected a bench file (.toml)")
+        if is_foreign(source):
+            raise _of_another_program(source) from None
+        fault = FileFault("", "is a recording; expected a bench file (.toml)")
+        if source.suffix.lower() not in {".h5", ".hdf5"}:
+            fault = FileFault("", f"byte {error.start} is not UTF-8 text; expected a bench file")
         raise BenchFileError(fault, source=source) from None
-    return parse(text, source, drivers)
+    try:
+        return parse(text, source, drivers)
+    except BenchFileError:
+        if source.suffix.lower() in SUFFIXES:
+            raise _of_another_program(source) from None
+        raise
+
+
+def _of_another_program(source: Path) -> BenchFileError:
+    problem = f"not a bench file (.toml); convert it to a recording: {import_command([source])}"
+    return BenchFileError(FileFault("", problem), source=source)
 
 
 def parse(

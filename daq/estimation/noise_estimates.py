@@ -359,8 +359,8 @@ def responses(frequency: FloatArray, channels: Channels, unit: str) -> ComplexAr
         if alike not in known:
             with np.errstate(divide="ignore", invalid="ignore"):
                 known[alike] = 1 / conversion(channel.unit, unit, frequency)
-            if channel.response is not None:
-                known[alike] = known[alike] * channel.response.at(frequency)
+                if channel.response is not None:
+                    known[alike] = known[alike] * channel.response.at(frequency)
         response[:, column] = known[alike]
     return response
 

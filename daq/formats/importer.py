@@ -22,6 +22,7 @@ from daq.bench.option_fit import misfits
 from daq.bench.units import canonical
 from daq.errors import ImportFormatError, WrongSettingError
 from daq.formats.assembly import Columns
+from daq.formats.defaults import from_files, still_chosen
 from daq.formats.memory import RecordingInMemory, SensorInMemory
 from daq.formats.miniseed_export import SIMULATED_COMMENT
 from daq.formats.readers.fdsn import FDSN, fetch
@@ -32,7 +33,7 @@ from daq.recording.array_writer import BLOCK_ROWS, ArrayWriter
 from daq.recording.file_format import SIMULATED, SensorLayout
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from daq.bench.estimate_settings import EstimateSettings
     from daq.formats.foreign_sensor import ForeignSensor, Stretch
@@ -77,12 +78,15 @@ class ImportResult:
         Channels that were not imported, with the reason.
     calibrations : tuple of Taken
         What every channel's counts are taken to be.
+    chosen : dict of str to str
+        By field of the settings: what was chosen from responses and rates, and why.
     """
 
     sensors: tuple[Imported, ...]
     problems: tuple[str, ...] = ()
     left_aside: dict[str, str] = field(default_factory=dict)
     calibrations: tuple[Taken, ...] = ()
+    chosen: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +121,7 @@ def import_files(
     response: Path | Sequence[Path] = (),
     response_for: Sequence[tuple[str, Path]] = (),
     sampling_rate: float | None = None,
-    estimate: EstimateSettings | None = None,
+    estimate: Callable[[EstimateSettings], EstimateSettings] | None = None,
     selection: Selection | None = None,
 ) -> ImportResult:
     """Write a recording from files of other programs.
@@ -142,9 +146,9 @@ def import_files(
         Patterns of channels, and the file whose response they take whatever its code is.
     sampling_rate : float, optional
         In Hz, where a file does not say.
-    estimate : EstimateSettings, optional
-        How the recording is to be estimated, unless said otherwise later; as the bench says, if not
-        given.
+    estimate : callable, optional
+        Changes how the recording is to be estimated: as the bench says or, without one, as
+        responses and rates suggest.
     selection : Selection, optional
         Channels, span of time, and what is done where files overlap.
 
@@ -215,7 +219,7 @@ def _import(
     bench: Bench | None,
     response_for: Sequence[tuple[str, Path]],
     sampling_rate: float | None,
-    estimate: EstimateSettings | None,
+    estimate: Callable[[EstimateSettings], EstimateSettings] | None,
     selection: Selection | None,
 ) -> ImportResult:
     opened = open_sources(sources.files, selection, sampling_rate=sampling_rate)
@@ -223,7 +227,14 @@ def _import(
     if bench is not None:
         found = _ordered(found, bench)
     described, taken = _all_described(found, bench, responses_in(sources.responses, response_for))
-    written = _bench(out, bench, tuple(described.values()), estimate)
+    sensors = tuple(described.values())
+    suggested, reasons = (
+        _suggested(tuple(found.values()), sensors) if bench is None else (bench.estimate, {})
+    )
+    settings = suggested if estimate is None else estimate(suggested)
+    if estimate is not None:
+        _refuse_misfits(settings, sensors)
+    written = _bench(out, bench, sensors, settings)
     start = min(sensor.stretches[0].start_utc_ns for sensor in found.values())
     with ArrayWriter(
         out,
@@ -239,6 +250,7 @@ def _import(
         opened.problems,
         opened.left_aside,
         taken,
+        still_chosen(reasons, suggested, settings),
     )
 
 
@@ -478,18 +490,28 @@ def _matched(foreign: ForeignSensor, listed: Sensor) -> Sequence[Channel]:
 
 
 def _bench(
-    out: Path, bench: Bench | None, sensors: tuple[Sensor, ...], estimate: EstimateSettings | None
+    out: Path, bench: Bench | None, sensors: tuple[Sensor, ...], estimate: EstimateSettings
 ) -> Bench:
     if bench is None:
         rate = min(sensor.sampling_rate for sensor in sensors)
         bench = Bench(name=_bench_name(out), sampling_rate=rate, sensors=sensors)
-    changes: dict[str, object] = {"sensors": sensors}
-    if estimate is not None:
-        misfit = next(misfits(estimate, sensors), None)
-        if misfit is not None:
-            raise WrongSettingError(f"{misfit.name} {misfit.value}: {misfit.expected}")
-        changes["estimate"] = estimate
+    changes = {"sensors": sensors, "estimate": estimate}
     return parse(dump(bench.model_copy(update=changes)), str(out))
+
+
+def _refuse_misfits(estimate: EstimateSettings, sensors: Sequence[Sensor]) -> None:
+    misfit = next(misfits(estimate, sensors), None)
+    if misfit is not None:
+        raise WrongSettingError(f"{misfit.name} {misfit.value}: {misfit.expected}")
+
+
+def _suggested(
+    found: Sequence[ForeignSensor], described: Sequence[Sensor]
+) -> tuple[EstimateSettings, dict[str, str]]:
+    shortest = min(
+        sum(stretch.n_samples for stretch in each.stretches) / each.sampling_rate for each in found
+    )
+    return from_files(described, shortest)
 
 
 def _bench_name(out: Path) -> str:

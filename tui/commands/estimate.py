@@ -5,17 +5,24 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from daq.foreign_files import import_command, is_foreign
 from tui.commands.options import (
+    ChannelsOption,
     CsvOption,
     DiagnosticsOption,
     EndOption,
     FilesArgument,
     JsonOption,
+    ResponseForOption,
+    ResponseOption,
     StartOption,
     examples,
     with_estimate_options,
@@ -39,6 +46,7 @@ if TYPE_CHECKING:
     "huddle estimate night.h5 --segment 60s --overlap 0.75 --json - --csv noise.csv",
     "huddle estimate night.h5 --octaves --dimension auto --details",
     "huddle estimate night.h5 --noise-parameters",
+    "huddle estimate *.mseed --response station.xml",
 )
 @with_estimate_options
 def estimate(
@@ -57,23 +65,45 @@ def estimate(
     ] = False,
     json: JsonOption = None,
     csv: CsvOption = None,
+    response: ResponseOption = None,
+    response_for: ResponseForOption = None,
+    channels: ChannelsOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Estimate the self-noise of every channel from recordings.
 
     Options not given come from the bench file inside the recording.
+
+    Files of other programs are read as huddle import reads them, and nothing
+    is stored. Segment, band and unit then follow from the responses and rates.
     """
     from tui.output.console import check_places, hint
 
     check_places(json, csv)
-    result = estimated(files, start=start, end=end, whole=noise_parameters, **wanted)
+    if any(map(is_foreign, files)):
+        result = _of_foreign_files(
+            files,
+            _Foreign(tuple(response or ()), tuple(response_for or ()), tuple(channels or ())),
+            json=json or csv,
+            start=start,
+            end=end,
+            **wanted,
+        )
+        hint(f"For a recording and reports: {import_command(files)}")
+    elif response or response_for or channels:
+        raise typer.BadParameter(
+            f"{files[0]}: a recording holds its responses and channels; expected --response,"
+            " --response-for and --channels with files of other programs"
+        )
+    else:
+        result = estimated(files, start=start, end=end, whole=noise_parameters, **wanted)
+        hint(f"For a report: huddle report {files[0]}")
     parameters = None
     if noise_parameters:
         from daq.results.noise_parameters import noise_parameters as parameters_of
 
         parameters = parameters_of(result, result.bench)
     show_result(result, json=json, csv=csv, diagnostics=diagnostics, parameters=parameters)
-    hint(f"For a report: huddle report {files[0]}")
     exit_with(result.verdict)
 
 
@@ -95,6 +125,58 @@ def exit_with(found: TestVerdict | None) -> None:
         raise typer.Exit(ExitCode.NOT_DECIDED)
 
 
+@dataclass(frozen=True, slots=True)
+class _Foreign:
+    """What is taken from files of other programs."""
+
+    response: tuple[Path, ...]
+    response_for: tuple[str, ...]
+    channels: tuple[str, ...]
+
+
+def _of_foreign_files(
+    files: Sequence[Path],
+    taken: _Foreign,
+    *,
+    json: str | None,
+    start: str | None,
+    end: str | None,
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
+) -> Result:
+    """Estimate files of other programs as if they were imported, without a recording."""
+    from daq.errors import ImportFormatError
+    from daq.estimation.estimation import estimate
+    from daq.formats.defaults import from_files, still_chosen
+    from daq.formats.importer import open_files
+    from daq.results.result import Result
+    from tui.commands.import_ import assigned, selected, show_chosen, show_taken
+    from tui.output.console import for_people
+    from tui.runs.estimate_settings import check_fit, chosen_for_files, spanned
+
+    screen = for_people(json)
+    with TemporaryDirectory(prefix="huddle-") as folder, _counted_segments() as count:
+        try:
+            recording, imported = open_files(
+                files,
+                Path(folder),
+                response=taken.response,
+                response_for=[assigned(text) for text in taken.response_for],
+                selection=selected(channels=taken.channels),
+            )
+        except ImportFormatError as error:
+            more = f"for options of such files: {import_command(files)}"
+            raise ImportFormatError(f"{error}\n{more}") from None
+        show_taken(imported, screen)
+        lengths = (each.n_samples / each.sampling_rate for each in recording.sensors)
+        suggested, reasons = from_files(recording.sensors, min(lengths))
+        settings = chosen_for_files(suggested, **wanted)
+        show_chosen(still_chosen(reasons, suggested, settings), screen)
+        check_fit(settings, recording.sensors)
+        began = datetime.fromtimestamp(recording.created_at.utc_ns / 1e9, tz=UTC)
+        settings = spanned(settings, began, start=start, end=end)
+        return Result(estimate([recording], settings, progress=count), settings)
+
+
 def estimated(
     files: Sequence[Path],
     *,
@@ -107,11 +189,16 @@ def estimated(
 
     The whole bench takes as long to read as to estimate: without limits only where it is wanted.
     """
+    from daq.errors import NotARecordingError
     from daq.estimation.estimation import estimate
     from daq.recording.reader import Recording
     from daq.results.result import Result
     from tui.runs.estimate_settings import settings_of
 
+    if any(map(is_foreign, files)):
+        raise NotARecordingError(
+            f"{files[0]}: not a huddle recording; convert it: {import_command(files)}"
+        )
     with (
         Recording.open(files[0]) as first,  # once, for its settings and for the estimate
         _counted_segments() as count,

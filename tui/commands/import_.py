@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -27,7 +28,9 @@ from tui.commands.options import (
 from tui.output.exit_codes import ExitCode
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
+
+    from rich.console import Console
 
     from daq.formats.importer import ImportResult
     from daq.formats.sources import Selection
@@ -165,10 +168,10 @@ def import_(
 def selected(
     *,
     channels: Sequence[str],
-    start: str | None,
-    end: str | None,
-    overlap: str | None,
-    codes: tuple[str, str, str],
+    start: str | None = None,
+    end: str | None = None,
+    overlap: str | None = None,
+    codes: tuple[str, str, str] = ("*", "*", "*"),
     columns: str = "",
     unit: str = "",
 ) -> Selection:
@@ -234,19 +237,17 @@ def import_recording(
         With the code of trouble, if a file or channel could not be used.
     """
     from daq.bench.loading import parse
-    from daq.estimation.settings import Settings
     from daq.formats.importer import import_files
     from tui.output.console import write_json
-    from tui.runs.estimate_settings import chosen
+    from tui.runs.estimate_settings import chosen_for_files
 
     described = None if bench is None else parse(bench.read_text(encoding="utf-8"), bench)
     given = any(value is not None for value in wanted.values())
-    settings = chosen(Settings.of(described), **wanted) if given else None
     result = import_files(
         sources,
         out,
         bench=described,
-        estimate=settings,
+        estimate=partial(chosen_for_files, **wanted) if given else None,
         response=response,
         response_for=[assigned(text) for text in response_for],
         sampling_rate=sampling_rate,
@@ -294,7 +295,7 @@ def _show(result: ImportResult, out: Path, json: str | None) -> None:
     from rich.table import Table
 
     from daq.bench.durations import format_duration
-    from tui.output.console import for_people, notices
+    from tui.output.console import for_people
     from tui.wording.formatting import several, utc
 
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
@@ -327,6 +328,15 @@ def _show(result: ImportResult, out: Path, json: str | None) -> None:
                 f"{entry.sensor}: missing where other channels have samples: {lacking}",
                 soft_wrap=True,
             )
+    show_taken(result, screen)
+    show_chosen(result.chosen, screen)
+    screen.print(f"{out} written; next: huddle estimate {out}")
+
+
+def show_taken(result: ImportResult, screen: Console) -> None:
+    """Print the calibration of every channel, and what was left aside or not imported."""
+    from tui.output.console import notices
+
     for line in _calibrations(result):
         screen.print(line, soft_wrap=True)
     for reason in sorted(set(result.left_aside.values())):
@@ -334,4 +344,9 @@ def _show(result: ImportResult, out: Path, json: str | None) -> None:
         screen.print(f"left aside ({reason}): {' '.join(sorted(names))}")
     for problem in result.problems:
         notices().print(f"not imported: {problem}", soft_wrap=True)
-    screen.print(f"{out} written; next: huddle estimate {out}")
+
+
+def show_chosen(reasons: Mapping[str, str], screen: Console) -> None:
+    """Print the settings that were chosen from responses and rates."""
+    if reasons:
+        screen.print(f"chosen for the estimate: {'; '.join(reasons.values())}", soft_wrap=True)

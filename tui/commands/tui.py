@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from daq.errors import BenchFileError, FileFault
+from daq.foreign_files import SUFFIXES
 from tui.application.terminal.ascii_text import is_ascii_only
 from tui.commands.options import ModelsOption, examples, with_estimate_options, with_log_file
 
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
     from daq.recording.interface import ReadableSensor
     from tui.application.app import HuddleApp
 
-FOREIGN = {".npz", ".npy", ".csv", ".txt", ".mat", ".mseed", ".miniseed", ".seed", ".sac", ".gcf"}
-"""Suffixes of files that must be imported first."""
 BROWSER = "TEXTUAL_DRIVER"
 """Set by ``textual serve``: the application is shown in a browser, and needs no terminal."""
 
@@ -117,13 +116,7 @@ def open_application(
     """
     if source.suffix.lower() in {".h5", ".hdf5"}:
         open_recording(source, on_event=on_event, models=models, baud=baud, **wanted)
-    elif source.suffix.lower() in FOREIGN:
-        problem = (
-            "neither a bench file (.toml) nor a recording (.h5); convert it to a recording first:"
-            f" huddle import {source} --out {source.with_suffix('.h5')}"
-        )
-        raise BenchFileError(FileFault("", problem), source=source)
-    elif not source.exists():
+    elif not source.exists() and source.suffix.lower() not in SUFFIXES:
         problem = (
             f"file does not exist; huddle init -o {source} writes a bench file, and huddle demo"
             " needs none"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from daq.bench.estimate_settings import OPTIONS
+from daq.bench.estimate_settings import OPTIONS, EstimateSettings
 from daq.estimation import settings as rules
 from daq.estimation.settings import ConflictingOptionError, Settings
 from daq.recording.reader import Recording
@@ -56,10 +56,38 @@ def settings_of(
     typer.BadParameter
         If an option does not fit the others or the sensors.
     """
-    created = recording.created
     settings = chosen(Settings.of(recording.outline), **wanted)
     check_fit(settings, recording.sensors)
+    return spanned(settings, recording.created, start=start, end=end)
+
+
+def spanned(
+    settings: Settings, created: datetime, *, start: str | None, end: str | None
+) -> Settings:
+    """Return settings of a part of a recording.
+
+    Raises
+    ------
+    typer.BadParameter
+        If a time is not understood.
+    """
     return replace(settings, start=_instant(start, created), end=_instant(end, created))
+
+
+def chosen_for_files(suggested: EstimateSettings, **wanted: Any) -> Settings:  # noqa: ANN401
+    """Return the settings of foreign files: options over what responses and rates suggest.
+
+    With octaves, the segment is that of the highest octave; a lower corner does not decide it.
+
+    Raises
+    ------
+    typer.BadParameter
+        The options contradict each other.
+    """
+    settings = Settings(**{each: getattr(suggested, each) for each in OPTIONS})
+    if wanted.get("octaves"):
+        settings = replace(settings, segment=EstimateSettings().segment)
+    return chosen(settings, **wanted)
 
 
 def chosen(settings: Settings, **wanted: Any) -> Settings:  # noqa: ANN401 - fields of EstimateSettings

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from daq.errors import NotARecordingError, RecordingError
+from daq.foreign_files import import_command
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,8 +35,7 @@ def _way_in(path: Path) -> str:
         return f"record by a bench file: huddle run {shlex.quote(str(path))}"
     if path.is_dir() or path.suffix in {".h5", ".hdf5"}:
         return "expected an HDF5 file"
-    recording = shlex.quote(f"{path.stem}.h5")
-    return f"convert it: huddle import {shlex.quote(str(path))} --out {recording}"
+    return f"convert it: {import_command([path])}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from daq.bench.estimate_settings import EstimateSettings
 from daq.recording.reader import Recording
 from tests.daq.formats.test_sources import START, STEP, counts, write_records
 from tui.commands.main import app
 from tui.output.exit_codes import ExitCode
+from tui.runs.estimate_settings import chosen_for_files
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -99,3 +101,74 @@ def test_what_single_channels_lack_is_printed(tmp_path: Path) -> None:
         (sensor,) = recording.sensors
         assert sensor.n_samples == 600
         assert sensor.absent.tolist() == [[0, 0, 100], [0, 300, 500]]
+
+
+def waves(path: Path, unit: str = "m/s") -> list[str]:
+    """Write a CSV file of three sensors in this unit, 100 s at 20 Hz, and return its name."""
+    rng = np.random.default_rng(3)
+    motion = rng.standard_normal(2000)
+    columns = [motion + 0.1 * rng.standard_normal(2000) for _ in "ABC"]
+    lines = [f"time (s),{','.join(f'{name}.Z ({unit})' for name in 'ABC')}"]
+    lines += [
+        ",".join([f"{row / 20:.2f}", *(f"{column[row]:.6f}" for column in columns)])
+        for row in range(2000)
+    ]
+    path.write_text("\n".join(lines), encoding="utf-8")
+    return [str(path)]
+
+
+def invoked(*words: str) -> dict[str, Any]:
+    found = CliRunner().invoke(app, [*words, "--json", "-"])
+    assert found.exit_code == ExitCode.DONE, found.stderr
+    return dict(json.loads(found.stdout), stderr=found.stderr)
+
+
+def test_an_estimate_of_files_is_that_of_their_recording(tmp_path: Path) -> None:
+    files = waves(tmp_path / "a.csv")
+    out = str(tmp_path / "a.h5")
+    imported = invoked("import", *files, "-o", out)
+    assert imported["chosen"] == {"unit": "unit m/s² (samples: m/s)"}
+    assert "chosen for the estimate: unit m/s² (samples: m/s)" in imported["stderr"]
+    directly, stored = invoked("estimate", *files), invoked("estimate", out)
+    assert directly["settings"] == stored["settings"]
+    assert directly["settings"]["unit"] == "m/s²"
+    assert (directly["method"], directly["channels"]) == (stored["method"], stored["channels"])
+    assert "chosen for the estimate: unit m/s²" in directly["stderr"]
+
+
+def test_an_option_takes_the_place_of_what_is_chosen(tmp_path: Path) -> None:
+    found = invoked("estimate", *waves(tmp_path / "a.csv"), "--unit", "mm/s", "--end", "50s")
+    assert found["settings"]["unit"] == "mm/s"
+    assert "chosen" not in found["stderr"]
+
+
+def test_octaves_keep_the_short_segment_of_the_highest_octave() -> None:
+    suggested = EstimateSettings(segment=1000.0)
+    assert chosen_for_files(suggested).segment == 1000
+    assert chosen_for_files(suggested, octaves=True).segment == 10
+    assert chosen_for_files(suggested, octaves=True, segment=50.0).segment == 50
+
+
+@pytest.mark.parametrize("command", ["report", "calibrate", "plot", "repair", "watch"])
+def test_commands_of_recordings_name_the_import(tmp_path: Path, command: str) -> None:
+    files = waves(tmp_path / "a b.csv")
+    found = CliRunner().invoke(app, [command, *files])
+    assert found.exit_code == ExitCode.TROUBLE
+    assert f"huddle import '{files[0]}' --out 'a b.h5'" in found.stderr
+
+
+@pytest.mark.parametrize("command", ["check", "plan", "run", "record", "verify", "web", "tui"])
+def test_commands_of_benches_name_the_import(tmp_path: Path, command: str) -> None:
+    files = waves(tmp_path / "a.csv")
+    found = CliRunner().invoke(app, [command, *files])
+    assert found.exit_code == ExitCode.USAGE
+    assert f"not a bench file (.toml); convert it to a recording: huddle import {files[0]}" in (
+        found.stderr
+    )
+
+
+def test_a_recording_takes_no_response(tmp_path: Path) -> None:
+    out = str(tmp_path / "a.h5")
+    invoked("import", *waves(tmp_path / "a.csv"), "-o", out)
+    found = CliRunner().invoke(app, ["estimate", out, "--channels", "Z"])
+    assert found.exit_code == ExitCode.USAGE

@@ -115,7 +115,11 @@ def test_places_that_cannot_take_a_result_are_told_before_anything_is_measured(
         ("missing.toml", "huddle init -o missing.toml"),
     ],
 )
-def test_the_application_says_what_to_do_with_other_files(source: str, said: str) -> None:
+def test_the_application_says_what_to_do_with_other_files(
+    source: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("arrays.npz").write_bytes(b"\xff")
     result = CliRunner().invoke(app, ["tui", source])
     assert result.exit_code == 2
     assert said in " ".join(result.output.split())
