@@ -67,6 +67,8 @@ class Reference(SphinxDirective):
             "commands": reference.commands,
             "bench_file": reference.bench_file,
             "troubleshooting": reference.troubleshooting,
+            "facts": reference.facts,
+            "findings": reference.findings,
             "result": reference.result,
         }
         found: list[nodes.Node] = self.parse_text_to_nodes(

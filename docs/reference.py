@@ -9,7 +9,9 @@ import inspect
 import json
 import re
 import textwrap
+from dataclasses import fields
 from importlib import resources
+from itertools import chain
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin
 
@@ -19,10 +21,14 @@ from pydantic_core import PydanticUndefined
 from daq.bench.durations import format_duration, parse_duration
 from daq.bench.estimate_settings import OPTIONS, EstimateSettings, table_keys
 from daq.bench.model import TABLES, Bench
-from daq.results.facts import RANK_OF_LEVEL, Finding, Rank
+from daq.results.facts import RANK_OF_LEVEL, Fact, Finding, Rank
+from estimator.checks import advice
+from estimator.checks.advice import Advice
 from tests.tui.wording.advice_examples import EXAMPLES as ADVICE
 from tests.tui.wording.fact_examples import EXAMPLES as FACTS
+from tests.tui.wording.fact_examples import kinds
 from tui.commands.help import PANELS, subcommand
+from tui.output.json_document import UNITS
 from tui.wording.facts import MARKS, RANKS, word
 from tui.wording.findings import Names
 
@@ -34,6 +40,8 @@ _WRITTEN = {"[[schedule.runs]]": "[[schedule]]"}
 _STYLE = re.compile(r"\x1b\[[0-9;]*m")
 _DURATION = "duration, such as `90s` or `2h`"
 _BLANK = "\n\n"
+_ATTRIBUTE = re.compile(r"^(\w[\w, ]*) : .*((?:\n +.*)*)", re.MULTILINE)
+"""Names and meaning of attributes of one entry of a numpydoc section."""
 _NAMES = {str: "text", float: "number", int: "whole number", bool: "true or false"}
 
 
@@ -55,7 +63,7 @@ def troubleshooting() -> str:
     """Return each kind of fact with an example in words: what is seen, its effect, what to do."""
     names = Names(("A", "B", "C"), tuple(f"{s}.{c}" for s in "ABC" for c in "XYZ"), (3, 3, 3))
     examples = [
-        *(Finding(rank=RANK_OF_LEVEL[advice.level], findings=(advice,)) for advice, _ in ADVICE),
+        *(Finding(rank=RANK_OF_LEVEL[each.level], findings=(each,)) for each, _ in ADVICE),
         *(fact for fact in FACTS if not isinstance(fact, Finding)),
     ]
     parts = []
@@ -87,6 +95,39 @@ def result() -> str:
         table = "\n".join(["| key | meaning |", "|---|---|", *rows])
         parts.append(f"#### `{name}`\n\n{about}{table}\n")
     return "\n".join(parts)
+
+
+def facts() -> str:
+    """Return a table of the kinds of facts in JSON, with their numbers."""
+    return _kinds(Fact, {kind.name: kind for kind in kinds()})
+
+
+def findings() -> str:
+    """Return a table of the kinds of findings in JSON, with their numbers."""
+    return _kinds(Advice, {str(kind.kind): kind for kind in kinds(Advice, advice)})
+
+
+def _kinds(base: type[Any], named: dict[str, type[Any]]) -> str:
+    common = {each.name for each in fields(base)}
+    rows = ["| `kind` | meaning | `numbers` |", "|---|---|---|"]
+    for name, kind in sorted(named.items()):
+        about, _, rest = (inspect.getdoc(kind) or "").partition(_BLANK)
+        said = dict(_ATTRIBUTE.findall(rest))
+        entries = [keys.split(", ") for keys in said]
+        written = set(chain.from_iterable(entries))
+        entries += [[each.name] for each in fields(kind) if each.name not in written]
+        numbers = "; ".join(
+            f"{', '.join(f'`{_in_json(key, base)}`' for key in keys)}"
+            f" {_plain(said.get(', '.join(keys), ''))}".rstrip(". ")
+            for keys in entries
+            if keys[0] not in common
+        )
+        rows.append(re.sub("NaN|None", "null", f"| `{name}` | {_plain(about)} | {numbers} |"))
+    return "\n".join(rows)
+
+
+def _in_json(key: str, base: type[Any]) -> str:
+    return "error_share" if base is Advice and key == "error" else UNITS.get(key, key)
 
 
 def _keys(schema: dict[str, Any], before: str) -> Iterator[tuple[str, str]]:

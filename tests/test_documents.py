@@ -9,8 +9,13 @@ from pathlib import Path
 import pytest
 
 from daq.bench.model import Bench
-from docs.reference import bench_file, commands
+from daq.results.facts import Finding, Rank
+from docs.reference import bench_file, commands, facts, findings
+from tests.tui.wording.advice_examples import EXAMPLES as ADVICE
+from tests.tui.wording.fact_examples import EXAMPLES as FACTS
 from tui.commands.help import COMMANDS, subcommand
+from tui.output.json_document import facts_document
+from tui.wording.facts import Known, Wording
 
 ROOT = Path(__file__).parents[1]
 DECISIONS = sorted((ROOT / "docs" / "decisions").glob("[0-9]*.md"))
@@ -127,6 +132,19 @@ def test_the_reference_of_commands_has_every_command_and_option() -> None:
         for parameter in subcommand(name).params:
             flags = [flag for flag in parameter.opts if flag.startswith("--")]
             assert getattr(parameter, "hidden", False) or all(flag in section for flag in flags)
+
+
+def test_the_reference_of_facts_has_every_kind_and_number_of_the_json() -> None:
+    advice = [Finding(rank=Rank.DELAYS, findings=(each,)) for each, _ in ADVICE]
+    written = facts_document([Known(each, Wording("", "")) for each in (*FACTS, *advice)])
+    for table, found in (
+        (facts(), written),
+        (findings(), [each for fact in written for each in fact["numbers"].get("findings", ())]),
+    ):
+        for each in found:
+            row = table.partition(f"\n| `{each['kind']}` |")[2].partition("\n")[0]
+            assert all(f"`{key}`" in row for key in each["numbers"]), each["kind"]
+            assert len(row.split(" | ")[0]) > 15
 
 
 def test_twenty_questions_are_answered_by_pages() -> None:
