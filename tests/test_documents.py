@@ -43,7 +43,11 @@ def test_a_decision_has_status_date_and_sections(page: Path) -> None:
     assert re.search(r"^- Status: (accepted|superseded|proposed)", text, re.MULTILINE)
     assert re.search(r"^- Date: \d{4}-\d\d-\d\d$", text, re.MULTILINE)
     sections = re.findall(r"^## (.*)$", text, re.MULTILINE)
-    assert sections == ["Context", "Decision", "Consequences"]
+    if "Status: superseded" in text:  # a line is left of it
+        assert (len(text.splitlines()), sections) == (6, [])
+    else:
+        assert sections == ["Context", "Decision", "Consequences"]
+    assert len(text.splitlines()) <= 45
     index = (page.parent / "index.md").read_text(encoding="utf-8")
     assert f"[{page.name[:4]}]({page.name})" in index
 
