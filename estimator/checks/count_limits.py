@@ -23,8 +23,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from estimator.median import median
-
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -153,8 +151,11 @@ class CountLimits:
         columns = {n: rows & np.isfinite(counts[:, n]) for n, rows in columns.items()}
         values = {column: counts[rows, column] for column, rows in columns.items() if rows.any()}
         wrapped = {n: found for n, own in values.items() if (found := wraps(own)) is not None}
-        clipped = {n: share for n, own in values.items() if (share := share_at_ends(own))}
-        known = {n: codes(own) for n, own in values.items()}
+        ordered = {n: np.sort(own) for n, own in values.items()}
+        clipped = {
+            n: share for n, own in values.items() if (share := share_at_ends(own, ordered[n]))
+        }
+        known = {n: codes(own) for n, own in ordered.items()}
         rows = np.all(list(columns.values()), axis=0) if columns else np.zeros(len(counts), bool)
         share = share_of_repeats(counts[rows][:, list(columns)])
         return cls(
@@ -170,37 +171,39 @@ class CountLimits:
         return {*self.clipped, *self.wrapped, *self.repeated}
 
 
-def share_at_ends(counts: NDArray[Any]) -> float:
+def share_at_ends(counts: NDArray[Any], ordered: NDArray[Any] | None = None) -> float:
     """Return the share of samples at the ends of the range of one channel, 0 if not clipped.
 
     Parameters
     ----------
     counts : ndarray, shape (n_samples,)
         In the order of time.
+    ordered : ndarray, shape (n_samples,), optional
+        The same, ascending.
     """
     if len(counts) < MIN_AT_END:
         return 0.0
-    hard = max((counts == end).sum() for end in (counts.min(), counts.max())) >= MIN_AT_END
-    if hard:
-        values, times = _distinct(counts)
+    ordered = np.sort(counts) if ordered is None else ordered
+    if any(np.ptp(end) == 0 for end in (ordered[:MIN_AT_END], ordered[-MIN_AT_END:])):
+        values, times = _distinct(ordered)
         if len(values) < DISTINCT:
             return 0.0
         ends = ((times[0], times[1:BESIDE].max()), (times[-1], times[-BESIDE:-1].max()))
         cut = [int(end) for end, beside in ends if end >= max(MIN_AT_END, TIMES * beside)]
         if cut and _has_slopes(values, times, sum(cut)):
             return sum(cut) / len(counts)
-    signal = counts.astype(np.float64)
-    unit = float(np.diff(_distinct(signal)[0]).min(initial=math.inf))
-    middle = float(median(signal))
+    signal, ordered = counts.astype(np.float64), ordered.astype(np.float64)
+    steps = np.diff(ordered)
+    unit = float(steps[steps > 0].min(initial=math.inf))
+    middle = float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2
     return sum(
         max(_at_soft_end(side * signal, parts, unit, side * middle) for parts in WIDTHS)
         for side in (1, -1)
     )
 
 
-def _distinct(values: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
+def _distinct(ordered: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
     """Return distinct values, ascending, with their numbers: ``np.unique`` loads numpy.ma."""
-    ordered = np.sort(values)
     first = np.flatnonzero(np.diff(ordered, prepend=ordered[:1] - 1) != 0)
     return ordered[first], np.diff(first, append=len(ordered))
 
@@ -297,7 +300,7 @@ def codes(counts: NDArray[Any]) -> Codes | None:
     whole = _whole(counts)
     if whole is None or not len(whole):
         return None
-    values, times = _distinct(whole)
+    values, times = _distinct(np.sort(whole, kind="stable"))  # fast where they are sorted
     if len(values) < DISTINCT_CODES:
         return None
     step = int(np.gcd.reduce(np.diff(values)))
@@ -314,11 +317,12 @@ def _stuck_bits(values: NDArray[np.int64], times: NDArray[np.int64], step: int) 
     if len(inner) < DISTINCT_CODES:
         return []
     span, bit, found = int(inner[-1] - inner[0]), step.bit_length(), []
+    changing = int(np.bitwise_or.reduce(inner)) ^ int(np.bitwise_and.reduce(inner))
     while (n_periods := span >> bit + 1) >= MIN_PERIODS[0]:
-        n_seen = len(set((inner >> bit + 1).tolist()))
-        is_constant = len(set((inner >> bit & 1).tolist())) == 1
-        if is_constant and n_seen >= max(MIN_PERIODS[0], min(MIN_PERIODS[1], n_periods / 2)):
-            found.append(bit)
+        if not changing >> bit & 1:
+            n_seen = 1 + np.count_nonzero(np.diff(inner >> bit + 1))
+            if n_seen >= max(MIN_PERIODS[0], min(MIN_PERIODS[1], n_periods / 2)):
+                found.append(bit)
         bit += 1
     return found
 
