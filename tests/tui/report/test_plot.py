@@ -249,7 +249,7 @@ def test_a_recording_against_time(tmp_path: Path) -> None:
     path = record(tmp_path / "night.h5")
     files = []
     for name in ("a.svg", "b.svg"):
-        arguments = ["plot", str(path), "--signal", "-o", str(tmp_path / name)]
+        arguments = ["plot", str(path), "--signal", "--segment", "10", "-o", str(tmp_path / name)]
         assert CliRunner().invoke(app, arguments).exit_code == 0
         files.append((tmp_path / name).read_bytes())
     assert files[0] == files[1]

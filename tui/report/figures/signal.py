@@ -152,6 +152,6 @@ class _Spectrum:
         axes.set_ylim(*ends)
         axes.yaxis.set_major_locator(FixedLocator(list(decades)))
         axes.yaxis.set_minor_locator(NullLocator())
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda at, _: f"{10**at:g}"))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda at, _: f"{10.0**at:g}"))
         axes.set_ylabel("Hz")
         _time_axis(axes, self.span, TICKS // 2)
