@@ -18,13 +18,14 @@ SUFFIXES = frozenset(
     )
 )
 """Of files that are named like a bench file by mistake."""
-_OWN = frozenset({".h5", ".hdf5", ".toml"})
+OWN = frozenset({".h5", ".hdf5", ".toml"})
+"""Suffixes of recordings and bench files."""
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
 def is_foreign(path: Path) -> bool:
     """Whether a file is neither a recording nor a bench file, by its name and first bytes."""
-    if path.suffix.lower() in _OWN or not path.is_file():
+    if path.suffix.lower() in OWN or not path.is_file():
         return False
     with path.open("rb") as file:
         return file.read(len(_HDF5)) != _HDF5

@@ -427,6 +427,11 @@ class Bench(Table):
         return float(self.simulation.get("speed", 1.0))
 
     @property
+    def has_scenario(self) -> bool:
+        """Whether motion and noise to simulate are described, not only the clock of devices."""
+        return "sensors" in self.simulation
+
+    @property
     def simulated_clock(self) -> str:
         """File of the clock by which simulated devices run; empty for a bench of real ones."""
         return str(self.simulation.get("clock", ""))

@@ -21,7 +21,7 @@ import contextlib
 import json
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from daq.errors import NotConnectedError
 from daq.transport import wire_log
@@ -99,11 +99,20 @@ def is_simulated(port: str) -> bool:
     A simulated device speaks the real protocol: nothing in its bytes says that it is simulated.
     So its server lists its ports in a file of its folder (``sim_devices.server.launch``).
     """
-    if is_virtual(port):
-        return True
+    return is_virtual(port) or bool(simulation_of(port))
+
+
+def simulation_of(port: str) -> dict[str, Any]:
+    """Return ``speed`` and ``clock`` of the simulated device that serves a port; else nothing.
+
+    As the table ``[simulation]`` of a bench file has them: they decide what a second is.
+    """
     for file in Path(tempfile.gettempdir()).glob("huddle-*/simulated-ports.json"):
         with contextlib.suppress(OSError, ValueError):  # of another user, or just removed
             served = json.loads(file.read_text(encoding="utf-8"))
-            if any(is_same_port(port, each) for each in served):
-                return True
-    return False
+            if isinstance(served, list):  # of an earlier version
+                served = {each: {"speed": 1.0} for each in served}
+            for each, simulation in served.items():
+                if is_same_port(port, each):
+                    return dict(simulation)
+    return {}

@@ -103,7 +103,8 @@ class DeviceServer:
             if "error" in answer:
                 message = f"a simulated device did not start: {answer['error']}"
                 raise ServeError(message, is_usage_error=answer["is_usage_error"])
-            ports = [device["port"] for device in answer["devices"]]
+            about = {"speed": spec["speed"], "clock": path}
+            ports = {device["port"]: about for device in answer["devices"]}
             # whoever records these ports, with a bench file of any origin, learns what they are
             (Path(folder) / "simulated-ports.json").write_text(json.dumps(ports), encoding="utf-8")
             try:

@@ -21,6 +21,7 @@ from tui.application.messages import ErrorReported, RecordingOpened
 from tui.application.plan import TestPlan
 from tui.application.reference import can_open
 from tui.application.state import TITLES, VIEWS
+from tui.application.view import COMMON_KEYS
 from tui.wording.formatting import clock_time
 
 if TYPE_CHECKING:
@@ -122,9 +123,7 @@ class HuddleApp(FollowingApp):
             Binding(str(number), f"view('{name}')", TITLES[name], show=False)
             for number, name in enumerate(VIEWS, start=1)
         ),
-        Binding("question_mark", "screen.help", "Help", key_display="?"),
-        Binding("q", "quit", "Quit"),
-        Binding("ctrl+c", "quit", "Quit", show=False),
+        *COMMON_KEYS,
     ]
 
     def __init__(

@@ -25,6 +25,8 @@ GLOBAL_KEYS = (
     ("ctrl+p", "all commands by name"),
     ("q", "quit, as Ctrl-C does; a recording continues, and is found again"),
 )
+COMMON = GLOBAL_KEYS[1:]
+"""Without views."""
 WORDS = (
     ("data", "what the channel recorded: motion and noise (grey)"),
     ("noise", "the channel's own noise (colour), ± its 95 % interval (whisker)"),
@@ -46,7 +48,8 @@ WORDS = (
 )
 
 
-def _pairs(pairs: tuple[tuple[str, str], ...], style: str) -> Table:
+def pairs(pairs: tuple[tuple[str, str], ...], style: str) -> Table:
+    """Return names and their meanings as two columns."""
     table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column(style=style, no_wrap=True, min_width=9)
     table.add_column()
@@ -57,7 +60,7 @@ def _pairs(pairs: tuple[tuple[str, str], ...], style: str) -> Table:
 
 def help_text(keys: tuple[tuple[str, str], ...]) -> RenderableType:
     """Return what each key does and what each word on the screen means."""
-    return Group(_pairs((*keys, *GLOBAL_KEYS), "bold #4cc9f0"), "", _pairs(WORDS, "bold"))
+    return Group(pairs((*keys, *GLOBAL_KEYS), "bold #4cc9f0"), "", pairs(WORDS, "bold"))
 
 
 class TextScreen(ModalScreen[None]):
@@ -73,7 +76,7 @@ class TextScreen(ModalScreen[None]):
     """
 
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("escape,q,question_mark,d,r,ctrl+c", "dismiss", "Close"),
+        Binding("escape,q,question_mark,f1,d,r,ctrl+c", "dismiss", "Close"),
     ]
 
     def __init__(

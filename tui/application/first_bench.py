@@ -7,9 +7,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
+from rich.console import Group
 from rich.style import Style
 from rich.text import Text
 from textual import work
+from textual.app import SystemCommand
 from textual.binding import Binding, BindingType
 from textual.containers import VerticalScroll
 from textual.screen import Screen
@@ -27,17 +29,19 @@ from tui.application.bench_view.sensors import (
     trace,
     width_of,
 )
+from tui.application.dialogs import COMMON, TextScreen, pairs
 from tui.application.forms.bench import BenchForm
 from tui.application.forms.form import Field, Form
 from tui.application.forms.sensor import PortForm, SensorForm, sensor_table
 from tui.application.themes import ThemedApp
-from tui.application.view import BAD, MUTED, KeyLine
+from tui.application.view import BAD, COMMON_KEYS, MUTED, KeyLine
 from tui.runs.first_bench import is_open, with_device, with_rate
 from tui.wording.formatting import listed, several
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
+    from rich.console import RenderableType
     from textual.app import ComposeResult
     from textual.driver import Driver
 
@@ -45,6 +49,15 @@ if TYPE_CHECKING:
     from daq.preflight.device_check import DiscoveredDevice
     from daq.preflight.preview import SensorPreview
 
+KEYS = (
+    ("enter", "state a missing sensitivity, then name the bench, and write its file"),
+    ("n", "search a port, a host or a network"),
+    ("r", "search the serial ports again"),
+    ("↑ ↓", "choose a sensor"),
+    ("e", "edit the chosen sensor: name, sensitivity, settings"),
+    ("a", "add a sensor by its driver, where none answers"),
+    ("del", "leave the chosen sensor out"),
+)
 WIDEST_PORT = 24
 """Columns for the name of a port."""
 
@@ -159,6 +172,10 @@ class FirstBenchScreen(Screen[None]):
     def on_resize(self) -> None:
         """Fit the terminal's size."""
         self._draw()
+
+    def action_help(self) -> None:
+        """Say what the keys do, and what a first bench needs."""
+        self.app.push_screen(TextScreen("huddle: first bench", help_of_first_bench))
 
     # ------------------------------------------------------------------ searching
 
@@ -424,11 +441,7 @@ class FirstBenchApp(ThemedApp[Path]):
 
     CSS_PATH = "huddle.tcss"
     TITLE = "huddle"
-    ENABLE_COMMAND_PALETTE = False
-    BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("q", "quit", "Quit"),
-        Binding("ctrl+c", "quit", "Quit", show=False),
-    ]
+    BINDINGS: ClassVar[list[BindingType]] = [*COMMON_KEYS]
 
     def __init__(self, controls: FirstBenchControls, driver: type[Driver] | None = None) -> None:
         super().__init__(driver)
@@ -437,6 +450,27 @@ class FirstBenchApp(ThemedApp[Path]):
     def on_mount(self) -> None:
         """Show what answers."""
         self.push_screen(FirstBenchScreen(self._controls))
+
+    def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
+        """Yield the commands of the palette: what the keys do, and the common ones."""
+        for each in FirstBenchScreen.BINDINGS if isinstance(screen, FirstBenchScreen) else ():
+            if isinstance(each, Binding) and each.show:
+                does = partial(self.run_action, each.action, screen)
+                yield SystemCommand(
+                    each.description, dict(KEYS)[each.key_display or each.key], does
+                )
+        yield from super().get_system_commands(screen)
+
+
+def help_of_first_bench() -> RenderableType:
+    """Return the keys, and how a bench file comes about."""
+    return Group(
+        "The ports are searched for sensors. What answers is read live: tap a sensor, and its row"
+        " lights up. Three sensors make a bench; two need motion that changes. enter writes the"
+        " bench file, and the application opens on it.",
+        "",
+        pairs((*KEYS, *COMMON), "bold #4cc9f0"),
+    )
 
 
 def sensor_rows(

@@ -141,9 +141,7 @@ class FollowingApp(ThemedApp[None]):
                 if not is_here or target.check_action(action.removeprefix("app."), ()):
                     shown = f"In the {TITLES[view.VIEW]} view"
                     yield SystemCommand(title, shown, partial(self._do, view.VIEW, action))
-        for command in super().get_system_commands(screen):
-            if command.title in {"Theme", "Screenshot"}:
-                yield command
+        yield from super().get_system_commands(screen)
 
     async def _do(self, view: str, action: str) -> None:
         """Do a task of a view, which is shown."""

@@ -17,11 +17,13 @@ from textual.filter import LineFilter, Monochrome
 from textual.theme import Theme
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from rich.color import Color as RichColor
+    from textual.app import SystemCommand
     from textual.color import Color
     from textual.driver import Driver
+    from textual.screen import Screen
 
 ANSI: Mapping[int | None, str] = {1: "red", 2: "green", 3: "yellow"}
 """Names of the first colours of a terminal, by number."""
@@ -135,6 +137,12 @@ class ThemedApp(App[Outcome]):
         self.theme = USUAL
         for name in self.available_themes.keys() - THEMES.keys():
             self.unregister_theme(name)
+
+    def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
+        """Yield the commands of Textual that the palette has."""
+        for command in super().get_system_commands(screen):
+            if command.title in {"Theme", "Screenshot"}:
+                yield command
 
     def get_line_filters(self) -> Sequence[LineFilter]:
         """Return what lines go through: harmless, and in the colours of the theme.

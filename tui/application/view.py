@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from rich.style import Style
 from rich.text import Text
+from textual.binding import Binding
 from textual.screen import Screen
 from textual.widget import Widget
 from textual.widgets import Static
@@ -17,7 +18,6 @@ from tui.wording.verdict_text import WORDS, style_of
 
 if TYPE_CHECKING:
     from textual.app import ComposeResult
-    from textual.binding import Binding
     from textual.events import MouseDown, Resize
 
     from tui.application.state import State
@@ -25,6 +25,14 @@ if TYPE_CHECKING:
 MUTED, BAD = "#9aa5b8", "bold #ff6b6b"
 TALL = 34  # rows from which there is room for remarks and air
 ALL_TABS = 60  # columns from which the titles of all views fit
+
+
+COMMON_KEYS: tuple[Binding, ...] = (
+    Binding("question_mark,f1", "screen.help", "Help", key_display="?"),
+    Binding("q", "quit", "Quit"),
+    Binding("ctrl+c", "quit", "Quit", show=False),
+)
+"""Of every application."""
 
 
 class KeyLine(Widget):

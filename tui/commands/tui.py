@@ -6,13 +6,14 @@ from __future__ import annotations
 
 import os
 import sys
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from daq.errors import BenchFileError, FileFault
-from daq.foreign_files import SUFFIXES
+from daq.foreign_files import OWN, SUFFIXES
 from tui.application.terminal.ascii_text import is_ascii_only
 from tui.commands.options import ModelsOption, examples, with_estimate_options, with_log_file
 
@@ -79,6 +80,8 @@ def tui(
     """
     from tui.runs.first_bench import is_first
 
+    if source is not None and not source.exists():
+        source = _meant(source)
     wanted_first = source is None and (bool(port) or not any(Path().glob("*.toml")))
     wanted_first |= source is not None and source.suffix == ".toml" and is_first(source)
     if wanted_first and _has_terminal():
@@ -93,6 +96,27 @@ def tui(
             " needs neither"
         )
     open_application(source, on_event=on_event, models=models, baud=baud, **wanted)
+
+
+def _meant(source: Path) -> Path:
+    """Return the file of the folder that a mistyped name may mean, if a person says so.
+
+    Raises
+    ------
+    BenchFileError
+        There is no terminal to ask at.
+    """
+    ours = OWN | SUFFIXES
+    there = {each.name: each for each in source.parent.glob("*.*") if each.suffix in ours}
+    stems = {each.stem: each for each in there.values()}
+    close = get_close_matches(source.name, there, n=1) or get_close_matches(source.name, stems, n=1)
+    if not close:
+        return source
+    found = (there | stems)[close[0]]
+    if not _has_terminal():
+        problem = f"file does not exist; did you mean {found}?"
+        raise BenchFileError(FileFault("", problem), source=source)
+    return found if typer.confirm(f"{source} does not exist. Open {found}?", True) else source
 
 
 def open_application(

@@ -253,7 +253,7 @@ def _positions(bench: Bench) -> FloatArray | None:
     known = [sensor.position for sensor in bench.sensors]
     if all(each is not None for each in known):
         return np.array(known, dtype=np.float64)
-    if not bench.simulation:
+    if not bench.has_scenario:
         return None
     scenario = scenario_of(bench)
     simulated = np.array([scenario.sensors[sensor.name].position for sensor in bench.sensors])
@@ -414,7 +414,7 @@ def _axes(
 
 def _directions(bench: Bench) -> FloatArray:
     """Return the directions of the channels: as simulated, or along common axes."""
-    if bench.simulation:
+    if bench.has_scenario:
         scenario = scenario_of(bench)
         return np.vstack([scenario.directions(sensor.name) for sensor in bench.sensors])
     most = max(sensor.n_main_channels for sensor in bench.sensors)

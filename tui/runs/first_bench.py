@@ -23,6 +23,7 @@ from daq.bench.option_values import one_of
 from daq.bench.tables.toml_text import to_toml
 from daq.bench.units import DensityUnit
 from daq.devices.epson.commands import COUNTS_PER_UNIT
+from daq.transport.ports import simulation_of
 from daq.transport.serial_ports import stable_path
 
 if TYPE_CHECKING:
@@ -37,6 +38,7 @@ DENSITY = "µg/√Hz"
 _SENSORS, _ESTIMATE, _SIMULATION = (
     f"# {'-' * (84 - len(name))} {name}\n" for name in ("sensors", "estimate", "simulation")
 )
+_OF_SIMULATED = "# Of the simulated devices that answered. Remove this table for real ones.\n"
 UNKNOWN = 1.0
 """Counts per unit of a channel whose sensitivity no device states."""
 
@@ -86,6 +88,7 @@ def is_open(sensor: Mapping[str, Any]) -> bool:
 def with_device(text: str, device: DiscoveredDevice) -> str:
     """Return a text with a sensor more, called by the next letter, before the table of estimates.
 
+    A simulated device adds the table of its simulation: its clock decides what a second is.
     The text itself, where the channels of the device are not known.
     """
     channels = channels_of(device)
@@ -106,6 +109,9 @@ def with_device(text: str, device: DiscoveredDevice) -> str:
     comment = f"# {device.port}: {device.remark or 'answered as ' + device.driver}\n"
     if device.information is None:
         comment += "# Fill in sampling_rate and the sensitivities, in counts per unit.\n"
+    simulation = simulation_of(device.port)
+    if simulation and "simulation" not in tomllib.loads(text):
+        text = f"{text}\n{_SIMULATION}{_OF_SIMULATED}{to_toml({'simulation': simulation})}"
     before, mark, rest = text.partition(_ESTIMATE)
     sensor = f"{comment}{to_toml({'sensors': [table]})}\n"
     return f"{before}{sensor}{mark}{rest}" if mark else f"{text}\n{sensor}"

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from textual.widgets import Input
 
-from daq.bench.tables.toml_text import to_toml
 from daq.devices.bench_file import load, parse
 from daq.devices.interface import DeviceInformation
 from daq.errors import NotConnectedError
@@ -26,7 +25,7 @@ from tests.tui.example_snapshot import demo_bench
 from tests.waiting import limit
 from tui.application.app import HuddleApp
 from tui.application.bench_view.sensors import tapped
-from tui.application.first_bench import FirstBenchApp
+from tui.application.first_bench import FirstBenchApp, FirstBenchScreen, NetworkForm
 from tui.commands.tui_controls import BenchControls, FirstBenchControls
 from tui.runs.first_bench import draft
 from tui.simulation.devices import simulated
@@ -235,6 +234,28 @@ async def test_hosts_that_accept_connections_are_searched() -> None:
 MOST_KEYS = 25
 
 
+@pytest.mark.parametrize("key", ["question_mark", "f1"])
+async def test_help_says_what_the_keys_do(tmp_path: Path, key: str) -> None:
+    app = FirstBenchApp(Prepared(tmp_path / "lab.toml"))
+    async with app.run_test(size=SIZES["small"]) as pilot:
+        await pilot.press(key)
+        await pilot.pause()
+        for said in ("n          search a port", "del        leave", "ctrl+p     all commands"):
+            assert said in screen_text(app)
+        await pilot.press(key)
+        assert isinstance(app.screen, FirstBenchScreen)
+
+
+async def test_the_palette_does_what_the_keys_do(tmp_path: Path) -> None:
+    controls = Prepared(tmp_path / "lab.toml")
+    app = FirstBenchApp(controls)
+    async with app.run_test(size=SIZES["small"]) as pilot:
+        commands = {each.title: each for each in app.get_system_commands(app.screen)}
+        assert {"Go on", "Network", "Search", "Edit", "Add", "Remove", "Theme"} <= set(commands)
+        await pilot.press("ctrl+p", *"Network", "enter")
+        await until(pilot, lambda: isinstance(app.screen, NetworkForm))
+
+
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals")
 async def test_from_cables_to_a_running_test_in_few_keys(tmp_path: Path) -> None:
@@ -247,8 +268,6 @@ async def test_from_cables_to_a_running_test_in_few_keys(tmp_path: Path) -> None
         await pilot.press(*some)
 
     with simulated(parse(text), speed=8.0) as reachable:
-        clock = {"speed": 8.0, "clock": reachable.simulated_clock}
-        path.write_text(to_toml({"simulation": clock}), encoding="utf-8")
         ports = [sensor.port for sensor in reachable.sensors]
         first = FirstBenchApp(FirstBenchControls(path, ports, draft(path)))
         async with first.run_test(size=SIZES["small"]) as pilot:
@@ -260,6 +279,7 @@ async def test_from_cables_to_a_running_test_in_few_keys(tmp_path: Path) -> None
             await press(pilot, "enter", *"Ann", "tab", "tab", *"E N U", "tab", "3", "enter")
             await until(pilot, lambda: first.return_value is not None)
         bench = load(path)
+        assert bench.simulation == {"speed": 8.0, "clock": reachable.simulated_clock}
         assert [sensor.port for sensor in bench.sensors] == ports
         assert all(sensor.serial_number for sensor in bench.sensors)
         controls = BenchControls(path, bench, Settings.of(bench))

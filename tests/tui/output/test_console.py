@@ -112,6 +112,9 @@ def test_places_that_cannot_take_a_result_are_told_before_anything_is_measured(
     ("source", "said"),
     [
         ("arrays.npz", "huddle import arrays.npz --out arrays.h5"),
+        ("arays.npz", "file does not exist; did you mean arrays.npz?"),
+        ("lba.toml", "file does not exist; did you mean lab.toml?"),
+        ("lab", "file does not exist; did you mean lab.toml?"),
         ("missing.toml", "huddle init -o missing.toml"),
     ],
 )
@@ -120,6 +123,7 @@ def test_the_application_says_what_to_do_with_other_files(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("arrays.npz").write_bytes(b"\xff")
+    Path("lab.toml").touch()
     result = CliRunner().invoke(app, ["tui", source])
     assert result.exit_code == 2
     assert said in " ".join(result.output.split())
