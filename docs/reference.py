@@ -21,16 +21,14 @@ from pydantic_core import PydanticUndefined
 from daq.bench.durations import format_duration, parse_duration
 from daq.bench.estimate_settings import OPTIONS, EstimateSettings, table_keys
 from daq.bench.model import TABLES, Bench
-from daq.results.facts import RANK_OF_LEVEL, Fact, Finding, Rank
-from estimator.checks import advice
-from estimator.checks.advice import Advice
+from daq.results.facts.fact import MARKS, Fact, Finding
+from estimator.checks.advice import Advice, Names, Rank
+from estimator.records import json_key
 from tests.tui.wording.advice_examples import EXAMPLES as ADVICE
 from tests.tui.wording.fact_examples import EXAMPLES as FACTS
 from tests.tui.wording.fact_examples import kinds
 from tui.commands.help import PANELS, subcommand
-from tui.output.json_document import UNITS
-from tui.wording.facts import MARKS, RANKS, word
-from tui.wording.findings import Names
+from tui.wording.facts import RANKS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -63,14 +61,14 @@ def troubleshooting() -> str:
     """Return each kind of fact with an example in words: what is seen, its effect, what to do."""
     names = Names(("A", "B", "C"), tuple(f"{s}.{c}" for s in "ABC" for c in "XYZ"), (3, 3, 3))
     examples = [
-        *(Finding(rank=RANK_OF_LEVEL[each.level], findings=(each,)) for each, _ in ADVICE),
+        *(Finding(rank=advice.rank, findings=(advice,), names=names) for advice, _ in ADVICE),
         *(fact for fact in FACTS if not isinstance(fact, Finding)),
     ]
     parts = []
     for rank in Rank:
         parts.append(f"## {MARKS[rank]} {RANKS[rank].capitalize()}\n")
         for fact in (each for each in examples if each.rank is rank):
-            words = word(fact, names)
+            words = fact.words
             kind = type(fact.findings[0] if isinstance(fact, Finding) else fact).__name__
             parts.append(f"### {words.line}\n\n{words} (`{kind}`)\n")
     return "\n".join(parts)
@@ -104,30 +102,27 @@ def facts() -> str:
 
 def findings() -> str:
     """Return a table of the kinds of findings in JSON, with their numbers."""
-    return _kinds(Advice, {str(kind.kind): kind for kind in kinds(Advice, advice)})
+    return _kinds(Advice, {kind.name: kind for kind in kinds(Advice)})
 
 
 def _kinds(base: type[Any], named: dict[str, type[Any]]) -> str:
     common = {each.name for each in fields(base)}
     rows = ["| `kind` | meaning | `numbers` |", "|---|---|---|"]
     for name, kind in sorted(named.items()):
+        in_json = {each.name: json_key(each) for each in fields(kind)}
         about, _, rest = (inspect.getdoc(kind) or "").partition(_BLANK)
         said = dict(_ATTRIBUTE.findall(rest))
         entries = [keys.split(", ") for keys in said]
         written = set(chain.from_iterable(entries))
         entries += [[each.name] for each in fields(kind) if each.name not in written]
         numbers = "; ".join(
-            f"{', '.join(f'`{_in_json(key, base)}`' for key in keys)}"
+            f"{', '.join(f'`{in_json[key]}`' for key in keys)}"
             f" {_plain(said.get(', '.join(keys), ''))}".rstrip(". ")
             for keys in entries
             if keys[0] not in common
         )
         rows.append(re.sub("NaN|None", "null", f"| `{name}` | {_plain(about)} | {numbers} |"))
     return "\n".join(rows)
-
-
-def _in_json(key: str, base: type[Any]) -> str:
-    return "error_share" if base is Advice and key == "error" else UNITS.get(key, key)
 
 
 def _keys(schema: dict[str, Any], before: str) -> Iterator[tuple[str, str]]:

@@ -8,8 +8,22 @@ Instances take longer to make than those of a frozen dataclass: it is for classe
 
 from __future__ import annotations
 
+import re
 from dataclasses import MISSING, FrozenInstanceError, dataclass, fields
-from typing import Any, NoReturn, TypeVar, dataclass_transform
+from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar, dataclass_transform
+
+if TYPE_CHECKING:
+    from dataclasses import Field
+
+Seconds: TypeAlias = float
+Hertz: TypeAlias = float
+Share: TypeAlias = float
+"""Of the noise, unless its field says of what else."""
+Decibels: TypeAlias = float
+Degrees: TypeAlias = float
+UNITS = {"Seconds": "s", "Hertz": "hz", "Share": "share", "Decibels": "db", "Degrees": "deg"}
+"""Of fields with these types: what is behind their names in JSON."""
+_UNIT = re.compile(rf"\b({'|'.join(UNITS)})\b")
 
 _Record = TypeVar("_Record", bound="Record")
 
@@ -62,3 +76,9 @@ class Record:
     def _items(self) -> list[tuple[str, Any]]:
         names = [each.name for each in fields(self)]  # type: ignore[arg-type]  # as above
         return [(name, getattr(self, name)) for name in names]
+
+
+def json_key(each: Field[Any]) -> str:
+    """Return the name of a field in JSON: its own, with the unit that its type names."""
+    found = _UNIT.search(str(each.type))
+    return f"{each.name}_{UNITS[found[1]]}" if found else each.name

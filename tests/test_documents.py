@@ -9,13 +9,14 @@ from pathlib import Path
 import pytest
 
 from daq.bench.model import Bench
-from daq.results.facts import Finding, Rank
+from daq.results.facts.fact import Finding
 from docs.reference import bench_file, commands, facts, findings
+from estimator.checks.advice import Rank
 from tests.tui.wording.advice_examples import EXAMPLES as ADVICE
+from tests.tui.wording.advice_examples import names
 from tests.tui.wording.fact_examples import EXAMPLES as FACTS
 from tui.commands.help import COMMANDS, subcommand
 from tui.output.json_document import facts_document
-from tui.wording.facts import Known, Wording
 
 ROOT = Path(__file__).parents[1]
 DECISIONS = sorted((ROOT / "docs" / "decisions").glob("[0-9]*.md"))
@@ -139,8 +140,9 @@ def test_the_reference_of_commands_has_every_command_and_option() -> None:
 
 
 def test_the_reference_of_facts_has_every_kind_and_number_of_the_json() -> None:
-    advice = [Finding(rank=Rank.DELAYS, findings=(each,)) for each, _ in ADVICE]
-    written = facts_document([Known(each, Wording("", "")) for each in (*FACTS, *advice)])
+    who = names("A", "B", "C")
+    advice = [Finding(rank=Rank.DELAYS, findings=(each,), names=who) for each, _ in ADVICE]
+    written = facts_document([*FACTS, *advice])
     for table, found in (
         (facts(), written),
         (findings(), [each for fact in written for each in fact["numbers"].get("findings", ())]),

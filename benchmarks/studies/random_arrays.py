@@ -18,20 +18,15 @@ from benchmarks.studies.judged import METHODS, Judged
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
-from estimator.checks.advice import (
-    Advice,
-    Delay,
-    Gain,
-    ModelMisfit,
-    NoSharedMotion,
-    Rotated,
-    SharedNoise,
-    UnequalResponses,
-)
+from estimator.checks.advice_on_model import ModelMisfit
+from estimator.checks.advice_on_noise import SharedNoise
+from estimator.checks.advice_on_sensors import Delay, Gain, Rotated, UnequalResponses
+from estimator.checks.advice_on_signals import NoSharedMotion
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from estimator.checks.advice import Advice
     from estimator.types import FloatArray
     from tui.studies.study import ProgressCallback, Study
 

@@ -17,16 +17,10 @@ from benchmarks.studies.judged import METHODS, Judged
 from benchmarks.studies.synthesis import Latency, synthesise
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
-from estimator.checks.advice import (
-    Delay,
-    Gain,
-    ModelMisfit,
-    NoiseChanges,
-    NoSharedMotion,
-    Rotated,
-    SharedNoise,
-    UnequalResponses,
-)
+from estimator.checks.advice_on_model import ModelMisfit
+from estimator.checks.advice_on_noise import NoiseChanges, SharedNoise
+from estimator.checks.advice_on_sensors import Delay, Gain, Rotated, UnequalResponses
+from estimator.checks.advice_on_signals import NoSharedMotion
 from sim_devices.world.scenario import Scenario
 
 if TYPE_CHECKING:

@@ -15,26 +15,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daq.archive.averages import Average, Estimator
-from daq.archive.changes import MIN_CONTRAST_DAYS, MIN_DAYS, courses
+from daq.archive.changes import courses
 from daq.archive.density import MIN_BINS
 from daq.archive.spectra_file import unpacked
 from daq.archive.years import Years, density_of, read_series
 from daq.errors import ArchiveError
 from daq.estimation.blas_threads import one_blas_thread
 from daq.results.band_summary import band_within, judged_method
-from daq.results.facts import (
-    AbsencesNotUsed,
-    ChangesUndecided,
-    NightsNotCompared,
-    Rank,
-    RecordingsLeftOut,
-    SpectraUnreadable,
-    StretchesLeftOut,
-)
 from daq.results.result import Result
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from datetime import tzinfo
 
     import h5py
@@ -48,7 +39,6 @@ if TYPE_CHECKING:
     from daq.archive.store import Store
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
-    from daq.results.facts import Fact
 
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
@@ -214,29 +204,6 @@ def answer(
         doubted=doubted,
         lacking={snapshot.channels[column].name: lacking[column] for column in sorted(lacking)},
     )
-
-
-def facts_of_archive(found: Answer) -> Iterator[Fact]:
-    """Yield what is known of an archive beside the facts of its pooled estimate, worst first."""
-    if found.problems:
-        yield SpectraUnreadable(rank=Rank.DELAYS, files=found.problems)
-    if found.doubted:
-        yield RecordingsLeftOut(
-            rank=Rank.DELAYS,
-            sensors=tuple(sorted({one for each in found.doubted for one in each.not_understood})),
-            recordings=tuple(each.origin.path for each in found.doubted),
-        )
-    if not any(each.decided for each in found.courses):
-        n_days = len(found.days_utc_ns)
-        yield ChangesUndecided(rank=Rank.DELAYS, n_days=n_days, needed=MIN_DAYS)
-    if found.lacking:
-        channels, n_segments = tuple(found.lacking), tuple(found.lacking.values())
-        yield AbsencesNotUsed(rank=Rank.TO_KNOW, channels=channels, n_segments=n_segments)
-    if n_short := found.density.n_short:
-        yield StretchesLeftOut(rank=Rank.TO_KNOW, n_stretches=n_short)
-    segments = [segment for course in found.courses for segment in course.segments]
-    if all(each.contrast_days < MIN_CONTRAST_DAYS for each in segments):
-        yield NightsNotCompared(rank=Rank.TO_KNOW, needed=MIN_CONTRAST_DAYS)
 
 
 class _Tally:

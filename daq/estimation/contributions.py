@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.estimation.settings import DIMENSIONS
-from estimator.checks.advice import Level, ModelMisfit, SharedNoise, TooFewDimensions
+from estimator.checks.advice import Rank
+from estimator.checks.advice_on_model import ModelMisfit, TooFewDimensions
+from estimator.checks.advice_on_noise import SharedNoise
 from estimator.checks.counts import MARGIN
 from estimator.checks.steadied import bounds
 from estimator.levels.contributions import (
@@ -329,7 +331,7 @@ def shared_parts(snapshot: Snapshot) -> FloatArray:
         if not isinstance(advice, SharedNoise) or advice.band is None:
             continue
         here = (frequency >= advice.band[0]) & (frequency <= advice.band[1])
-        for pair, amount in zip(advice.channels, advice.amounts, strict=True):
+        for pair, amount in zip(advice.channels, advice.coherencies, strict=True):
             rows = np.ix_(here, np.array(pair))
             parts[rows] = np.maximum(parts[rows], min(abs(amount), MOST_SHARED))
     return parts
@@ -353,7 +355,7 @@ def _misfits(snapshot: Snapshot, explained: BoolArray) -> dict[Source, FloatArra
     frequency = snapshot.frequency
     found = {source: np.zeros(len(frequency)) for source in (Source.MISFIT, Source.SHARED_NOISE)}
     for advice in snapshot.diagnostics.advice:
-        if advice.band is None or advice.level is Level.NOTE:
+        if advice.band is None or advice.rank is Rank.TO_KNOW:
             continue
         here = (frequency >= advice.band[0]) & (frequency <= advice.band[1])
         source, error = Source.MISFIT, 0.0

@@ -19,17 +19,10 @@ from daq.estimation.snapshot_diagnostics import (
     SnapshotDiagnostics,
     Synchronisation,
 )
-from estimator.checks.advice import (
-    Advice,
-    Delay,
-    Gain,
-    Level,
-    ModelMisfit,
-    NoiseChanges,
-    ResponseChanges,
-    SharedNoise,
-    Untested,
-)
+from estimator.checks.advice import Advice, Rank, Untested
+from estimator.checks.advice_on_model import ModelMisfit
+from estimator.checks.advice_on_noise import NoiseChanges, ResponseChanges, SharedNoise
+from estimator.checks.advice_on_sensors import Delay, Gain
 from estimator.checks.count_limits import CountLimits
 from estimator.checks.diagnose import Diagnostics, diagnose
 from estimator.checks.stability import Stability
@@ -100,8 +93,8 @@ class Findings:
             )
             differ = {sensor for each in leaks for sensor in each.sensors}
             rest = [each for each in whole.advice if not _is_by_response(each, differ)]
-            order = list(Level)
-            advice = sorted([*rest, *leaks], key=lambda each: order.index(each.level))
+            order = list(Rank)
+            advice = sorted([*rest, *leaks], key=lambda each: order.index(each.rank))
             whole = replace(whole, advice=tuple(advice))
         return cls(counts, stood_still, whole, untested, edges)
 
@@ -424,7 +417,7 @@ def _is_across(
     most = snr * np.repeat(axes, dims)
     return all(
         abs(amount) <= max(most[one], most[other])
-        for (one, other), amount in zip(advice.channels, advice.amounts, strict=True)
+        for (one, other), amount in zip(advice.channels, advice.coherencies, strict=True)
     )
 
 

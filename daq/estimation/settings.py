@@ -15,6 +15,7 @@ from daq.bench.option_fit import misfits
 from daq.errors import WrongSettingError
 from estimator.errors import EstimatorError
 from estimator.levels.contributions import across
+from estimator.likelihood.dimension import has_room
 from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:
@@ -25,14 +26,10 @@ if TYPE_CHECKING:
     from daq.recording.interface import ReadableSensor
 
 _LONG_WINDOW = 4096  # samples, in which every window with a parameter that has one is possible
-ROOM, ROOM_OF_ONE_CHANNEL = 4, 6
-"""Sensors from which ``auto`` looks for more dimensions of motion than a sensor has channels."""
 DIMENSIONS = 3
 """Of the motion of a floor."""
 AXIS_TOLERANCE, OF_KNOWN_LEAN = 1.0, 0.1
 """Degrees, rms, if nothing else is given: of any lean, and of what remains of a known one."""
-MAX_CHANNELS = 96
-"""Channels up to which ``auto`` is maximum likelihood, to limit its cost."""
 _NEEDED = {
     "dimension": "maximum-likelihood",
     "gains": "two-channel",
@@ -107,12 +104,6 @@ class Settings(EstimateSettings):
             **{each.name: getattr(bench.estimate, each.name) for each in fields(EstimateSettings)}
         )
         return replace(found, target_cov=None, target_cov_bin=None) if bench.has_limits else found
-
-
-def has_room(dims: tuple[int, ...]) -> bool:
-    """Whether sensors leave room for more dimensions of motion than one has channels."""
-    least = ROOM_OF_ONE_CHANNEL if 1 in dims else ROOM
-    return len(dims) >= least and len(set(dims)) == 1 and sum(dims) <= MAX_CHANNELS
 
 
 def _seen(dims: tuple[int, ...]) -> list[bool]:

@@ -12,6 +12,7 @@ from daq.estimation.snapshot_diagnostics import (
     added_by_clocks,
 )
 from daq.recording.sensor_state import STATE_AFTER
+from estimator.checks.advice import Names
 from estimator.errors import InsufficientDataError
 
 if TYPE_CHECKING:
@@ -301,6 +302,18 @@ class Snapshot:
     def sensor_names(self) -> tuple[str, ...]:
         """Names of the sensors whose channels are estimated, in the order of `dims`."""
         return tuple(dict.fromkeys(label.sensor for label in self.channels))
+
+    @property
+    def names(self) -> Names:
+        """For advice, which refers to sensors and channels by number."""
+        chosen = ("auto",) if self.diagnostics.dimensions else ()
+        return Names(
+            self.sensor_names,
+            tuple(label.name for label in self.channels),
+            self.dims,
+            frozenset((*self.results, *chosen)),
+            self.start_utc_ns,
+        )
 
     @property
     def added_by_clocks(self) -> FloatArray | None:

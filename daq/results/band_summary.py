@@ -16,7 +16,7 @@ import numpy as np
 
 from daq.estimation.contributions import contributions, shared_parts
 from daq.estimation.noise_estimates import ALL_METHODS
-from estimator.checks.advice import NoSharedMotion
+from estimator.checks.advice_on_signals import NoSharedMotion
 from estimator.levels.bands import band_edges, band_levels, bin_correlation, third_octaves
 from estimator.levels.contributions import Source, by_chance, deviation, widened
 from estimator.levels.interval import NORMAL_95, interval, unpredicted

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 from daq.results.band_summary import Estimate
 from daq.results.clock_effect import effect_by_sensor
 from daq.results.decision.end import remaining
-from daq.results.known_facts import facts_of, facts_of_verdict, is_outside, ranked
+from daq.results.decision.verdict import facts_of_verdict
+from daq.results.facts.all_facts import facts_of, ranked
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from daq.results.decision.end import Remaining
     from daq.results.decision.verdict import TestVerdict
-    from daq.results.facts import Fact
+    from daq.results.facts.fact import Fact
     from daq.results.sources import Source
 
 
@@ -85,10 +86,6 @@ class Result(Estimate):
         """With those of the verdict."""
         found = self.verdict
         return ranked([*self.facts, *(() if found is None else facts_of_verdict(found))], self)
-
-    def is_outside(self, fact: Fact) -> bool:
-        """Return whether all that a fact concerns is outside of what matters here."""
-        return is_outside(fact.band, self.concern)
 
     @cached_property
     def clock_effects(self) -> dict[str, float]:

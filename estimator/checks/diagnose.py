@@ -13,13 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.checks.advice import (
-    DisturbedSegments,
-    Level,
-    NoiseChanges,
-    ResponseChanges,
-    Untested,
-)
+from estimator.checks.advice import Rank, Untested
+from estimator.checks.advice_on_noise import DisturbedSegments, NoiseChanges, ResponseChanges
 from estimator.checks.band import BandDiagnosis
 from estimator.checks.relative_response import (
     PairProducts,
@@ -101,7 +96,7 @@ def changes(
     for change in stability.changes:
         own = sensor_of == change.sensor
         yield ResponseChanges(
-            level=Level.WARNING,
+            rank=Rank.DELAYS,
             sensors=(change.sensor,),
             channel=change.channel,
             is_turn=change.is_turn,
@@ -113,9 +108,9 @@ def changes(
         )
     n_disturbed = len(stability.disturbed)
     if n_disturbed and times is not None:
-        level = Level.WARNING if stability.excess >= SMALL else Level.NOTE
+        rank = Rank.DELAYS if stability.excess >= SMALL else Rank.TO_KNOW
         yield DisturbedSegments(
-            level=Level.PROBLEM if stability.excess >= LARGE else level,
+            rank=Rank.INVALIDATES if stability.excess >= LARGE else rank,
             sensors=(int(sensor_of[stability.channel]),),
             n_disturbed=n_disturbed,
             n_segments=stability.n_segments,
@@ -138,7 +133,7 @@ def changes(
         return
     group, channel = np.unravel_index(int(strength.argmax()), strength.shape)
     yield NoiseChanges(
-        level=Level.WARNING if strength.max() >= LARGE else Level.NOTE,
+        rank=Rank.DELAYS if strength.max() >= LARGE else Rank.TO_KNOW,
         sensors=(int(sensor_of[channel]),),
         band=(float(stability.low[group]), float(stability.high[group])),
         channel=int(channel),

@@ -20,27 +20,30 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.checks.advice import (
-    Advice,
-    Copies,
-    Delay,
-    Gain,
-    Level,
-    MissingChannels,
+from estimator.checks.advice import Advice, Rank
+from estimator.checks.advice_on_model import (
     MissingDimension,
     ModelMisfit,
     MotionAcross,
     NearlySingular,
-    NoSharedMotion,
-    NoSignal,
+    TooFewDimensions,
+    WeakMotion,
+)
+from estimator.checks.advice_on_noise import SharedNoise
+from estimator.checks.advice_on_sensors import (
+    Delay,
+    Gain,
     NotOrthogonal,
     ReversedPolarity,
     Rotated,
-    SharedNoise,
     SwappedChannels,
-    TooFewDimensions,
+)
+from estimator.checks.advice_on_signals import (
+    Copies,
+    MissingChannels,
+    NoSharedMotion,
+    NoSignal,
     TooFewSensors,
-    WeakMotion,
 )
 from estimator.checks.shared_motion import outsiders
 from estimator.likelihood.goodness_of_fit import less, rejected_below
@@ -93,7 +96,7 @@ def orientation(
     swapped = {} if response.is_ambiguous else _swapped(response)
     if swapped:
         yield SwappedChannels(
-            level=Level.WARNING,
+            rank=Rank.DELAYS,
             sensors=pair,
             band=band,
             channels=tuple((own + c, counterpart + other) for c, other in swapped.items()),
@@ -102,7 +105,7 @@ def orientation(
     has_sign = not response.is_ambiguous
     if has_sign and _exceeds(response.rotation_deg, ROTATED_DEG, response.rotation_error_deg):
         yield Rotated(
-            level=Level.NOTE,
+            rank=Rank.TO_KNOW,
             sensors=pair,
             band=band,
             angle_deg=response.rotation_deg,
@@ -113,14 +116,14 @@ def orientation(
     if _exceeds(skew, SKEWED_DEG, response.nonorthogonality_error_deg):
         very = skew > VERY_SKEWED_DEG
         yield NotOrthogonal(
-            level=Level.WARNING if very else Level.NOTE,
+            rank=Rank.DELAYS if very else Rank.TO_KNOW,
             sensors=pair,
             band=band,
             deviation_deg=skew,
         )
     for channel in response.reversed_channels if has_sign else ():
         yield ReversedPolarity(
-            level=Level.WARNING,
+            rank=Rank.DELAYS,
             sensors=pair,
             band=band,
             channel=own + channel,
@@ -129,7 +132,7 @@ def orientation(
     off = int(np.argmax(np.abs(response.gains - 1)))
     if _exceeds(abs(response.gains[off] - 1), GAIN, response.gain_errors[off]):
         yield Gain(
-            level=Level.NOTE,
+            rank=Rank.TO_KNOW,
             sensors=pair,
             band=band,
             channel=own + off,
@@ -139,7 +142,7 @@ def orientation(
     samples = response.delay * 2 * nyquist
     if has_sign and _exceeds(abs(samples), DELAY_SAMPLES, response.delay_error * 2 * nyquist):
         yield Delay(
-            level=Level.WARNING,
+            rank=Rank.DELAYS,
             sensors=pair,
             band=band,
             delay=response.delay,
@@ -224,8 +227,8 @@ def advise(
         *(each for each in others if not any(_overlap(each, other) for other in strangers)),
         *(advice for response in responses for advice in orientation(response, dims, nyquist)),
     ]
-    order = list(Level)
-    return tuple(sorted(found, key=lambda advice: order.index(advice.level)))
+    order = list(Rank)
+    return tuple(sorted(found, key=lambda advice: order.index(advice.rank)))
 
 
 def _overlap(one: Advice, other: Advice) -> bool:
@@ -259,7 +262,7 @@ def _stranger(
     weights = [band.n_frequencies for band in run]
     shared = np.average([band.shared for band in run], axis=0, weights=weights)
     return NoSharedMotion(
-        level=Level.PROBLEM,
+        rank=Rank.INVALIDATES,
         sensors=(sensor,),
         band=_span(run),
         partners=partners,
@@ -298,7 +301,7 @@ def _absent(given: Coherency, dims: tuple[int, ...]) -> Iterator[Advice]:
         own = np.flatnonzero((sensor_of == sensor) & (dead > 0.5))
         if len(own):
             yield NoSignal(
-                level=Level.PROBLEM,
+                rank=Rank.INVALIDATES,
                 sensors=(sensor,),
                 channels=tuple(own.tolist()),
                 whole_sensor=len(own) == dims[sensor] > 1,
@@ -307,7 +310,7 @@ def _absent(given: Coherency, dims: tuple[int, ...]) -> Iterator[Advice]:
     pairs = np.argwhere(np.triu(copies > 0.5))
     if len(pairs):
         yield Copies(
-            level=Level.PROBLEM,
+            rank=Rank.INVALIDATES,
             sensors=tuple(np.unique(sensor_of[pairs]).tolist()),
             channels=tuple((int(original), int(copy)) for original, copy in pairs),
             share_of_frequencies=float(copies.max()),
@@ -315,9 +318,9 @@ def _absent(given: Coherency, dims: tuple[int, ...]) -> Iterator[Advice]:
     there = presence(given, dims)
     missing = tuple(s for s in range(len(dims)) if s not in there.whole)
     if len(there.sensors) < min(3, len(dims)):  # a bench of two lacks none
-        yield TooFewSensors(level=Level.PROBLEM, sensors=there.sensors)
+        yield TooFewSensors(rank=Rank.INVALIDATES, sensors=there.sensors)
     elif missing and len(there.whole) < 3:
-        yield MissingChannels(level=Level.WARNING, sensors=missing, whole_sensors=there.whole)
+        yield MissingChannels(rank=Rank.DELAYS, sensors=missing, whole_sensors=there.whole)
 
 
 def _statistic(*bands: BandDiagnosis) -> float:
@@ -331,7 +334,7 @@ def _too_few_dimensions(bands: tuple[BandDiagnosis, ...], n_factors: int) -> Ite
     for run in _runs(bands, lambda band: band.test.p_value < rejected):
         worst = max(run, key=_statistic)
         yield TooFewDimensions(
-            level=Level.PROBLEM,
+            rank=Rank.INVALIDATES,
             band=_span(run),
             n_factors=n_factors,
             statistic=_statistic(*run),
@@ -352,11 +355,11 @@ def _incoherence(
         seen = float(np.sqrt(max(0.0, most - 1) / max(n_effective - d, 1.0)))
         error, largest = TYPICAL * seen, crossing * seen
         likely = float(np.sqrt(error * largest)) if np.isfinite(largest) else error
-        level = Level.WARNING if likely >= SMALL_ERROR else Level.NOTE
+        rank = Rank.DELAYS if likely >= SMALL_ERROR else Rank.TO_KNOW
         if likely >= LARGE_ERROR:
-            level = Level.PROBLEM
+            rank = Rank.INVALIDATES
         yield ModelMisfit(
-            level=level,
+            rank=rank,
             band=_span(run),
             n_factors=n_factors,
             statistic=_statistic(*run),
@@ -392,19 +395,19 @@ def _shared_noise(
     for pair in dict.fromkeys(sensors):
         here = [number for number, each in enumerate(sensors) if each == pair]
         found = SharedNoise(
-            level=Level.NOTE,
+            rank=Rank.TO_KNOW,
             sensors=pair,
             band=_span([bands[n] for n in shared.bands]),
             channels=tuple(shared.pairs[n] for n in here),
-            amounts=tuple(float(shared.amount[n]) for n in here),
-            errors=tuple(float(shared.error[n]) for n in here),
+            coherencies=tuple(float(shared.amount[n]) for n in here),
+            standard_errors=tuple(float(shared.error[n]) for n in here),
             alternatives=shared.alternatives,
             three_sensor=_largest(shared.three_sensor),
             maximum_likelihood=_largest(shared.maximum_likelihood),
             channel=int(np.nanargmax(bias)) if np.isfinite(bias).any() else shared.pairs[0][0],
         )
-        level = Level.WARNING if found.harm >= SMALL_ERROR else Level.NOTE
-        yield replace(found, level=Level.PROBLEM if found.harm >= LARGE_ERROR else level)
+        rank = Rank.DELAYS if found.harm >= SMALL_ERROR else Rank.TO_KNOW
+        yield replace(found, rank=Rank.INVALIDATES if found.harm >= LARGE_ERROR else rank)
 
 
 def _largest(bias: FloatArray) -> float:
@@ -423,7 +426,7 @@ def _sensor_space(bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...]) -> It
     for d in sorted({n for n in shared if n < 3}):
         larger = tuple(i for i, n in enumerate(dims) if n > d)
         yield MotionAcross(
-            level=Level.NOTE,
+            rank=Rank.TO_KNOW,
             sensors=tuple(i for i, n in enumerate(shared) if n == d) if larger else (),
             band=_span(strong),
             n_channels=d,
@@ -446,7 +449,7 @@ def _dimensions(
 
     for run in _runs(bands, is_missing):
         yield MissingDimension(
-            level=Level.WARNING,
+            rank=Rank.DELAYS,
             band=_span(run),
             n_dimensions=min(b.dimension for b in run),
             n_channels=full,
@@ -455,11 +458,11 @@ def _dimensions(
     limit = max(_NEARLY_SINGULAR, float(np.sqrt(n_effective)))
     for run in _runs(bands, lambda band: band.dimension >= full and band.condition > limit):
         yield NearlySingular(
-            level=Level.NOTE, band=_span(run), condition=max(b.condition for b in run)
+            rank=Rank.TO_KNOW, band=_span(run), condition=max(b.condition for b in run)
         )
 
 
 def _weak_motion(bands: tuple[BandDiagnosis, ...]) -> Iterator[Advice]:
     for run in _runs(bands, _is_weak):
         snr = float(np.nanmax([b.snr for b in run]))
-        yield WeakMotion(level=Level.NOTE, band=_span(run), snr=snr)
+        yield WeakMotion(rank=Rank.TO_KNOW, band=_span(run), snr=snr)

@@ -43,6 +43,10 @@ if TYPE_CHECKING:
     from estimator.self_noise.coherency import Presence
     from estimator.types import ComplexArray, FloatArray, IntArray
 
+ROOM, ROOM_OF_ONE_CHANNEL = 4, 6
+"""Sensors from which ``auto`` looks for more dimensions of motion than a sensor has channels."""
+MAX_CHANNELS = 96
+"""Channels up to which ``auto`` is maximum likelihood, to limit its cost."""
 MISFIT_LEVEL = REJECT
 """Probability that a dimension is rejected in any of the bands although it is right: in each band,
 this over their number. With 5 % for each band, four sensors had a rejected one in every second
@@ -69,6 +73,12 @@ OVERFIT = 1.15
 """What a factor that is not there takes from the statistic of one frequency, beyond its degrees of
 freedom, for each channel. Of 9 to 24 channels and 40 to 600 averages, the first one takes 0.7 to
 1.25, the second one less."""
+
+
+def has_room(dims: tuple[int, ...]) -> bool:
+    """Whether sensors leave room for more dimensions of motion than one has channels."""
+    least = ROOM_OF_ONE_CHANNEL if 1 in dims else ROOM
+    return len(dims) >= least and len(set(dims)) == 1 and sum(dims) <= MAX_CHANNELS
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.checks.advice import Level, UnequalResponses
+from estimator.checks.advice import Rank
+from estimator.checks.advice_on_sensors import UnequalResponses
 from estimator.likelihood.dimension import bands
 from estimator.responses.edge_leakage import band_shares
 from estimator.self_noise.coherency import own_channels
@@ -102,13 +103,13 @@ def leakage_advice(
     channel = int(np.argmax(of_channels))
     sensor_of = np.repeat(np.arange(len(dims)), dims)
     left = float(share.max())
-    level = Level.NOTE
+    rank = Rank.TO_KNOW
     if left > LARGE:
-        level = Level.PROBLEM
+        rank = Rank.INVALIDATES
     elif left > least:
-        level = Level.WARNING
+        rank = Rank.DELAYS
     yield UnequalResponses(
-        level=level,
+        rank=rank,
         sensors=tuple(
             np.unique(sensor_of[of_channels > WITH_MOST * of_channels[channel]]).tolist()
         ),

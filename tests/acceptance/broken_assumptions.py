@@ -32,8 +32,9 @@ from daq.errors import HuddleError
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
-from daq.results.facts import Finding, Rank
+from daq.results.facts.fact import Finding
 from daq.results.result import Result
+from estimator.checks.advice import Rank
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from daq.estimation.settings import Settings
-from daq.results.facts import (
+from daq.results.facts.clocks import (
     ClockNotUnderstood,
     ClockSet,
     RatesNominal,

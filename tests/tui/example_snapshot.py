@@ -31,10 +31,10 @@ from daq.recording.sensor_state import SensorState
 from daq.recording.storage.names import CONTINUES
 from daq.recording.writer import RecordingWriter
 from daq.results.result import Result
-from estimator.checks.advice import Level, NoSharedMotion
+from estimator.checks.advice import Rank
+from estimator.checks.advice_on_signals import NoSharedMotion
 from estimator.checks.diagnose import Diagnostics, diagnose
 from estimator.methods import self_noise
-from tui.wording.facts import known
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -55,7 +55,7 @@ RATE = 200.0
 PPM, RESIDUALS = (5.9, -9.1, 4.0), (0.0, 0.4e-6, 0.6e-6)
 
 STRANGER = NoSharedMotion(
-    level=Level.PROBLEM,
+    rank=Rank.INVALIDATES,
     sensors=(0,),
     band=(0.5, 100.0),
     partners=(1, 2),
@@ -402,4 +402,4 @@ def judged(result: Result, verdict: TestVerdict) -> Result:
 
 def said(snapshot: Snapshot, settings: Settings | None = None) -> list[str]:
     """Return the sentences on all facts of a snapshot."""
-    return [str(each) for each in known(Result(snapshot, settings or Settings()))]
+    return [str(each) for each in Result(snapshot, settings or Settings()).facts]

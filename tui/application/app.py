@@ -13,6 +13,7 @@ from textual.binding import Binding, BindingType
 from daq.bench.end_condition import NEVER, EndCondition
 from daq.errors import HuddleError
 from daq.whole_file import write_whole
+from estimator.wording import clock_time
 from tui.application.dialogs import MarkScreen, QuestionScreen, StopScreen
 from tui.application.following import FollowingApp
 from tui.application.forms.form import Field, Form
@@ -22,7 +23,6 @@ from tui.application.plan import TestPlan
 from tui.application.reference import can_open
 from tui.application.state import TITLES, VIEWS
 from tui.application.view import COMMON_KEYS
-from tui.wording.formatting import clock_time
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

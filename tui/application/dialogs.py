@@ -12,7 +12,7 @@ from textual.containers import VerticalScroll
 from textual.screen import ModalScreen
 from textual.widgets import Input, Static
 
-from tui.wording.vocabulary import STATE_MEANINGS
+from daq.results.vocabulary import STATE_MEANINGS
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -20,6 +20,7 @@ from textual.widgets import Static
 from daq.bench.editing import without_sensor
 from daq.bench.loading import parse
 from daq.errors import BenchFileError, HuddleError
+from estimator.wording import listed, several
 from tui.application.bench_view.sensors import (
     LEAST_TRACE,
     columns,
@@ -36,7 +37,6 @@ from tui.application.forms.sensor import PortForm, SensorForm, sensor_table
 from tui.application.themes import ThemedApp
 from tui.application.view import BAD, COMMON_KEYS, MUTED, KeyLine
 from tui.runs.first_bench import is_open, with_device, with_rate
-from tui.wording.formatting import listed, several
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence

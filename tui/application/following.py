@@ -41,7 +41,6 @@ from tui.application.test_view.view import TestView
 from tui.application.themes import ThemedApp
 from tui.application.view import View
 from tui.runs.catalogue import delete_recording
-from tui.wording.findings import Names, alert
 from tui.wording.verdict_text import WORDS
 
 if TYPE_CHECKING:
@@ -214,7 +213,7 @@ class FollowingApp(ThemedApp[None]):
         snapshot = result.snapshot
         moved = () if snapshot.closed else self._recent.strangers(snapshot)
         if moved and not self._is_moved:
-            self.announce("trouble", alert(moved[0], Names.of(snapshot)))
+            self.announce("trouble", moved[0].words(snapshot.names).line)
         self._is_moved = bool(moved)
         result = replace(result, snapshot=with_advice(snapshot, moved), bench=self._bench)
         self.state = replace(self.state, result=result, note="")

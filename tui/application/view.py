@@ -11,9 +11,9 @@ from textual.screen import Screen
 from textual.widget import Widget
 from textual.widgets import Static
 
+from estimator.wording import clock_time
 from tui.application.dialogs import TextScreen, help_text
 from tui.application.state import TITLES, VIEWS
-from tui.wording.formatting import clock_time
 from tui.wording.verdict_text import WORDS, style_of
 
 if TYPE_CHECKING:

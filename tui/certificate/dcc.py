@@ -18,6 +18,7 @@ from daq.protocols.block import Quantity
 from daq.results.decision.conformity import Statement, conformity, with_rule
 from daq.results.sources import conditions
 from daq.results.uncertainty_budget import band_budgets, third_octave_budgets
+from estimator.wording import span
 from tui.report.certificate import (
     PROCEDURE,
     QUANTITIES,
@@ -27,7 +28,6 @@ from tui.report.certificate import (
     outside_range,
 )
 from tui.report.noise import decision_rule
-from tui.wording.formatting import span
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

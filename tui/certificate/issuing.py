@@ -28,7 +28,6 @@ from tui.report.contents import report_of
 from tui.report.evidence import invalidating
 from tui.report.paper import write_paper
 from tui.report.writing import write_content
-from tui.wording.facts import known as known_facts
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -247,7 +246,7 @@ def issue(result: Result, examined: Examined, ledger: Ledger) -> tuple[Entry, Pa
             " --specimen makes a specimen"
         )
     result = with_stated(result, examined)
-    invalid = invalidating(known_facts(result))
+    invalid = invalidating(result.facts)
     if invalid and not order.despite:
         lines = "\n".join(f"  {each.text}" for each in invalid)
         raise NotIssuedError(

@@ -399,12 +399,11 @@ def _show(screen: Console, found: Answer, time_zone: str) -> None:
     """Print the tables of an archive."""
     from tui.output.archive.tables import course_table, course_title, remarks
     from tui.output.results import averages_line, result_table, result_title
-    from tui.wording.facts import known
 
     screen.print(result_title(found.result))
     screen.print(result_table(found.result))
     screen.print(averages_line(found.pooled))
-    for each in known(found.result):
+    for each in found.result.facts:
         screen.print(each.line)
     screen.print(course_title(found))
     screen.print(course_table(found))
@@ -416,8 +415,8 @@ def _take_new(archive: Store, paths: Sequence[Path], run: Run) -> list[str]:
     """Take what is new; returns a message for each recording that failed."""
     from daq.archive.execution import failure_of, tasks_of
     from daq.archive.sources import sort
+    from estimator.wording import several
     from tui.output.console import notices
-    from tui.wording.formatting import several
 
     screen = notices()
     with archive.writing() as n_unfinished:
@@ -450,8 +449,8 @@ def _take_new(archive: Store, paths: Sequence[Path], run: Run) -> list[str]:
 
 def _thin(archive: Store, days: int | None, *, single: bool) -> None:
     """Reduce the matrices of old recordings."""
+    from estimator.wording import several
     from tui.output.console import notices
-    from tui.wording.formatting import several
 
     if days is None:
         return
@@ -500,8 +499,8 @@ def _runner(jobs: int, scheduler: str | None) -> Run:
 
 
 def _connected(dashboard: str, n_workers: int) -> None:
+    from estimator.wording import several
     from tui.output.console import notices
-    from tui.wording.formatting import several
 
     waiting = "" if n_workers else "; work begins when there is one"
     notices().print(
@@ -592,8 +591,8 @@ def _take_days(found: Found, stores: Mapping[str, Store], reading: Reading, run:
     """Take the days that are new; returns a message for each that failed."""
     from daq.archive.execution import failure_of
     from daq.archive.stations import work
+    from estimator.wording import several
     from tui.output.console import notices
-    from tui.wording.formatting import several
 
     screen = notices()
     with contextlib.ExitStack() as stack:
@@ -669,6 +668,7 @@ def _write_stations(
     Adds what fails to `problems`, which the JSON has at its end.
     """
     from daq.archive.answers import answer
+    from estimator.wording import several
     from tui.output.archive.document import (
         STATIONS_HEADER,
         archive_json,
@@ -677,7 +677,6 @@ def _write_stations(
     )
     from tui.output.console import for_people, growing, progress
     from tui.output.csv_text import csv_text
-    from tui.wording.formatting import several
 
     n_figures = 0
     with contextlib.ExitStack() as stack:

@@ -81,7 +81,6 @@ def calibrate(
     )
     from tui.output.console import check_places, for_people, hint, write_json
     from tui.output.json_document import calibration_document
-    from tui.wording.facts import known
 
     check_places(json)
     result = estimated(files, start=start, end=end, whole=True, **wanted)
@@ -99,7 +98,7 @@ def calibrate(
         _show(screen, "Budget of the noise PSD, relative", budget_table(noise))
     for line in (LEGEND, *remarks(found, snapshot)):
         screen.print(line)
-    for each in known(result):
+    for each in result.facts:
         if each.needs_action:
             screen.print(str(each))
     write_json(json, calibration_document(found, snapshot))

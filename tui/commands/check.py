@@ -93,8 +93,8 @@ def check_bench(path: Path, *, devices: bool, write: bool = False, json: str | N
     """
     from daq.devices.bench_file import is_simulated, load
     from daq.preflight.device_check import Examination
+    from daq.results.facts.recordings import SIMULATED
     from tui.output.console import for_people, write_json
-    from tui.wording.facts import SIMULATED
 
     bench = load(path)
     screen = for_people(json)
@@ -205,9 +205,9 @@ def check_port(port: str, *, json: str | None) -> None:
 
     from daq.host_clock import SystemClock
     from daq.preflight.device_check import discover, search_description
+    from daq.results.facts.recordings import SIMULATED
     from daq.transport.ports import is_simulated
     from tui.output.console import for_people, write_json
-    from tui.wording.facts import SIMULATED
 
     found = asyncio.run(discover(port, SystemClock()))
     simulated = is_simulated(port)
@@ -300,7 +300,7 @@ def _device_table(found: Sequence[SensorCheck]) -> Table:
 
 def remarks(entry: SensorCheck, serial_number: str) -> Iterator[str]:
     """Yield remarks on a sensor, for which the bench file expects a serial number or none."""
-    from tui.wording.formatting import signed
+    from estimator.wording import signed
 
     about = entry.information
     if serial_number and not about.serial_number and not about.trouble:

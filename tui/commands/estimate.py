@@ -249,7 +249,7 @@ def show_result(
     from tui.output.diagnosis import details
     from tui.output.noise_parameters import quantisation_notes
     from tui.output.results import averages_line, curves_csv, result_table, result_title
-    from tui.wording.facts import NOTHING_TO_DO, brief, known
+    from tui.wording.facts import NOTHING_TO_DO, brief
     from tui.wording.verdict_text import STYLES, Decision, limit_line
 
     snapshot, screen = result.snapshot, for_people(json, csv)
@@ -264,7 +264,7 @@ def show_result(
         screen.print(line)
     if parameters is not None:
         _show_parameters(screen, parameters, snapshot.unit)
-    facts = known(result)
+    facts = result.facts
     is_open = decision is not None and decision.next_step != NOTHING_TO_DO
     for part in details(snapshot, facts) if diagnostics else brief(facts, is_open=is_open):
         screen.print(part)

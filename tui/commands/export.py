@@ -61,10 +61,10 @@ def export(
 
     uff58: a function of type 9 (PSD) for each curve.
     """
+    from estimator.wording import several
     from tui.notebook.curve_files import MINISEED, WRITERS, write_curves
     from tui.output.console import for_people, write_json
     from tui.output.json_document import provenance
-    from tui.wording.formatting import several
 
     if kind == MINISEED:
         given = [start, end, *wanted.values()]
@@ -88,9 +88,9 @@ def export(
 
 
 def _export_samples(file: Path, out: Path, json: str | None) -> None:
+    from estimator.wording import several
     from tui.notebook.curve_files import MINISEED, write_samples
     from tui.output.console import for_people, write_json
-    from tui.wording.formatting import several
 
     written, station = write_samples(file, out)
     screen = for_people(json)

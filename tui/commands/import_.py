@@ -295,8 +295,9 @@ def _show(result: ImportResult, out: Path, json: str | None) -> None:
     from rich.table import Table
 
     from daq.bench.durations import format_duration
+    from estimator.wording import several
     from tui.output.console import for_people
-    from tui.wording.formatting import several, utc
+    from tui.wording.formatting import utc
 
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for column in ("sensor", "channels", "rate", "start (UTC)", "samples", "gaps"):

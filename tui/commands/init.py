@@ -91,9 +91,9 @@ def write_discovered(out: Path, ports: Sequence[str], *, force: bool) -> None:
         No port has a device that huddle can read.
     """
     from daq.devices.bench_file import parse
+    from estimator.wording import listed, several
     from tui.output.console import check_places, console, write_text
     from tui.runs.first_bench import answers_in, draft, with_device
-    from tui.wording.formatting import listed, several
 
     if out.exists() and not force:
         raise typer.BadParameter(f"{out}: exists already; --force replaces it")

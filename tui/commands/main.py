@@ -105,11 +105,10 @@ def messages(error: BaseException) -> Iterator[str]:
         if loaded is not None and isinstance(error, loaded.NoResultError):
             from daq.estimation.settings import Settings  # noqa: PLC0415 - seldom needed
             from daq.results.result import Result  # noqa: PLC0415
-            from tui.wording.facts import known  # noqa: PLC0415
 
             refused = error.snapshot.refused  # in the message already
-            for each in known(Result(error.snapshot, Settings())):
-                if each.needs_action and each.fact.method not in refused:
+            for each in Result(error.snapshot, Settings()).facts:
+                if each.needs_action and each.method not in refused:
                     yield str(each)
 
 

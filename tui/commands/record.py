@@ -188,7 +188,7 @@ class GapLog:
 
     def look(self, status: RecorderStatus) -> None:
         """Log new gaps of a recorder's status."""
-        from tui.wording.formatting import several
+        from estimator.wording import several
 
         if time.monotonic() < self._next and not status.closed:
             return
@@ -205,7 +205,7 @@ class GapLog:
 
 def progress_line(status: RecorderStatus, duration: float | None = None) -> str:
     """Return the safe samples of every sensor, and the time until a run of this duration ends."""
-    from tui.wording.formatting import clock_time, roughly, several
+    from estimator.wording import clock_time, roughly, several
 
     sensors = "  ".join(
         f"{name} {sensor.samples}"

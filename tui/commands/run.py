@@ -322,7 +322,7 @@ class _Bar:
 
     def recording(self, n_segments: int, elapsed: float) -> None:
         """Show the progress of the recording."""
-        from tui.wording.formatting import clock_time
+        from estimator.wording import clock_time
 
         parts = [f"{n_segments} segments"]
         if not math.isnan(self._cov):

@@ -71,9 +71,9 @@ class _Lines:
         self._says_why = False
 
     def status(self, status: RecordingStatus) -> None:
+        from daq.results.facts.recordings import SIMULATED
+        from estimator.wording import clock_time
         from tui.output.console import console
-        from tui.wording.facts import SIMULATED
-        from tui.wording.formatting import clock_time
 
         before, self._now = self._now, status
         events = status.events[self._n_events :]
@@ -98,9 +98,9 @@ class _Lines:
 
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
         from daq.results.result import Result
+        from estimator.wording import clock_time
         from tui.output.console import console
         from tui.wording.facts import why_no_estimate
-        from tui.wording.formatting import clock_time
 
         result = Result(snapshot, settings, self._bench, (self._file,))
         before, self.last = self.last, result
@@ -137,7 +137,7 @@ class _Lines:
 
 
 def _line(result: Result, now: RecordingStatus | None) -> str:
-    from tui.wording.formatting import clock_time
+    from estimator.wording import clock_time
     from tui.wording.verdict_text import how_long
 
     snapshot, state = result.snapshot, "ended"

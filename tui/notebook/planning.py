@@ -15,20 +15,21 @@ from daq.bench.durations import format_duration
 from daq.devices.bench_file import load
 from daq.errors import WrongSettingError
 from daq.estimation.noise_estimates import responses
-from daq.estimation.settings import ROOM, ROOM_OF_ONE_CHANNEL, Settings
+from daq.estimation.settings import Settings
 from daq.results.band_summary import correlation_of
 from estimator import planning
 from estimator.levels.bands import third_octaves
 from estimator.levels.interval import worth
+from estimator.likelihood.dimension import ROOM, ROOM_OF_ONE_CHANNEL
 from estimator.responses.edge_leakage import slope_factor
 from estimator.responses.equalisation import THRESHOLD
 from estimator.spectra.welch import WelchSettings
 from estimator.spectra.windows import get_window
+from estimator.wording import percent, signed
 from tui.notebook.options import settings_of
 from tui.notebook.text import rendered
 from tui.notebook.waves import Waves, waves_across
 from tui.simulation.devices import scenario_of
-from tui.wording.formatting import percent, signed
 
 if TYPE_CHECKING:
     import os

@@ -22,10 +22,11 @@ from daq.formats.sources import Selection
 from daq.protocols.block import BlockFlag
 from daq.recording.interface import absences
 from daq.recording.reader import Recording
+from estimator.wording import several
 from tui.notebook.estimates import PathLike, Response, estimate, response_sources, self_noise
 from tui.notebook.options import moment
 from tui.output.extras import load
-from tui.wording.formatting import several, utc
+from tui.wording.formatting import utc
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

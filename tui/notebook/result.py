@@ -16,7 +16,6 @@ from daq.results.sources import uncounted_events
 from estimator.levels.bands import band_edges
 from tui.notebook import text
 from tui.output.extras import load
-from tui.wording.facts import known
 
 if TYPE_CHECKING:
     import os
@@ -36,10 +35,10 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot_diagnostics import (
         SnapshotDiagnostics,
     )
+    from daq.results.facts.fact import Fact
     from daq.results.sources import LoggedEvent
     from estimator.self_noise.result import SelfNoise
     from estimator.types import ComplexArray, FloatArray, IntArray
-    from tui.wording.facts import Known
 
 
 def figure(result: results.Result, *, models: Sequence[Mask], width: float) -> Figure:
@@ -261,12 +260,12 @@ class Result:
         return self.snapshot.diagnostics
 
     @property
-    def facts(self) -> tuple[Known, ...]:
+    def facts(self) -> tuple[Fact, ...]:
         """What is known of the test beyond its numbers, the worst first.
 
         Each has its typed ``fact`` with numbers, and its ``words``; ``str()`` gives sentences.
         """
-        return known(self.result)
+        return self.result.facts
 
     @property
     def advice(self) -> tuple[str, ...]:

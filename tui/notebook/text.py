@@ -14,7 +14,7 @@ from rich.text import Text
 from estimator.decision.verdict import Verdict
 from estimator.errors import BandError
 from tui.output.results import averages_line, result_table, result_title
-from tui.wording.facts import brief, known
+from tui.wording.facts import brief
 from tui.wording.formatting import level, level_with_error
 from tui.wording.verdict_text import Decision
 
@@ -43,7 +43,7 @@ def text(result: Result) -> str:
         return rendered([Text(f"Self-noise: {error}"), Text(averages_line(result.snapshot))])
     is_open = result.verdict is not None and result.verdict.verdict is not Verdict.PASS
     more = "print(*result.facts, sep='\\n')"
-    parts += map(Text, brief(known(result), more, is_open=is_open))
+    parts += map(Text, brief(result.facts, more, is_open=is_open))
     return rendered(parts)
 
 
@@ -67,7 +67,7 @@ def html(result: Result) -> str:
         for tag, row in zip(chain(["th"], repeat("td")), zip(*columns, strict=True), strict=False)
     ]
     body = "".join(f"<tr>{row}</tr>" for row in rows)
-    lines = (averages_line(result.snapshot), *(each.line for each in known(result)))
+    lines = (averages_line(result.snapshot), *(each.line for each in result.facts))
     below = "".join(f"<p>{escape(line)}</p>" for line in lines)
     above = "".join(f"<p>{escape(line)}</p>" for line in _decision(result))
     return (

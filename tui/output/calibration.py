@@ -9,7 +9,7 @@ from daq.bench.units import decibels
 from daq.clocks.clock_model import RelativeTime
 from daq.results.clock_effect import relative_time
 from daq.results.uncertainty_budget import student_quantile
-from tui.wording.formatting import signed, span
+from estimator.wording import signed, span
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

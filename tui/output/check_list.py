@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 from rich.text import Text
 
 from daq.preflight.findings import Check, Outcome, Problem
-from tui.wording.formatting import listed
-from tui.wording.vocabulary import CAUSES
+from daq.results.vocabulary import CAUSES
+from estimator.wording import listed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

@@ -9,9 +9,8 @@ from rich.table import Table
 from rich.text import Text
 
 from estimator.spectra.segment_rejection import Reason
+from estimator.wording import degrees, ratio, signed
 from tui.wording.facts import RANKS
-from tui.wording.findings import Names
-from tui.wording.formatting import degrees, ratio, signed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,8 +21,9 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot_diagnostics import (
         Diagnosis,
     )
+    from daq.results.facts.fact import Fact
+    from estimator.checks.advice import Names
     from estimator.checks.stability import Stability
-    from tui.wording.facts import Known
 
 _LEGEND = (
     "Coherence: the lowest between like channels of two sensors. Condition: condition number of "
@@ -34,12 +34,10 @@ _LEGEND = (
 )
 
 
-def details(snapshot: Snapshot, facts: Sequence[Known]) -> list[RenderableType]:
+def details(snapshot: Snapshot, facts: Sequence[Fact]) -> list[RenderableType]:
     """Return the diagnosis of every band and pair of sensors, and all facts in full."""
     found = snapshot.diagnostics.diagnosis
-    listed_facts: list[RenderableType] = [
-        Text(f"{RANKS[each.fact.rank]}: {each}") for each in facts
-    ]
+    listed_facts: list[RenderableType] = [Text(f"{RANKS[each.rank]}: {each}") for each in facts]
     if found is None:
         return listed_facts
     parts: list[RenderableType] = [_heading("Common motion by band"), _bands(found), Text(_LEGEND)]
@@ -48,7 +46,7 @@ def details(snapshot: Snapshot, facts: Sequence[Known]) -> list[RenderableType]:
         parts += [_heading("Orientation, gain and delay of the sensors"), pairs]
     if snapshot.octaves:
         parts += [_heading("Segments of each octave"), _octaves(snapshot)]
-    names = Names.of(snapshot)
+    names = snapshot.names
     if found.stability is not None:
         between, table = _repeatability(found.stability, names)
         parts += [_heading(f"Repeatability of the noise between {between}"), table]

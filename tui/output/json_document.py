@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any
 from daq.bench.estimate_settings import table_keys
 from daq.protocols.block import Quantity
 from daq.results.clock_effect import relative_time
-from daq.results.facts import Fact, Finding
+from daq.results.facts.fact import Fact, Finding
 from daq.results.sources import conditions
 from daq.results.uncertainty_budget import level_budget
-from estimator.checks.advice import Advice
+from estimator.checks.advice import Advice, Rank
+from estimator.records import json_key
 from estimator.self_noise.result import Flag
 from tui import __version__
 from tui.output.calibration import channels_of
@@ -28,7 +29,6 @@ from tui.output.json_diagnostics import (
 )
 from tui.output.json_values import plain
 from tui.output.noise_parameters import noise_parameters_document
-from tui.wording.facts import known
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from daq.results.sources import Source
     from estimator.responses.calibration import SensorCalibration
     from estimator.responses.derived_quantities import Value
-    from tui.wording.facts import Known
 
 SCHEMA_VERSION = 2
 """Rises when a key is removed or changes its meaning; new keys do not change it."""
@@ -97,7 +96,7 @@ def document(
     }
     whole |= documents[0] if len(documents) == 1 else {"results": documents}
     whole |= verdict_document(result.verdict)
-    whole["facts"] = facts_document(known(result, with_verdict=True))
+    whole["facts"] = facts_document(result.all_facts)
     whole["band_means"] = _band_means(result)
     if noise_parameters is not None:
         whole["noise_parameters"] = noise_parameters_document(noise_parameters)
@@ -263,7 +262,9 @@ def verdict_document(found: TestVerdict | None) -> dict[str, Any]:
                 "cause": each.cause,
             }
             for each in found.sensitivities
-            for name, gain, error in zip(each.channels, each.gains, each.errors, strict=True)
+            for name, gain, error in zip(
+                each.channels, each.gains, each.standard_errors, strict=True
+            )
         ],
         "record_for": None
         if prediction is None
@@ -303,52 +304,28 @@ def verdict_document(found: TestVerdict | None) -> dict[str, Any]:
     }
 
 
-def facts_document(facts: Sequence[Known]) -> list[dict[str, Any]]:
+def facts_document(facts: Sequence[Fact]) -> list[dict[str, Any]]:
     """Return what is known of a test beyond its numbers, the worst first."""
     return [
         {
-            "kind": fact.name,
-            "rank": fact.rank,
-            "sensors": list(fact.sensors),
-            "channels": list(fact.channels),
-            "band_hz": fact.band,
-            "time_utc_ns": fact.time_utc_ns,
-            "method": fact.method or None,
-            "numbers": _numbers(fact),
-            "line": words.line,
-            "explanation": words.explanation,
-            "action": words.action or None,
+            "kind": each.name,
+            "rank": each.rank,
+            "sensors": list(each.sensors),
+            "channels": list(each.channels),
+            "band_hz": each.band,
+            "time_utc_ns": each.time_utc_ns,
+            "method": each.method or None,
+            "numbers": _numbers(each),
+            "line": each.words.line,
+            "explanation": each.words.explanation,
+            "action": each.words.action or None,
         }
-        for fact, words, _ in facts
+        for each in facts
     ]
 
 
-_IN_SECONDS = (
-    *("segment", "longest", "missing", "overdue", "total", "error", "left"),
-    *("corrected", "uncorrected", "delay", "times", "begin", "end"),
-)
-_IN_HERTZ = ("below", "bands", "worst_band", "covers", "judged", "refresh", "polled")
-_SHARES = (
-    *("lost", "leakage", "excess", "deviation", "expected", "unexplained", "largest_error"),
-    *("added_by_one_degree", "three_sensor", "maximum_likelihood"),
-    *("size", "size_error", "variance"),
-)
-UNITS: Mapping[str, str] = (
-    {name: f"{name}_s" for name in _IN_SECONDS}
-    | {name: f"{name}_hz" for name in _IN_HERTZ}
-    | {name: f"{name}_share" for name in _SHARES}
-    | {
-        "change": "change_db",
-        "difference": "difference_db",
-        "rotation": "rotation_deg",
-        "rotation_error": "rotation_error_deg",
-        "delay_error": "delay_error_s",
-        "seconds": "constant_s",
-        "amounts": "coherencies",
-        "errors": "standard_errors",
-    }
-)
-"""Names of the numbers of facts and findings in JSON, where those in the code have no unit."""
+_LEVELS = {Rank.INVALIDATES: "problem", Rank.DELAYS: "warning", Rank.TO_KNOW: "note"}
+"""Ranks of findings in JSON."""
 
 
 def _numbers(fact: Fact) -> dict[str, Any]:
@@ -365,7 +342,7 @@ def _numbers(fact: Fact) -> dict[str, Any]:
 def _with_units(found: Fact | Advice, base: type) -> dict[str, Any]:
     common = {each.name for each in fields(base)}
     return {
-        UNITS.get(each.name, each.name): plain(getattr(found, each.name))
+        json_key(each): plain(getattr(found, each.name))
         for each in fields(found)
         if each.name not in common and each.name not in _PARTS
     }
@@ -386,15 +363,12 @@ _PARTS: Mapping[str, Callable[[Any], dict[str, Any]]] = {
 
 
 def _finding(advice: Advice) -> dict[str, Any]:
-    numbers = _with_units(advice, Advice)
-    if "error_s" in numbers:  # of a finding, this is a share of the noise
-        numbers["error_share"] = numbers.pop("error_s")
     return {
-        "kind": advice.kind,
-        "level": advice.level,
+        "kind": advice.name,
+        "level": _LEVELS[advice.rank],
         "sensors": list(advice.sensors),
         "band_hz": advice.band,
-        "numbers": numbers,
+        "numbers": _with_units(advice, Advice),
     }
 
 

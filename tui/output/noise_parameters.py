@@ -9,7 +9,8 @@ import numpy as np
 
 from daq.results.noise_parameters import QUANTISATION_SHARE, Outcome, Quantity
 from estimator.noise_parameters.fit import Term
-from tui.wording.formatting import level, percent, scientific, span
+from estimator.wording import percent, span
+from tui.wording.formatting import level, scientific
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

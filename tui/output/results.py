@@ -10,18 +10,10 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.results.band_summary import data_interval
+from daq.results.vocabulary import FLAG_WORDS, PARTNER_WORDS
 from estimator.self_noise.result import Flag
-from tui.wording.formatting import (
-    clock_time,
-    level,
-    level_with_error,
-    several,
-    utc,
-)
-from tui.wording.vocabulary import (
-    FLAG_WORDS,
-    PARTNER_WORDS,
-)
+from estimator.wording import clock_time, several
+from tui.wording.formatting import level, level_with_error, utc
 
 if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot

@@ -13,6 +13,7 @@ from daq.estimation.settings import Settings
 from daq.results.calibration import calibrate
 from daq.results.decision.conformity import conformity, with_rule
 from estimator.errors import InsufficientDataError
+from estimator.wording import span
 from tui.output.calibration import (
     LEGEND,
     angle_table,
@@ -42,8 +43,7 @@ from tui.report.noise import limits_section, noise_section, verdict
 from tui.report.parameters import parameters_section
 from tui.report.parts import Facts, Paragraph, Part, Report, Section, Signatures, Table
 from tui.report.uncertainty import uncertainty_section
-from tui.wording.facts import known
-from tui.wording.formatting import is_known, local_time, span, utc_time
+from tui.wording.formatting import is_known, local_time, utc_time
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -147,7 +147,7 @@ def report_of(
         sentence = Paragraph(text, "bad" if sentence.tone == "bad" else "doubtful")
     about = bench if about is None else about
     by_rule = with_rule(bench, about)
-    facts = known(result)
+    facts = result.facts
     sections = [  # the result comes first; what it rests on follows
         limits_section(
             snapshot,

@@ -11,38 +11,31 @@ import numpy as np
 from daq.bench.units import decibels
 from daq.protocols.block import EventKind
 from daq.results.clock_effect import grade, reference, residuals
-from daq.results.facts import Rank
+from daq.results.facts.fact import MARKS
 from daq.results.sources import uncounted_events, with_uncounted
-from estimator.checks.advice import NoSharedMotion
+from daq.results.vocabulary import clock_source
+from estimator.checks.advice import Rank
+from estimator.checks.advice_on_sensors import ANY_AXES
+from estimator.checks.advice_on_signals import NoSharedMotion
 from estimator.likelihood.goodness_of_fit import rejected_below
+from estimator.wording import several, span
 from tui.report.figures.drift import drift_plot
 from tui.report.figures.model_test import model_test_plot
 from tui.report.parts import Items, Paragraph, Part, Section, Table
-from tui.wording.facts import MARKS, NOTHING_TO_DO, RANKS
-from tui.wording.findings import ANY_AXES
-from tui.wording.formatting import (
-    NOTHING,
-    plain_number,
-    probability,
-    scientific,
-    several,
-    share,
-    span,
-    utc,
-)
-from tui.wording.vocabulary import clock_source
+from tui.wording.facts import NOTHING_TO_DO, RANKS
+from tui.wording.formatting import NOTHING, plain_number, probability, scientific, share, utc
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from daq.clocks.clock_model import ClockState
     from daq.estimation.snapshot import Snapshot
+    from daq.results.facts.fact import Fact
     from daq.results.result import Result
     from daq.results.sources import LoggedEvent, Source
     from estimator.checks.band import BandDiagnosis
     from estimator.checks.relative_response import RelativeResponse
     from tui.report.parts import Tone
-    from tui.wording.facts import Known
 
 LISTED = 40
 """Most lines of the list of what happened; with more, those of one kind go together."""
@@ -271,12 +264,12 @@ def events_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
     return Section("What happened", tuple(parts))
 
 
-def facts_section(facts: Sequence[Known]) -> Section:
+def facts_section(facts: Sequence[Fact]) -> Section:
     """Return what is known of the test beyond its numbers, the worst first."""
     items = tuple(
         Paragraph(
             f"{each.mark} {each}" if each.needs_action else str(each),
-            TONES[each.fact.rank] if each.needs_action else "plain",
+            TONES[each.rank] if each.needs_action else "plain",
         )
         for each in facts
     )
@@ -289,12 +282,12 @@ def facts_section(facts: Sequence[Known]) -> Section:
     return Section("Facts", (*parts, Paragraph(f"{legend}.", "quiet")))
 
 
-def invalidating(facts: Sequence[Known]) -> tuple[Paragraph, ...]:
+def invalidating(facts: Sequence[Fact]) -> tuple[Paragraph, ...]:
     """Return the lines of facts that invalidate the result, for the first page."""
     return tuple(
-        Paragraph(each.line, TONES[each.fact.rank] if each.needs_action else "doubtful")
+        Paragraph(each.line, TONES[each.rank] if each.needs_action else "doubtful")
         for each in facts
-        if each.fact.rank is Rank.INVALIDATES
+        if each.rank is Rank.INVALIDATES
     )
 
 

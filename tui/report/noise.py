@@ -10,8 +10,10 @@ from daq.bench.tables.certificate import Rule
 from daq.bench.units import decibels
 from daq.results.band_summary import known_range
 from daq.results.decision.conformity import Statement
+from daq.results.vocabulary import FLAG_WORDS, PARTNER_WORDS
 from estimator.decision.verdict import Verdict
 from estimator.self_noise.result import Flag
+from estimator.wording import span
 from tui.report.figures.curves import noise_plots
 from tui.report.parts import Paragraph, Part, Section, Table
 from tui.wording.formatting import (
@@ -21,10 +23,8 @@ from tui.wording.formatting import (
     level_with_error,
     plain_number,
     scientific,
-    span,
 )
 from tui.wording.verdict_text import WORDS, Decision, margin
-from tui.wording.vocabulary import FLAG_WORDS, PARTNER_WORDS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

@@ -11,12 +11,13 @@ import numpy as np
 from daq.bench.units import in_acceleration
 from daq.results.band_summary import without_sensitivity
 from daq.results.uncertainty_budget import STATED, band_budgets
+from daq.results.vocabulary import SOURCE_WORDS
 from estimator.levels.contributions import Source
+from estimator.wording import span
 from tui.report.figures import drawing
 from tui.report.figures.curves import logarithmic
 from tui.report.parts import Paragraph, Plot, Section, Table
-from tui.wording.formatting import NOTHING, level, plain_number, scientific, span
-from tui.wording.vocabulary import SOURCE_WORDS
+from tui.wording.formatting import NOTHING, level, plain_number, scientific
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

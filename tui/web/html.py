@@ -9,9 +9,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from rich.text import Text
 
-from daq.results.facts import Rank
+from estimator.checks.advice import Rank
 from estimator.decision.verdict import Verdict
-from tui.wording.formatting import clock_time, several, utc
+from estimator.wording import clock_time, several
+from tui.wording.formatting import utc
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

@@ -26,6 +26,7 @@ from daq.estimation.follow import follow
 from daq.recording.storage.locking import LOCKS_ARE_VISIBLE, is_being_written
 from daq.results.result import Result
 from estimator.errors import EstimatorError
+from estimator.wording import span
 from tui.application.state import State
 from tui.application.test_view.channels import channel_table
 from tui.application.test_view.clocks import clock_line, clock_table
@@ -36,8 +37,6 @@ from tui.service.status import status_lines
 from tui.web.chart import choice_of, drawn
 from tui.web.html import page
 from tui.web.traces import traces
-from tui.wording.facts import known
-from tui.wording.formatting import span
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Sequence
@@ -353,7 +352,7 @@ def _of_estimate(state: State, result: Result) -> dict[str, str]:
         "now_estimate",
         # Without a verdict, what delays it is among the facts.
         advice=Text() if result.verdict is None else advice(result, choice),
-        facts=[each for each in known(result) if each.needs_action],
+        facts=[each for each in result.facts if each.needs_action],
         band=of_band(result),
         noise=noise,
         clock=clock_line(result, width=WIDE),

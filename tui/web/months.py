@@ -14,7 +14,6 @@ from tui.service.history.series import history
 from tui.service.history.shown import history_figure, history_lines, history_table
 from tui.service.records.store import RunStore
 from tui.web.work import check_wanted
-from tui.wording.facts import known
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -89,7 +88,7 @@ class Months:
             "titles": (result_title(found.result), course_title(found)),
             "tables": (result_table(found.result), course_table(found)),
             "averages": averages_line(found.pooled),
-            "facts": [each.line for each in known(found.result)],
+            "facts": [each.line for each in found.result.facts],
             "remarks": list(remarks(found, "UTC")),
         }
 

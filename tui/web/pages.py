@@ -8,11 +8,12 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.results.comparison import compare
+from daq.results.facts.fact import MARKS
 from tui.application.result_view.result_text import difference_text
 from tui.application.test_view.channels import channel_table
 from tui.web.chart import choice_of
 from tui.web.live import WIDE, band_means, of_band
-from tui.wording.facts import MARKS, NOTHING_TO_DO, known
+from tui.wording.facts import NOTHING_TO_DO
 from tui.wording.verdict_text import Decision, limit_line
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ def about_test(state: State, settings_table: Mapping[str, Any]) -> dict[str, Any
         "comparison": ""
         if state.reference is None or differences is not None
         else "The two tests cannot be compared: no channel, method, unit or band in common.",
-        "facts": known(result),
+        "facts": result.facts,
         "marks": MARKS,
         "nothing_to_do": NOTHING_TO_DO,
         "limits": [] if verdict is None else [limit_line(each) for each in verdict.limits],

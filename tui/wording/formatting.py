@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from daq.bench.units import decibels
+from estimator.wording import several, signed, span
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,22 +35,6 @@ def utc(ns: int) -> str:
     whole, rest = divmod(ns, 1_000_000_000)
     moment = datetime.fromtimestamp(whole, tz=UTC)
     return f"{moment:%Y-%m-%dT%H:%M:%S}.{rest // 1_000_000:03d}Z"
-
-
-def clock_time(seconds: float) -> str:
-    """Return a length of time as h:mm:ss, or m:ss below an hour."""
-    whole = max(0, math.floor(seconds + 0.5))
-    hours, rest = divmod(whole, 3600)
-    minutes, left = divmod(rest, 60)
-    return f"{hours}:{minutes:02d}:{left:02d}" if hours else f"{minutes}:{left:02d}"
-
-
-def roughly(seconds: float) -> str:
-    """Return a length of time in its largest unit, rounded up."""
-    for limit, unit, size in ((90, "s", 1), (5400, "min", 60), (172800, "h", 3600)):
-        if seconds < limit:
-            return f"{math.ceil(seconds / size)} {unit}"
-    return f"{math.ceil(seconds / 86400)} days"
 
 
 def level(psd: float, digits: int = 2) -> str:
@@ -106,16 +91,6 @@ def interval(low: float, high: float) -> str:
     return f"… {level(high)}" if low <= 0 else f"{level(low)} … {level(high)}"
 
 
-def signed(value: float, spec: str) -> str:
-    """Return a number with the minus sign of typography."""
-    return f"{value:{spec}}".replace("-", "−")
-
-
-def several(count: int, one: str, more: str | None = None) -> str:
-    """Return a count with its noun."""
-    return f"{count:,} {one if count == 1 else more or one + 's'}".replace(",", "\u202f")
-
-
 def readings(values: Sequence[float], unit: str) -> tuple[list[str], str]:
     """Return readings of one unit as decimal numbers, and the unit that all of them have then.
 
@@ -151,32 +126,6 @@ def readings(values: Sequence[float], unit: str) -> tuple[list[str], str]:
     if takes_prefix:
         return texts, _PREFIXES[shift] + base
     return texts, f"{power_of_ten(shift)} {unit}" if shift else unit
-
-
-def degrees(angle: float) -> str:
-    """Return an angle to a thousandth of a degree."""
-    return f"{signed(angle, '.3f')}°" if math.isfinite(angle) else "?"
-
-
-def percent(share: float) -> str:
-    """Return a share in per cent, to two digits."""
-    value = float(f"{100 * share:.2g}")
-    return f"{value:.0f} %" if value >= 10 else f"{value:.2g} %"
-
-
-def ratio(value: float) -> str:
-    """Return a ratio to two digits, without an exponent where people need none."""
-    return f"{float(f'{value:.2g}'):.0f}" if 10 <= value < 1e6 else signed(value, ".2g")
-
-
-def span(low: float, high: float) -> str:
-    """Return a band of frequencies."""
-    return f"{low:.3g}–{high:.3g} Hz"
-
-
-def listed(words: Sequence[str], conjunction: str = "and") -> str:
-    """Return words as a list with "and"."""
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {conjunction} {words[-1]}"
 
 
 def power_of_ten(exponent: float) -> str:
@@ -242,3 +191,20 @@ def local_time(moment: datetime, bench: Bench | None) -> str:
     name = bench.schedule.named_zone if bench is not None and named else ""
     local = moment.astimezone(ZoneInfo(name) if name else None)
     return f"{local:%Y-%m-%d %H:%M:%S} UTC{local:%z}" + (f" ({name})" if name else "")
+
+
+def drift_line(
+    sensor: str,
+    change: tuple[float, float],
+    *,
+    since: datetime,
+    n_tests: int,
+    band: tuple[float, float],
+) -> str:
+    """Return by how many dB, ± the 95 % interval, the noise of a sensor differs from the first."""
+    year = "" if since.year == datetime.now(UTC).year else f" {since.year}"
+    db, error = change
+    return (
+        f"{sensor}: {signed(round(db, 1) + 0.0, '+.1f')} ± {error:.1f} dB since {since.day}"
+        f" {since:%B}{year}, {several(n_tests, 'test')} ({span(*band)})"
+    )

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from daq.results.decision.end import Goal
-from daq.results.facts import LimitUndecided, WrongSensitivity
+from daq.results.decision.facts import LimitUndecided, WrongSensitivity
+from daq.results.decision.verdict import facts_of_verdict
 from estimator.decision.verdict import REMOVED_BY_TIME, Verdict
-from tui.wording.facts import NOTHING_TO_DO, known, known_of_verdict
-from tui.wording.formatting import level, listed, percent, roughly, several, signed
+from estimator.wording import listed, percent, roughly, several, signed
+from tui.wording.facts import NOTHING_TO_DO
+from tui.wording.formatting import level
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -77,7 +79,7 @@ class Decision:
             steps = [steps[-1], *steps[:-1]]
         usual = REPAIR
         if found.verdict is Verdict.PASS:
-            needed = any(each.needs_action for each in known(result))
+            needed = any(each.needs_action for each in result.facts)
             usual = SEE_FACTS if needed else NOTHING_TO_DO
         remarks = (*steps[1:], *not_judged(found))
         return cls(found.verdict, headline(found), steps[0] if steps else usual, remarks)
@@ -125,13 +127,13 @@ def what_to_do(found: TestVerdict) -> list[str]:
 
     Where it is decided, only sensitivities that are wrong.
     """
-    lines = [str(each) for each in known_of_verdict(found) if each.needs_action]
+    lines = [str(each) for each in facts_of_verdict(found) if each.needs_action]
     return [line for line in (*lines, record_for(found)) if line]
 
 
 def not_judged(found: TestVerdict) -> list[str]:
     """Return where limits go beyond the spectrum and are not judged, a line a limit."""
-    return [str(each) for each in known_of_verdict(found) if not each.needs_action]
+    return [str(each) for each in facts_of_verdict(found) if not each.needs_action]
 
 
 def record_for(found: TestVerdict) -> str:
@@ -210,9 +212,9 @@ def _not_by_time(found: TestVerdict) -> list[str]:
     """Return why a longer recording does not decide."""
     lines = [
         str(each)
-        for each in known_of_verdict(found)
-        if isinstance(each.fact, WrongSensitivity)
-        or (isinstance(each.fact, LimitUndecided) and each.fact.obstacle not in REMOVED_BY_TIME)
+        for each in facts_of_verdict(found)
+        if isinstance(each, WrongSensitivity)
+        or (isinstance(each, LimitUndecided) and each.obstacle not in REMOVED_BY_TIME)
     ]
     return [line for line in (*lines, record_for(found)) if line]
 

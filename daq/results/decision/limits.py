@@ -18,8 +18,9 @@ from daq.results.band_summary import (
     known_range,
     without_partners,
 )
+from daq.results.decision.facts import WrongSensitivity
 from daq.results.decision.verdict import LimitResult, TestVerdict
-from daq.results.facts import Rank, WrongSensitivity
+from estimator.checks.advice import Rank
 from estimator.checks.sensitivities import TOLERANCE, wrong_gains
 from estimator.decision.comparison import (
     Comparison,
@@ -124,7 +125,7 @@ def _named(snapshot: Snapshot, found: Iterable[WrongGain]) -> tuple[WrongSensiti
             sensors=(labels[group[0].channel].sensor,),
             channels=tuple(labels[each.channel].name for each in group),
             gains=tuple(each.gain for each in group),
-            errors=tuple(each.error for each in group),
+            standard_errors=tuple(each.error for each in group),
             against=tuple(sensors[n] for n in group[0].against),
             cause=group[0].cause,
         )

@@ -7,12 +7,17 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from daq.bench.units import decibels
+from daq.results.decision.facts import LimitNotJudged, LimitUndecided
+from estimator.checks.advice import Rank
 from estimator.decision.decision_time import INTERVAL_FACTOR
-from estimator.decision.verdict import Verdict
+from estimator.decision.verdict import Obstacle, Verdict
 
 if TYPE_CHECKING:
-    from daq.results.facts import WrongSensitivity
-    from estimator.decision.verdict import Obstacle, Prediction
+    from collections.abc import Iterator
+
+    from daq.results.decision.facts import WrongSensitivity
+    from daq.results.facts.fact import Fact
+    from estimator.decision.verdict import Prediction
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,3 +139,23 @@ class TestVerdict:
     def having(self, verdict: Verdict) -> list[LimitResult]:
         """Return the channels and limits of one verdict."""
         return [each for each in self.limits if each.verdict is verdict]
+
+
+def facts_of_verdict(found: TestVerdict) -> Iterator[Fact]:
+    """Yield what is known of a verdict: wrong sensitivities, obstacles, what is not judged."""
+    yield from found.sensitivities
+    for obstacle in found.obstacles if found.verdict is Verdict.NOT_DECIDED else ():
+        if obstacle is Obstacle.SENSITIVITY:
+            continue  # those are facts
+        concerned = [each for each in found.limits if each.obstacle is obstacle]
+        yield LimitUndecided(
+            rank=Rank.DELAYS,
+            channels=tuple(dict.fromkeys(each.name for each in concerned)),
+            obstacle=obstacle,
+            limits=tuple(dict.fromkeys(each.limit for each in concerned)),
+        )
+    for limit, covers, judged in dict.fromkeys(
+        (each.limit, each.covers, each.judged) for each in found.limits
+    ):
+        if covers[0] < judged[0] or judged[1] < covers[1]:
+            yield LimitNotJudged(rank=Rank.TO_KNOW, limit=limit, covers=covers, judged=judged)

@@ -18,7 +18,6 @@ from daq.estimation.settings import Settings
 from daq.results.result import Result
 from sim_devices.world.scenario import Scenario
 from tui.commands.main import app
-from tui.wording.facts import known
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -176,7 +175,7 @@ def test_where_the_resampler_damps_nothing_is_said(tmp_path: Path) -> None:
     noise = snapshot.results["three-sensor"].noise_psd
     assert np.isnan(noise[beyond]).all()
     assert np.isfinite(noise[2:][~beyond[2:]]).all()  # the trend is not in the first bins
-    said = "\n".join(each.line for each in known(Result(snapshot, Settings())))
+    said = "\n".join(each.line for each in Result(snapshot, Settings()).facts)
     assert "no estimate above 90 Hz" in said
     assert "not finite" not in said
     found = snapshot.diagnostics.diagnosis

@@ -14,9 +14,10 @@ import h5py
 import numpy as np
 import pytest
 
-from daq.archive.answers import answer, facts_of_archive
+from daq.archive.answers import answer
 from daq.archive.density import LOWEST_DB, Density
 from daq.archive.execution import carried_out, is_exposed
+from daq.archive.facts import AbsencesNotUsed, facts_of_archive
 from daq.archive.index import FILE as INDEX
 from daq.archive.index import ROLLUP
 from daq.archive.sources import recordings_in, sort
@@ -28,7 +29,7 @@ from daq.errors import ArchiveError, RecordingError, WrongArchiveError, WrongSet
 from daq.estimation.contributions import contributions
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
-from daq.results.facts import AbsencesNotUsed, SpanShortened
+from daq.results.facts.recordings import SpanShortened
 from estimator.levels.contributions import Source
 from estimator.spectra.segment_rejection import Reason
 from tests import known_clocks
@@ -409,7 +410,7 @@ def test_a_sensor_that_shortens_recordings_is_named(tmp_path: Path) -> None:
         facts = found.result.facts
         (fact,) = [each for each in facts if isinstance(each, SpanShortened)]
         assert (fact.sensors, fact.at_end) == (("C",), False)
-        assert fact.seconds == pytest.approx(1200.0, abs=1.0)
+        assert fact.unused == pytest.approx(1200.0, abs=1.0)
 
 
 def test_a_recording_from_1970_is_in_the_answer(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from daq.estimation.estimation import estimate
 from daq.estimation.segments import segment_pass
 from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
-from estimator.checks.advice import Copies
+from estimator.checks.advice_on_signals import Copies
 from tests.daq.clocks.recordings import Sensor, counts, write
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
-from daq.results.facts import ClockNotUnderstood, SamplesUncounted
+from daq.results.facts.clocks import ClockNotUnderstood, SamplesUncounted
 from daq.results.result import Result
 from tests.daq.clock_facts import clock_facts
 from tests.known_clocks import NOISE, Oscillator, Scene, growing, record, seconds_of

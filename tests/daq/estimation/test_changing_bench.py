@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,8 +13,7 @@ import huddle
 from daq.estimation.settings import Settings
 from daq.results.calibration import calibrate
 from daq.results.result import Result
-from estimator.checks.advice import NoiseChanges, ResponseChanges
-from tui.wording.findings import Names, alert
+from estimator.checks.advice_on_noise import NoiseChanges, ResponseChanges
 
 if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
@@ -67,12 +67,7 @@ def test_a_response_that_changes_is_named_sized_and_dated(
     snapshot = estimated(kind, 1, ratio=ratio)
     found = snapshot.diagnostics.advice
     (change,) = [each for each in found if isinstance(each, ResponseChanges)]
-    text = alert(
-        change,
-        Names(
-            snapshot.sensor_names, tuple(label.name for label in snapshot.channels), snapshot.dims
-        ),
-    )
+    text = change.words(replace(snapshot.names, start_utc_ns=0)).line
     for each in words:
         assert each in text
     assert change.size == pytest.approx(size, rel=0.05)

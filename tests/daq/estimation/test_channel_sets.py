@@ -17,9 +17,11 @@ from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
 from daq.formats.importer import import_files
 from daq.recording.reader import Recording
-from daq.results.facts import ChannelsAbsent, SpanShortened
+from daq.results.facts.recordings import SpanShortened
+from daq.results.facts.segments import ChannelsAbsent
 from daq.results.result import Result
-from estimator.checks.advice import ResponseChanges, Untested
+from estimator.checks.advice import Untested
+from estimator.checks.advice_on_noise import ResponseChanges
 from estimator.checks.count_limits import CountLimits
 from estimator.levels.pooled import blocks_of
 from estimator.self_noise.result import Flag, SelfNoise, combined
@@ -199,7 +201,7 @@ def test_a_third_sensor_that_begins_late_shortens_the_estimate_and_is_named() ->
     (fact,) = [
         fact for fact in Result(snapshot, Settings()).facts if isinstance(fact, SpanShortened)
     ]
-    assert (fact.sensors, fact.seconds, fact.at_end) == (("B",), PART / RATE, False)
+    assert (fact.sensors, fact.unused, fact.at_end) == (("B",), PART / RATE, False)
     whole = estimated("ABC", {})
     assert whole.shortened == {}
 
@@ -261,8 +263,8 @@ def test_a_recording_says_where_channels_have_no_samples(tmp_path: Path) -> None
     result = huddle.estimate(path, segment=2.0)
     read = huddle.read(tmp_path / "given.npz")
     np.testing.assert_array_equal(huddle.self_noise(read, segment=2.0).noise_psd, result.noise_psd)
-    (fact,) = [each for each in result.facts if each.fact.name == "channels-absent"]
-    assert len(fact.fact.channels) == 3
+    (fact,) = [each for each in result.facts if each.name == "channels-absent"]
+    assert len(fact.channels) == 3
     (tmp_path / "all").mkdir()
     complete = imported(tmp_path / "all", {})
     with h5py.File(complete) as file:

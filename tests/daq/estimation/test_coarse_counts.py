@@ -9,7 +9,7 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
 from daq.results.band_summary import Spectrum
-from daq.results.facts import RoundedAlike
+from daq.results.facts.channels import RoundedAlike
 from daq.results.result import Result
 from estimator.levels.contributions import Source
 

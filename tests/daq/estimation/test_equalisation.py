@@ -14,7 +14,7 @@ from daq.bench.response import Fir, Measured, PolesZeros, Response
 from daq.estimation import equalisation, noise_estimates
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.settings import Settings
-from estimator.checks.advice import UnequalResponses
+from estimator.checks.advice_on_sensors import UnequalResponses
 from estimator.methods import self_noise
 from sim_devices.world.scenario import Scenario
 from tests import known_clocks

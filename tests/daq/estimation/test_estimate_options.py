@@ -16,16 +16,11 @@ from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError
 from daq.protocols.block import BlockFlag
-from daq.results.facts import ChannelsWrap, Rank, ReadingsRepeat
+from daq.results.facts.channels import ChannelsWrap, ReadingsRepeat
 from daq.results.result import Result
-from estimator.checks.advice import (
-    Copies,
-    Gain,
-    NoSharedMotion,
-    NoSignal,
-    SwappedChannels,
-    Untested,
-)
+from estimator.checks.advice import Rank, Untested
+from estimator.checks.advice_on_sensors import Gain, SwappedChannels
+from estimator.checks.advice_on_signals import Copies, NoSharedMotion, NoSignal
 from estimator.errors import InsufficientDataError
 from estimator.methods import Flag, self_noise
 from estimator.spectra.segment_rejection import Reason

@@ -27,7 +27,7 @@ from daq.estimation.follow import (
 from daq.estimation.settings import Settings
 from daq.estimation.throttle import Throttle
 from daq.recording.control import Command, serve
-from daq.results.facts import NotInLiveEstimate
+from daq.results.facts.recordings import NotInLiveEstimate
 from daq.results.result import Result
 from daq.results.sources import sources, uncounted_events
 from estimator.errors import InsufficientDataError

@@ -9,9 +9,10 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
 from daq.results.calibration import calibrate
-from daq.results.facts import NotLinear, Rank
+from daq.results.facts.channels import NotLinear
 from daq.results.result import Result
-from estimator.checks.advice import ResponseChanges
+from estimator.checks.advice import Rank
+from estimator.checks.advice_on_noise import ResponseChanges
 
 RATE, N_SAMPLES = 100.0, 30_000
 EDGES = np.array([1.0, 5.0, 10.0, 20.0, 40.0])

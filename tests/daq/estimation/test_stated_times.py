@@ -19,7 +19,7 @@ from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.segments.stated_times import compare, drift_of
 from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
-from daq.results.facts import (
+from daq.results.facts.clocks import (
     ClockNotUnderstood,
     ClockSet,
     ClocksMayExplain,

@@ -12,14 +12,14 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
 from daq.results.band_summary import data_interval
-from daq.results.facts import (
-    FewSensors,
+from daq.results.facts.changes import (
     MethodsDiffer,
     NoiseNotIdentified,
     NoisePartShared,
-    PairCompared,
     SteadyGainsAssumed,
 )
+from daq.results.facts.model import FewSensors
+from daq.results.facts.precision import PairCompared
 from daq.results.result import Result
 from estimator.self_noise.result import Flag, Refusal
 

@@ -13,7 +13,7 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
 from daq.results.result import Result
-from estimator.checks.advice import SharedNoise
+from estimator.checks.advice_on_noise import SharedNoise
 from estimator.levels.contributions import across
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
 from daq.results.result import Result
-from estimator.checks.advice import SharedNoise
+from estimator.checks.advice_on_noise import SharedNoise
 
 if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot

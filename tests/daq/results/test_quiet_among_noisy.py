@@ -14,7 +14,7 @@ from daq.protocols.block import HostTime
 from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
 from daq.results.result import Result
-from estimator.checks.advice import WeakMotion
+from estimator.checks.advice_on_model import WeakMotion
 from estimator.levels.bands import band_levels
 from estimator.methods import self_noise
 from estimator.self_noise.result import Flag

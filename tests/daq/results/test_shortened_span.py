@@ -9,8 +9,9 @@ import pytest
 
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
-from daq.results.facts import Rank, SpanShortened
+from daq.results.facts.recordings import SpanShortened
 from daq.results.result import Result
+from estimator.checks.advice import Rank
 from tests.daq.clocks.recordings import Sensor, write
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def test_what_others_have_beyond_a_sensor_is_said(
     (fact,) = shortened(snapshot)
     assert snapshot.elapsed == pytest.approx(SECONDS - seconds, abs=3.0)
     assert (fact.sensors, fact.at_end, fact.rank) == (("C",), end < SECONDS, rank)
-    assert fact.seconds == pytest.approx(seconds, abs=1.0)
+    assert fact.unused == pytest.approx(seconds, abs=1.0)
 
 
 def test_less_than_a_minute_is_no_fact(tmp_path: Path) -> None:

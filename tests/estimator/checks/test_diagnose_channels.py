@@ -6,15 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from estimator.checks.advice import (
-    Copies,
-    Level,
-    MissingChannels,
-    MotionAcross,
-    NoSignal,
-    TooFewSensors,
-    Untested,
-)
+from estimator.checks.advice import Rank, Untested
+from estimator.checks.advice_on_model import MotionAcross
+from estimator.checks.advice_on_signals import Copies, MissingChannels, NoSignal, TooFewSensors
 from estimator.checks.diagnose import diagnose
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.goodness_of_fit import model_test
@@ -38,7 +32,7 @@ def test_a_dead_channel_leaves_the_rest_of_the_bench_its_diagnostics() -> None:
     csm[:, 4, :] = csm[:, :, 4] = 0
     csm[5] = np.nan
     found = diagnose(csm, FREQUENCY, dims=(3,) * 4, n_effective=1080, neighbours=INDEPENDENT)
-    (problem,) = [advice for advice in found.advice if advice.level is Level.PROBLEM]
+    (problem,) = [advice for advice in found.advice if advice.rank is Rank.INVALIDATES]
     assert isinstance(problem, NoSignal)
     assert (problem.sensors, problem.channels, problem.whole_sensor) == ((1,), (4,), False)
     assert problem.share_of_frequencies == 1
@@ -59,7 +53,7 @@ def test_a_signal_connected_twice_is_reported_with_its_copy() -> None:
     csm[:, 4, :] = csm[:, 1, :]
     csm[:, :, 4] = csm[:, :, 1]
     found = diagnose(csm, FREQUENCY, dims=THREE, n_effective=1080)
-    problem, warning = (a for a in found.advice if a.level is not Level.NOTE)
+    problem, warning = (a for a in found.advice if a.rank is not Rank.TO_KNOW)
     assert isinstance(problem, Copies)
     assert (problem.sensors, problem.channels) == ((0, 1), ((1, 4),))
     assert isinstance(warning, MissingChannels)
@@ -79,7 +73,7 @@ def test_two_remaining_sensors_get_the_possible_advice(how: str) -> None:
     found = of(csm)
     (left,) = advice_of(TooFewSensors, found)
     assert left.sensors == (0, 1)
-    assert left.level is Level.PROBLEM
+    assert left.rank is Rank.INVALIDATES
     if how == "dead":
         (dead,) = advice_of(NoSignal, found)
         assert (dead.sensors, dead.channels, dead.whole_sensor) == ((2,), (6, 7, 8), True)

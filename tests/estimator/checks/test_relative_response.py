@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from estimator.checks.advice import ModelMisfit, Rotated
+from estimator.checks.advice_on_model import ModelMisfit
+from estimator.checks.advice_on_sensors import Rotated
 from estimator.checks.diagnose import diagnose
 from estimator.checks.relative_response import PairProducts, relative_response
 from estimator.checks.rules import orientation
@@ -162,7 +163,7 @@ def test_equal_sensors_in_weak_motion_are_not_said_to_differ(
     """Their differences exceed what is tolerated in 5 and 12 of 25 draws, but are not certain."""
     csm, frequency = bench([np.eye(dims[0])] * 3, snr=snr)[::every], FREQUENCY[::every]
     kinds = [
-        found.kind
+        found.name
         for draw in wishart(csm, 20, np.random.default_rng(5), n_draws=25)
         for found in orientation(
             relative_response(draw, frequency, dims=dims, first=0, second=1), dims, 20.0

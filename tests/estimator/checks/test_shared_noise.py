@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from estimator.checks.advice import Level, ModelMisfit, SharedNoise
+from estimator.checks.advice import Rank
+from estimator.checks.advice_on_model import ModelMisfit
+from estimator.checks.advice_on_noise import SharedNoise
 from estimator.checks.diagnose import diagnose
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.score_test import pair_scores
@@ -58,7 +60,7 @@ def test_pairs_are_reported_with_their_amount(
     (advice,) = found_in(averages(rng, pairs, amount, level=(1.0, 4, 1, 1, 1, 9, 1, 1, 2)))
     assert set(advice.channels) == set(pairs)
     assert advice.sensors == sensors
-    for value, error in zip(advice.amounts, advice.errors, strict=True):
+    for value, error in zip(advice.coherencies, advice.standard_errors, strict=True):
         assert abs(value - amount) < 4 * error
         assert error < 0.02
 
@@ -97,7 +99,7 @@ def test_reported_shared_noise_is_no_further_misfit() -> None:
     csm = averages(np.random.default_rng(2), ((0, 3),), 0.25)
     found = diagnose(csm, FREQUENCY, dims=DIMS, n_effective=N, neighbours=INDEPENDENT)
     assert min(band.test.p_value for band in found.bands) < 1e-6
-    kinds = [type(each) for each in found.advice if each.level is not Level.NOTE]
+    kinds = [type(each) for each in found.advice if each.rank is not Rank.TO_KNOW]
     assert SharedNoise in kinds
     assert not [each for each in found.advice if isinstance(each, ModelMisfit)]
 
@@ -110,7 +112,7 @@ def test_noise_shared_in_one_band_is_reported_there() -> None:
     assert advice.channels == ((0, 3),)
     assert advice.band is not None
     assert advice.band[1] < 30
-    assert advice.amounts[0] == pytest.approx(0.3, abs=0.08)
+    assert advice.coherencies[0] == pytest.approx(0.3, abs=0.08)
 
 
 def test_waves_across_the_bench_are_not_reported_as_shared_noise() -> None:

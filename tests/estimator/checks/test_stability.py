@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from estimator.checks.advice import AdviceKind, DisturbedSegments, NoiseChanges
+from estimator.checks.advice_on_noise import DisturbedSegments, NoiseChanges
 from estimator.checks.diagnose import Diagnostics, diagnose
 from estimator.checks.shared_motion import (
     CanonicalCoherence,
@@ -119,8 +119,8 @@ def test_changing_noise_causes_no_false_alarms() -> None:
     (advice,) = [each for each in found.advice if isinstance(each, NoiseChanges)]
     assert advice.deviation == pytest.approx(0.6, rel=0.4)  # levels 0.4 and 1.6
     assert advice.expected < 0.3
-    kinds = {each.kind for each in found.advice}
-    assert not kinds & {AdviceKind.MODEL_MISFIT, AdviceKind.SHARED_NOISE}
+    kinds = {each.name for each in found.advice}
+    assert not kinds & {"model-misfit", "shared-noise"}
 
 
 def test_kept_segments_are_bounded_in_number() -> None:

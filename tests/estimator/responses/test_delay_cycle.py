@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from estimator.checks.advice import Delay, ReversedPolarity
+from estimator.checks.advice_on_sensors import Delay, ReversedPolarity
 from estimator.checks.relative_response import cycle_is_ambiguous, relative_response
 from estimator.checks.rules import orientation
 from estimator.responses.calibration import calibrate_sensor

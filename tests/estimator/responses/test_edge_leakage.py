@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from estimator.checks.advice import Level
+from estimator.checks.advice import Rank
 from estimator.methods import self_noise
 from estimator.responses.edge_leakage import (
     band_shares,
@@ -24,7 +24,7 @@ from estimator.responses.equalisation import (
 from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:
-    from estimator.checks.advice import UnequalResponses
+    from estimator.checks.advice_on_sensors import UnequalResponses
 
 DIMS = (3, 3, 3)
 T = 10.0
@@ -161,9 +161,9 @@ def test_advice_names_the_sensor_that_leaks_and_how_much() -> None:
     assert found.sensors == (1,)
     assert found.channel == 4
     assert found.band == (FREQUENCY[100], FREQUENCY[199])
-    assert found.level is Level.PROBLEM
+    assert found.rank is Rank.INVALIDATES
     (better,) = advised(0 * share, share, "estimated")
-    assert better.level is Level.NOTE
+    assert better.rank is Rank.TO_KNOW
     assert better.share_without == 0.4
     assert not advised(0.01 * share, 0.01 * share)
     assert leakage_threshold(1e9) == pytest.approx(0.01)

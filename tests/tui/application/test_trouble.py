@@ -12,6 +12,7 @@ from daq.bench.model import Limit
 from daq.devices.bench_file import parse
 from daq.errors import HuddleError
 from daq.results.result import Result
+from estimator.wording import clock_time
 from tests.tui.application.screen_text import resized, screen_text
 from tests.tui.application.test_app import NARROW, WIDE, ended, running, shown, view
 from tests.tui.example_snapshot import (
@@ -26,7 +27,6 @@ from tests.tui.example_snapshot import (
 )
 from tui.application.app import HuddleApp
 from tui.application.messages import ErrorReported, Progress, SnapshotReady, StatusUpdated
-from tui.wording.formatting import clock_time
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -19,7 +19,7 @@ from daq.estimation.snapshot_diagnostics import (
     SnapshotDiagnostics,
     Synchronisation,
 )
-from daq.results.facts import ModelUntested
+from daq.results.facts.model import ModelUntested
 from daq.results.result import Result
 from estimator.checks.advice import Untested
 from estimator.checks.count_limits import CountLimits
@@ -28,7 +28,6 @@ from estimator.spectra.segment_rejection import Reason
 from tests.tui.example_snapshot import SETTINGS, STRANGER, diagnosed, made_snapshot, rotation, said
 from tui.output.diagnosis import details
 from tui.output.results import result_table
-from tui.wording.facts import known
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -42,7 +41,7 @@ def test_angles_have_the_minus_of_typography_and_pairs_are_put_together() -> Non
     assert "A–B −5.000°, A–C −9.000°, B–C −4.000°" in rotated
     assert rotated.count("no bias") == 1
     assert "−5.000°" in shown(
-        details(diagnosed(other_way), known(Result(diagnosed(other_way), Settings())))
+        details(diagnosed(other_way), Result(diagnosed(other_way), Settings()).facts)
     )
 
 
@@ -85,7 +84,7 @@ def test_names_with_punctuation_are_kept_whole(sensors: tuple[str, ...]) -> None
     for one, two in ((f"{c}.X", f"{a}.Y"), (f"{c}.Y", f"{b}.X")):
         assert re.search(rf"{re.escape(one)} \w+( as)? {re.escape(two)}", line)
     for snapshot in (reversed_, exchanged):
-        printed = " ".join(shown(details(snapshot, known(Result(snapshot, Settings())))).split())
+        printed = " ".join(shown(details(snapshot, Result(snapshot, Settings()).facts)).split())
         assert all(f"{one} → {two}" in printed for one, two in combinations(sensors, 2))
         assert f"{c}.Z has" in printed or f"{c}.X" in printed
 
@@ -118,14 +117,14 @@ def shown(parts: Sequence[RenderableType]) -> str:
 
 
 def test_the_long_form_explains_its_columns_and_leaves_out_empty_tables() -> None:
-    text = shown(details(diagnosed(), known(Result(diagnosed(), Settings()))))
+    text = shown(details(diagnosed(), Result(diagnosed(), Settings()).facts))
     legend = "Model test: its statistic over its expectation, 1 if one common motion"
     assert legend in " ".join(text.split())
     assert "Orientation, gain and delay" in text
     assert "e+0" not in text
     dead = np.eye(9)
     dead[4, 4] = 0
-    without = shown(details(diagnosed(dead), known(Result(diagnosed(dead), Settings()))))
+    without = shown(details(diagnosed(dead), Result(diagnosed(dead), Settings()).facts))
     assert "Orientation, gain and delay" not in without
     assert "invalidates the result: B.Y has no signal" in without
 
@@ -137,7 +136,7 @@ def test_octaves_say_what_each_has_left_out() -> None:
     )
     snapshot = replace(diagnosed(), octaves=octaves)
     assert "Segments with transients excluded: 3 at 20.1–100 Hz." in said(snapshot)
-    text = " ".join(shown(details(snapshot, known(Result(snapshot, Settings())))).split())
+    text = " ".join(shown(details(snapshot, Result(snapshot, Settings()).facts)).split())
     assert "0–20 20 s 50 1 0 47 20.1–100 10 s 100 2 3 94" in text
     alone = said(replace(snapshot, octaves=octaves[1:]))
     assert not any("octaves below" in line.lower() or "above 20.1 Hz" in line for line in alone)
@@ -177,7 +176,7 @@ def test_too_few_averages_for_the_model_test_are_said() -> None:
     early = diagnosed(n_effective=9.0)
     expected = "The model test needs more averages (9 so far) than channels (9)."
     assert f"{expected} Record longer." in said(early)
-    assert "nan" not in shown(details(early, known(Result(early, Settings()))))
+    assert "nan" not in shown(details(early, Result(early, Settings()).facts))
     assert not any("needs more averages" in line for line in said(diagnosed()))
 
 
@@ -205,11 +204,11 @@ def test_why_there_is_no_diagnosis_is_said(why: Untested) -> None:
     """Whatever the reason, and of two sensors not that there is too little yet."""
     snapshot = replace(made_snapshot(), diagnostics=SnapshotDiagnostics(untested=why))
     (untested,) = [
-        each for each in known(Result(snapshot, Settings())) if isinstance(each.fact, ModelUntested)
+        each for each in Result(snapshot, Settings()).facts if isinstance(each, ModelUntested)
     ]
     assert str(untested).endswith(".")
     assert ("first segments" in str(untested)) == (why is Untested.UNFINISHED)
-    assert str(untested) in shown(details(snapshot, known(Result(snapshot, Settings()))))
+    assert str(untested) in shown(details(snapshot, Result(snapshot, Settings()).facts))
 
 
 def test_what_may_come_from_a_clock_that_is_not_known_says_so() -> None:

@@ -10,19 +10,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from daq.results.decision.facts import WrongSensitivity
 from daq.results.decision.verdict import LimitResult, TestVerdict
-from daq.results.facts import Fact, WrongSensitivity
+from daq.results.facts.fact import Fact
 from daq.results.result import Result
-from estimator.checks import advice
 from estimator.checks.advice import Advice, Untested
 from estimator.checks.count_limits import CountLimits
 from estimator.decision.verdict import Obstacle, Verdict
+from estimator.records import json_key
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
 from tests.tui.example_snapshot import SETTINGS, diagnosed, judged, made_snapshot
 from tests.tui.wording.fact_examples import EXAMPLES, kinds
 from tui.output.console import write_json
-from tui.output.json_document import UNITS, document, result_document
+from tui.output.json_document import document, result_document
 from tui.output.json_values import json_text
 from tui.wording.verdict_text import headline, what_to_do
 
@@ -125,12 +126,12 @@ DIMENSIONLESS = {
 
 
 def test_numbers_of_facts_have_their_units_in_their_names() -> None:
-    for kind in {*kinds(), *kinds(Advice, advice)}:
+    for kind in {*kinds(), *kinds(Advice)}:
         common = {each.name for each in fields(Fact if issubclass(kind, Fact) else Advice)}
         for each in fields(kind):
             if each.name in {*common, "transients_by_octave"} or "float" not in str(each.type):
                 continue
-            name = UNITS.get(each.name, each.name)
+            name = json_key(each)
             assert name in DIMENSIONLESS or name.endswith(("_s", "_hz", "_share", "_deg", "_db")), (
                 kind
             )

@@ -17,7 +17,7 @@ from daq.bench.sensitivity import KnownSensitivity
 from daq.bench.units import decibels
 from daq.estimation.contributions import with_sensitivities
 from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics, Synchronisation
-from daq.results.facts import IntervalsWidened
+from daq.results.facts.precision import IntervalsWidened
 from daq.results.result import Result
 from daq.results.uncertainty_budget import band_budgets
 from estimator.levels.bands import band_edges
@@ -33,7 +33,6 @@ from tui.output.results import result_table
 from tui.report.noise import noise_section
 from tui.report.parts import Table
 from tui.web.chart import _numbers
-from tui.wording.facts import known
 
 if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
@@ -171,8 +170,8 @@ def test_the_budget_has_the_ends_of_the_levels_and_adds_its_lines_by_squares(
 
 
 def test_what_widens_an_interval_is_named_with_its_size(snapshot: Snapshot) -> None:
-    facts = known(Result(snapshot, THIRD))
-    lines = [str(each) for each in facts if isinstance(each.fact, IntervalsWidened)]
+    facts = Result(snapshot, THIRD).facts
+    lines = [str(each) for each in facts if isinstance(each, IntervalsWidened)]
     if snapshot.sensitivities:
         document = _band_means(Result(snapshot, THIRD))[0]
         assert [each["source"] for each in document["contributions"]][-2:] == [

@@ -24,7 +24,6 @@ from tui.report.contents import by_sensor, report_of
 from tui.report.evidence import facts_section
 from tui.report.figures.drift import without_line
 from tui.report.parts import Plot, Section, Table
-from tui.wording.facts import known
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -176,13 +175,13 @@ def test_the_report_and_json_say_that_shared_noise_was_not_searched_for(
 ) -> None:
     snapshot = estimate([reported.recording])
     plain, searched = (
-        facts_section(known(Result(snapshot, Settings()))),
+        facts_section(Result(snapshot, Settings()).facts),
         result_document(snapshot, next(iter(snapshot.results))),
     )
-    for module in ("daq.results.known_facts", "tui.output.json_diagnostics"):
+    for module in ("daq.results.facts.methods", "tui.output.json_diagnostics"):
         monkeypatch.setattr(f"{module}.MAX_CHANNELS", 2)
     words = "Noise that two channels share is not searched for among more than 2 channels"
-    assert words in str(facts_section(known(Result(snapshot, Settings()))))
+    assert words in str(facts_section(Result(snapshot, Settings()).facts))
     assert words not in str(plain)
     assert searched["diagnostics"]["shared_noise_searched"] is True
     assert (

@@ -4,37 +4,41 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from estimator.checks.advice import (
-    Advice,
-    Copies,
-    Delay,
-    DisturbedSegments,
-    Gain,
-    Level,
-    MissingChannels,
+from estimator.checks.advice import Advice, Names, Rank
+from estimator.checks.advice_on_model import (
     MissingDimension,
     ModelMisfit,
     MotionAcross,
     NearlySingular,
-    NoiseChanges,
-    NoSharedMotion,
-    NoSignal,
-    NotOrthogonal,
-    ResponseChanges,
-    ReversedPolarity,
-    Rotated,
-    SharedNoise,
-    SwappedChannels,
     TooFewDimensions,
-    TooFewSensors,
-    UnequalResponses,
     WeakMotion,
 )
-from tui.wording.findings import Names
+from estimator.checks.advice_on_noise import (
+    DisturbedSegments,
+    NoiseChanges,
+    ResponseChanges,
+    SharedNoise,
+)
+from estimator.checks.advice_on_sensors import (
+    Delay,
+    Gain,
+    NotOrthogonal,
+    ReversedPolarity,
+    Rotated,
+    SwappedChannels,
+    UnequalResponses,
+)
+from estimator.checks.advice_on_signals import (
+    Copies,
+    MissingChannels,
+    NoSharedMotion,
+    NoSignal,
+    TooFewSensors,
+)
 
 BAND = (2.0, 8.0)
 MISFIT = ModelMisfit(
-    level=Level.PROBLEM,
+    rank=Rank.INVALIDATES,
     band=BAND,
     n_factors=3,
     statistic=2.5,
@@ -47,7 +51,7 @@ MISFIT = ModelMisfit(
     is_wrong=True,
 )
 FEW = TooFewDimensions(
-    level=Level.PROBLEM,
+    rank=Rank.INVALIDATES,
     band=BAND,
     n_factors=1,
     statistic=3.0,
@@ -55,7 +59,7 @@ FEW = TooFewDimensions(
     worst_band=(4.0, 5.0),
 )
 ACROSS = MotionAcross(
-    level=Level.NOTE,
+    rank=Rank.TO_KNOW,
     band=BAND,
     n_channels=2,
     larger_sensors=(),
@@ -63,23 +67,23 @@ ACROSS = MotionAcross(
     added_by_one_degree=0.046,
 )
 ROTATED = Rotated(
-    level=Level.NOTE,
+    rank=Rank.TO_KNOW,
     sensors=(0, 1),
     band=BAND,
     angle_deg=4.12,
     horizontal_deg=-2.5,
     error_deg=0.1,
 )
-SKEWED = NotOrthogonal(level=Level.NOTE, sensors=(0, 1), band=BAND, deviation_deg=5.74)
-GAIN = Gain(level=Level.NOTE, sensors=(0, 1), band=BAND, channel=4, counterpart=1, ratio=1.05)
-LEADS = Delay(level=Level.WARNING, sensors=(0, 1), band=BAND, delay=-0.02, delay_samples=-0.8)
+SKEWED = NotOrthogonal(rank=Rank.TO_KNOW, sensors=(0, 1), band=BAND, deviation_deg=5.74)
+GAIN = Gain(rank=Rank.TO_KNOW, sensors=(0, 1), band=BAND, channel=4, counterpart=1, ratio=1.05)
+LEADS = Delay(rank=Rank.DELAYS, sensors=(0, 1), band=BAND, delay=-0.02, delay_samples=-0.8)
 SHARED = SharedNoise(
-    level=Level.WARNING,
+    rank=Rank.DELAYS,
     sensors=(0, 1),
     band=BAND,
     channels=((0, 3), (1, 4)),
-    amounts=(0.1, -0.08),
-    errors=(0.004, 0.003),
+    coherencies=(0.1, -0.08),
+    standard_errors=(0.004, 0.003),
     alternatives=((0, 5), (2, 3)),
     three_sensor=-0.07,
     maximum_likelihood=0.06,
@@ -97,12 +101,14 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
         ),
     ),
     (
-        replace(SHARED, sensors=(0,), channels=((0, 1),), amounts=(0.1,), errors=(0.01,)),
+        replace(
+            SHARED, sensors=(0,), channels=((0, 1),), coherencies=(0.1,), standard_errors=(0.01,)
+        ),
         ("Channels of a share noise", "a.x and a.y 10 ± 1 %"),
     ),
     (
         DisturbedSegments(
-            level=Level.WARNING,
+            rank=Rank.DELAYS,
             sensors=(1,),
             n_disturbed=7,
             n_segments=240,
@@ -119,7 +125,7 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
     ),
     (
         ResponseChanges(
-            level=Level.WARNING,
+            rank=Rank.DELAYS,
             sensors=(1,),
             channel=4,
             is_turn=False,
@@ -133,7 +139,7 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
     ),
     (
         ResponseChanges(
-            level=Level.WARNING,
+            rank=Rank.DELAYS,
             sensors=(1,),
             channel=None,
             is_turn=True,
@@ -147,7 +153,7 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
     ),
     (
         NoiseChanges(
-            level=Level.NOTE,
+            rank=Rank.TO_KNOW,
             sensors=(1,),
             band=BAND,
             channel=4,
@@ -165,7 +171,7 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
     ),
     (
         NoSignal(
-            level=Level.PROBLEM,
+            rank=Rank.INVALIDATES,
             sensors=(1,),
             channels=(4,),
             whole_sensor=False,
@@ -175,7 +181,7 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
     ),
     (
         NoSignal(
-            level=Level.PROBLEM,
+            rank=Rank.INVALIDATES,
             sensors=(1,),
             channels=(3, 4, 5),
             whole_sensor=True,
@@ -185,7 +191,7 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
     ),
     (
         Copies(
-            level=Level.PROBLEM,
+            rank=Rank.INVALIDATES,
             sensors=(0, 1),
             channels=((1, 4), (2, 5)),
             share_of_frequencies=1.0,
@@ -194,7 +200,7 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
     ),
     (
         NoSharedMotion(
-            level=Level.PROBLEM,
+            rank=Rank.INVALIDATES,
             sensors=(0,),
             band=BAND,
             partners=(1, 2),
@@ -210,7 +216,7 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
     ),
     (
         NoSharedMotion(
-            level=Level.PROBLEM,
+            rank=Rank.INVALIDATES,
             sensors=(0,),
             band=BAND,
             partners=(1, 2),
@@ -224,19 +230,19 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
         ),
     ),
     (
-        TooFewSensors(level=Level.PROBLEM, sensors=(0, 1)),
+        TooFewSensors(rank=Rank.INVALIDATES, sensors=(0, 1)),
         ("Only sensors a and b have", "--method two-channel", "--method maximum-likelihood"),
     ),
     (
-        TooFewSensors(level=Level.PROBLEM),
+        TooFewSensors(rank=Rank.INVALIDATES),
         ("Fewer than two sensors have", "until three have a signal"),
     ),
     (
-        MissingChannels(level=Level.WARNING, sensors=(1,), whole_sensors=(0, 2)),
+        MissingChannels(rank=Rank.DELAYS, sensors=(1,), whole_sensors=(0, 2)),
         ("Channels of b are missing", "no three-sensor estimate for a and c", "maximum-likelihood"),
     ),
     (
-        MissingChannels(level=Level.WARNING, sensors=(0, 1, 2), whole_sensors=()),
+        MissingChannels(rank=Rank.DELAYS, sensors=(0, 1, 2), whole_sensors=()),
         ("no three-sensor estimate for any sensor",),
     ),
     (
@@ -253,9 +259,7 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
         ),
     ),
     (
-        replace(
-            MISFIT, level=Level.WARNING, worst_band=BAND, error=0.2, is_wrong=False, n_factors=2
-        ),
+        replace(MISFIT, rank=Rank.DELAYS, worst_band=BAND, error=0.2, is_wrong=False, n_factors=2),
         ("one motion of 2 dimensions", "expectation: significant, but small)", "may be wrong by"),
     ),
     (
@@ -281,20 +285,20 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
     ),
     (
         MissingDimension(
-            level=Level.WARNING, band=BAND, n_dimensions=2.0, n_channels=3, condition=100.0
+            rank=Rank.DELAYS, band=BAND, n_dimensions=2.0, n_channels=3, condition=100.0
         ),
         ("At 2–8 Hz motion is significant in only 2 of 3 dimensions", "--dimension auto"),
     ),
     (
-        NearlySingular(level=Level.NOTE, band=BAND, condition=123.0),
+        NearlySingular(rank=Rank.TO_KNOW, band=BAND, condition=123.0),
         ("At 2–8 Hz", "nearly singular (condition number 123)"),
     ),
     (
-        WeakMotion(level=Level.NOTE, band=BAND, snr=0.3),
+        WeakMotion(rank=Rank.TO_KNOW, band=BAND, snr=0.3),
         ("At 2–8 Hz the motion that the sensors share is weaker than the rest (SNR at most 0.3)",),
     ),
     (
-        SwappedChannels(level=Level.WARNING, sensors=(0, 1), band=BAND, channels=((3, 1), (4, 0))),
+        SwappedChannels(rank=Rank.DELAYS, sensors=(0, 1), band=BAND, channels=((3, 1), (4, 0))),
         ("Channels are swapped: b.x follows a.y and b.y follows a.x.", "order of the channels"),
     ),
     (
@@ -310,7 +314,7 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
         ("Channels of sensor a or b deviate by 5.7° from a right angle",),
     ),
     (
-        ReversedPolarity(level=Level.WARNING, sensors=(0, 1), band=BAND, channel=5, counterpart=2),
+        ReversedPolarity(rank=Rank.DELAYS, sensors=(0, 1), band=BAND, channel=5, counterpart=2),
         ("b.z has the opposite polarity to a.z: no bias", "sign of the sensitivity"),
     ),
     (
@@ -327,7 +331,7 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
     ),
     (
         UnequalResponses(
-            level=Level.PROBLEM,
+            rank=Rank.INVALIDATES,
             sensors=(1,),
             band=BAND,
             channel=3,
@@ -339,7 +343,7 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
     ),
     (
         UnequalResponses(
-            level=Level.WARNING,
+            rank=Rank.DELAYS,
             sensors=(0, 1, 2),
             band=BAND,
             channel=3,
@@ -351,7 +355,7 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
     ),
     (
         UnequalResponses(
-            level=Level.WARNING,
+            rank=Rank.DELAYS,
             sensors=(1,),
             band=BAND,
             channel=3,

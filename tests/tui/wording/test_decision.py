@@ -9,7 +9,8 @@ import pytest
 
 from daq.results.decision.end import Goal, Remaining
 from daq.results.result import Result
-from estimator.checks.advice import Level, ModelMisfit
+from estimator.checks.advice import Rank
+from estimator.checks.advice_on_model import ModelMisfit
 from estimator.decision.verdict import Verdict
 from tests.daq.results.decision.benches import bench_with
 from tests.tui.example_snapshot import SETTINGS, diagnosed, empty_snapshot, made_snapshot
@@ -18,14 +19,14 @@ from tui.application.test_view.plotted import Choice
 from tui.commands.estimate import show_result
 from tui.notebook import text
 from tui.report.noise import verdict
-from tui.wording.facts import NOTHING_TO_DO, brief, known
+from tui.wording.facts import NOTHING_TO_DO, brief
 from tui.wording.verdict_text import Decision, how_long, style_of
 
 if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
 
 ALONE = ModelMisfit(
-    level=Level.PROBLEM, sensors=(), band=(0.5, 8.3), statistic=30.0, n_factors=3,
+    rank=Rank.INVALIDATES, sensors=(), band=(0.5, 8.3), statistic=30.0, n_factors=3,
     worst_statistic=30.0, worst_band=(0.5, 8.3), p_value=0.0, unexplained=0.6, error=0.6,
     is_wrong=True, largest_error=0.6,
 )  # fmt: skip
@@ -73,7 +74,7 @@ def test_the_first_line_answers_is_it_good_and_what_next(
     )
     assert text.text(result).splitlines()[0].startswith(lines[0][:90])
     assert verdict(result).text.startswith(lines[0])
-    needed = any(each.needs_action for each in known(result))
+    needed = any(each.needs_action for each in result.facts)
     assert (decision.next_step == NOTHING_TO_DO) == (is_good and not needed)
 
 
@@ -89,15 +90,15 @@ def test_the_tests_above_have_all_verdicts() -> None:
 
 def test_a_fact_outside_the_band_is_not_the_first_line() -> None:
     """The first line was "at 0–8.3 Hz: wrong by 60 %", with --band 8.6:15 where all was right."""
-    whole = known(Result(misfit(), replace(SETTINGS, band=None)))
+    whole = Result(misfit(), replace(SETTINGS, band=None)).facts
     assert brief(whole)[0].startswith("✗ The sensors do not share one motion at 0.5–8.3 Hz")
     asked = Result(misfit(), replace(SETTINGS, band=(8.6, 15.0), target_cov=None))
-    (line,) = brief(known(asked))
+    (line,) = brief(asked.facts)
     assert line.startswith(NOTHING_TO_DO)
     assert "outside your band" in line
-    assert str(known(asked)[-1]).startswith("Outside your band: The model test fails at 0.5–8.3")
+    assert str(asked.facts[-1]).startswith("Outside your band: The model test fails at 0.5–8.3")
     limited = Result(misfit(), asked.settings, bench_with(1e-9))  # from 1 to 30 Hz
-    assert brief(known(limited))[0].startswith("✗ The sensors do not share one motion")
+    assert brief(limited.facts)[0].startswith("✗ The sensors do not share one motion")
 
 
 @pytest.mark.parametrize("seconds", [0.0, 40.0])

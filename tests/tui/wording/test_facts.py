@@ -17,10 +17,13 @@ from rich.console import Console
 import huddle
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Bridged
-from daq.results import facts
-from daq.results.facts import BlocksDamaged, Fact, Finding, GapsBridged, Rank
+from daq.results.facts.fact import Fact, Finding
+from daq.results.facts.methods import MethodRefused
+from daq.results.facts.recordings import BlocksDamaged, SensorsSimulated
+from daq.results.facts.segments import GapsBridged
 from daq.results.result import Result
 from daq.results.sources import sources
+from estimator.checks.advice import Advice, Rank
 from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot
 from tests.tui.night_recording import record
 from tests.tui.wording.fact_examples import EXAMPLES, kinds
@@ -31,13 +34,11 @@ from tui.output.diagnosis import details
 from tui.output.json_document import document
 from tui.output.json_values import json_text
 from tui.report.contents import report_of
-from tui.wording.facts import MOST_LINES, Known, brief, known, word
-from tui.wording.findings import Names
+from tui.wording.facts import MOST_LINES, brief
 
 if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
 
-NAMES = Names.of(made_snapshot())
 ROOT = Path(__file__).parents[3]
 
 
@@ -53,13 +54,15 @@ def test_every_kind_has_one_maker() -> None:
         for path in chain.from_iterable((ROOT / part).rglob("*.py") for part in ("daq", "tui"))
         for each in re.finditer(r"\b(\w+)\(\s*rank=", path.read_text("utf-8"))
     ]
+    advice = {kind.__name__ for kind in kinds(Advice)}
+    made = [each for each in made if each not in advice]
     assert set(made) == {kind.__name__ for kind in kinds()}
     assert {kind for kind in made if made.count(kind) > 1} == {"ChannelsStuck"}  # now, and earlier
 
 
 @pytest.mark.parametrize("fact", EXAMPLES, ids=lambda fact: str(fact.name))
 def test_words_are_a_line_and_sentences(fact: Fact) -> None:
-    words = word(fact, NAMES)
+    words = fact.words
     assert not words.line.endswith(".")
     assert "\n" not in words.line
     assert "nan" not in str(words)
@@ -78,7 +81,7 @@ def test_every_renderer_shows_every_kind(recorded: Path, monkeypatch: pytest.Mon
     snapshot = diagnosed()
     monkeypatch.setattr("daq.results.result.facts_of", lambda *_: tuple(EXAMPLES))
     shown = {
-        "console": printed(*details(snapshot, known(Result(snapshot, Settings())))),
+        "console": printed(*details(snapshot, Result(snapshot, Settings()).facts)),
         "application": printed(result(state_of(snapshot), width=160)),
         "report": " ".join(
             str(
@@ -92,10 +95,10 @@ def test_every_renderer_shows_every_kind(recorded: Path, monkeypatch: pytest.Mon
                 )
             ).split()
         ),
-        "notebook": " ".join(map(str, known(Result(snapshot, Settings())))),
+        "notebook": " ".join(map(str, Result(snapshot, Settings()).facts)),
     }
     entries = json.loads(json_text(document(Result(snapshot, SETTINGS))["facts"]))
-    words_of = {fact.name: word(fact, Names.of(snapshot)) for fact in EXAMPLES}
+    words_of = {fact.name: fact.words for fact in EXAMPLES}
     for renderer, text in shown.items():
         for words in words_of.values():
             assert squeezed(words.explanation) in squeezed(text), renderer
@@ -116,32 +119,31 @@ def test_below_a_table_is_what_delays_or_invalidates(
     monkeypatch.setattr("daq.results.result.facts_of", lambda *_: (fact,))
     live = [line.plain for line in findings(Result(snapshot, Settings()), width=400)]
     if fact.rank is Rank.TO_KNOW:
-        assert len(live) == isinstance(fact, facts.SensorsSimulated)
-        assert brief(known(Result(snapshot, Settings()))) == [
+        assert len(live) == isinstance(fact, SensorsSimulated)
+        assert brief(Result(snapshot, Settings()).facts) == [
             "Nothing to do. 1 fact: --details shows all"
         ]
     else:
         (line,) = live
-        assert line.endswith(word(fact, Names.of(snapshot)).line)
-        assert brief(known(Result(snapshot, Settings()))) == [line]
+        assert line.endswith(fact.words.line)
+        assert brief(Result(snapshot, Settings()).facts) == [line]
 
 
 def test_a_notebook_has_the_facts_of_the_result() -> None:
     model = huddle.simulate("fig9", duration="1min")
     found = huddle.self_noise(model, fs=model.fs, segment="2s")
-    assert [each.fact.name for each in found.facts] == [each.name for each in found.result.facts]
+    assert found.facts == found.result.facts
     assert set(found.advice) <= {str(each) for each in found.facts}
 
 
 def test_below_a_table_there_are_at_most_three_lines_the_worst_first() -> None:
     ranks = {rank: number for number, rank in enumerate(Rank)}
     ordered = sorted(EXAMPLES, key=lambda each: ranks[each.rank])
-    found = [Known(each, word(each, NAMES)) for each in ordered]
-    for n in range(1, len(found) + 1):
-        lines = brief(found[:n])
+    for n in range(1, len(ordered) + 1):
+        lines = brief(ordered[:n])
         assert 1 <= len(lines) <= MOST_LINES
         assert lines[0].startswith("✗")
-    assert lines[-1] == f"· {len(found) - 2} more facts: --details shows all"
+    assert lines[-1] == f"· {len(ordered) - 2} more facts: --details shows all"
     assert brief([]) == ["Nothing to do."]
 
 
@@ -183,8 +185,6 @@ def test_a_method_that_waits_for_averages_invalidates_no_test_that_goes_on() -> 
     ended = replace(made_snapshot(), results={}, refused={"three-sensor": "1 average"}, closed=True)
     for snapshot, rank in ((ended, Rank.INVALIDATES), (replace(ended, closed=False), Rank.TO_KNOW)):
         (refused,) = (
-            each
-            for each in Result(snapshot, SETTINGS).facts
-            if isinstance(each, facts.MethodRefused)
+            each for each in Result(snapshot, SETTINGS).facts if isinstance(each, MethodRefused)
         )
         assert refused.rank is rank

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from daq.results.facts import Finding, Rank
-from estimator.checks.advice import Advice, AdviceKind, Level, NearlySingular, WeakMotion
+from daq.results.facts.fact import Finding
+from estimator.checks.advice import Advice, Rank
+from estimator.checks.advice_on_model import NearlySingular, WeakMotion
 from tests.tui.wording.advice_examples import (
     BAND,
     EXAMPLES,
@@ -21,18 +22,24 @@ from tests.tui.wording.advice_examples import (
     SKEWED,
     names,
 )
-from tui.wording.facts import word
-from tui.wording.findings import alert, explain, together
+from tests.tui.wording.fact_examples import kinds
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from estimator.checks.advice import Names
+    from estimator.wording import Words
+
+
+def together(found: Sequence[Advice], who: Names) -> Words:
+    return found[0].together(found, who)
 
 
 @pytest.mark.parametrize(("advice", "words"), EXAMPLES)
 def test_advice_says_what_where_how_much_and_what_to_do(
     advice: Advice, words: Sequence[str]
 ) -> None:
-    text = str(explain(advice, names("a", "b", "c")))
+    text = str(advice.words(names("a", "b", "c")))
     for each in words:
         assert each in text
     assert text[0] == text[0].upper() or text[1] == "."  # or the name of a channel
@@ -41,29 +48,29 @@ def test_advice_says_what_where_how_much_and_what_to_do(
 
 
 def test_every_kind_has_words() -> None:
-    assert {advice.kind for advice, _ in EXAMPLES} == set(AdviceKind)
+    assert {type(advice) for advice, _ in EXAMPLES} == kinds(Advice)
 
 
 def test_what_to_do_about_a_misfit_is_for_these_sensors() -> None:
-    three = explain(MISFIT, names("a", "b", "c")).remedy
+    three = MISFIT.words(names("a", "b", "c")).action
     assert "triaxial data" not in three
     assert "--dimension auto" not in three
-    planar = explain(MISFIT, names("a", "b", "c", n_channels=2)).remedy
+    planar = MISFIT.words(names("a", "b", "c", n_channels=2)).action
     assert "If the motion has more than 2 dimensions, sensors of 2 channels must point" in planar
     assert "use triaxial data" in planar
-    five = explain(MISFIT, names(*"abcde")).remedy
+    five = MISFIT.words(names(*"abcde")).action
     assert "5 sensors allow more dimensions (--dimension auto)" in five
-    assert "--method auto" in alert(MISFIT, names(*"abcde"))
+    assert "--method auto" in MISFIT.words(names(*"abcde")).line
     axes = names(*"abcd", n_channels=1)  # --method auto is three-sensor for them
-    assert "auto" not in explain(MISFIT, axes).remedy + alert(MISFIT, axes)
+    assert "auto" not in MISFIT.words(axes).action + MISFIT.words(axes).line
 
 
 @pytest.mark.parametrize(("advice", "words"), EXAMPLES)
 def test_alone_in_a_summary_it_is_what_it_is_alone(advice: Advice, words: Sequence[str]) -> None:
     del words
     who = names("a", "b", "c")
-    fact = Finding(rank=Rank.TO_KNOW, findings=(advice,))
-    assert str(word(fact, who)) == str(explain(advice, who))
+    fact = Finding(rank=Rank.TO_KNOW, findings=(advice,), names=who)
+    assert fact.words == advice.words(who)
 
 
 def test_bands_that_fail_are_one_line_the_worst_first() -> None:
@@ -108,7 +115,9 @@ def test_pairs_of_one_kind_are_one_line() -> None:
     line = str(together(all_pairs(GAIN), who))
     assert line.startswith("Gains differ (a–b 1.050, a–c 1.050, b–c 1.050): no bias")
     assert "in common" not in line  # no sensor is part of all three pairs
-    singular = [NearlySingular(level=Level.NOTE, band=b, condition=99.0) for b in (BAND, (9.0, 10))]
+    singular = [
+        NearlySingular(rank=Rank.TO_KNOW, band=b, condition=99.0) for b in (BAND, (9.0, 10))
+    ]
     line = str(together(singular, who))
     assert "nearly singular at 2–8 Hz, 9–10 Hz: one direction" in line
 
@@ -128,5 +137,5 @@ def test_of_very_many_pairs_the_worst_are_listed() -> None:
 
 
 def test_kinds_without_a_common_form_are_said_one_by_one() -> None:
-    weak = [WeakMotion(level=Level.NOTE, band=b, snr=0.3) for b in (BAND, (9.0, 10.0))]
+    weak = [WeakMotion(rank=Rank.TO_KNOW, band=b, snr=0.3) for b in (BAND, (9.0, 10.0))]
     assert str(together(weak, names("a", "b", "c"))).count("weaker than the rest") == 2

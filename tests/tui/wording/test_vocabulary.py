@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import pytest
 
-from daq.results.known_facts import WITHOUT_ESTIMATE
+from daq.results.facts.methods import WITHOUT_ESTIMATE
 from daq.results.result import Result
+from daq.results.vocabulary import FLAG_WORDS
 from estimator.self_noise.result import Flag
 from tests.tui.example_snapshot import SETTINGS, made_now, made_snapshot, said
 from tui.application.test_view.panels import noise_in_band, sensor_table
 from tui.application.test_view.plotted import Choice
 from tui.output.console import console
-from tui.wording.vocabulary import FLAG_WORDS
 
 
 def test_every_flag_has_words_of_its_own() -> None:

@@ -15,12 +15,13 @@ from daq.errors import HuddleError
 from daq.preflight.findings import Check, Outcome
 from daq.preflight.preflight import check_list, is_complete
 from estimator.spectra.welch import CrossSpectra, WelchSettings
+from estimator.wording import listed
 from tui.application.test_view.braille import DOTS, FIRST
 from tui.application.test_view.clocks import COLOURS
 from tui.application.test_view.curves import data_curve, mask_curve
 from tui.application.test_view.plotted import MARKERS, MODEL_MARKERS
 from tui.output.check_list import sentence
-from tui.wording.formatting import listed, readings
+from tui.wording.formatting import readings
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence

@@ -10,8 +10,8 @@ from pydantic import BaseModel, ValidationError
 
 from daq.bench.editing import with_values
 from daq.bench.tables.certificate import CertificateTable, Customer, Laboratory, Rule
+from estimator.wording import listed
 from tui.application.forms.form import Field, Form
-from tui.wording.formatting import listed
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

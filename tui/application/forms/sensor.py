@@ -14,8 +14,8 @@ from daq.devices.registry import driver_names, driver_type
 from daq.errors import BenchFileError, HuddleError
 from daq.preflight.device_check import search_description
 from daq.transport.serial_ports import serial_ports
+from estimator.wording import listed
 from tui.application.forms.form import Field, Form
-from tui.wording.formatting import listed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -11,6 +11,7 @@ from textual import on, work
 from textual.binding import Binding, BindingType
 from textual.widgets import DataTable, Input, Static
 
+from estimator.wording import clock_time
 from tui.application.dialogs import QuestionScreen
 from tui.application.forms.estimate import SettingsForm
 from tui.application.messages import (
@@ -23,7 +24,6 @@ from tui.application.messages import (
 from tui.application.state import RECORDINGS, RESULT, TEST
 from tui.application.view import MUTED, View
 from tui.runs.catalogue import catalogue
-from tui.wording.formatting import clock_time
 from tui.wording.verdict_text import STYLES, WORDS
 
 if TYPE_CHECKING:

@@ -10,12 +10,15 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.results.comparison import compare
-from daq.results.facts import Rank, TargetMissed
+from daq.results.facts.precision import TargetMissed
+from daq.results.vocabulary import PARTNER_WORDS
+from estimator.checks.advice import Rank
 from estimator.decision.verdict import Verdict
+from estimator.wording import percent, signed
 from tui.application.test_view.panels import alerts, known_to
 from tui.output.results import averages_line
-from tui.wording.facts import NOTHING_TO_DO, known
-from tui.wording.formatting import level, level_with_error, percent, signed
+from tui.wording.facts import NOTHING_TO_DO
+from tui.wording.formatting import level, level_with_error
 from tui.wording.verdict_text import (
     MARKS,
     STYLES,
@@ -24,7 +27,6 @@ from tui.wording.verdict_text import (
     margin,
     worst_by_channel,
 )
-from tui.wording.vocabulary import PARTNER_WORDS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -54,15 +56,13 @@ def result(state: State, *, width: int) -> RenderableType:
         parts += [_channels(state, found, width=width)]
         parts += [*_notes(state, found), *map(Text, state.sensors_since), ""]
     facts = [  # with limits, how long to record is said with the verdict
-        each
-        for each in known(found)
-        if found.verdict is None or not isinstance(each.fact, TargetMissed)
+        each for each in found.facts if found.verdict is None or not isinstance(each, TargetMissed)
     ]
     is_open = found.verdict is not None and found.verdict.verdict is not Verdict.PASS
     if not is_open and not any(each.needs_action for each in facts):
         parts.append(item(NOTHING_TO_DO))
     parts += [
-        item(str(each), each.mark, _STYLES_OF_RANKS[each.fact.rank] if each.needs_action else MUTED)
+        item(str(each), each.mark, _STYLES_OF_RANKS[each.rank] if each.needs_action else MUTED)
         for each in facts
     ]
     parts.append(item(averages_line(snapshot)))

@@ -8,13 +8,14 @@ from rich.text import Text
 from textual.containers import Vertical, VerticalScroll
 from textual.widgets import Static
 
-from daq.results.facts import SensorLost, TargetMissed
+from daq.results.facts.precision import TargetMissed
+from daq.results.facts.recordings import SensorLost
+from estimator.wording import clock_time
 from tui.application.test_view import clocks, panels
 from tui.application.test_view.channels import channel_table
 from tui.application.test_view.plot import DriftPlot, PsdPlot
 from tui.application.test_view.plotted import Choice, curves, plot_title, read_out, unit_of
 from tui.application.view import TALL
-from tui.wording.formatting import clock_time
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

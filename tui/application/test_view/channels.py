@@ -9,10 +9,11 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.bench.units import decibels
+from daq.results.vocabulary import PARTNER_WORDS
+from estimator.wording import percent, signed
 from tui.application.test_view.panels import MUTED, grouped
-from tui.wording.formatting import level, level_with_error, percent, signed
+from tui.wording.formatting import level, level_with_error
 from tui.wording.verdict_text import MARKS, STYLES, worst_by_channel
-from tui.wording.vocabulary import PARTNER_WORDS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -19,8 +19,8 @@ from daq.results.clock_effect import (
     reference,
     residuals,
 )
+from daq.results.vocabulary import clock_source
 from tui.application.test_view.curves import Line
-from tui.wording.vocabulary import clock_source
 
 if TYPE_CHECKING:
     from daq.clocks.clock_model import ClockState

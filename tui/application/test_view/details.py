@@ -10,10 +10,10 @@ from rich.text import Text
 
 from daq.protocols.block import EventKind
 from daq.results.sources import LoggedEvent, uncounted_events, with_uncounted
+from estimator.wording import clock_time
 from tui.application.test_view.panels import grouped, state
 from tui.output.diagnosis import details as diagnosis_details
-from tui.wording.facts import known
-from tui.wording.formatting import clock_time, utc
+from tui.wording.formatting import utc
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,7 +35,7 @@ def details(now: RecordingStatus, result: Result | None, *, trouble: str) -> Ren
     if result is not None:
         parts += ["", Text("segments", HEADER), _segments(result)]
         parts += ["", Text("diagnosis", HEADER)]
-        parts += diagnosis_details(result.snapshot, known(result))
+        parts += diagnosis_details(result.snapshot, result.facts)
     clocks = () if result is None else result.snapshot.clocks
     found = uncounted_events(clocks)
     parts += ["", Text("events, latest first", HEADER), _events(now, found)]

@@ -13,12 +13,13 @@ from rich.text import Text
 
 from daq.recording.sensor_state import SensorState
 from daq.results.decision.end import NOT_KNOWN_FROM, Goal
-from daq.results.facts import Rank, SensorsSimulated
-from daq.results.known_facts import WITHOUT_ESTIMATE
-from tui.wording.facts import known, known_of_sensors
-from tui.wording.formatting import clock_time, level_with_error, percent, several
+from daq.results.facts.methods import WITHOUT_ESTIMATE
+from daq.results.facts.recordings import SensorsSimulated, facts_of_sensors
+from daq.results.vocabulary import FLAG_WORDS, PARTNER_WORDS
+from estimator.checks.advice import Rank
+from estimator.wording import clock_time, percent, several
+from tui.wording.formatting import level_with_error
 from tui.wording.verdict_text import headline, how_long, style_of
-from tui.wording.vocabulary import FLAG_WORDS, PARTNER_WORDS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus, SensorStatus
     from daq.results.band_summary import BandMeans, Precision, WithoutPartner
-    from daq.results.facts import Fact
+    from daq.results.facts.fact import Fact
     from daq.results.result import Result
     from tui.application.test_view.plotted import Choice
 
@@ -277,8 +278,8 @@ def _gone_on(now: RecordingStatus, snapshot: Snapshot) -> float:
 def alerts(now: RecordingStatus, result: Result | None) -> list[Text]:
     """Return faults of sensors with remedies, the worst first."""
     return [
-        Text(f"▲ {each.words.line}", _STYLES[each.fact.rank])
-        for each in known_of_sensors(now, None if result is None else result.settings)
+        Text(f"▲ {each.words.line}", _STYLES[each.rank])
+        for each in facts_of_sensors(now, None if result is None else result.settings)
     ]
 
 
@@ -289,11 +290,11 @@ def findings(result: Result, *, width: int, besides: tuple[type[Fact], ...] = ()
     """
     needed = [
         each
-        for each in known(result)
-        if (each.needs_action or isinstance(each.fact, SensorsSimulated))
-        and not isinstance(each.fact, besides)
+        for each in result.facts
+        if (each.needs_action or isinstance(each, SensorsSimulated))
+        and not isinstance(each, besides)
     ]
-    lines = [Text(each.line, _STYLES[each.fact.rank]) for each in needed]
+    lines = [Text(each.line, _STYLES[each.rank]) for each in needed]
     for line in lines:
         line.truncate(width, overflow="ellipsis")
     return lines

@@ -9,7 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from estimator.checks.advice import Level, NoSharedMotion
+from estimator.checks.advice import Rank
+from estimator.checks.advice_on_signals import NoSharedMotion
 from estimator.checks.shared_motion import CanonicalCoherence, outsiders, shared_motion
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ def _strangers(snapshot: Snapshot, before: _Sum, now: _Sum) -> tuple[NoSharedMot
         share = shared_motion(canonical, snapshot.dims, inside, n_effective)
         for sensor, partners in outsiders(share, n_effective, int(inside.sum())):
             found[sensor] = NoSharedMotion(
-                level=Level.PROBLEM,
+                rank=Rank.INVALIDATES,
                 sensors=(sensor,),
                 band=(lowest.setdefault(sensor, band.low), band.high),
                 partners=partners,

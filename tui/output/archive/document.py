@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from daq.archive.answers import facts_of_archive
 from daq.archive.density import LOWEST_DB
+from daq.archive.facts import facts_of_archive
 from tui.output.archive.tables import day_text
 from tui.output.console import growing
 from tui.output.csv_text import csv_text
 from tui.output.json_document import document, facts_document
 from tui.output.json_values import json_text
-from tui.wording.facts import worded
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -68,7 +67,7 @@ def archive_json(answer: Answer, store: Store, n_recordings: int, wrong: Sequenc
                 for each in answer.doubted
             ],
         },
-        "facts": facts_document(worded(facts_of_archive(answer))),
+        "facts": facts_document(tuple(facts_of_archive(answer))),
         "pooled": document(answer.result),
         "method": answer.method,
         "unit": pooled.unit,

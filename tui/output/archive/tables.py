@@ -9,11 +9,9 @@ from typing import TYPE_CHECKING, Any
 from rich.table import Table
 from rich.text import Text
 
-from daq.archive.answers import facts_of_archive
+from daq.archive.facts import NightsNotCompared, facts_of_archive
 from daq.bench.units import decibels
-from daq.results.facts import NightsNotCompared
-from tui.wording.facts import worded
-from tui.wording.formatting import percent, several, signed, span
+from estimator.wording import percent, several, signed, span
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -99,7 +97,7 @@ def course_table(answer: Answer) -> Table:
 def remarks(answer: Answer, zone: str) -> Iterator[str]:
     """Yield sentences below the table; `zone` is that of working hours and nights."""
     facts = list(facts_of_archive(answer))
-    yield from map(str, worded(facts))
+    yield from map(str, facts)
     n_channels = len(answer.pooled.channels)
     n_decided = sum(each.decided for each in answer.courses)
     if n_decided:

@@ -20,9 +20,9 @@ from daq.archive.density import HIGHEST_DB, LOWEST_DB
 from daq.archive.spectra_file import DAY_NS
 from daq.bench.units import levels_db
 from daq.whole_file import write_whole
+from estimator.wording import span
 from tui.output.archive.tables import day_text
 from tui.report.figures import drawing
-from tui.wording.formatting import span
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

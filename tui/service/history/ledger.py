@@ -24,7 +24,7 @@ from daq.recording.reader import Recording
 from daq.results.band_summary import CONSTANT, known_range
 from estimator.errors import BandError
 from tui.service.records.run_state import BandNoise, utc_text
-from tui.wording.findings import drift_line
+from tui.wording.formatting import drift_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

@@ -14,7 +14,8 @@ from daq.bench.loading import parse
 from daq.estimation.contributions import contributions
 from daq.estimation.snapshot_diagnostics import Synchronisation
 from daq.results.result import Result
-from estimator.checks.advice import Level, ModelMisfit
+from estimator.checks.advice import Rank
+from estimator.checks.advice_on_model import ModelMisfit
 from estimator.checks.count_limits import CountLimits
 from estimator.decision.verdict import MIN_AVERAGES, Obstacle, Verdict
 from estimator.levels.contributions import Source
@@ -230,7 +231,7 @@ def test_where_the_model_fails_by_more_than_the_margin_nothing_is_decided() -> N
     snapshot = diagnosed(n_effective=5000.0)
     assert snapshot.diagnostics.diagnosis is not None
     misfit = ModelMisfit(
-        level=Level.PROBLEM, band=(0.5, 99.0), n_factors=3, statistic=50.0, worst_statistic=50.0,
+        rank=Rank.INVALIDATES, band=(0.5, 99.0), n_factors=3, statistic=50.0, worst_statistic=50.0,
         worst_band=(0.5, 99.0), p_value=0.0, unexplained=0.1, error=0.9, largest_error=9.0,
         is_wrong=True,
     )  # fmt: skip

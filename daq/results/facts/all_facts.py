@@ -1,0 +1,83 @@
+"""The facts of an estimate, made here once from its snapshot."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from daq.results.facts.channels import facts_of_channels, facts_of_linearity, facts_of_rounding
+from daq.results.facts.clocks import facts_of_clocks
+from daq.results.facts.fact import Finding
+from daq.results.facts.methods import facts_of_methods
+from daq.results.facts.model import facts_of_model
+from daq.results.facts.precision import facts_of_precision
+from daq.results.facts.recordings import facts_of_recordings
+from daq.results.facts.segments import facts_of_segments
+from estimator.checks.advice import Rank
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from daq.estimation.snapshot import Snapshot
+    from daq.results.band_summary import Estimate
+    from daq.results.facts.fact import Fact
+    from estimator.checks.advice import Advice
+
+
+def facts_of(estimate: Estimate) -> list[Fact]:
+    """Return all facts of an estimate; not those of its verdict."""
+    snapshot = estimate.snapshot
+    return [
+        *_findings(snapshot, estimate.concern),
+        *facts_of_recordings(snapshot),
+        *facts_of_segments(snapshot),
+        *facts_of_channels(snapshot),
+        *facts_of_rounding(snapshot),
+        *facts_of_linearity(snapshot),
+        *facts_of_clocks(snapshot),
+        *facts_of_model(snapshot),
+        *facts_of_methods(snapshot),
+        *facts_of_precision(estimate),
+    ]
+
+
+def ranked(facts: Iterable[Fact], estimate: Estimate) -> tuple[Fact, ...]:
+    """Return facts that concern the band asked for by their rank, the worst first; then others."""
+    ranks, asked = list(Rank), estimate.concern
+    placed = (
+        replace(fact, is_outside=True) if is_outside(fact.band, asked) else fact for fact in facts
+    )
+    return tuple(sorted(placed, key=lambda fact: (fact.is_outside, ranks.index(fact.rank))))
+
+
+def is_outside(band: tuple[float, float] | None, asked: tuple[float, float] | None) -> bool:
+    """Return whether a band has nothing in common with the one asked for."""
+    if band is None or asked is None:
+        return False
+    return band[1] < asked[0] or asked[1] < band[0]
+
+
+def _findings(snapshot: Snapshot, asked: tuple[float, float] | None) -> Iterator[Fact]:
+    """Yield the findings of the diagnosis, those of one kind together.
+
+    Those outside of the band asked for go by themselves: they must not hide what is inside.
+    """
+    kinds: dict[tuple[type[Advice], bool], list[Advice]] = {}
+    for each in snapshot.diagnostics.advice:
+        kinds.setdefault((type(each), is_outside(each.band, asked)), []).append(each)
+    ranks, names = list(Rank), snapshot.sensor_names
+    for found in kinds.values():
+        concerned = sorted({sensor for each in found for sensor in each.sensors})
+        bands = [each.band for each in found]
+        known = [band for band in bands if band is not None]
+        yield Finding(
+            rank=min((each.rank for each in found), key=ranks.index),
+            sensors=tuple(names[sensor] for sensor in concerned)
+            if all(each.sensors for each in found)
+            else (),
+            band=(min(low for low, _ in known), max(high for _, high in known))
+            if known and len(known) == len(bands)
+            else None,
+            findings=tuple(found),
+            names=snapshot.names,
+        )

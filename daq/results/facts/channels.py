@@ -1,0 +1,319 @@
+"""Channels whose samples are wrong: the range, the counts, squares and cubes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from daq.estimation.contributions import MUCH_NONLINEAR
+from daq.results.band_summary import known_range
+from daq.results.facts.fact import Fact
+from estimator.checks.advice import Rank
+from estimator.levels.bands import third_octaves
+from estimator.records import record
+from estimator.wording import Words, listed, percent, several
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from daq.estimation.snapshot import Snapshot
+    from estimator.records import Hertz, Seconds
+
+
+MUCH_ROUNDING = 0.1
+"""Share of the noise from which rounding that channels share is a fact."""
+
+
+@record
+class ChannelsClipped(Fact):
+    """Samples are at the end of the range: the noise of these channels is too high.
+
+    Attributes
+    ----------
+    shares : tuple of float
+        Share of the samples of each channel.
+    """
+
+    name: ClassVar[str] = "channels-clipped"
+    shares: tuple[float, ...]
+
+    def _words(self) -> Words:
+        each = zip(self.channels, self.shares, strict=True)
+        who = ", ".join(f"{name} ({100 * share:.2g} %)" for name, share in each)
+        return Words(
+            f"{who} clipped, so the noise is too high: use a larger range, or less motion",
+            f"Clipped: {who} of the samples are at the largest or smallest count of the range: the "
+            "noise of these channels is too high.",
+            "Use a larger range, or less motion.",
+        )
+
+
+@record
+class ChannelsWrap(Fact):
+    """Counts wrap: the noise of these channels is too high.
+
+    Attributes
+    ----------
+    bits : tuple of int
+        The counts of each channel wrap at 2**bits.
+    """
+
+    name: ClassVar[str] = "channels-wrap"
+    bits: tuple[int, ...]
+
+    def _words(self) -> Words:
+        each = zip(self.channels, self.bits, strict=True)
+        who = ", ".join(f"{name} (at {bits} bits)" for name, bits in each)
+        return Words(
+            f"the counts of {who} wrap, so the noise is too high: use a larger range, or less "
+            "motion",
+            f"Overflow: the counts of {who} wrap: a value beyond one end of the range continues "
+            "at the other end. The noise of these channels is too high.",
+            "Use a larger range, or less motion. If the device sends more bits than the bench "
+            "file or its settings say, correct the data type.",
+        )
+
+
+@record
+class CodesMissing(Fact):
+    """Codes of channels never occur: their resolution is less than their counts suggest.
+
+    Attributes
+    ----------
+    steps, n_missing : tuple of int
+        Step of the counts of each channel, and codes that never occur between those that do.
+    stuck_bits : tuple of tuple of int
+        Bits of each channel that never change within the range of its signal.
+    bits : tuple of float
+        Effective number of bits of the range of each channel's signal.
+    """
+
+    name: ClassVar[str] = "codes-missing"
+    steps: tuple[int, ...]
+    n_missing: tuple[int, ...]
+    stuck_bits: tuple[tuple[int, ...], ...]
+    bits: tuple[float, ...]
+
+    def _words(self) -> Words:
+        each = []
+        for name, step, missing, stuck, bits in zip(
+            self.channels, self.steps, self.n_missing, self.stuck_bits, self.bits, strict=True
+        ):
+            what = [f"in steps of {step} counts"] * (step > 1)
+            what += [f"bit {listed([str(bit) for bit in stuck])} constant"] if stuck else []
+            what += [several(missing, "missing code")] * (missing > 0)
+            each.append(f"{name} ({', '.join(what)}; {bits:.1f} bits are used)")
+        who = ", ".join(each)
+        is_faulty = any(self.stuck_bits) or any(self.n_missing)
+        return Words(
+            f"Codes never occur: {who}",
+            f"Codes never occur: {who}. The resolution is less than the counts suggest.",
+            "Check the digitizer." if is_faulty else "",
+        )
+
+
+@record
+class ReadingsRepeat(Fact):
+    """A device repeats its readings: the noise of its channels is too high.
+
+    Attributes
+    ----------
+    share : float
+        Share of the rows that repeat the row before.
+    refresh, polled : float
+        Hz: of new readings, and of the rows.
+    """
+
+    name: ClassVar[str] = "readings-repeat"
+    share: float
+    refresh: Hertz
+    polled: Hertz
+
+    def _words(self) -> Words:
+        (sensor,) = self.sensors
+        how = f"it refreshes at {self.refresh:.3g} Hz, polled at {self.polled:g} Hz"
+        return Words(
+            f"{sensor} repeats its values, so the noise is too high: {how}",
+            f"{sensor} repeats its values: {how}. {percent(self.share)} of its rows repeat the row "
+            "before, and the noise of its channels is too high.",
+            "Set its sampling_rate in the bench file to its refresh rate, or below, or let the "
+            "device refresh faster.",
+        )
+
+
+@record
+class ChannelsStoodStill(Fact):
+    """Channels had a constant count for a while.
+
+    Attributes
+    ----------
+    constant : tuple of float
+        How long, for each channel.
+    """
+
+    name: ClassVar[str] = "channels-stood-still"
+    constant: tuple[Seconds, ...]
+
+    def _words(self) -> Words:
+        each = zip(self.channels, self.constant, strict=True)
+        who = ", ".join(f"{name} (for {seconds:.2g} s)" for name, seconds in each)
+        return Words(
+            f"{who} had a constant count, so the noise is too high: exclude that time (--reject)",
+            f"Temporarily dead: {who} had a constant count. The motion missing there counts as "
+            "noise.",
+            "Exclude that time (--reject; --start and --end for minutes), and check the cable and "
+            "the power supply.",
+        )
+
+
+@record
+class RoundedAlike(Fact):
+    """Channels of several sensors are rounded to counts alike, and share a part of that noise.
+
+    Attributes
+    ----------
+    share : float
+        Of the noise, largest of a channel and a third of an octave.
+    """
+
+    name: ClassVar[str] = "rounded-alike"
+    share: float
+
+    def _words(self) -> Words:
+        text = f"{listed(self.channels)} are rounded to counts alike"
+        return Words(
+            f"{text}: up to {self.share:.0%} of their noise; use smaller counts",
+            f"{text}. Up to {self.share:.0%} of their noise may be taken for motion, or counted "
+            "more than once; the intervals include it.",
+            "Use a smaller range or a higher gain, so that the noise is half a count or more.",
+        )
+
+
+@record
+class NotLinear(Fact):
+    """Channels of a sensor are not linear: squares and cubes of the motion add to their noise.
+
+    Attributes
+    ----------
+    shares : tuple of float
+        Of the noise of each of `channels`, that they explain: the mean over thirds of an octave.
+    evidence : float
+        That they are not linear, in standard deviations.
+    is_subtracted : bool
+    """
+
+    name: ClassVar[str] = "not-linear"
+    shares: tuple[float, ...]
+    evidence: float
+    is_subtracted: bool
+
+    def _words(self) -> Words:
+        verb = "is" if len(self.channels) == 1 else "are"
+        most = max(self.shares)
+        text = f"{listed(self.channels)} {verb} not linear"
+        done = "subtracted" if self.is_subtracted else "in the intervals"
+        return Words(
+            f"{text}: up to {most:.0%} of the noise, {done}; check {listed(self.sensors)}",
+            f"{text}: squares and cubes of the motion are up to {most:.0%} of the noise"
+            f" ({self.evidence:.0f} standard deviations). They are {done}.",
+            "Check the range and the supply of the sensor, or record with less motion."
+            + ("" if self.is_subtracted else " --linearise subtracts them."),
+        )
+
+
+def facts_of_channels(snapshot: Snapshot) -> Iterator[Fact]:
+    """Yield channels whose samples are wrong."""
+    names = [label.name for label in snapshot.channels]
+    counts, still = snapshot.diagnostics.counts, snapshot.diagnostics.stood_still
+    clipped, wrapped, codes = counts.clipped, counts.wrapped, counts.codes
+    if clipped:
+        yield ChannelsClipped(
+            rank=Rank.INVALIDATES,
+            channels=tuple(names[column] for column in clipped),
+            shares=tuple(clipped.values()),
+        )
+    if wrapped:
+        yield ChannelsWrap(
+            rank=Rank.INVALIDATES,
+            channels=tuple(names[column] for column in wrapped),
+            bits=tuple(each.bits for each in wrapped.values()),
+        )
+    shares = {snapshot.channels[n].sensor: share for n, share in counts.repeated.items()}
+    rates = {each.name: each.sampling_rate for each in snapshot.sensors}
+    for sensor, share in shares.items():
+        yield ReadingsRepeat(
+            rank=Rank.INVALIDATES,
+            sensors=(sensor,),
+            share=share,
+            refresh=(1 - share) * rates[sensor],
+            polled=rates[sensor],
+        )
+    if codes:
+        is_faulty = any(each.stuck_bits or each.n_missing for each in codes.values())
+        yield CodesMissing(
+            rank=Rank.DELAYS if is_faulty else Rank.TO_KNOW,
+            channels=tuple(names[column] for column in codes),
+            steps=tuple(each.step for each in codes.values()),
+            n_missing=tuple(each.n_missing for each in codes.values()),
+            stuck_bits=tuple(each.stuck_bits for each in codes.values()),
+            bits=tuple(each.bits for each in codes.values()),
+        )
+    if still:
+        yield ChannelsStoodStill(
+            rank=Rank.INVALIDATES,
+            channels=tuple(names[column] for column in still),
+            constant=tuple(still.values()),
+        )
+
+
+def facts_of_rounding(snapshot: Snapshot) -> Iterator[RoundedAlike]:
+    """Yield the channels that share more than a little of their rounding."""
+    edges = third_octaves(snapshot.frequency, *known_range(snapshot))
+    alike = snapshot.rounded_alike
+    if alike is None or not snapshot.results or len(edges) < 2:
+        return
+    noise = next(iter(snapshot.results.values())).noise_psd
+    both = (np.where(np.isfinite(noise), each, 0.0) for each in (alike.most, noise))
+    part, whole = (np.add.reduceat(each[: edges[-1]], edges[:-1]) for each in both)
+    largest = np.maximum(np.abs(whole), part)
+    share = np.max(np.where(part > 0, part / np.where(part > 0, largest, 1.0), 0.0), axis=0)
+    if (share > MUCH_ROUNDING).any():
+        yield RoundedAlike(
+            rank=Rank.DELAYS,
+            channels=tuple(
+                label.name
+                for label, part in zip(snapshot.channels, share, strict=True)
+                if part > MUCH_ROUNDING / 3  # offsets raise a noise by three times that
+            ),
+            share=float(share.max()),
+        )
+
+
+def facts_of_linearity(snapshot: Snapshot) -> Iterator[NotLinear]:
+    """Yield the sensors that are not linear, the one with the largest evidence first."""
+    edges = third_octaves(snapshot.frequency, *known_range(snapshot))
+    if not snapshot.nonlinear or not snapshot.results or len(edges) < 2:
+        return
+    noise = next(iter(snapshot.results.values())).noise_psd
+    shares: dict[str, dict[str, float]] = {}
+    evidence: dict[str, float] = {}
+    for each in snapshot.nonlinear:
+        known = np.isfinite(noise[:, each.column])
+        both = (np.where(known, part, 0.0) for part in (each.explained, noise[:, each.column]))
+        part, whole = (np.add.reduceat(values[: edges[-1]], edges[:-1]) for values in both)
+        whole = np.maximum(np.abs(whole) + (part if snapshot.linearised else 0.0), part)
+        share = float(np.mean(part[whole > 0] / whole[whole > 0]))
+        label = snapshot.channels[each.column]
+        shares.setdefault(label.sensor, {})[label.name] = share
+        evidence.setdefault(label.sensor, each.evidence)
+    for sensor, of_channel in shares.items():
+        much = max(of_channel.values()) > MUCH_NONLINEAR and not snapshot.linearised
+        yield NotLinear(
+            rank=Rank.DELAYS if much else Rank.TO_KNOW,
+            sensors=(sensor,),
+            channels=tuple(of_channel),
+            shares=tuple(of_channel.values()),
+            evidence=evidence[sensor],
+            is_subtracted=snapshot.linearised,
+        )

@@ -1,0 +1,307 @@
+"""How the times of samples are known, and where they are wrong or may be."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, ClassVar
+
+from daq.clocks.clock_model import ClockSource
+from daq.protocols.block import UNCOUNTED_CHECK
+from daq.results.band_summary import known_range
+from daq.results.clock_effect import reference
+from daq.results.facts.fact import Fact
+from estimator.checks.advice import Rank
+from estimator.checks.advice_on_model import ModelMisfit
+from estimator.checks.advice_on_sensors import Delay, Gain
+from estimator.checks.advice_on_signals import NoSharedMotion
+from estimator.records import record
+from estimator.wording import Words, listed, several, signed, time_of_day
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from daq.clocks.clock_model import ClockSetting
+    from daq.estimation.snapshot import Snapshot
+    from daq.protocols.block import Uncounted
+    from estimator.records import Seconds
+
+
+_LIKE_A_CLOCK = Delay | Gain | ModelMisfit | NoSharedMotion
+"""Findings that unknown clocks alone can bring about."""
+
+
+_TURN = 0.3  # rad at the highest frequency: 9 % of the motion is taken for noise there
+
+
+_SURE = 3.0  # residuals of a clock, beyond which it drifts besides where it was set
+
+
+_SETTINGS = 3  # named one by one
+
+
+@record
+class ClocksFitted(Fact):
+    """The times of samples come from clocks fitted to their arrivals.
+
+    Attributes
+    ----------
+    ppm : tuple of float
+        Rate of each sensor's clock against nominal.
+    error : float
+        Largest remaining error between them, s rms.
+    """
+
+    name: ClassVar[str] = "clocks-fitted"
+    ppm: tuple[float, ...]
+    error: Seconds
+
+    def _words(self) -> Words:
+        rates = zip(self.sensors, self.ppm, strict=True)
+        each = ", ".join(f"{sensor} {signed(ppm, '+.1f')} ppm" for sensor, ppm in rates)
+        error = "an unknown error" if math.isnan(self.error) else f"about {_us(self.error)}"
+        text = f"Clocks {each}, aligned to {error}"
+        return Words(text, f"{text}.")
+
+
+@record
+class StatedTimesDrift(Fact):
+    """The UTC that sensors state drifts against the motion.
+
+    Attributes
+    ----------
+    corrected, uncorrected : mapping of str to float
+        Drift of each sensor, s rms.
+    left : float
+        Error after the correction, s rms; NaN without one.
+    reference : str
+        The sensor against which the motion shows it; empty if none.
+    """
+
+    name: ClassVar[str] = "stated-times-drift"
+    corrected: Mapping[str, Seconds]
+    uncorrected: Mapping[str, Seconds]
+    left: Seconds
+    reference: str
+
+    def _words(self) -> Words:
+        drifts = {**self.corrected, **self.uncorrected}
+        by = ", ".join(f"{sensor} by {_us(size)} rms" for sensor, size in drifts.items())
+        against = f" against those of {self.reference}" if self.reference else ""
+        head = f"Stated times drift{against}"
+        text = f"{head}, as the motion shows: {by}."
+        line = f"{head}: {by}; check that the clocks are synchronised"
+        if self.corrected:
+            who = f"Those of {listed(list(self.corrected))}" if self.uncorrected else "They"
+            text += f" {who} were corrected to within about {_us(self.left)}."
+        if self.uncorrected:
+            text += (
+                f" Those of {listed(list(self.uncorrected))} could not be corrected: the motion is"
+            )
+            text += " too weak for so short segments, or times step."
+        do = "Check whether the clocks were synchronised, or whether waves changed direction."
+        return Words(line, text, f"Choose longer segments. {do}" if self.uncorrected else do)
+
+
+@record
+class StatedTimesUnchecked(Fact):
+    """The UTC that sensors state could not be compared with the motion."""
+
+    name: ClassVar[str] = "stated-times-unchecked"
+
+    def _words(self) -> Words:
+        verb = "states" if len(self.sensors) == 1 else "state"
+        text = f"The times that {listed(self.sensors)} {verb} could not be compared with the motion"
+        return Words(
+            f"{text}: record longer, or with more motion",
+            f"{text} everywhere: it is too weak, the recording too short, or the sensors differ "
+            "in a part of it, as where times step by seconds. If they drift or step, the noise is "
+            "wrong by a share of the motion.",
+            "Record longer, or with more motion.",
+        )
+
+
+@record
+class ClockSet(Fact):
+    """The clock by which a sensor states UTC was set; its count is the clock."""
+
+    name: ClassVar[str] = "clock-set"
+    settings: tuple[ClockSetting, ...]
+
+    def _words(self) -> Words:
+        each = [(signed(one.step, "+.3f"), time_of_day(one.utc_ns)) for one in self.settings]
+        by = listed([f"{step} s at {at} UTC" for step, at in each[:_SETTINGS]])
+        more = (
+            f" and {several(len(each) - _SETTINGS, 'more time')}" if len(each) > _SETTINGS else ""
+        )
+        text = f"The clock of {listed(self.sensors)} was set by {by}{more}"
+        return Words(
+            f"{text}; samples count on",
+            f"{text}. The count of its samples is used there, and not its times.",
+            "Check its time service (GPS, NTP).",
+        )
+
+
+@record
+class SamplesUncounted(Fact):
+    """A sensor lost or repeated samples without counting them; its count was corrected."""
+
+    name: ClassVar[str] = "samples-uncounted"
+    slips: tuple[Uncounted, ...]
+
+    def _words(self) -> Words:
+        slips, sensor = self.slips, listed(self.sensors)
+        total = sum(abs(slip.n_samples) for slip in slips)
+        verbs = {slip.n_samples > 0 for slip in slips}
+        verb = "lost or repeated" if len(verbs) > 1 else "lost" if verbs == {True} else "repeated"
+        first, last = (time_of_day(slips[at].utc_ns) for at in (0, -1))
+        when = f"at about {first} UTC"
+        if len(slips) > 1:
+            when = f"between {first} and {last} UTC, {len(slips)} times,"
+        text = (
+            f"{sensor} {verb} {several(total, 'sample')} {when} without counting"
+            f" {'it' if total == 1 else 'them'}"
+        )
+        return Words(
+            f"{text}: check the logger's buffers and cable",
+            f"{text}. Its count was corrected, and the segments around are excluded.",
+            f"{UNCOUNTED_CHECK[0].upper()}{UNCOUNTED_CHECK[1:]}.",
+        )
+
+
+@record
+class ClockNotUnderstood(Fact):
+    """The delays measured from the motion do not lie on a sensor's clock.
+
+    Attributes
+    ----------
+    ppm : float
+    error : float
+        s rms.
+    """
+
+    name: ClassVar[str] = "clock-not-understood"
+    ppm: float
+    error: Seconds
+
+    def _words(self) -> Words:
+        if math.isinf(self.error):
+            head = f"{listed(self.sensors)} does not follow the common motion in a part of the"
+            head += " recording"
+            return Words(
+                f"{head}: its clock is not understood",
+                f"{head}. Its times are off by more than can be measured, or it measures "
+                "something else there. The intervals include this, and limits are not decided.",
+                "Compare the traces of the sensors before and after that part. Check the clock of "
+                "the logger, and whether the sensor was moved, switched off or set to another "
+                "channel.",
+            )
+        whose = f"{listed(self.sensors)} ({signed(self.ppm, '+.0f')} ppm)"
+        head = f"The clock of {whose} is not understood"
+        return Words(
+            f"{head} (off by {_us(self.error)} rms): check for lost samples, and the rate",
+            f"{head}: its samples are off by about {_us(self.error)} rms. The intervals include "
+            "this error, and limits are not decided.",
+            "Check whether samples are lost or repeated without being counted (buffers, cable, the"
+            " logger's software), and the sampling rate.",
+        )
+
+
+@record
+class RatesNominal(Fact):
+    """Samples are taken to be at their nominal rates; no interval includes that error."""
+
+    name: ClassVar[str] = "rates-nominal"
+
+    def _words(self) -> Words:
+        text = f"The samples of {listed(self.sensors)} are taken to be at their nominal rate"
+        return Words(
+            f"{text}; intervals do not include its error",
+            f"{text}. If it is not exact, the noise is too high or too low; intervals and budgets "
+            "do not include this error.",
+        )
+
+
+@record
+class ClocksMayExplain(Fact):
+    """Clocks are so little known that findings may come from them alone; `error` in s rms."""
+
+    name: ClassVar[str] = "clocks-may-explain"
+    error: Seconds
+
+    def _words(self) -> Words:
+        clocks, verb = ("clock", "is") if len(self.sensors) == 1 else ("clocks", "are")
+        head = f"The {clocks} of {listed(self.sensors)} {verb} known to about"
+        head += f" {self.error * 1e3:.2g} ms"
+        return Words(
+            f"{head} only: give the sensors one clock",
+            f"{head} only. Lags, missing motion or a misfit may come from that alone.",
+            "Give the sensors one clock, see that connections are not lost, or record with more"
+            " motion.",
+        )
+
+
+def _us(seconds: float) -> str:
+    value = seconds * 1e6
+    return f"{value:.0f} µs" if value > 10 else f"{value:.1f} µs"
+
+
+def facts_of_clocks(snapshot: Snapshot) -> Iterator[Fact]:
+    """Yield how the times of samples are known, and where they are wrong or may be."""
+    clocks, left = snapshot.clocks, snapshot.diagnostics.synchronisation.residual
+    fitted = [clock for clock in clocks if clock.source is ClockSource.ARRIVAL_TIMES]
+    if fitted:
+        yield ClocksFitted(
+            rank=Rank.TO_KNOW,
+            sensors=tuple(clock.sensor for clock in fitted),
+            ppm=tuple(clock.ppm for clock in fitted),
+            error=max(left.get(clock.sensor, math.nan) for clock in fitted),
+        )
+    wrong = [
+        clock
+        for clock in clocks
+        if clock.corrected > (_SURE * clock.residual if clock.settings else 0) and not clock.drifts
+    ]
+    lost = [clock for clock in clocks if clock.drifts]
+    if wrong or lost:
+        after = [each.residual if lost else left.get(each.sensor, math.nan) for each in wrong]
+        yield StatedTimesDrift(
+            rank=Rank.INVALIDATES if lost else Rank.DELAYS,
+            sensors=tuple(clock.sensor for clock in (*wrong, *lost)),
+            corrected={clock.sensor: clock.corrected for clock in wrong},
+            uncorrected={clock.sensor: clock.residual for clock in lost},
+            left=max(after, default=math.nan),
+            reference=reference(snapshot) or "",
+        )
+    if unchecked := tuple(clock.sensor for clock in clocks if clock.unchecked):
+        yield StatedTimesUnchecked(rank=Rank.DELAYS, sensors=unchecked)
+    for clock in clocks:
+        if clock.settings:
+            yield ClockSet(
+                rank=Rank.TO_KNOW,
+                sensors=(clock.sensor,),
+                settings=clock.settings,
+                time_utc_ns=(clock.settings[0].utc_ns, clock.settings[-1].utc_ns),
+            )
+        if clock.slips:
+            yield SamplesUncounted(
+                rank=Rank.DELAYS,
+                sensors=(clock.sensor,),
+                slips=tuple(clock.slips),
+                time_utc_ns=(clock.slips[0].utc_ns, clock.slips[-1].utc_ns),
+            )
+        if not clock.is_understood:
+            yield ClockNotUnderstood(
+                rank=Rank.INVALIDATES,
+                sensors=(clock.sensor,),
+                ppm=clock.ppm,
+                error=clock.residual,
+            )
+    if nominal := tuple(clock.sensor for clock in clocks if math.isnan(clock.residual)):
+        yield RatesNominal(rank=Rank.DELAYS, sensors=nominal)
+    if any(isinstance(each, _LIKE_A_CLOCK) for each in snapshot.diagnostics.advice):
+        omega = 2 * math.pi * known_range(snapshot)[1]
+        loose = {sensor: late for sensor, late in left.items() if _TURN < omega * late < math.inf}
+        if loose:
+            yield ClocksMayExplain(
+                rank=Rank.DELAYS, sensors=tuple(loose), error=max(loose.values())
+            )

@@ -1,0 +1,271 @@
+"""What the model test and the choice of dimensions say."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, ClassVar
+
+from daq.results.facts.fact import Fact
+from estimator.checks.advice import Rank, Untested, model
+from estimator.checks.advice_on_model import ModelMisfit, TooFewDimensions
+from estimator.checks.advice_on_signals import NoSharedMotion, TooFewSensors
+from estimator.records import record
+from estimator.wording import Words, span
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from daq.estimation.snapshot import Snapshot
+    from estimator.likelihood.dimension import BandDimension
+    from estimator.records import Hertz
+
+
+_WHY_UNTESTED = {
+    Untested.UNFINISHED: "The diagnosis follows with the first segments.",
+    Untested.NO_SEGMENTS: "The model test needs averages, and the recording has no segment.",
+    Untested.INCOMPLETE: "The model test needs segments in which all channels have samples, and "
+    "there are none.",
+    Untested.TOO_FEW_SENSORS: "The model test needs three sensors with a signal of their own.",
+    Untested.TOO_FEW_AVERAGES: "The model test needs more averages ({n:.0f} so far) than channels "
+    "({channels}).",
+    Untested.TOO_FEW_CHANNELS: "The model test is not possible: {model} explains any signals of so "
+    "few channels.",
+    Untested.SINGULAR: "The model test is not possible: at no frequency is the cross-spectral "
+    "matrix finite and regular.",
+}
+
+
+@record
+class FewSensors(Fact):
+    """One sensor alone, or none: no method tells its noise from motion.
+
+    Attributes
+    ----------
+    n_sensors : int
+    """
+
+    name: ClassVar[str] = "few-sensors"
+    n_sensors: int
+
+    def _words(self) -> Words:
+        return Words(
+            "Noise needs more sensors: the table shows the PSD of what the sensor recorded",
+            "One sensor alone cannot tell its noise from motion: its noise is below its PSD.",
+            "Place two more sensors beside it; one more suffices where the motion changes.",
+        )
+
+
+@record
+class ModelUntested(Fact):
+    """Whether one common motion explains the averages was not tested.
+
+    Attributes
+    ----------
+    why : Untested
+    n_effective : float
+    n_channels, n_factors : int
+    dims : tuple of int
+    """
+
+    name: ClassVar[str] = "model-untested"
+    why: Untested
+    n_effective: float
+    n_channels: int
+    n_factors: int
+    dims: tuple[int, ...]
+
+    def _words(self) -> Words:
+        text = _WHY_UNTESTED[self.why].format(
+            n=self.n_effective, channels=self.n_channels, model=model(self.n_factors, self.dims)
+        )
+        do = "Record longer." if self.why is Untested.TOO_FEW_AVERAGES else ""
+        return Words(text.rstrip("."), text, do)
+
+
+@record
+class ModelPasses(Fact):
+    """The model test passes in all bands."""
+
+    name: ClassVar[str] = "model-passes"
+    n_factors: int
+    dims: tuple[int, ...]
+
+    def _words(self) -> Words:
+        return Words(
+            "The model test passes in all bands",
+            f"The model test passes in all bands: {model(self.n_factors, self.dims)} explains "
+            "what the sensors have in common.",
+        )
+
+
+@record
+class DimensionsChosen(Fact):
+    """The dimensions of the motion were chosen by band.
+
+    Attributes
+    ----------
+    choices : tuple of BandDimension
+        Accepted choices with an unusual dimension; empty if all are usual.
+    usual : int
+        The usual dimension.
+    elsewhere : bool
+        Whether bands with the usual dimension remain.
+    """
+
+    name: ClassVar[str] = "dimensions-chosen"
+    choices: tuple[BandDimension, ...]
+    usual: int
+    elsewhere: bool
+
+    def _words(self) -> Words:
+        lines = _gradients([choice for choice in self.choices if choice.gradients])
+        lines += [_choice(choice) for choice in self.choices if not choice.gradients]
+        if self.elsewhere:
+            where = "Elsewhere" if self.choices else "In all bands"
+            lines.append(f"{where} the motion has all {self.usual} dimensions.")
+        if not self.choices:
+            return Words(lines[0].rstrip("."), lines[0])
+        found = sorted({choice.n_factors for choice in self.choices})
+        numbers = f"{found[0]}" if len(found) == 1 else f"{found[0]} to {found[-1]}"
+        bands = _bands([(choice.low, choice.high) for choice in self.choices])
+        line = f"At {bands} Hz the motion has {numbers} dimensions, not {self.usual}"
+        return Words(line, " ".join(lines))
+
+
+@record
+class DimensionsUnexplained(Fact):
+    """No dimension that the sensors allow explains the averages in `bands` (Hz)."""
+
+    name: ClassVar[str] = "dimensions-unexplained"
+    bands: tuple[tuple[Hertz, Hertz], ...]
+
+    def _words(self) -> Words:
+        head = f"At {_bands(self.bands)} Hz no dimension that these sensors allow explains the"
+        head += " averages"
+        text = f"{head}: the noise estimate is biased there."
+        do = "Put the sensors closer together, or use more sensors."
+        return Words(f"{head}: put the sensors closer together", text, do)
+
+
+@record
+class DimensionsUndetermined(Fact):
+    """More dimensions explain the averages in `bands` (Hz), but are not told from noise."""
+
+    name: ClassVar[str] = "dimensions-undetermined"
+    bands: tuple[tuple[Hertz, Hertz], ...]
+    usual: int
+    n_sensors: int
+
+    def _words(self) -> Words:
+        head = f"At {_bands(self.bands)} Hz the sensors do not share one motion of {self.usual}"
+        head += " dimensions"
+        return Words(
+            f"{head}: use six sensors, or put them closer together",
+            f"{head}. More dimensions explain the averages, but {self.n_sensors} sensors cannot "
+            "tell them from noise: the noise estimate may be wrong by any amount.",
+            "Use six sensors, or put them closer together.",
+        )
+
+
+def _gradients(choices: Sequence[BandDimension]) -> list[str]:
+    """Return the bands that gradients of the motion explain, and their cost in precision."""
+    if not choices:
+        return []
+    low, high = (f"{pick(each.cov for each in choices):.2g}" for pick in (min, max))
+    usual = max(each.usual_cov for each in choices)
+    return [
+        (
+            f"At {_bands([(each.low, each.high) for each in choices])} Hz the motion and its "
+            "gradients across the bench explain the averages; the"
+            f" c.o.v. of one frequency is {low if low == high else f'{low} to {high}'} instead of"
+            f" {usual:.2g}."
+        )
+    ]
+
+
+def _choice(choice: BandDimension) -> str:
+    """Return an unusual dimension, and its cost in precision."""
+    price = f"the c.o.v. of one frequency is {choice.cov:.2g}"
+    if math.isfinite(choice.usual_cov):
+        price += f" instead of {choice.usual_cov:.2g}"
+    at = f"At {span(choice.low, choice.high)}"
+    if choice.n_factors < choice.usual:
+        return f"{at} the motion has {choice.n_factors} of {choice.usual} dimensions; {price}."
+    return (
+        f"{at} the sensors do not share one motion of {choice.usual} dimensions; "
+        f"{choice.n_factors} dimensions explain the averages; {price}."
+    )
+
+
+def _bands(bands: Sequence[tuple[float, float]]) -> str:
+    """Return bands, neighbours taken together."""
+    spans: list[tuple[float, float]] = []
+    for low, high in bands:
+        if spans and low - spans[-1][1] < (high - low) / 4:
+            spans[-1] = (spans[-1][0], high)
+        else:
+            spans.append((low, high))
+    return ", ".join(f"{low:.3g}–{high:.3g}" for low, high in spans)
+
+
+def facts_of_model(snapshot: Snapshot) -> Iterator[Fact]:
+    """Yield what the model test and the choice of dimensions say."""
+    diagnostics = snapshot.diagnostics
+    found, choices = diagnostics.diagnosis, diagnostics.dimensions
+    failing = found is not None and any(
+        isinstance(each, ModelMisfit | NoSharedMotion | TooFewDimensions) for each in found.advice
+    )
+    more = any(each.n_factors > each.usual for each in choices)
+    if diagnostics.untested is not None:
+        named = found is not None and any(isinstance(each, TooFewSensors) for each in found.advice)
+        if len(snapshot.dims) == 1:
+            yield FewSensors(rank=Rank.DELAYS, n_sensors=1)
+        elif len(snapshot.dims) > 2 and not named and snapshot.no_segment is None:
+            yield _untested(snapshot, diagnostics.untested)
+    elif (
+        found is not None
+        and not failing
+        and not more
+        and all(clock.is_understood for clock in snapshot.clocks)
+    ):
+        yield ModelPasses(rank=Rank.TO_KNOW, n_factors=found.n_factors, dims=snapshot.dims)
+    if not choices:
+        return
+    biased = [(each.low, each.high) for each in choices if each.is_biased]
+    unknown = [each for each in choices if each.is_undetermined and not each.is_biased]
+    unusual = tuple(each for each in choices if each.accepted and each.n_factors != each.usual)
+    if biased:
+        yield DimensionsUnexplained(rank=Rank.INVALIDATES, bands=tuple(biased))
+    if unknown:
+        yield DimensionsUndetermined(
+            rank=Rank.INVALIDATES,
+            bands=tuple((each.low, each.high) for each in unknown),
+            usual=unknown[0].usual,
+            n_sensors=unknown[0].n_sensors,
+        )
+    elsewhere = len(unusual) + len(biased) + len(unknown) < len(choices)
+    if unusual or elsewhere:
+        yield DimensionsChosen(
+            rank=Rank.TO_KNOW, choices=unusual, usual=choices[0].usual, elsewhere=elsewhere
+        )
+
+
+def _is_young(snapshot: Snapshot) -> bool:
+    """Return whether a test that goes on lacks nothing but averages yet: nothing is wrong."""
+    why = snapshot.diagnostics.untested
+    return why is Untested.UNFINISHED or (
+        not snapshot.closed and why in {Untested.NO_SEGMENTS, Untested.TOO_FEW_AVERAGES}
+    )
+
+
+def _untested(snapshot: Snapshot, why: Untested) -> ModelUntested:
+    """Return why the model was not tested."""
+    found = snapshot.diagnostics.diagnosis
+    return ModelUntested(
+        rank=Rank.TO_KNOW if _is_young(snapshot) else Rank.DELAYS,
+        why=why,
+        n_effective=snapshot.n_effective,
+        n_channels=len(snapshot.channels),
+        n_factors=max(snapshot.dims) if found is None else found.n_factors,
+        dims=snapshot.dims,
+    )

@@ -1,0 +1,194 @@
+"""How two sensors compare, what widens intervals, and whether a target is reached."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from daq.results.band_summary import averages_at, correlation_of
+from daq.results.facts.fact import Fact
+from daq.results.facts.recordings import LEAST_SHARE
+from daq.results.vocabulary import SOURCE_WORDS
+from estimator.checks.advice import Rank
+from estimator.checks.relative_response import pair_coherence
+from estimator.errors import BandError
+from estimator.levels.interval import NORMAL_95
+from estimator.records import record
+from estimator.wording import Words, listed, percent, roughly, signed, span
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from daq.results.band_summary import Estimate
+    from estimator.levels.contributions import Source
+    from estimator.records import Degrees, Seconds
+
+
+_TWO = 2  # sensors
+
+
+@record
+class PairCompared(Fact):
+    """The second of two sensors against the first, from the motion in `band`, with errors (1 σ).
+
+    Attributes
+    ----------
+    coherence, coherence_error : float
+        Mean over directions.
+    rotation, rotation_error : float
+        Degrees; NaN of sensors with one channel.
+    gains, gain_errors : tuple of float
+        Of each channel.
+    delay, delay_error : float
+        Seconds; NaN where the motion does not tell.
+    """
+
+    name: ClassVar[str] = "pair-compared"
+    coherence: float
+    coherence_error: float
+    rotation: Degrees
+    rotation_error: Degrees
+    gains: tuple[float, ...]
+    gain_errors: tuple[float, ...]
+    delay: Seconds
+    delay_error: Seconds
+
+    def _words(self) -> Words:
+        first, second = self.sensors
+        gains = zip(self.gains, self.gain_errors, strict=True)
+        parts = [
+            ("gain " + ", ".join(_measured(*each, 4) for each in gains), self.gains[0]),
+            (f"rotation {_measured(self.rotation, self.rotation_error, 3)}°", self.rotation),
+            (f"delay {_measured(1e6 * self.delay, 1e6 * self.delay_error, 2)} µs", self.delay),
+            (f"coherence {_measured(self.coherence, self.coherence_error, 4)}", self.coherence),
+        ]
+        known = ", ".join(text for text, value in parts if math.isfinite(value))
+        where = "" if self.band is None else f" at {span(*self.band)}"
+        return Words(
+            f"{second} against {first}: {known}",
+            f"{second} against {first}{where}, with 95 % intervals: {known}.",
+        )
+
+
+@record
+class IntervalsWidened(Fact):
+    """What intervals of the table include beside scatter.
+
+    Attributes
+    ----------
+    shares : mapping of Source to float
+        Largest share of the noise; infinite without limit.
+    """
+
+    name: ClassVar[str] = "intervals-widened"
+    shares: Mapping[Source, float]
+
+    def _words(self) -> Words:
+        parts = [
+            SOURCE_WORDS[source]
+            + (f" (up to {percent(share)})" if math.isfinite(share) else " (without limit)")
+            for source, share in self.shares.items()
+        ]
+        text = f"{self.method}: beside scatter, the intervals include {listed(parts)}"
+        return Words(text, f"{text}.")
+
+
+@record
+class TargetMissed(Fact):
+    """The wanted precision is not reached.
+
+    Attributes
+    ----------
+    cov, target : float
+    total : float or None
+        Seconds of recording that reach the target.
+    """
+
+    name: ClassVar[str] = "target-missed"
+    cov: float
+    target: float
+    total: Seconds | None
+
+    def _words(self) -> Words:
+        text = f"The c.o.v. of the noise is {percent(self.cov)}, wanted {percent(self.target)}"
+        if self.total is None:
+            return Words(f"{text}: record longer", f"{text}.", "Record longer.")
+        long = roughly(self.total)
+        return Words(f"{text}: record for {long} in all", f"{text}.", f"Record for {long} in all.")
+
+
+def _measured(value: float, error: float, digits: int) -> str:
+    """Return a number with the half-width of its 95 % interval."""
+    reach = f" ±{NORMAL_95 * error:.{digits}f}" if math.isfinite(error) else ""
+    return f"{signed(value, f'.{digits}f')}{reach}"
+
+
+def _compared(estimate: Estimate) -> Iterator[PairCompared]:
+    """Yield coherence, rotation, gains and delay where there are two sensors only."""
+    snapshot = estimate.snapshot
+    found = snapshot.diagnostics.diagnosis
+    for pair in found.responses if found is not None and len(snapshot.dims) == _TWO else ():
+        inside = (snapshot.frequency >= pair.low) & (snapshot.frequency <= pair.high)
+        averages = averages_at(snapshot, np.array([pair.low]))
+        coherence, error = pair_coherence(
+            snapshot.csm[inside],
+            dims=snapshot.dims,
+            pair=(pair.first, pair.second),
+            n_effective=float(averages[0]),
+            correlation=correlation_of(estimate.settings),
+        )
+        turns = len(pair.gains) > 1
+        yield PairCompared(
+            rank=Rank.TO_KNOW,
+            sensors=tuple(snapshot.sensor_names[each] for each in (pair.first, pair.second)),
+            band=(pair.low, pair.high),
+            coherence=coherence,
+            coherence_error=error,
+            rotation=pair.rotation_deg if turns else math.nan,
+            rotation_error=pair.rotation_error_deg if turns else math.nan,
+            gains=tuple(pair.gains.tolist()),
+            gain_errors=tuple(pair.gain_errors.tolist()),
+            delay=pair.delay,
+            delay_error=pair.delay_error,
+        )
+
+
+def facts_of_precision(estimate: Estimate) -> Iterator[Fact]:
+    """Yield how two sensors compare, what widens intervals, and whether a target is reached."""
+    yield from _compared(estimate)
+    for method in estimate.snapshot.results:
+        if shares := widening(estimate, method):
+            rank = Rank.TO_KNOW
+            yield IntervalsWidened(rank=rank, method=method, shares=shares)
+    settings = estimate.settings
+    if not estimate.snapshot.closed or (settings.target_cov or settings.target_cov_bin) is None:
+        return
+    try:
+        reached = estimate.precision()
+    except BandError:
+        return
+    if reached.target is not None and math.isfinite(reached.cov) and not reached.is_reached:
+        yield TargetMissed(
+            rank=Rank.DELAYS, cov=reached.cov, target=reached.target, total=reached.total
+        )
+
+
+def widening(estimate: Estimate, method: str) -> dict[Source, float]:
+    """Return what intervals of a method include beside scatter, as shares of the noise.
+
+    The largest share of a channel, from `LEAST_SHARE` on.
+    """
+    try:
+        means = estimate.means(method)
+    except BandError:
+        return {}
+    most: dict[Source, float] = {}
+    for mean in means:
+        level = abs(float(mean.mean[0]))
+        for source, (below, above) in mean.parts.items():
+            share = max(float(below[0]), float(above[0])) / level if level else math.nan
+            if share >= LEAST_SHARE:
+                most[source] = max(most.get(source, 0.0), share)
+    return most

@@ -1,0 +1,245 @@
+"""Advice on noise that is shared, or changes, and on responses that change."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+from estimator.checks.advice import Advice, Names, Rank
+from estimator.records import Seconds, Share, record
+from estimator.wording import Words, listed, percent, several, time_of_day
+
+
+@record
+class SharedNoise(Advice):
+    """Pairs of channels, of one sensor or of two, share noise.
+
+    Attributes
+    ----------
+    channels : tuple of (int, int)
+    coherencies : tuple of float
+        Coherency of the noise of each pair, from -1 to 1.
+    standard_errors : tuple of float
+        Their standard errors.
+    alternatives : tuple of (int, int)
+        Pairs, of these sensors or of others, one of which may share noise instead.
+    three_sensor : float
+        Largest bias of the three-sensor noise of any channel, as a fraction of the noise; NaN
+        without such an estimate.
+    maximum_likelihood : float
+        The same for the maximum likelihood noise.
+    channel : int
+        The channel with the largest bias.
+    """
+
+    name: ClassVar[str] = "shared-noise"
+    channels: tuple[tuple[int, int], ...]
+    coherencies: tuple[float, ...]
+    standard_errors: tuple[float, ...]
+    alternatives: tuple[tuple[int, int], ...]
+    three_sensor: Share
+    maximum_likelihood: Share
+    channel: int
+
+    @property
+    def harm(self) -> float:
+        """Larger of the two biases, as a fraction of the noise."""
+        known = [abs(x) for x in (self.three_sensor, self.maximum_likelihood) if not math.isnan(x)]
+        return max(known, default=0.0)
+
+    def _words(self, names: Names) -> Words:
+        harm = (
+            "" if self.rank is Rank.TO_KNOW else f", which biases estimates by {percent(self.harm)}"
+        )
+        pairs = _pairs(self.channels + self.alternatives, names)
+        coherencies = [
+            f"{pair} {100 * amount:.2g} ± {100 * error:.1g} %"
+            for pair, amount, error in zip(
+                _pairs(self.channels, names), self.coherencies, self.standard_errors, strict=True
+            )
+        ]
+        whose = "Channels of" if len(self.sensors) == 1 else "Sensors"
+        others = _pairs(self.alternatives, names)
+        instead = (
+            f" It may be {listed(others, 'or')} instead: these averages cannot tell."
+            if others
+            else ""
+        )
+        return Words(
+            f"{listed(pairs, 'or' if self.alternatives else 'and')} share noise{harm}",
+            f"{whose} {names.list_sensors(self.sensors)} share noise at {self.where} "
+            f"({', '.join(coherencies)} of the noise).{instead} {_effect(self, names)}",
+            "Check what these channels have in common: digitizer, power supply, ground, cable, "
+            "mount.",
+        )
+
+
+@record
+class DisturbedSegments(Advice):
+    """Single segments differ from all others beyond their common motion.
+
+    Attributes
+    ----------
+    n_disturbed, n_segments : int
+    times : tuple of float
+        Start times of the first disturbed segments, s from the start.
+    excess : float
+        Noise added by these segments, as a fraction, at the frequencies with the largest fraction.
+    channel : int
+        The channel with the largest excess.
+    """
+
+    name: ClassVar[str] = "disturbed-segments"
+    n_disturbed: int
+    n_segments: int
+    times: tuple[Seconds, ...]
+    excess: Share
+    channel: int
+
+    def _words(self, names: Names) -> Words:
+        more = self.n_disturbed - len(self.times)
+        times = ", ".join(f"{time:.0f} s" for time in self.times)
+        return Words(
+            f"{several(self.n_disturbed, 'disturbed segment')}, most in "
+            f"{names.channels[self.channel]}: "
+            f"noise up to {percent(self.excess)} too high; use --reject",
+            f"{self.n_disturbed} of {self.n_segments} segments "
+            f"{'differ' if self.n_disturbed > 1 else 'differs'} from all others in what is "
+            f"no common motion, most in {names.channels[self.channel]} (from the start: {times}"
+            f"{f' and {more} more' if more else ''}). They add up to {percent(self.excess)} to the "
+            "noise.",
+            "Exclude disturbed segments (--reject).",
+        )
+
+
+@record
+class NoiseChanges(Advice):
+    """The noise of a channel differs between parts of the recording.
+
+    Attributes
+    ----------
+    channel : int
+    deviation : float
+        Standard deviation between parts, as a fraction of the noise.
+    expected : float
+        Expected standard deviation for steady noise.
+    n_parts : int
+    inflation : float
+        Correction of the model test and the tests of shared noise.
+    """
+
+    name: ClassVar[str] = "noise-changes"
+    channel: int
+    deviation: Share
+    expected: Share
+    n_parts: int
+    inflation: float
+
+    def _words(self, names: Names) -> Words:
+        intervals = (
+            f"Intervals and tests allow for it: the variance is {self.inflation:.2g} times that of "
+            "steady noise"
+            if self.inflation > 1
+            else "Intervals are those of steady noise"
+        )
+        return Words(
+            f"The noise of {names.channels[self.channel]} changes by {percent(self.deviation)} at "
+            f"{self.where}: estimate parts (--start, --end)",
+            f"The noise changes during the recording, most in {names.channels[self.channel]} at "
+            f"{self.where}: by {percent(self.deviation)} between {self.n_parts} parts "
+            f"({percent(self.expected)} if it were steady). The estimate is the mean. "
+            f"{intervals}; another recording of this length would differ by "
+            f"{percent(self.deviation / math.sqrt(self.n_parts))} (standard error).",
+            "Estimate parts of the recording by themselves (--start, --end).",
+        )
+
+
+@record
+class ResponseChanges(Advice):
+    """The gain or the direction of a sensor changes during the recording.
+
+    Attributes
+    ----------
+    channel : int or None
+        The channel whose gain changes; None: all channels of the sensor.
+    is_turn : bool
+        Whether the sensor turns; its gains otherwise.
+    size : float
+        Change of the gain, as a fraction of the gain before; of a turn in radians.
+    size_error : float
+        Standard error of the size.
+    begin, end : float
+        Seconds from the start, between which it changes; equal for a step.
+    variance : float
+        Noise that the change adds in the average of all segments, as a fraction of the motion's
+        PSD, for the worst channel.
+    """
+
+    name: ClassVar[str] = "response-changes"
+    channel: int | None
+    is_turn: bool
+    size: Share
+    size_error: Share
+    begin: Seconds
+    end: Seconds
+    variance: Share
+
+    def _words(self, names: Names) -> Words:
+        own = names.list_sensors(self.sensors)
+        return Words(
+            f"{_response_change(self, names)}; {_remedy(self)}",
+            f"{_response_change(self, names)} (standard error "
+            + (
+                f"{math.degrees(self.size_error):.1g}°"
+                if self.is_turn
+                else f"{percent(self.size_error)}"
+            )
+            + f"). Over all segments, this leaves up to {percent(self.variance)} of the motion's "
+            f"PSD in the noise of {own}. Noise is estimated within parts of time where these have "
+            "enough averages; intervals include what is left.",
+            f"{_remedy(self).capitalize()} and record again, or estimate the time before or "
+            "after (--start, --end).",
+        )
+
+
+def _response_change(advice: ResponseChanges, names: Names) -> str:
+    """Return what changed, by how much and when."""
+    (sensor,) = (names.sensors[number] for number in advice.sensors)
+    if advice.is_turn:
+        what = f"Sensor {sensor} turned by {math.degrees(abs(advice.size)):.2g}°"
+    else:
+        whose = sensor if advice.channel is None else names.channels[advice.channel]
+        direction = "rose" if advice.size > 0 else "fell"
+        what = f"The gain of {whose} {direction} by {percent(abs(advice.size))}"
+    begin, end = (_clock_time(names, at) for at in (advice.begin, advice.end))
+    return f"{what} at {begin}" if begin == end else f"{what} from {begin} to {end}"
+
+
+def _clock_time(names: Names, seconds: float) -> str:
+    if not names.start_utc_ns:
+        return f"{seconds:.0f} s"
+    return time_of_day(names.start_utc_ns + round(seconds * 1e9))
+
+
+def _remedy(advice: ResponseChanges) -> str:
+    return "fix the sensor" if advice.is_turn else "let the sensor settle"
+
+
+def _pairs(pairs: tuple[tuple[int, int], ...], names: Names) -> list[str]:
+    return [f"{names.channels[one]} and {names.channels[other]}" for one, other in pairs]
+
+
+def _effect(advice: SharedNoise, names: Names) -> str:
+    found = []
+    for method, bias in (
+        ("three-sensor", advice.three_sensor),
+        ("maximum likelihood", advice.maximum_likelihood),
+    ):
+        if not math.isnan(bias):
+            size = percent(abs(bias))
+            off = f"too {'high' if bias > 0 else 'low'} by up to {size}"
+            found.append(f"the {method} noise is {off if abs(bias) > 1e-3 else 'not biased'}")
+    if not found:
+        return "The noise estimates may be wrong by as much."
+    text = f"{listed(found)} (worst in {names.channels[advice.channel]})."
+    return text[0].upper() + text[1:]
