@@ -107,6 +107,7 @@ def test_commands_and_their_options_exist() -> None:
             continue
         known = {
             "--help",
+            "--help-all",
             *chain.from_iterable(p.opts + p.secondary_opts for p in subcommand(word).params),
         }
         wrong += [f"{where}: huddle {word} {option}" for option in options if option not in known]

@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     "huddle archive day-*.h5 --scheduler tls://10.0.0.1:8786 --store /shared/archive",
     "huddle archive --store recordings/huddle-archive --band 1:20 --json - --csv days.csv",
     "huddle archive sds:///data/sds --net XX --response stations.xml --jobs 4 --store archive",
+    first="store stretch jobs out band segment response channels json csv",
 )
 @with_logging
 @with_estimate_options

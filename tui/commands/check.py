@@ -34,6 +34,14 @@ if TYPE_CHECKING:
     "huddle check lab.toml --no-devices --json -",
     "huddle check lab.toml --write   (write serial numbers and port names into the file)",
     "huddle check --port /dev/ttyUSB0   (identify a device without a bench file)",
+    worked="""\
+$ huddle check lab.toml
+Bench file lab.toml: no errors.
+✓ ports         every sensor answers and sends samples
+✓ identity      the serial numbers are those of the bench file
+✗ sensitivities A reads 0.102 of B and C: correct its sensitivity
+
+✓ is right, ✗ must be corrected before a test, ? needs more to decide.""",
 )
 def check(
     bench: Annotated[

@@ -47,6 +47,16 @@ if TYPE_CHECKING:
     "huddle estimate night.h5 --octaves --dimension auto --details",
     "huddle estimate night.h5 --noise-parameters",
     "huddle estimate *.mseed --response station.xml",
+    first="methods segment band unit response start end diagnostics json csv",
+    worked="""\
+$ huddle estimate night.h5 --band 1:20
+Self-noise, mean over 1 to 20 Hz, dB re 1 (m/s²)²/Hz, with its 95 % interval
+sensor  channel    data   three-sensor
+A       X        −90.00  −114.02 ±0.13
+▲ The c.o.v. of the noise is 13 %, wanted 5 %: record for 72 min in all
+
+A.X recorded −90.00 dB, mostly motion; its own noise is between −114.15 and
+−113.89 dB. A recording four times as long halves the interval.""",
 )
 @with_estimate_options
 def estimate(

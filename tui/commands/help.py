@@ -8,6 +8,7 @@ module of a command is imported when the command is used, or asked for its help.
 
 from __future__ import annotations
 
+from copy import copy
 from enum import Enum
 from functools import cache
 from importlib import import_module
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import typer
 from typer.core import TyperArgument, TyperCommand, TyperGroup
 
-from tui.commands.options import EXAMPLES
+from tui.commands.options import ESSENTIAL, ESTIMATE_PANEL, GUIDES, LOG_PANEL, Guide
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -77,12 +78,20 @@ COMMANDS = [name for panel in PANELS.values() for name in panel]
 _MODULES = {"import": "import_", "issues": "issue", "pin": "runs"}
 """The module of a command that is not in one of its name."""
 
+_FIRST = "huddle.first"
+"""Key of a context that shows the options that people need first."""
 _HYPHEN = "\N{NON-BREAKING HYPHEN}"
 """In place of a hyphen while lines are broken: --no-reject stays whole."""
 
 
 class HelpfulCommand(TyperCommand):
-    """A subcommand."""
+    """A subcommand.
+
+    ``--help`` shows the options that people need first, ``--help-all`` all of them, as the manual
+    page and the documents do.
+    """
+
+    guide = Guide((), frozenset(), "")
 
     def __init__(self, *args: Any, **declared: Any) -> None:
         super().__init__(*args, **declared)
@@ -92,22 +101,48 @@ class HelpfulCommand(TyperCommand):
             parameter.get_runtime_param = converter.itself
 
     def get_help(self, ctx: Any) -> str:
-        """Return the page."""
+        """Return the page with all options."""
         return super().get_help(ctx).replace(_HYPHEN, "-")
 
     def get_help_option(self, ctx: Any) -> Any:
-        """Return ``--help``, off by default."""
-        return _off_by_default(super().get_help_option(ctx))
+        """Return ``--help``, off by default; it shows what is needed first."""
+        switch = _off_by_default(super().get_help_option(ctx))
+        switch.callback = _show_first
+        return switch
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the parameters, with ``--help-all``; it is listed where ``--help`` is shorter."""
+        found = super().get_params(ctx)
+        n_more = sum(not self._is_first(each) for each in self.params)
+        whole: Any = copy(found[-1])
+        whole.opts, whole.name, whole.callback = ["--help-all"], "help_all", _show_all
+        whole.help, whole.hidden = f"Show all options, {n_more} more, and exit.", not n_more
+        return [*found, whole]
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write a section for each panel of options."""
-        _write_sections(formatter, _options(self.get_params(ctx), ctx))
+        shown = self.get_params(ctx)
+        if _FIRST in ctx.meta:
+            shown = [each for each in shown if self._is_first(each)]
+        _write_sections(formatter, _options(shown, ctx))
+
+    def _is_first(self, parameter: Any) -> bool:
+        """Whether ``--help`` shows a parameter."""
+        if isinstance(parameter, TyperArgument) or parameter.name in {"help", "help_all"}:
+            return True
+        if self.guide.first:
+            return parameter.name in self.guide.first
+        panel = parameter.rich_help_panel
+        return panel not in {ESTIMATE_PANEL, LOG_PANEL} or parameter.name in ESSENTIAL
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        """Write the examples, each on a line of its own."""
+        """Write the examples, each on a line of its own, and one with its output."""
         del ctx
         with formatter.section(_heading("Examples")):
-            formatter.write_text(f"\b\n{self.epilog}")
+            formatter.write_text("\b\n" + "\n".join(self.guide.lines))
+        if self.guide.worked:
+            with formatter.section(_heading("Worked example")):
+                formatter.write_text("\b\n" + self.guide.worked.replace("\n\n", "\n\n\b\n"))
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command. Its own options of log lines are applied later."""
@@ -115,6 +150,19 @@ class HelpfulCommand(TyperCommand):
 
         configure()
         return super().invoke(ctx)
+
+
+def _show_first(ctx: Any, param: Any, value: bool) -> None:
+    if value:
+        ctx.meta[_FIRST] = True
+    _show_all(ctx, param, value)
+
+
+def _show_all(ctx: Any, param: Any, value: bool) -> None:
+    del param
+    if value and not ctx.resilient_parsing:
+        typer.echo(ctx.get_help(), color=ctx.color)
+        ctx.exit()
 
 
 class _Converter:
@@ -199,9 +247,10 @@ def subcommand(name: str) -> Any:
     module = import_module(f"tui.commands.{_MODULES.get(name, name)}")
     function = getattr(module, name if hasattr(module, name) else f"{name}_")  # import_
     alone = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-    epilog = "\n".join(EXAMPLES[function.__name__])
-    alone.command(name, cls=HelpfulCommand, epilog=epilog)(function)
-    return typer.main.get_command(alone)
+    alone.command(name, cls=HelpfulCommand)(function)
+    command: Any = typer.main.get_command(alone)
+    command.guide = GUIDES[function.__name__]
+    return command
 
 
 def _off_by_default(switch: Any) -> Any:

@@ -51,6 +51,12 @@ _ORIGINS = {
     " --out anmo.h5",
     "huddle import samples.csv --bench lab.toml --out lab.h5",
     "huddle import corrected.mseed --sample-unit m/s² --out lab.h5",
+    first="out response response_for channels bench start end columns sample_unit json",
+    worked="""\
+$ huddle import *.mseed --response station.xml --out lab.h5
+all channels: response, 1.2655e+09 counts per m/s; 11 poles, 6 zeros
+chosen for the estimate: segment 16m40s (lower corner 120 s); unit m/s²
+lab.h5 written; next: huddle estimate lab.h5""",
 )
 @with_logging
 @with_estimate_options

@@ -31,6 +31,7 @@ from tui.output.extras import require
     "huddle issue night.h5 --by 'A. Lovelace' --bench lab.toml",
     "huddle issue night.h5 --specimen",
     "huddle issue night.h5 --by 'A. Lovelace' --segment 20s --reason 'resolution of 0.05 Hz'",
+    first="by reason bench folder allow_incomplete despite specimen sign start end",
 )
 @with_estimate_options
 def issue(

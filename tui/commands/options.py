@@ -4,6 +4,7 @@
 
 import inspect
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias, TypeVar
@@ -14,18 +15,42 @@ from daq.bench.durations import parse_duration
 from daq.bench.estimate_settings import OPTIONS, default_text, from_text
 from tui.output.logs.options import LogFormat, LogLevel
 
-_ESTIMATE_PANEL = "Estimate (defaults come from the bench file)"
+ESTIMATE_PANEL = "Estimate (defaults come from the bench file)"
 Command = TypeVar("Command", bound=Callable[..., object])
 
-EXAMPLES: dict[str, tuple[str, ...]] = {}
-"""Example lines by the name of the function of a command."""
+ESSENTIAL = frozenset({"methods", "segment", "band", "unit"})
+"""Options of an estimate that every help shows."""
 
 
-def examples(*lines: str) -> Callable[[Command], Command]:
-    """Add examples to the help of a command."""
+@dataclass(frozen=True, slots=True)
+class Guide:
+    """What a command shows first: example lines, parameters, and an example with its output."""
+
+    lines: tuple[str, ...]
+    first: frozenset[str]
+    worked: str
+
+
+GUIDES: dict[str, Guide] = {}
+"""By the name of the function of a command."""
+
+
+def examples(*lines: str, first: str = "", worked: str = "") -> Callable[[Command], Command]:
+    """Add examples to the help of a command.
+
+    Parameters
+    ----------
+    *lines : str
+        Commands.
+    first : str
+        Names of the parameters that ``--help`` shows; all but those of an estimate and of log
+        lines, if not given. ``--help-all`` shows all.
+    worked : str
+        A command with its output, and what that means.
+    """
 
     def keep(command: Command) -> Command:
-        EXAMPLES[command.__name__] = lines
+        GUIDES[command.__name__] = Guide(lines, frozenset(first.split()), worked)
         return command
 
     return keep
@@ -171,7 +196,7 @@ def _parameter(name: str) -> inspect.Parameter:
         *option.flags,
         metavar=option.metavar or None,
         help=f"{option.help} Default: {default}." if default else option.help,
-        rich_help_panel=_ESTIMATE_PANEL,
+        rich_help_panel=ESTIMATE_PANEL,
         show_default=False,
     )
     return inspect.Parameter(
@@ -217,14 +242,14 @@ def with_estimate_options(command: Callable[..., None]) -> Callable[..., None]:
     return with_options
 
 
-_LOG_PANEL = "Log lines on standard error"
+LOG_PANEL = "Log lines on standard error"
 
 LogLevelOption: TypeAlias = Annotated[
     LogLevel,
     typer.Option(
         "--log-level",
         metavar="LEVEL",
-        rich_help_panel=_LOG_PANEL,
+        rich_help_panel=LOG_PANEL,
         help="Lowest severity to write: debug, info, warning or error (default info).",
         show_default=False,
     ),
@@ -234,7 +259,7 @@ LogFormatOption: TypeAlias = Annotated[
     typer.Option(
         "--log-format",
         metavar="FORMAT",
-        rich_help_panel=_LOG_PANEL,
+        rich_help_panel=LOG_PANEL,
         help="text, or json: one JSON object per line, and no other output on standard error;"
         " or journal: entries of systemd's journal (default text).",
         show_default=False,
@@ -245,7 +270,7 @@ LogFileOption: TypeAlias = Annotated[
     typer.Option(
         "--log-file",
         metavar="FILE",
-        rich_help_panel=_LOG_PANEL,
+        rich_help_panel=LOG_PANEL,
         help="Append log lines to this file (default: write none).",
     ),
 ]

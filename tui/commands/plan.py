@@ -16,6 +16,13 @@ from tui.commands.options import JsonOption, examples
 @examples(
     "huddle plan lab.toml --snr 1000 --cov 0.05",
     "huddle plan --sensors 2 --rate 200 --snr 30 --cov 0.05",
+    worked="""\
+$ huddle plan lab.toml
+method                  duration  segments    remaining bias  efficiency
+three-sensor              48m25s       580              none         99%
+
+Record for 49 minutes: the noise in the worst third of an octave from 1 Hz on
+then scatters by 5 %, where motion is 1000 times the noise (--snr).""",
 )
 def plan(
     path: Annotated[

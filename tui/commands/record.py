@@ -40,7 +40,15 @@ GAP_INTERVAL = 60.0
 """Minimum seconds between two log lines about gaps; a polled sensor can have many."""
 
 
-@examples("huddle record lab.toml --duration 3h --out night.h5")
+@examples(
+    "huddle record lab.toml --duration 3h --out night.h5",
+    first="duration until until_stopped out check anyway operator json wire_log",
+    worked="""\
+$ huddle record lab.toml --duration 20min --out night.h5
+$ huddle estimate night.h5
+
+Records for 20 minutes. Ctrl-C ends earlier, and what was recorded is kept.""",
+)
 @with_logging
 def record(
     path: BenchArgument,

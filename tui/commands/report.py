@@ -38,6 +38,12 @@ _COLOURS = {"good": "green", "bad": "red", "doubtful": "yellow"}
     "huddle report night.h5 --out night.pdf --band 1:20",
     "huddle report night.h5 --models nlnm,nhnm,brochure.csv",
     "huddle report monday.h5 tuesday.h5 --method all --out week.html",
+    worked="""\
+$ huddle report night.h5 --band 1:20
+No verdict: the bench file has no limits.
+night.html written
+
+With limits in the bench file the first line is the verdict: PASS or FAIL.""",
 )
 @with_estimate_options
 def report(

@@ -59,6 +59,13 @@ STATUS_INTERVAL = 1.0
     "huddle run lab.toml --until-decided --duration 3h",
     "huddle run lab.toml --until-cov 0.05 --band 1:20",
     "huddle run lab.toml -d 20min --json result.json --report result.pdf",
+    first="duration until_decided until_cov anyway out report json band segment unit",
+    worked="""\
+$ huddle run lab.toml --until-decided --duration 3h --report result.pdf
+
+Reads the sensors of lab.toml until every limit is met or not met, for three
+hours at most, shows the noise meanwhile, and writes result.pdf. The exit code
+is 0 for PASS, 1 for FAIL, 4 for not decided. Ctrl-C ends the test early.""",
 )
 @with_logging
 @with_estimate_options

@@ -12,7 +12,15 @@ import typer
 from tui.commands.options import DurationOption, JsonOption, examples, with_logging
 
 
-@examples("huddle simulate lab.toml --duration 3h --out model.h5")
+@examples(
+    "huddle simulate lab.toml --duration 3h --out model.h5",
+    worked="""\
+$ huddle simulate lab.toml --duration 10min --out night.h5
+night.h5: 600 s of A, B, C, simulated
+$ huddle estimate night.h5 --band 1:20
+
+The estimate shows the noise that the table [simulation] of lab.toml has.""",
+)
 @with_logging
 def simulate(
     scenario: Annotated[

@@ -11,6 +11,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from importlib import import_module
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +76,32 @@ def test_every_command_has_help_with_examples(name: str) -> None:
     text = huddle(name, "--help")
     assert "Examples" in text
     assert f"huddle {name} " in text or f"huddle {name}\n" in text
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_shows_what_is_needed_first_and_help_all_the_rest(name: str) -> None:
+    short, whole = huddle(name, "--help"), huddle(name, "--help-all")
+    options = re.findall(r"^  (?:-\w, )?(--[\w-]+)", short, re.MULTILINE)
+    assert len(set(options) - {"--help", "--help-all"}) <= 10
+    assert {*options} - {"--help-all"} <= {
+        *re.findall(r"^  (?:-\w, )?(--[\w-]+)", whole, re.MULTILINE)
+    }
+    shown = [each for each in subcommand(name).params if not getattr(each, "hidden", False)]
+    declared = chain.from_iterable(each.opts for each in shown)
+    assert [each for each in declared if each.startswith("--") and each not in whole] == []
+    assert ("--help-all" in short) is (short != whole)
+
+
+@pytest.mark.parametrize(
+    "name", ["estimate", "run", "record", "report", "check", "plan", "simulate", "import"]
+)
+def test_main_commands_have_a_worked_example_of_options_that_exist(name: str) -> None:
+    text = huddle(name, "--help").partition("Worked example:")[2]
+    assert f"$ huddle {name} " in text
+    assert max(map(len, text.splitlines())) <= 80
+    for command, rest in re.findall(r"\$ huddle (\w+)(.*)", text):
+        known = {*chain.from_iterable(each.opts for each in subcommand(command).params)}
+        assert set(re.findall(r"--[\w-]+", rest)) <= known
 
 
 def test_a_bare_command_and_help_show_help() -> None:

@@ -32,13 +32,13 @@ def run(bench: Path, folder: Path, duration: str = "6s") -> list[str]:
 
 @pytest.mark.parametrize("command", LONG)
 def test_commands_that_run_for_long_have_both_options(command: str) -> None:
-    said = CliRunner().invoke(app, [command, "--help"]).output
+    said = CliRunner().invoke(app, [command, "--help-all"]).output
     assert "--log-level" in said
     assert "--log-format" in said
 
 
 def test_the_application_logs_to_a_file_only() -> None:
-    assert "--log-file" in CliRunner().invoke(app, ["tui", "--help"]).output
+    assert "--log-file" in CliRunner().invoke(app, ["tui", "--help-all"]).output
 
 
 @pseudo_terminals
