@@ -1,13 +1,12 @@
 """A report as a PDF of A4 pages, by fpdf2: with title, outline, and tagged headings and plots.
 
 Parts flow down a page; one that does not fit starts the next page. Tables break between rows, and
-their header comes again. Lengths are in inches. Plots are vectors, their letters shapes.
+their header comes again. Lengths are in inches. Plots are paths, with letters of the font.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
 import logging
 import math
 from datetime import UTC, datetime
@@ -19,7 +18,7 @@ import matplotlib as mpl
 from fpdf import FPDF, FontFace, TextStyle
 from fpdf.enums import TableBordersLayout, WrapMode, XPos, YPos
 
-from tui.report.figures import drawing
+from tui.report.figures import drawing, on_paper
 from tui.report.figures.curves import WIDTH as INNER
 from tui.report.parts import Facts, Items, Paragraph, Plot, Signatures, Table
 
@@ -232,12 +231,10 @@ class _Paper(FPDF):
             self.add_page()
         if part.title:
             self.lines(part.title, TEXT, bold=True)
-        content = io.BytesIO()
-        with drawing.look(), mpl.rc_context({"svg.fonttype": "path"}):
-            drawing.alone(part, INNER).savefig(content, format="svg", metadata=_NO_METADATA)
-        content.seek(0)
-        self.image(content, x=MARGIN, w=INNER, h=height, alt_text=part.alt)
-        self.set_xy(MARGIN, max(self.y, TOP))
+        with self._marked_sequence(alt_text=part.alt):
+            page = on_paper.Page(self, _FAMILY, self._out)
+            on_paper.draw(part, page, left=MARGIN, top=self.y, width=INNER)
+        self.set_xy(MARGIN, self.y + height)
 
     @part.register
     def _(self, part: Signatures) -> None:
@@ -370,6 +367,3 @@ class _Paper(FPDF):
 def _shown(text: str) -> str:
     """Return a text that fits on a page."""
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}…"
-
-
-_NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -18,12 +19,14 @@ from tests.tui.night_recording import RATE
 from tests.tui.report.written_report import Reported, Words, paper_of, texts_of
 from tui.commands.main import app
 from tui.report.contents import report_of
-from tui.report.parts import Facts, Paragraph, Plot, Section, Table
+from tui.report.figures.curves import WIDTH
+from tui.report.parts import Facts, Paragraph, Plot, Report, Section, Table
 from tui.report.writing import write
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from matplotlib.axes import Axes
     from pypdf import PageObject
 
 
@@ -139,3 +142,39 @@ def test_one_channel_a_sensor_and_fifteen_sensors_fit(reported: Reported, tmp_pa
         assert places
         right, top = float(page.mediabox.right), float(page.mediabox.top)
         assert all(0 < x < right and 0 < y < top for x, y in places)
+
+
+def test_curves_are_paths_where_the_axes_have_them() -> None:
+    at, level = np.array([1.0, 2.0, 3.0, 4.0]), np.array([0.5, 2.5, np.nan, 1.0])
+    places = []
+
+    def panel(axes: Axes) -> None:
+        axes.fill_between(at, at - 4, at, color="#ff0000", alpha=0.25, lw=0)
+        axes.plot(at, level, color="#0000ff", lw=1.5, dashes=(4, 2))
+        axes.set(xlim=(1, 4), ylim=(0, 2), xlabel="time ($s$)", ylabel="height")
+        places.append(axes.get_position())
+
+    plot = Plot("", (panel,), n_columns=1, height=1.0, alt="a curve")
+    report = Report("Plots", "", Paragraph("drawn"), (Section("One", (plot,)),))
+    (page,) = PdfReader(paper_of(report)).pages
+    assert "time ($s$)" in page.extract_text()
+    resources: Any = page["/Resources"]
+    assert [each["/ca"] for each in resources["/ExtGState"].values() if "/ca" in each] == [0.25]
+    content = page.get_contents()
+    assert content is not None
+    words = content.get_data().decode("latin-1").splitlines()
+    (curve,) = (line for line in words if " 0 0 1 RG 1.5 w" in line)
+    assert "[6 3] 0 d" in curve  # dashes are in widths of the line
+    assert (curve.count(" m"), curve.count(" l")) == (2, 1)  # a gap, and a point alone after it
+    found = re.search(r"([\d.]+) ([\d.]+) m ([\d.]+) ([\d.]+) l", curve)
+    clip = re.search(r"([\d.]+) ([\d.]+) ([\d.]+) ([\d.]+) re W n", curve)
+    assert found is not None
+    assert clip is not None
+    x, y, width, height = map(float, clip.groups())
+    assert (width, height) == pytest.approx(
+        (72 * places[0].width * WIDTH, 72 * plot.height), abs=0.01
+    )
+    points = np.array(found.groups(), float).reshape(2, 2)
+    shown = [(x, y + 0.25 * height), (x + width / 3, y + 1.25 * height)]
+    np.testing.assert_allclose(points, shown, atol=0.01)
+    assert any(" 1 0 0 rg" in line and line.endswith("f Q") for line in words)
