@@ -47,6 +47,7 @@ def completion(
 def manual() -> Iterator[str]:
     """Yield the lines of the manual page, in man's macros: a section for each command."""
     import re
+    from datetime import UTC, datetime
 
     from tui import __version__
     from tui.commands.help import PANELS, subcommand
@@ -55,7 +56,8 @@ def manual() -> Iterator[str]:
         text = text.replace("\\", "\\e").replace("-", "\\-")
         return re.sub(r"^(?=[.'])", "\\\\&", text, flags=re.MULTILINE)
 
-    yield f'.TH HUDDLE 1 "" "huddle {__version__}" "User Commands"'
+    made = f"{datetime.now(UTC):%Y-%m-%d}"  # the page is that of the program of today
+    yield f'.TH HUDDLE 1 "{made}" "huddle {__version__}" "User Commands"'
     yield from (".SH NAME", "huddle \\- measure the self\\-noise of sensors placed side by side")
     yield from (".SH SYNOPSIS", ".B huddle", ".I COMMAND [OPTIONS]")
     for panel, commands in PANELS.items():

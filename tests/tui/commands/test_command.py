@@ -155,9 +155,13 @@ def test_the_shells_themselves_complete(tmp_path: Path, shell: str) -> None:
 
 def test_the_manual_has_every_command() -> None:
     page = huddle("completion", "man")
-    assert page.startswith(".TH HUDDLE 1")
+    assert re.match(r'\.TH HUDDLE 1 "\d{4}-\d\d-\d\d" "huddle ', page)
     for name in COMMANDS:
         assert f"\n.SS huddle {name}\n" in page
+    if shutil.which("mandoc") is not None:
+        lint = ["mandoc", "-T", "lint", "-W", "warning"]
+        done = subprocess.run(lint, input=page, capture_output=True, text=True, check=False)
+        assert (done.stdout + done.stderr, done.returncode) == ("", 0)
 
 
 def test_a_closed_pipe_is_no_failed_limit(tmp_path: Path) -> None:
