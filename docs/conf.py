@@ -1,19 +1,21 @@
 """Builds the documentation with Sphinx: ``make docs``.
 
-Pages are Markdown; the API reference comes from the docstrings. Examples run when their page is
-built: the directive ``example`` shows a script of ``examples/``, what it prints, and the figures
-that it writes.
+Pages are Markdown; the API reference comes from the docstrings. The directive ``example`` runs a
+script of ``examples/`` and shows what it prints and draws, ``gallery`` runs commands and shows
+their pictures, ``reference`` makes tables of what the program declares.
 """
 
 from __future__ import annotations
 
+import asyncio
 import os
+import shlex
+import shutil
 import subprocess
 import sys
 import tempfile
 from importlib.metadata import version as installed
 from pathlib import Path
-from shutil import copyfile
 from typing import TYPE_CHECKING, ClassVar
 
 from docutils import nodes
@@ -108,14 +110,66 @@ class Example(SphinxDirective):
         ]
 
     def _figure(self, path: Path, stem: str) -> nodes.image:
-        kept = ROOT / "docs" / FIGURES / f"{stem}-{path.name}"
-        kept.parent.mkdir(exist_ok=True)
-        copyfile(path, kept)
-        return nodes.image(uri=f"/{FIGURES}/{kept.name}", alt=f"Figure written by {stem}.py")
+        return kept_image(path, f"{stem}-{path.name}", f"Figure written by {stem}.py")
+
+
+class Gallery(SphinxDirective):
+    """Runs commands of huddle, and shows the pictures that they write.
+
+    All commands of a page share a folder. A line ``huddle tui FILE  # KEYS`` is a picture of the
+    application after these keys, one ``huddle report … --out NAME.pdf`` of the first page.
+    """
+
+    has_content = True
+    option_spec: ClassVar[dict[str, object]] = {}
+
+    def run(self) -> list[nodes.Node]:
+        """Run the commands, each in its turn."""
+        made = self.env.temp_data.setdefault("gallery", tempfile.TemporaryDirectory())
+        folder = Path(made.name)
+        lines = list(self.content)
+        found: list[nodes.Node] = [nodes.literal_block("", "\n".join(lines), language="sh")]
+        for line in lines:
+            before = set(folder.iterdir())
+            picture(line, folder)
+            for path in sorted(set(folder.iterdir()) - before):
+                if path.suffix in {".png", ".svg"}:
+                    name = f"gallery-{path.name}"
+                    found.append(kept_image(path, name, f"Made by: {line}"))
+        return found
+
+
+def picture(line: str, folder: Path) -> None:
+    """Run a line of the gallery in a folder; raises RuntimeError if it fails."""
+    sys.path.insert(0, str(ROOT))
+    from docs.images.terminal import photograph  # noqa: PLC0415 - needs the root on the path
+
+    words = shlex.split(line, comments=True)
+    if words[1] == "tui":
+        keys = tuple(line.partition("#")[2].split())
+        drawn = asyncio.run(photograph(folder / words[2], size=(100, 30), keys=keys))
+        (folder / f"application-{'-'.join(keys)}.svg").write_text(drawn, encoding="utf-8")
+        return
+    command = [sys.executable, "-P", "-m", "tui", *words[1:]]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    if done.returncode not in {0, 1, 4}:  # 1 and 4 are verdicts
+        raise RuntimeError(f"{line}: exit code {done.returncode}\n{done.stderr}")
+    if words[-1].endswith(".pdf") and shutil.which("pdftoppm"):  # of poppler-utils
+        page = ["pdftoppm", "-singlefile", "-r", "60", "-png", words[-1], words[-1][:-4]]
+        subprocess.run(page, cwd=folder, check=True)
+
+
+def kept_image(path: Path, name: str, alt: str) -> nodes.image:
+    """Keep a picture beside the pages, where Sphinx finds it."""
+    kept = ROOT / "docs" / FIGURES / name
+    kept.parent.mkdir(exist_ok=True)
+    shutil.copyfile(path, kept)
+    return nodes.image(uri=f"/{FIGURES}/{name}", alt=alt)
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Register the directives."""
     app.add_directive("example", Example)
+    app.add_directive("gallery", Gallery)
     app.add_directive("reference", Reference)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -104,5 +104,17 @@ def test_notebooks_run(notebook: Path, tmp_path: Path, monkeypatch: pytest.Monke
     assert str(names["result"]).startswith("Self-noise, mean over ")
 
 
+@pytest.mark.long
+def test_the_gallery_draws_its_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each command of the page runs; sessions of the application are drawn by its own tests."""
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
+    commands = re.findall(r"^huddle (?!tui )(.*)$", page, re.MULTILINE)
+    for command in commands:
+        done = CliRunner().invoke(app, shlex.split(command))
+        assert done.exit_code == 0, (command, done.output)
+    assert all(Path(each.rpartition(" ")[2]).stat().st_size > 9000 for each in commands[1:])
+
+
 def test_readme_is_short() -> None:
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 110
