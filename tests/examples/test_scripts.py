@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -55,6 +56,25 @@ def test_added_noise_is_found_in_its_channel_alone(tmp_path: Path) -> None:
     risen = levels["7.0 dB more noise in A.X"]
     assert risen[0] - levels["three-sensor"][0] == pytest.approx(7.0, abs=0.3)
     assert risen[1:] == pytest.approx(levels["three-sensor"][1:], abs=0.1)
+
+
+@pytest.mark.long
+def test_noise_added_to_a_real_recording_is_found(
+    usgs_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the method page says; where the recording is absent, the script says so and ends."""
+    pytest.importorskip("obspy")
+    monkeypatch.setenv("HUDDLE_DATA", str(usgs_recording.parent))
+    printed = run("noise_added_to_real_data.py", tmp_path).splitlines()
+    errors = [[float(word) for word in line.split()[-2:]] for line in printed[1:]]
+    assert len(errors) == 5
+    assert np.abs(errors).max() < 0.15
+    page = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| [\d.]+–\d+ \|(.*)\|$", page, re.MULTILINE)
+    quoted = [[float(word) for word in row.replace("−", "-").split("|")] for row in rows]
+    assert np.allclose([[*map(float, line.split()[1:])] for line in printed[1:]], quoted, atol=0.03)
+    monkeypatch.setenv("HUDDLE_DATA", str(tmp_path))
+    assert run("noise_added_to_real_data.py", tmp_path).startswith("skipped")
 
 
 @pytest.mark.long
