@@ -45,6 +45,7 @@ from daq.estimation.recording_set import (
     continuations,
     is_left,
     open_another,
+    that_sent,
 )
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
@@ -174,6 +175,7 @@ class Estimation:
             first = self._recordings[0]
             self.settings = Settings.of(first.outline) if settings is None else settings
             self._sensors = live_sensors(first, self.settings) if live else None
+            self._sensors = self._sensors or that_sent(self._recordings)
             self._passes = [self._pass(recording) for recording in self._recordings]
             check_same(self._passes)
             if not live:
@@ -219,8 +221,8 @@ class Estimation:
 
     @property
     def is_whole(self) -> bool:
-        """Whether all sensors are estimated."""
-        return self._sensors is None
+        """Whether the sensors that are estimated are all that sent anything."""
+        return self._sensors == that_sent(self._recordings)
 
     @property
     def recordings(self) -> tuple[ReadableRecording, ...]:

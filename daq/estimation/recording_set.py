@@ -107,6 +107,15 @@ def _following(recording: ReadableRecording) -> Iterator[Recording]:
             found.close()
 
 
+def that_sent(recordings: Sequence[ReadableRecording]) -> tuple[str, ...] | None:
+    """Return the sensors with samples; None if that is all or none, or if more may come."""
+    last, names = recordings[-1], [one.name for one in recordings[0].sensors]
+    if isinstance(last, Recording) and not (last.closed or is_left(last)):
+        return None
+    sent = {one.name for each in recordings for one in each.sensors if one.n_samples}
+    return tuple(name for name in names if name in sent) if 0 < len(sent) < len(names) else None
+
+
 def check_same(passes: Sequence[Pass]) -> None:
     """Refuse recordings of other sensors.
 

@@ -244,7 +244,7 @@ class Snapshot:
     bridged : Bridged or None
         None where no segment with gaps counts.
     not_estimated : tuple of str
-        Sensors that a live estimate leaves out, because all would take too much memory.
+        Sensors that sent nothing, and those that a live estimate leaves out to limit its memory.
     across_axes : tuple of float
         Share of the motion's PSD, across axes that may be off, by which the noise of each sensor
         may be off; empty: not at all.
@@ -314,6 +314,12 @@ class Snapshot:
             frozenset((*self.results, *chosen)),
             self.start_utc_ns,
         )
+
+    @property
+    def not_in_memory(self) -> tuple[str, ...]:
+        """Names of the sensors that sent samples, and that a live estimate leaves out."""
+        left = (each for each in self.sensors if each.name in self.not_estimated)
+        return tuple(each.name for each in left if each.n_samples)
 
     @property
     def added_by_clocks(self) -> FloatArray | None:

@@ -397,7 +397,7 @@ class Estimate:
         """
         snapshot, settings = self.snapshot, self.settings
         known = [cov for cov in self.covs if math.isfinite(cov)]
-        if snapshot.not_estimated:
+        if snapshot.not_in_memory:
             known = []
         cov = max(known, default=math.nan)
         target = target or settings.target_cov_bin or settings.target_cov

@@ -77,10 +77,9 @@ class Decision:
         steps = what_to_do(found)
         if record_for(found):  # by time alone: nothing else is missing
             steps = [steps[-1], *steps[:-1]]
-        usual = REPAIR
-        if found.verdict is Verdict.PASS:
-            needed = any(each.needs_action for each in result.facts)
-            usual = SEE_FACTS if needed else NOTHING_TO_DO
+        usual = REPAIR if found.verdict is Verdict.FAIL else SEE_FACTS
+        if found.verdict is Verdict.PASS and not any(each.needs_action for each in result.facts):
+            usual = NOTHING_TO_DO
         remarks = (*steps[1:], *not_judged(found))
         return cls(found.verdict, headline(found), steps[0] if steps else usual, remarks)
 
@@ -108,6 +107,11 @@ def _headline(found: TestVerdict) -> str:
         who = "the channel is" if n_channels == 1 else f"all {n_channels} channels are"
         return f"{word}: {who} below {names}."
     if found.verdict is Verdict.NOT_DECIDED:
+        if found.limits and not undecided and not found.obstacles:
+            have = (
+                "channel that has a result is" if n_channels == 1 else "channels with a result are"
+            )
+            return f"{word}: the {n_channels} {have} below {names}, and the others have none."
         if not undecided:
             return f"{word}: whether the channels are below {names} cannot be said."
         who = f"{len(undecided)} of {several(n_channels, 'channel')}"

@@ -221,9 +221,8 @@ def facts_of_recordings(snapshot: Snapshot) -> Iterator[Fact]:
                 n_samples=sensor.n_missing,
             )
     yield from _shortened(snapshot)
-    if left_out := snapshot.not_estimated:
-        n_all = len(snapshot.sensor_names) + len(left_out)
-        yield NotInLiveEstimate(rank=Rank.TO_KNOW, sensors=tuple(left_out), n_all=n_all)
+    if left_out := snapshot.not_in_memory:
+        yield NotInLiveEstimate(rank=Rank.TO_KNOW, sensors=left_out, n_all=len(snapshot.sensors))
 
 
 def _shortened(snapshot: Snapshot) -> Iterator[SpanShortened]:

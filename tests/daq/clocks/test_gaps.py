@@ -15,6 +15,8 @@ from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError
 from daq.recording.reader import Recording
 from daq.recording.sensor_record import SensorRecord
+from daq.results.facts.recordings import NotInLiveEstimate, SensorLost
+from daq.results.result import Result
 from tests.daq.clocks.recordings import Sensor as FreeRunning
 from tests.daq.clocks.recordings import blocks, counts, create, write, write_polled
 
@@ -126,15 +128,25 @@ def test_loss_of_half_of_all_samples_is_reported_immediately(tmp_path: Path) -> 
         estimate([path], Settings(segment=4.0))
 
 
-def test_a_sensor_that_never_sent_is_named(tmp_path: Path) -> None:
-    sensors = {name: FreeRunning(counts(3000, 3, ord(name))) for name in "ABC"}
+@pytest.mark.parametrize("names", ["AB", "ABC"])
+def test_a_sensor_that_never_sent_is_named_and_left_out(tmp_path: Path, names: str) -> None:
+    sensors = {name: FreeRunning(counts(3000, 3, ord(name))) for name in names}
     writer = create(tmp_path / "r.h5", sensors | {"D": FreeRunning(counts(1, 3, 1))})
     for name, sensor in sensors.items():
         for block in blocks(name, sensor):
             writer.append(block)
-    writer.close()
+    writer.commit()
     with pytest.raises(NoResultError, match="no samples of D, and an estimate needs"):
-        estimate([tmp_path / "r.h5"], Settings(segment=4.0))
+        estimate([tmp_path / "r.h5"], Settings(segment=4.0))  # it may still send some
+    writer.close()
+    found = estimate([tmp_path / "r.h5"], Settings(segment=4.0))
+    alone = estimate([write(tmp_path / "alone.h5", sensors)], Settings(segment=4.0))
+    np.testing.assert_array_equal(found.csm, alone.csm)
+    assert (found.not_estimated, found.not_in_memory) == (("D",), ())
+    facts = Result(found, Settings(segment=4.0)).facts
+    (lost,) = [each for each in facts if isinstance(each, SensorLost)]
+    assert (lost.sensors, lost.never_seen) == (("D",), True)
+    assert not [each for each in facts if isinstance(each, NotInLiveEstimate)]
 
 
 def test_many_gaps_of_free_running_sensors_do_not_increase_the_reads(

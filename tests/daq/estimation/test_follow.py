@@ -327,6 +327,16 @@ def test_more_sensors_than_memory_allows_wait_for_the_result(
     np.testing.assert_array_equal(last.csm, estimate([writer.path], SETTINGS).csm)
 
 
+def test_a_test_whose_sensor_never_sent_ends_with_the_result_of_the_others(tmp_path: Path) -> None:
+    with growing(tmp_path / "run.h5") as writer:
+        noted, settings = Noted(), replace(SETTINGS, methods=("auto",))
+        Bench(writer).send("AB", 30)
+        result = follow(writer.path, settings, noted, recorder=Process(writer.close))
+    assert result is noted.snapshots[-1]
+    assert (result.sensor_names, result.not_estimated) == (("A", "B"), ("C",))
+    np.testing.assert_array_equal(result.csm, estimate([writer.path], settings).csm)
+
+
 def test_an_observer_that_decides_by_the_estimate_gets_all_sensors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

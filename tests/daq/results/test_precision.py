@@ -33,7 +33,7 @@ def test_a_target_that_is_reached_takes_no_more_time() -> None:
     assert found.seconds_left == 0.0
     assert found.total == snapshot.elapsed
     of_some = Result(
-        replace(snapshot, not_estimated=("D",)), replace(SETTINGS, target_cov=cov)
+        replace(snapshot, not_estimated=("C",)), replace(SETTINGS, target_cov=cov)
     ).precision()
     assert not of_some.is_reached
 

@@ -137,3 +137,14 @@ def test_scatter_is_not_called_how_well_the_noise_is_known() -> None:
     """It said "known to 3.3 %" beside +1.35 −4.08 dB."""
     reached = Result(diagnosed(), SETTINGS).precision(0.05)
     assert known_to(reached).startswith("c.o.v. ")
+
+
+def test_a_test_that_lacks_a_sensor_is_not_decided_for_that_reason() -> None:
+    found = Decision.of(
+        Result(replace(diagnosed(), not_estimated=("D",)), SETTINGS, bench_with(1e-7))
+    )
+    assert found is not None
+    assert found.state is Verdict.NOT_DECIDED
+    assert found.reason == (
+        "NOT DECIDED: the 9 channels with a result are below data sheet, and the others have none."
+    )
