@@ -40,8 +40,8 @@ WITHOUT_ESTIMATE = (
 _NO_FLAG = Flag(0)
 
 
-ARCHIVES = "archives"
-"""A cause of `SteadinessNotTested`."""
+ARCHIVES, TOO_LITTLE = "archives", "so few averages, or motion so weak"
+"""Causes of `SteadinessNotTested`."""
 
 
 @record
@@ -192,8 +192,8 @@ def facts_of_methods(snapshot: Snapshot) -> Iterator[Fact]:
         ("segments with gaps", snapshot.bridged is not None),
         (ARCHIVES, not snapshot.sensors),  # of which no averages know
     )
-    if found is not None and found.stability is None and any(holds for _, holds in causes):
-        names = tuple(name for name, holds in causes if holds)
+    if found is not None and found.stability is None:
+        names = tuple(name for name, holds in causes if holds) or (TOO_LITTLE,)
         yield SteadinessNotTested(rank=Rank.TO_KNOW, causes=names)
     yield from facts_of_changes(snapshot)
     if "two-channel" in snapshot.results:

@@ -159,3 +159,13 @@ def test_a_gain_that_drifts_is_in_the_uncertainty_of_the_calibration() -> None:
     assert "drift" not in by_sensor["C"]
     found = calibrate(Result(snapshot, Settings()), None, reference="B")
     assert all("drift" in {e.source for e in each.components} for each in found.budgets[:3])
+
+
+@pytest.mark.parametrize(("segment", "is_tested"), [("30s", False), ("0.5s", True)])
+def test_too_few_averages_to_test_for_changes_are_a_fact(segment: str, *, is_tested: bool) -> None:
+    rng = np.random.default_rng(8)
+    motion = 30 * rng.standard_normal((6000, 1))
+    samples = {name: motion + rng.standard_normal((6000, 1)) for name in "ABC"}
+    found = huddle.self_noise(samples, fs=RATE, segment=segment)
+    names = [each.name for each in found.result.facts]
+    assert ("steadiness-not-tested" not in names) == is_tested
