@@ -18,6 +18,11 @@ if TYPE_CHECKING:
 STEPS = 30
 SETTLED = 1e-6
 """Decrease of the discrepancy in a step from which there is no further step."""
+MANY = 8
+"""Sensors with equal numbers of channels from which information is inverted sensor by sensor."""
+_SINGULAR = 0.2  # eigenvalue of the information of one sensor below which all are inverted at once
+_RIDGE = 1e-10  # of the diagonal, added to information
+_NEGLIGIBLE = 1e-6  # of a trace, as a share of its largest value
 _LEAST = 0.05  # of the noise in any direction, over that before the step
 _SHORTER = 0.4  # of a step that gains nothing
 _TRIALS = 6
@@ -40,8 +45,156 @@ def coupling(Q: ComplexArray, a: IntArray, b: IntArray) -> ComplexArray:
 def inverse(J: ComplexArray) -> ComplexArray:
     """Invert information matrices, scaled to a unit diagonal."""
     D = np.sqrt(np.maximum(np.einsum("bii->bi", J).real, 1e-30))
-    scaled = J / (D[:, :, None] * D[:, None, :]) + 1e-10 * np.eye(J.shape[1])
+    scaled = J / (D[:, :, None] * D[:, None, :]) + _RIDGE * np.eye(J.shape[1])
     return np.asarray(np.linalg.inv(scaled) / (D[:, :, None] * D[:, None, :]))
+
+
+def are_many(sensor: IntArray) -> bool:
+    """Whether these are many sensors with equal numbers of channels."""
+    counts = np.bincount(sensor)
+    return len(counts) >= MANY and bool((counts == counts[0]).all())
+
+
+def coupling_beside(U: ComplexArray, sensor: IntArray) -> ComplexArray:
+    """Return `coupling` beside motion in the orthonormal columns of U, shape (n, m, m).
+
+    Notes
+    -----
+    With ``Q = 1 - U U*``, ``G = U_s U_s*`` of one sensor and ``V_(ab)(kl) = U_ak conj(U_bl)``, the
+    coupling is ``V V*`` and one block ``1 - G x 1 - 1 x conj(G)`` for each sensor.
+    """
+    if not are_many(sensor):
+        return coupling(np.eye(U.shape[1]) - U @ U.conj().swapaxes(1, 2), *pairs(sensor))
+    local, V, within = _beside(U, sensor)
+    J = V @ V.conj().swapaxes(1, 2)
+    J[:, *within] += local
+    return np.asarray(J)
+
+
+def inverse_beside(U: ComplexArray, sensor: IntArray) -> ComplexArray:
+    """Return the `inverse` of `coupling_beside`.
+
+    Notes
+    -----
+    The eigenvalues of the blocks are at least one less twice that of G: Woodbury's formula is
+    accurate unless one sensor has most of a direction.
+    """
+    if not are_many(sensor):
+        return inverse(coupling_beside(U, sensor))
+    local, V, within = _beside(U, sensor)
+    n, n_pairs, rank = V.shape
+    heavy = np.linalg.eigvalsh(local)[:, :, 0].min(axis=1) < _SINGULAR
+    if heavy.any():
+        found = np.empty((n, n_pairs, n_pairs), np.complex128)
+        found[heavy] = inverse(coupling_beside(U[heavy], sensor))
+        found[~heavy] = inverse_beside(U[~heavy], sensor)
+        return found
+    blocks = V.reshape(*local.shape[:3], rank)
+    size = np.einsum("nsii->nsi", local).real + (np.abs(blocks) ** 2).sum(axis=3)
+    own = np.linalg.inv(local + _RIDGE * size[..., None] * np.eye(local.shape[3]))
+    LV = (own @ blocks).reshape(V.shape)
+    root = np.linalg.cholesky(np.eye(rank) + V.conj().swapaxes(1, 2) @ LV)
+    R = LV @ np.linalg.inv(root).conj().swapaxes(1, 2)
+    found = -R @ R.conj().swapaxes(1, 2)
+    found[:, *within] += own
+    return np.asarray(found)
+
+
+def _beside(
+    U: ComplexArray, sensor: IntArray
+) -> tuple[ComplexArray, ComplexArray, tuple[IntArray, IntArray]]:
+    """Return blocks of the sensors, V of `coupling_beside`, and rows and columns of the blocks."""
+    n, p, q = U.shape
+    n_sensors = int(sensor[-1]) + 1
+    d = p // n_sensors
+    of = U.reshape(n, n_sensors, d, q)
+    G, one = of @ of.conj().swapaxes(2, 3), np.eye(d)
+    taken = G[:, :, :, None, :, None] * one[:, None, :]
+    taken = taken + one[:, None, :, None] * G.conj()[:, :, None, :, None]
+    local = np.eye(d * d) - taken.reshape(n, n_sensors, d * d, d * d)
+    V = (of[:, :, :, None, :, None] * of.conj()[:, :, None, :, None]).reshape(
+        n, n_sensors * d * d, q * q
+    )
+    at = np.arange(n_sensors * d * d).reshape(n_sensors, d * d)
+    return local, V, (at[:, :, None], at[:, None])
+
+
+def traces(weight: ComplexArray, projected: ComplexArray, sensor: IntArray) -> FloatArray:
+    """Return ``tr((C_i Y)**k)``, k = 2, 3, 4, for every channel: shape (3, n, p).
+
+    Parameters
+    ----------
+    weight : complex128, shape (n, p, n_pairs)
+        Elements of C_i, one block for each sensor; of its Hermitian part.
+    projected : complex128, shape (n, p, p)
+        Y, Hermitian and positive semidefinite.
+    sensor : int64, shape (p,)
+
+    Notes
+    -----
+    With many sensors ``C_i Y = e + g``, where e has the rows of the channel's own sensor. With the
+    small matrices ``a_k = e g**k``, in the columns of that sensor,
+
+        tr(e + g)**2 = tr(g**2) + 2 tr a_1 + tr a_0**2,
+        tr(e + g)**3 = tr(g**3) + 3 tr a_2 + 3 tr(a_0 a_1) + tr a_0**3,
+        tr(e + g)**4 = tr(g**4) + 4 tr a_3 + 4 tr(a_0 a_2) + 2 tr a_1**2 + 4 tr(a_0**2 a_1)
+                       + tr a_0**4.
+
+    As ``|tr(g**k)| <= tr(g**2)**(k/2)``, those of k = 3 and 4 are left out where they are
+    negligible.
+    """
+    n, p = weight.shape[:2]
+    a, b = pairs(sensor)
+    if not are_many(sensor):
+        C = np.zeros((n, p, p, p), np.complex128)
+        C[:, :, b, a] = weight
+        B = (C + C.conj().swapaxes(2, 3)) / 2 @ projected[:, None]
+        twice = B @ B
+        return np.stack([_along(B, B), _along(B, twice), _along(twice, twice)])
+    n_sensors, d = int(sensor[-1]) + 1, p // (int(sensor[-1]) + 1)
+    at = np.arange(p)
+    C = weight.reshape(n, p, n_sensors, d, d).swapaxes(3, 4)
+    C = (C + C.conj().swapaxes(3, 4)) / 2
+    own = C[:, at, sensor]
+    C[:, at, sensor] = 0
+    rows = projected.reshape(n, n_sensors, d, p)
+
+    def by_g(x: ComplexArray) -> ComplexArray:
+        of = x.reshape(n, p, d, n_sensors, d)
+        xC = sum(of[..., k, None] * C[:, :, None, :, k] for k in range(d))
+        return np.asarray((np.reshape(xC, (n, p * d, p)) @ projected).reshape(n, p, d, p))
+
+    chain = [own @ rows[:, sensor]]
+    for _ in range(3):
+        chain.append(by_g(chain[-1]))
+    small = [x.reshape(n, p, d, n_sensors, d)[:, at, :, sensor].swapaxes(0, 1) for x in chain]
+    a0, a1, a2, a3 = small
+    square = a0 @ a0
+    one = np.eye(d)
+    f = C.swapaxes(3, 4).reshape(n, p, len(a))
+    first = np.einsum("npm,npm->np", f @ coupling(projected, a, b), f.conj()).real
+    found = np.stack(
+        [
+            first + 2 * _along(a1, one) + _along(a0, a0),
+            3 * _along(a2, one) + 3 * _along(a0, a1) + _along(a0, square),
+            4 * _along(a3, one)
+            + 4 * _along(a0, a2)
+            + 2 * _along(a1, a1)
+            + 4 * _along(square, a1)
+            + _along(square, square),
+        ]
+    )
+    if (np.maximum(first, 0) ** 1.5 > _NEGLIGIBLE * found[0] ** 1.5).any():
+        g = (C @ rows[:, None]).reshape(n, p, p, p)
+        twice = g @ g
+        found[1] += _along(g, twice)
+        found[2] += _along(twice, twice)
+    return found
+
+
+def _along(one: ComplexArray, other: ComplexArray | FloatArray) -> FloatArray:
+    """Return the real trace of the product of matrices, shape (n, p)."""
+    return np.asarray(np.einsum("...ml,...lm->...", one, other).real)
 
 
 def times(matrices: ComplexArray, vectors: ComplexArray) -> ComplexArray:

@@ -33,7 +33,17 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from estimator.levels.interval import moved, worth
-from estimator.levels.noise_matrices import axes_of, coupling, inverse, pairs, times, white
+from estimator.levels.noise_matrices import (
+    are_many,
+    axes_of,
+    coupling_beside,
+    inverse,
+    inverse_beside,
+    pairs,
+    times,
+    traces,
+    white,
+)
 from estimator.median import median
 
 if TYPE_CHECKING:
@@ -124,14 +134,15 @@ class _Parts:
 class _Fit:
     """Directions of the motion, and the noise, in some blocks.
 
-    ``projector`` and ``white``, the whitened mean matrix, are those of the sub-blocks. ``gain``
+    ``motion``, orthonormal columns, and ``white``, the whitened mean matrix, are those of the
+    sub-blocks. ``gain``
     corrects for the averages that directions take, ``left`` are those that are left. ``resolved``,
     ``whitener`` W of the weights, which makes the noise ``W N W*`` one, and ``level``, the mean
     noise, are those of the blocks.
     """
 
     parts: _Parts
-    projector: ComplexArray
+    motion: ComplexArray
     white: ComplexArray
     gain: FloatArray
     left: FloatArray
@@ -345,7 +356,6 @@ def _fitted(
     p = mean.shape[1]
     own, N, whole = parts.block, parts.averages, parts.whole
     a, b = pairs(sensor)
-    column = np.arange(p)[::-1]  # eigenvalues ascend: the leading one is the last
     r, wanted = np.zeros(len(q), np.int64), q
     # noise at first: what the other sensors do not predict
     alone = np.linalg.inv(np.where(sensor[:, None] == sensor, np.linalg.inv(mean), 0))
@@ -355,14 +365,15 @@ def _fitted(
     )
     for turn in range(ROUNDS):
         X = white(mean, whitener[own])
+        U = np.zeros((len(own), p, 0), np.complex128)
         P = np.broadcast_to(np.eye(p, dtype=np.complex128), X.shape)
         g = np.ones(len(own))
         if resolve:
             r = _n_resolved(X, parts, wanted, sensor)
-            V = np.linalg.eigh(X)[1] * (column < r[own, None])[:, None, :]
-            P = P - V @ V.conj().swapaxes(1, 2)
+            U = _leading(np.linalg.eigh(X)[1], r[own])
+            P = P - U @ U.conj().swapaxes(1, 2)
             source = _nearest(P, parts, sensor)
-            P = P[source]
+            P, U = P[source], U[source]
             # directions take noise of the samples they are from, and let motion of others pass
             g = N / np.where(source == np.arange(len(own)), N - r[own], N + r[own])
         T = parts.mean(g[:, None, None] * (P @ X @ P)) if resolve else X
@@ -373,16 +384,17 @@ def _fitted(
         weak = q - r
         Q = P
         if weak.any():
-            A = A * (column < weak[:, None])[:, None, :]
-            PA = P @ A[own]
-            gram = A[own].conj().swapaxes(1, 2) @ PA
-            unused = (column >= weak[own, None]).astype(float)
-            gram += unused[:, :, None] * np.eye(p)
-            Q = P - PA @ np.linalg.solve(gram, PA.conj().swapaxes(1, 2))
+            PA = P @ _leading(A, weak)[own]
+            gram = PA.conj().swapaxes(1, 2) @ PA
+            unused = (np.einsum("bii->bi", gram) == 0).astype(float)
+            gram += unused[:, :, None] * np.eye(gram.shape[1])
+            PA = PA @ np.linalg.inv(np.linalg.cholesky(gram)).conj().swapaxes(1, 2)
+            Q, U = P - PA @ PA.conj().swapaxes(1, 2), np.concatenate([U, PA], axis=2)
         loss = 1 + weak / np.maximum(whole - q, 1.0)
         y = g[:, None] * (Q @ X @ Q)[:, a, b]
-        couples = coupling(Q, a, b)
-        noise = loss[:, None] * times(inverse(parts.mean(couples)), parts.mean(y))
+        noise = loss[:, None] * times(
+            inverse(parts.mean(coupling_beside(U, sensor))), parts.mean(y)
+        )
         kept = parts.mean(np.einsum("bii->bi", Q).real)
         floor = 0.5 / np.maximum(kept, 1e-9) / np.sqrt(whole)[:, None]
         floor = np.maximum(floor, _FLOOR * np.einsum("bii->bi", parts.mean(X)).real)
@@ -396,11 +408,11 @@ def _fitted(
     n_sensors = sensor[-1] + 1
     hidden = SHOWN * np.sqrt(2 * _degrees(sensor, q)) / ((1 - 1 / n_sensors) * p * n_sensors)
     unseen = 1 + UNSEEN * hidden * (1 - q / np.maximum(wanted, 1)) * (wanted > 0)
-    mean_noise = loss[:, None] * parts.mean(times(inverse(couples), y))
+    mean_noise = loss[:, None] * parts.mean(times(inverse_beside(U, sensor), y))
     root: ComplexArray = np.asarray(np.linalg.inv(whitener), np.complex128)
     return _Fit(
         parts=parts,
-        projector=Q,
+        motion=U,
         white=X,
         gain=g * loss[own],
         left=n_effective * (1 - r[own] / N - weak[own] / whole[own]) / unseen[own],
@@ -418,12 +430,13 @@ def _read(
     wanted: BoolArray | None = None,
 ) -> None:
     """Write noise and cumulants of the bins of some blocks: of all, or of the wanted ones."""
-    parts, Q = fit.parts, fit.projector
+    parts, U = fit.parts, fit.motion
+    Q = np.eye(U.shape[1]) - U @ U.conj().swapaxes(1, 2)
     a, b = pairs(sensor)
     at = np.repeat(np.arange(len(parts.count)), parts.count)
     root = np.linalg.inv(fit.whitener)[parts.block]
     # noise of a bin is linear in the projected matrix: the weights of its elements
-    weight = (root[:, :, a] * root[:, :, b].conj()) @ inverse(coupling(Q, a, b))
+    weight = (root[:, :, a] * root[:, :, b].conj()) @ inverse_beside(U, sensor)
     if len(parts.block) == len(parts.first):  # few: directions that all bins of a block share
         n, p = Q.shape[:2]
         G = Q @ fit.whitener[parts.block]
@@ -444,6 +457,13 @@ def _read(
     use = np.ones(len(at), np.bool_) if wanted is None else wanted[parts.block][at]
     found.noise[parts.bins[use]] = noise[use]
     found.cumulants[:, parts.bins[use]] = cumulants[:, use]
+
+
+def _leading(axes: ComplexArray, number: IntArray) -> ComplexArray:
+    """Return so many leading eigenvectors, of ascending eigenvalues; further columns are zero."""
+    most = int(number.max(initial=0))
+    kept = np.arange(most)[::-1] < number[:, None]
+    return np.asarray(axes[:, :, axes.shape[2] - most :] * kept[:, None])
 
 
 def _nearest(P: ComplexArray, parts: _Parts, sensor: IntArray) -> IntArray:
@@ -485,10 +505,15 @@ def _stand_out(
     r = q.copy()
     number = np.arange(most)
     averages = np.broadcast_to(averages, r.shape)
+    bounds = _Bounds.of(X, most) if are_many(sensor) and most else None
     for i in range(int(sensor[-1]) + 1):
-        left = np.flatnonzero(r > 0)
+        surely = np.zeros(len(r), np.bool_)
+        if bounds is not None:
+            edge = OUTSTANDING * (1 + np.sqrt(np.count_nonzero(sensor != i) / averages)) ** 2
+            surely = bounds.surely_stand(X, np.flatnonzero(sensor == i), r, q, edge)
+        left = np.flatnonzero((r > 0) & ~surely)
         if not len(left):
-            break
+            continue
         keep = np.flatnonzero(sensor != i)
         eigenvalues = np.linalg.eigvalsh(X[left][:, :, keep[:, None], keep])[:, :, ::-1]
         w = median(np.asarray(eigenvalues.swapaxes(0, 1), np.float64))
@@ -501,6 +526,44 @@ def _stand_out(
         last = np.where(apart & (number < stands[:, None]), number + 1, 0).max(axis=1)
         r[left] = np.minimum(r[left], np.where(stands < q[left], last, stands))
     return r
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Bounds:
+    """Leading eigenvalues, descending, and eigenvectors of whitened matrices with all sensors.
+
+    Without a sensor, eigenvalues are at most these (Cauchy), and at least those of the compression
+    to these eigenvectors without its rows (Ritz).
+    """
+
+    values: FloatArray
+    axes: ComplexArray
+    upper: FloatArray
+
+    @classmethod
+    def of(cls, X: ComplexArray, most: int) -> _Bounds:
+        """Return bounds of the leading eigenvalues of matrices, (n_blocks, n_sampled, p, p)."""
+        w, u = np.linalg.eigh(X)
+        values = np.asarray(w[:, :, ::-1][:, :, : most + 1], np.float64)
+        return cls(
+            values[:, :, :most], u[:, :, :, ::-1][:, :, :, :most], median(values.swapaxes(0, 1))
+        )
+
+    def surely_stand(
+        self, X: ComplexArray, own: IntArray, r: IntArray, q: IntArray, edge: FloatArray
+    ) -> BoolArray:
+        """Return in which blocks r of q dimensions surely stand out without a sensor's channels."""
+        V = self.axes[:, :, own]
+        adjoint, values = V.conj().swapaxes(2, 3), self.values
+        shared = (adjoint @ V) * values[:, :, None]
+        H = -shared - shared.conj().swapaxes(2, 3)
+        H += adjoint @ X[:, :, own[:, None], own] @ V
+        np.einsum("bsii->bsi", H)[:] += values
+        low = median(np.asarray(np.linalg.eigvalsh(H)[:, :, ::-1].swapaxes(0, 1), np.float64))
+        at = np.arange(len(r))
+        least, last = low[at, np.maximum(r - 1, 0)], low[at, np.maximum(q - 1, 0)]
+        apart = least - 1 >= APART * (self.upper[at, r] - 1)
+        return np.asarray((last > edge) | ((least > edge) & apart))
 
 
 def _shown(
@@ -554,23 +617,7 @@ def _traces(weight: ComplexArray, projected: ComplexArray, sensor: IntArray) -> 
     n, p = weight.shape[:2]
     step = max(1, _TRACE_BYTES // (16 * p**3))
     parts = [
-        _traces_of_some(weight[low : low + step], projected[low : low + step], sensor)
+        traces(weight[low : low + step], projected[low : low + step], sensor)
         for low in range(0, max(n, 1), step)
     ]
     return np.concatenate(parts, axis=1)
-
-
-def _traces_of_some(weight: ComplexArray, projected: ComplexArray, sensor: IntArray) -> FloatArray:
-    n, p = weight.shape[:2]
-    a, b = pairs(sensor)
-    C = np.zeros((n, p, p, p), np.complex128)
-    C[:, :, b, a] = weight
-    B = (C + C.conj().swapaxes(2, 3)) / 2 @ projected[:, None]
-    twice = B @ B
-    return np.stack(
-        [
-            np.einsum("nimm->ni", twice).real,
-            np.einsum("niml,nilm->ni", B, twice).real,
-            np.einsum("niml,nilm->ni", twice, twice).real,
-        ]
-    )
