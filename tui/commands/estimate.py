@@ -259,6 +259,7 @@ def show_result(
     from tui.output.diagnosis import details
     from tui.output.noise_parameters import quantisation_notes
     from tui.output.results import averages_line, curves_csv, result_table, result_title
+    from tui.output.standing import standing
     from tui.wording.facts import NOTHING_TO_DO, brief
     from tui.wording.verdict_text import STYLES, Decision, limit_line
 
@@ -277,6 +278,8 @@ def show_result(
     facts = result.facts
     is_open = decision is not None and decision.next_step != NOTHING_TO_DO
     for part in details(snapshot, facts) if diagnostics else brief(facts, is_open=is_open):
+        screen.print(part)
+    for part in standing(result, width=screen.width) if diagnostics else ():
         screen.print(part)
     for each in () if result.verdict is None else result.verdict.limits:
         if each.verdict is not Verdict.PASS:

@@ -28,6 +28,8 @@ SUFFIXES = (".svg", ".png", ".pdf")
     "huddle plot night.h5 -o noise.pdf --models nlnm,nhnm --width 85",
     "huddle plot night.h5 -o noise.png --method all --models brochure.csv",
     "huddle plot night.h5 -o night.png --signal --start 2h --end 2h30min",
+    "huddle plot night.h5 -o sensors.svg --sensors",
+    first="out models signal sensors width start end band unit methods",
 )
 @with_estimate_options
 def plot(
@@ -55,6 +57,14 @@ def plot(
             " of the recorded PSD and of the noise, from --start to --end.",
         ),
     ] = False,
+    sensors: Annotated[
+        bool,
+        typer.Option(
+            "--sensors",
+            help="Draw how the sensors stand: the axes of each (rotation, lean, polarity), and the"
+            " coherence of all pairs.",
+        ),
+    ] = False,
     start: StartOption = None,
     end: EndOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
@@ -78,10 +88,15 @@ def plot(
         _plot_signal(files, out, width=width / 25.4, start=start, end=end, **wanted)
         return
     result = estimated(files, start=start, end=end, whole=True, **wanted)
-    from tui.report.figures.curves import write_figure
+    from tui.report.figures.curves import write_figure, write_plots
+    from tui.report.figures.standing import standing_plots
 
     with notices().status("drawing"):
-        write_figure(result, out, models=masks, width=width / 25.4)
+        if sensors:
+            title = f"How the sensors of {files[0].name} stand"
+            write_plots(standing_plots(result), out, width=width / 25.4, title=title)
+        else:
+            write_figure(result, out, models=masks, width=width / 25.4)
     console().print(f"{out} written", soft_wrap=True)
 
 

@@ -161,7 +161,7 @@ def report_of(
         parameters_section(result),
         calibration_section(result),
         model_test_section(result),
-        alignment_section(snapshot),
+        alignment_section(result),
         clocks_section(result),
         events_section(snapshot, found),
         parties_section(found, about, issue),

@@ -21,6 +21,7 @@ from estimator.likelihood.goodness_of_fit import rejected_below
 from estimator.wording import several, span
 from tui.report.figures.drift import drift_plot
 from tui.report.figures.model_test import model_test_plot
+from tui.report.figures.standing import standing_plots
 from tui.report.parts import Items, Paragraph, Part, Section, Table
 from tui.wording.facts import NOTHING_TO_DO, RANKS
 from tui.wording.formatting import NOTHING, plain_number, probability, scientific, share, utc
@@ -131,9 +132,9 @@ def model_test_section(result: Result) -> Section:
     return Section(title, tuple(parts))
 
 
-def alignment_section(snapshot: Snapshot) -> Section:
-    """Return the orientation, gain and delay of the sensors against the first one."""
-    title = "Alignment of the sensors"
+def alignment_section(result: Result) -> Section:
+    """Return orientation, gain and delay of the sensors against the first one, and coherence."""
+    title, snapshot = "Alignment of the sensors", result.snapshot
     diagnosis = snapshot.diagnostics.diagnosis
     found = () if diagnosis is None else diagnosis.responses
     if not found:
@@ -175,6 +176,7 @@ def alignment_section(snapshot: Snapshot) -> Section:
         ),
         Table(header, tuple(rows), left=frozenset({0, 7})),
     ]
+    parts += standing_plots(result)
     if missing:
         parts.append(Paragraph(f"Could not be compared: {', '.join(missing)}.", "doubtful"))
     return Section(title, tuple(parts))

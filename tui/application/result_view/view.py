@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
+from rich.console import Group
 from rich.text import Text
 from textual.binding import Binding, BindingType
 from textual.containers import VerticalScroll
 from textual.widgets import Static
 
+from tui.application.dialogs import TextScreen
 from tui.application.forms.estimate import SettingsForm
 from tui.application.messages import OpeningRequested, ReferenceRequested
 from tui.application.result_view.result_text import result
 from tui.application.state import RESULT
 from tui.application.view import MUTED, View
+from tui.output.standing import standing
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -21,6 +24,10 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
     from textual.app import ComposeResult
     from textual.events import Resize
+
+
+_MARGIN = 8
+"""Columns beside a text in a dialog."""
 
 
 class ResultView(View):
@@ -33,6 +40,7 @@ class ResultView(View):
         Binding("i", "app.issue", "Issue"),
         Binding("e", "estimate", "Estimate"),
         Binding("c", "compare", "Compare"),
+        Binding("a", "axes", "Axes", show=False),
         Binding("v", "app.save", "Save", show=False),
         Binding("s", "app.start", "Start"),
     ]
@@ -42,6 +50,7 @@ class ResultView(View):
         ("Issue a certificate, or make a specimen", "app.issue"),
         ("Estimate again with other settings", "estimate"),
         ("Compare with an earlier test", "compare"),
+        ("Show how the sensors stand: axes, coherence", "axes"),
     )
     KEYS = (
         ("w", "write the report beside the recording"),
@@ -49,6 +58,7 @@ class ResultView(View):
         ("i", "issue a certificate, or make a watermarked specimen of one"),
         ("e", "estimate the recording again with other settings"),
         ("c", "compare: choose an earlier recording, c there; c again ends it"),
+        ("a", "axes of the sensors (rotation, lean, polarity), coherence of pairs"),
         ("v", "save the estimate as CSV and JSON, and this screen as a picture (SVG)"),
         ("s", "start the next recording of this bench"),
         ("↑ ↓", "scroll"),
@@ -78,7 +88,16 @@ class ResultView(View):
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
         """Offer only what can be done now."""
         del parameters
-        return self.state.has_result if action in {"estimate", "compare"} else True
+        return self.state.has_result if action in {"estimate", "compare", "axes"} else True
+
+    def action_axes(self) -> None:
+        """Show how the sensors stand."""
+        found = self.state.result
+        if found is None:
+            return
+        parts = standing(found, width=self.app.size.width - _MARGIN)
+        said = Group(*parts) if parts else Text("Not known: this takes motion that two share.")
+        self.app.push_screen(TextScreen("how the sensors stand", lambda: said))
 
     async def action_compare(self) -> None:
         """Choose a recording to compare with, or compare no longer."""

@@ -1,0 +1,166 @@
+"""How the sensors stand, as text: a sketch of the axes of each, and the coherence of pairs."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.table import Table
+from rich.text import Text
+
+from daq.results.standing import pair_coherence, stances
+from estimator.wording import listed, signed
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from rich.console import RenderableType
+
+    from daq.results.result import Result
+    from daq.results.standing import PairCoherence, Stance
+    from estimator.types import FloatArray
+
+_WIDTH, _HEIGHT = 17, 7
+"""Columns and rows of a sketch; a row is as high as two columns are wide."""
+_SHADES = "·░▒▓█"
+LEVELS = (0.5, 0.9, 0.99, 0.999)
+"""Coherences at which a shade begins."""
+_SMALL = 0.35
+"""Length in the plane, of a unit vector, up to which an axis points at the viewer."""
+
+
+def standing(result: Result, *, width: int) -> list[RenderableType]:
+    """Return sketches of all axes and the coherence of all pairs; empty where none is known."""
+    found, coherence = stances(result.snapshot), pair_coherence(result)
+    parts: list[RenderableType] = []
+    if found:
+        parts.append(Text("Axes of the sensors, seen from above", "bold"))
+        per_row = max(1, width // (_WIDTH + 3))
+        starts = range(0, len(found), per_row)
+        parts += [_row(found[first : first + per_row]) for first in starts]
+        parts.append(Text(caption(found)))
+    if coherence is not None:
+        names = result.snapshot.sensor_names
+        low, high = result.band
+        parts += [
+            Text(f"Coherence of pairs, mean over {low:.3g} to {high:.3g} Hz", "bold"),
+            _matrix(coherence.matrix, names),
+            Text("Coherence of pairs against frequency", "bold"),
+            _strips(coherence, names),
+            Text(_legend()),
+        ]
+    return parts
+
+
+def caption(found: Sequence[Stance]) -> str:
+    """Return what the sketches show, and which sensors could not be compared."""
+    reference = next(each for each in found if each.is_reference)
+    names = [reference.channels[each] for each in reference.order]
+    ways = ("right", "up", "at you (⊙; ⊗ away)")
+    points = ", ".join(f"{name} {way}" for name, way in zip(names, ways, strict=False))
+    said = f"{reference.name} is the reference: its {points}. Channels of others by their motion."
+    missing = [each.name for each in found if not each.is_known]
+    return f"{said} Not known: {listed(missing)}." if missing else said
+
+
+def remark(stance: Stance) -> str:
+    """Return rotation, lean and polarity of a sensor in words."""
+    if stance.is_reference:
+        return "reference"
+    if not stance.is_known:
+        return "not known"
+    parts = []
+    if math.isfinite(stance.turn_deg):
+        parts.append(f"turned {signed(stance.turn_deg, '.1f')}°")
+    if math.isfinite(stance.lean_deg):
+        parts.append(f"leans {stance.lean_deg:.1f}°")
+    if stance.is_upside_down:
+        parts.append("upside down")
+    if stance.reversed_channels:
+        names = [stance.channels[each] for each in stance.reversed_channels]
+        parts.append(f"reversed {' '.join(names)}")
+    return ", ".join(parts) or "same polarity"
+
+
+def _row(found: Sequence[Stance]) -> Table:
+    table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 3, 0, 0))
+    for _ in found:
+        table.add_column(width=_WIDTH)
+    table.add_row(*(Text(each.name, "bold") for each in found))
+    table.add_row(*(Text("\n".join(sketch(each)), no_wrap=True) for each in found))
+    table.add_row(*(Text(remark(each)) for each in found))
+    return table
+
+
+def sketch(stance: Stance) -> list[str]:
+    """Return the axes of a sensor in rows of characters, as seen from above."""
+    rows = [[" "] * _WIDTH for _ in range(_HEIGHT)]
+    across, down = _WIDTH // 2, _HEIGHT // 2
+    if not stance.is_known:
+        rows[down][across] = "?"
+        return ["".join(row) for row in rows]
+    rows[down][across] = "+"
+    for number, axis in enumerate(stance.directions[:, list(stance.order)]):
+        right, up, out = [*axis.tolist(), 0.0, 0.0][:3]
+        letter = stance.channels[number][-1:]
+        if math.hypot(right, up) <= _SMALL and len(axis) == 3:
+            rows[down][across] = "⊙" if out > 0 else "⊗"
+            rows[down + 1][across + 1] = letter
+            continue
+        for step in range(1, 2 * down + 1):
+            place = step / (2 * down)
+            at = across + round(right * place * 2 * down), down - round(up * place * down)
+            if rows[at[1]][at[0]] == " ":
+                rows[at[1]][at[0]] = "·"
+        rows[down - round(up * down)][across + round(right * 2 * down)] = letter
+    return ["".join(row) for row in rows]
+
+
+def _matrix(values: FloatArray, names: Sequence[str]) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for name in ("", *names):
+        table.add_column(Text(name), justify="right" if name else "left", no_wrap=True)
+    for number, name in enumerate(names):
+        cells = [
+            "" if other == number else _shown(float(values[number, other]))
+            for other in range(len(names))
+        ]
+        table.add_row(Text(name, "bold"), *cells)
+    return table
+
+
+def _shown(value: float) -> str:
+    return "?" if math.isnan(value) else f"{_shade(value)} {value:.4f}"
+
+
+def _shade(value: float) -> str:
+    return " " if math.isnan(value) else _SHADES[sum(value >= each for each in LEVELS)]
+
+
+def _strips(found: PairCoherence, names: Sequence[str]) -> Table:
+    """Return a row of shades for each pair, from the lowest to the highest frequency."""
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    low, high = (f"{found.frequency[end]:.3g} Hz" for end in (0, -1))
+    gap = " " * max(1, found.frequency.size - len(low) - len(high))
+    table.add_column("pair")
+    table.add_column(f"{low}{gap}{high}", no_wrap=True)
+    table.add_column("least")
+    for (one, two), values in zip(found.pairs, found.value, strict=True):
+        table.add_row(
+            Text(f"{names[one]} {names[two]}"), "".join(map(_shade, values)), _least(found, values)
+        )
+    return table
+
+
+def _least(found: PairCoherence, values: FloatArray) -> str:
+    if np.isnan(values).all():
+        return "?"
+    least = int(np.nanargmin(values))
+    return f"{values[least]:.4f} at {found.frequency[least]:.3g} Hz"
+
+
+def _legend() -> str:
+    ends: Iterator[str] = (f"from {each:g}" for each in LEVELS)
+    parts = (f"{shade} {end}" for shade, end in zip(_SHADES[1:], ends, strict=True))
+    return f"{_SHADES[0]} below {LEVELS[0]:g}, {', '.join(parts)}; in the direction of the least."

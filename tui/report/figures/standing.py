@@ -1,0 +1,117 @@
+"""How the sensors stand, as figures: axes of each sensor, and the coherence of pairs."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from itertools import cycle
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.ticker import FuncFormatter, NullLocator
+
+from daq.results.standing import pair_coherence, stances
+from tui.output.standing import caption, remark
+from tui.report.figures import drawing
+from tui.report.figures.curves import logarithmic
+from tui.report.parts import Plot
+from tui.wording.formatting import power_of_ten
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from daq.results.result import Result
+    from daq.results.standing import PairCoherence, Stance
+
+COLUMNS, SKETCH_HEIGHT, COHERENCE_HEIGHT = 6, 0.85, 1.0
+_MOST_PAIRS = 15
+_LEAST_LOSS = 1e-5
+"""Of the vertical scale: what two sensors do not share."""
+
+
+def standing_plots(result: Result) -> list[Plot]:
+    """Return sketches of the axes, the coherence against frequency, and its matrix."""
+    found, coherence = stances(result.snapshot), pair_coherence(result)
+    plots = []
+    for first in range(0, len(found), COLUMNS):
+        some = found[first : first + COLUMNS]
+        alt = "; ".join(f"{each.name}: {remark(each)}" for each in some)
+        title = "" if first else caption(found).replace("⊙; ⊗ away", "dot; cross: away")
+        panels = tuple(partial(_draw_axes, each) for each in some)
+        plots.append(Plot(title, panels, COLUMNS, SKETCH_HEIGHT, alt, titled=True))
+    if coherence is not None:
+        names = result.snapshot.sensor_names
+        draw = partial(_draw_coherence, coherence, names)
+        rows = -(-min(len(coherence.pairs), _MOST_PAIRS) // 6)
+        alt = "Coherence of every pair of sensors against frequency"
+        plots.append(Plot(_TITLE, (draw,), 1, COHERENCE_HEIGHT, alt, key_rows=rows))
+        low, high = result.band
+        title = f"Coherence of pairs, mean over {low:.3g} to {high:.3g} Hz"
+        height = 0.17 * len(names) + 0.1
+        plots.append(Plot(title, (partial(_draw_matrix, coherence, names),), 2, height, title))
+    return plots
+
+
+_TITLE = "What pairs of sensors do not share: one minus their coherence, in the worst direction"
+
+
+def _draw_axes(stance: Stance, axes: Axes) -> None:
+    axes.set_title(stance.name)
+    axes.set_xlabel(remark(stance).replace(", ", "\n"), size=6)
+    for side in axes.spines.values():
+        side.set_visible(False)
+    axes.set_xlim(-1.35, 1.35)
+    axes.set_ylim(-1.35, 1.35)
+    axes.set_aspect("equal", adjustable="box", anchor="W")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    if not stance.is_known:
+        axes.text(0, 0, "?", ha="center", va="center", size=12)
+        return
+    for number, axis in enumerate(stance.directions[:, list(stance.order)]):
+        right, up, out = [*axis.tolist(), 0.0, 0.0][:3]
+        colour = drawing.LIMIT if number in stance.reversed_channels else drawing.NOISE
+        size = np.hypot(right, up)
+        if len(axis) == 3 and abs(out) > size:
+            axes.plot(0, 0, "o", ms=7, mfc="none", mec=colour, mew=0.9)
+            axes.plot(0, 0, "." if out > 0 else "x", ms=4, color=colour)
+            axes.plot([0, right], [0, up], color=colour, lw=0.9)
+            axes.text(right - 0.2, up - 0.3, stance.channels[number], ha="center", size=6)
+            continue
+        tip = {"arrowstyle": "->", "color": colour, "lw": 1.0, "shrinkA": 0, "shrinkB": 0}
+        axes.annotate("", (right, up), (0, 0), arrowprops=tip)
+        place = 1.2 * right, 1.2 * up
+        axes.text(*place, stance.channels[number], ha="center", va="center", size=6)
+
+
+def _draw_coherence(found: PairCoherence, names: tuple[str, ...], axes: Axes) -> None:
+    logarithmic(axes, (float(found.frequency[0]), float(found.frequency[-1])))
+    axes.set_yscale("log")
+    lost = np.maximum(1 - found.value, _LEAST_LOSS)
+    worst = np.argsort(-np.nanmean(np.log(lost), axis=1))[:_MOST_PAIRS]
+    styles = zip(cycle(drawing.LINES), cycle([(1, 0), *drawing.DASHES]), strict=False)
+    for number, (colour, dashes) in zip(sorted(worst), styles, strict=False):
+        one, two = found.pairs[number]
+        label = f"{names[one]}, {names[two]}"
+        axes.plot(found.frequency, lost[number], color=colour, dashes=dashes, lw=0.9, label=label)
+    axes.set_ylim(_LEAST_LOSS, 1.2)
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda at, _: power_of_ten(math.log10(at))))
+    axes.set_ylabel("1 − coherence")
+
+
+def _draw_matrix(found: PairCoherence, names: tuple[str, ...], axes: Axes) -> None:
+    lost = np.log10(np.maximum(1 - found.matrix, _LEAST_LOSS))
+    np.fill_diagonal(lost, np.nan)
+    axes.pcolormesh(lost, cmap="viridis_r", vmin=np.log10(_LEAST_LOSS), vmax=0)
+    axes.invert_yaxis()
+    axes.grid(visible=False)
+    middles = np.arange(len(names)) + 0.5
+    axes.set_xticks(middles, names)
+    axes.set_yticks(middles, names)
+    for (row, column), value in np.ndenumerate(found.matrix):
+        if row != column and np.isfinite(value):
+            dark = lost[row, column] > -2
+            colour = "white" if dark else drawing.INK
+            place = column + 0.5, row + 0.5
+            axes.text(*place, f"{value:.4f}", ha="center", va="center", size=5.5, color=colour)
