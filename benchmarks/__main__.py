@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import multiprocessing
 import os
 import pkgutil
+import signal
 import sys
 import time
 import traceback
@@ -14,6 +17,10 @@ import benchmarks
 
 if TYPE_CHECKING:
     from benchmarks.row import Row
+
+
+LONGEST = 1800.0
+"""Seconds after which a benchmark is ended, and the next begins."""
 
 
 def table(rows: list[Row]) -> str:
@@ -55,18 +62,35 @@ def main(names: list[str]) -> int:
     if unknown:
         print(f"no benchmark named {', '.join(sorted(unknown))}", file=sys.stderr)
         return 2
-    missed = False
-    for name in modules:
-        begin = time.perf_counter()
-        try:
-            rows: list[Row] = importlib.import_module(f"benchmarks.{name}").run()
-        except Exception:  # noqa: BLE001 - the others are measured whatever one does
-            print(f"{name}: FAILED\n{traceback.format_exc()}", flush=True)
-            missed = True
-            continue
-        print(f"{name} ({time.perf_counter() - begin:.0f} s)\n{table(rows)}\n", flush=True)
-        missed |= any(row.reached is False for row in rows)
-    return int(missed)
+    reached = [_is_reached(name) for name in modules]
+    return int(not all(reached))
+
+
+def _is_reached(name: str) -> bool:
+    """Measure in a process of its own, which ends with all it started when its time is over."""
+    part = multiprocessing.get_context("fork").Process(target=_show, args=(name,))
+    part.start()
+    part.join(LONGEST)
+    is_over = part.is_alive()
+    if part.pid is not None:
+        with contextlib.suppress(ProcessLookupError):  # nothing that it started is left
+            os.killpg(part.pid, signal.SIGKILL)
+    part.join()
+    if is_over:
+        print(f"{name}: FAILED\nnot at its end after {LONGEST:g} s\n", flush=True)
+    return part.exitcode == 0
+
+
+def _show(name: str) -> None:
+    os.setsid()
+    begin = time.perf_counter()
+    try:
+        rows: list[Row] = importlib.import_module(f"benchmarks.{name}").run()
+    except Exception:  # noqa: BLE001 - said here, and the others are measured
+        print(f"{name}: FAILED\n{traceback.format_exc()}", flush=True)
+        sys.exit(1)
+    print(f"{name} ({time.perf_counter() - begin:.0f} s)\n{table(rows)}\n", flush=True)
+    sys.exit(any(row.reached is False for row in rows))
 
 
 if __name__ == "__main__":

@@ -10,11 +10,8 @@ import os
 import statistics
 import subprocess
 import sys
-import tempfile
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks.estimate_file import ESTIMATE, recorded_file, sensor_samples
 from benchmarks.row import Row
 from daq.python_process import python_command
 
@@ -22,11 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 REPEATS = 7
-CLOCKS = {"one clock": ((0.0, 0.0, 0.0), 0.5), "three clocks": ((0.0, 15.0, -20.0), 0.7)}
-"""How far the clocks of three sensors are off, in ppm, and the processor time to reach, in s."""
 RECORD = "rich.live, daq.recorder.recorder, daq.devices.bench_file, tui.simulation.host_time"
 """Modules that ``huddle record`` imports when it runs."""
-LIBRARIES = "import typer.main, rich.console, rich.table, pydantic.fields, numpy, h5py"
 
 
 def processor_time(command: Sequence[str]) -> float:
@@ -56,30 +50,6 @@ def run(*, smallest: bool = False) -> list[Row]:
     ]
     recorder = usual_time([sys.executable, "-c", f"import tui.commands.main, {RECORD}"], repeats)
     rows.append(Row("imports of the recorder's process", recorder, "s", note="processor time"))
-    return rows + short_recordings(repeats)
-
-
-def short_recordings(repeats: int = REPEATS) -> list[Row]:
-    """Return the rows of the estimate of four minutes."""
-    libraries = usual_time([sys.executable, "-c", LIBRARIES], repeats)
-    ours = usual_time([sys.executable, "-c", f"import tui.commands.main, {ESTIMATE}"], repeats)
-    rows: list[Row] = []
-    with tempfile.TemporaryDirectory() as folder:
-        for clocks, (ppm, most) in CLOCKS.items():
-            path = recorded_file(
-                Path(folder) / f"{len(rows)}.h5", sensor_samples(4 / 60, ppm=ppm), ppm=ppm
-            )
-            command = python_command("tui", "estimate", str(path), "--json", f"{path}.json")
-            rows.append(
-                Row(
-                    f"huddle estimate of four minutes, 9 × 200 Hz, {clocks}: processor time",
-                    usual_time(command, repeats),
-                    "s",
-                    at_most=most,
-                    note=f"process start included; imports {ours:.2f} s, of which libraries"
-                    f" {libraries:.2f} s",
-                )
-            )
     return rows
 
 

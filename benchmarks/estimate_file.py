@@ -1,10 +1,9 @@
 """The estimate from the file: decompression, alignment, spectra, noise; diagnosis; the command.
 
 Files of three sensors: as the recorder leaves it, in chunks of one to two seconds; as it is
-imported, in chunks of 4096 rows, by one clock; and a real import from `.npz`, whose sensors have
-clocks of their own and stated times. Two files of more sensors show how cost grows with them, by
-the method that is the default for many sensors. Ratios are of processor times within one run, all
-threads and processes together. Notes give what no reader can save: inflating, and the imports.
+imported, in chunks of 4096 rows, by one clock. `benchmarks.reach` has what users wait for. Ratios
+are of processor times within one run, all threads and processes together. Notes give what no
+reader can save: inflating.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import os
 import subprocess
 import sys
 import tempfile
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +32,6 @@ from daq.results.store import store_results
 
 RATE, LENGTH, HOURS = 200, 2000, 3
 SLOW_RATE, SLOW_LENGTH, SLOW_HOURS = 40, 400, 24
-FEW, MANY, MANY_RATE, MANY_HOURS = 8, 16, 100, 0.5
 REPEATS = 3
 ESTIMATE = (
     "rich.table, daq.estimation.estimation, tui.output.results, tui.output.diagnosis,"
@@ -72,7 +69,6 @@ def run(*, smallest: bool = False) -> list[Row]:
         return [
             *_three_hours(Path(folder), SHORT if smallest else HOURS, repeats),
             *_a_day(Path(folder), SHORT if smallest else SLOW_HOURS, repeats),
-            *_many_sensors(Path(folder), SHORT if smallest else MANY_HOURS, repeats),
             _memory_of_many(Path(folder), MIN_SENSORS if smallest else ALONE),
         ]
 
@@ -82,7 +78,6 @@ def _three_hours(folder: Path, hours: float, repeats: int) -> list[Row]:
     samples = sensor_samples(hours)
     recorded = recorded_file(folder / "recorded.h5", samples)
     imported = recorded_file(folder / "imported.h5", samples, chunk_rows=BLOCK_ROWS)
-    stated = imported_file(folder / "stated.h5", samples)
     ppm = (0.0, 15.0, -20.0)
     free = recorded_file(folder / "free.h5", sensor_samples(hours, ppm=ppm), ppm=ppm)
     frames = np.lib.stride_tricks.sliding_window_view(samples, LENGTH, axis=0)[:: LENGTH // 2]
@@ -93,15 +88,13 @@ def _three_hours(folder: Path, hours: float, repeats: int) -> list[Row]:
             scipy.fft.rfft(frames[first : first + 24] * window, axis=-1)
 
     settings = Settings()
-    ffts, of_recorded_noise, of_imported_noise, with_diagnosis, from_free = least_work(
+    ffts, of_recorded_noise, of_imported_noise, with_diagnosis = least_work(
         bare,
         lambda: _noise(recorded, settings),
         lambda: _noise(imported, settings),
         lambda: estimate([recorded], settings),
-        lambda: estimate([free], settings),
         repeats=repeats,
     )
-    (start,) = least_work(lambda: _run("-c", f"import {ESTIMATE}"), repeats=repeats)
     rows = [
         Row(
             f"{what} {kind}, one clock: matrix and noise against the bare FFTs",
@@ -115,29 +108,6 @@ def _three_hours(folder: Path, hours: float, repeats: int) -> list[Row]:
             ("imported", imported, of_imported_noise),
         )
     ]
-    for name, options, of_loop in (
-        ("Hann, 50 %", (), {}),
-        (
-            "rectangular, no overlap",
-            ("--window", "rectangular", "--overlap", "0"),
-            {"window": "boxcar", "noverlap": 0},
-        ),
-    ):
-        (loop,) = least_work(partial(_csd_loop, samples, **of_loop), repeats=1)
-        files = {"recorded": recorded, "imported": imported, "imported, times stated": stated}
-        commands = least_work(
-            *(partial(_command, path, *options) for path in files.values()), repeats=repeats
-        )
-        rows += [
-            Row(
-                f"{what} {kind}, {name}: csd loop in memory against the whole command",
-                loop / command,
-                "×",
-                at_least=5.0,
-                note=f"{command:.2f} s, of which imports {start:.2f} s",
-            )
-            for kind, command in zip(files, commands, strict=True)
-        ]
     snapshot = estimate([recorded], Settings(methods=("all",)))
     (stored,) = least_work(lambda: store_results(recorded, snapshot), repeats=repeats)
     return [
@@ -147,13 +117,6 @@ def _three_hours(folder: Path, hours: float, repeats: int) -> list[Row]:
             with_diagnosis / ffts,
             "×",
             note=f"{with_diagnosis:.2f} s",
-        ),
-        Row(
-            f"{what}, three clocks refined, against the bare FFTs",
-            from_free / ffts,
-            "×",
-            at_most=10.0,
-            note=f"{from_free:.2f} s",
         ),
         Row(
             f"{what}: results of all methods into the recording, against its estimate",
@@ -182,8 +145,8 @@ def _a_day(folder: Path, hours: float, repeats: int) -> list[Row]:
     _mlab(channels[:, :SLOW_LENGTH])  # imports it
     spectra, of_recorded, of_imported = least_work(
         lambda: _mlab(channels),
-        lambda: _command(recorded, "--method", "three-channel"),
-        lambda: _command(imported, "--method", "three-channel"),
+        lambda: command(recorded, "--method", "three-channel"),
+        lambda: command(imported, "--method", "three-channel"),
         repeats=repeats,
     )
     rows = [
@@ -204,32 +167,6 @@ def _a_day(folder: Path, hours: float, repeats: int) -> list[Row]:
     return [*rows, Row(f"memory of an estimate, {hours:g} h", memory, "MB", at_most=250.0)]
 
 
-def _many_sensors(folder: Path, hours: float, repeats: int) -> list[Row]:
-    few, many = (
-        recorded_file(
-            folder / f"{number}.h5",
-            sensor_samples(hours, rate=MANY_RATE, ppm=(0.0,) * number),
-            rate=MANY_RATE,
-            ppm=(0.0,) * number,
-            chunk_rows=BLOCK_ROWS,
-        )
-        for number in (FEW, MANY)
-    )
-    of_few, of_many = least_work(
-        lambda: estimate([few], Settings()), lambda: estimate([many], Settings()), repeats=repeats
-    )
-    return [
-        Row(
-            f"{hours:g} h × {MANY_RATE} Hz, diagnosis included: {MANY} triaxial sensors against"
-            f" {FEW}",
-            of_many / of_few,
-            "×",
-            at_most=2.4,
-            note=f"{of_many:.2f} s",
-        )
-    ]
-
-
 def _memory_of_many(folder: Path, n_sensors: int) -> Row:
     samples = sensor_samples(ALONE_HOURS if n_sensors == ALONE else SHORT, ppm=(0.0,) * n_sensors)
     path = recorded_file(
@@ -239,7 +176,7 @@ def _memory_of_many(folder: Path, n_sensors: int) -> Row:
         chunk_rows=BLOCK_ROWS,
         axes="x",
     )
-    memory = _run("-c", COMMAND_MEMORY, "estimate", str(path), "--json", f"{path}.json")
+    memory = run_python("-c", COMMAND_MEMORY, "estimate", str(path), "--json", f"{path}.json")
     matrix = 16 * (LENGTH // 2 + 1) * n_sensors**2 / 1e6
     return Row(
         f"memory of the whole command, {n_sensors} sensors of one channel × {RATE} Hz",
@@ -311,21 +248,6 @@ def recorded_file(
     return path
 
 
-def imported_file(path: Path, samples: np.ndarray) -> Path:
-    """Import the samples from a `.npz`, which states when its first sample was taken."""
-    arrays = path.with_suffix(".npz")
-    np.savez(
-        arrays,
-        sampling_rate=RATE,
-        start_time="2026-09-21T14:13:20",
-        a=samples[:, :3],
-        b=samples[:, 3:6],
-        c=samples[:, 6:],
-    )
-    _run("-m", "tui", "import", str(arrays), "--out", str(path))
-    return path
-
-
 def _noise(path: Path, settings: Settings) -> None:
     """Estimate the noise and nothing else."""
     with Estimation([path], settings) as estimation:
@@ -350,19 +272,21 @@ def _inflating(path: Path) -> float:
     return least_work(inflate, repeats=2)[0]
 
 
-def _command(path: Path, *options: str) -> None:
+def command(path: Path, *options: str) -> None:
     """Run the whole command."""
-    _run("-m", "tui", "estimate", str(path), *options, "--json", f"{path}.json")
+    run_python("-m", "tui", "estimate", str(path), *options, "--json", f"{path}.json")
 
 
-def _run(*arguments: str) -> str:
+def run_python(*arguments: str) -> str:
+    """Return what a Python process prints; modules it imports are compiled already."""
     kept = {key: text for key, text in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     return subprocess.run(
         [sys.executable, *arguments], check=True, capture_output=True, text=True, env=kept
     ).stdout
 
 
-def _csd_loop(samples: np.ndarray, **options: Any) -> None:  # noqa: ANN401 - of scipy's csd
+def csd_loop(samples: np.ndarray, **options: Any) -> None:  # noqa: ANN401 - of scipy's csd
+    """Take all cross-spectra of nine channels one by one, as a script would."""
     from scipy import signal  # noqa: PLC0415 - takes 1.6 s
 
     channels = np.ascontiguousarray(samples.T.astype(float))
@@ -391,4 +315,4 @@ def _mlab(channels: np.ndarray) -> None:
 
 def _memory(path: Path) -> float:
     """Return the peak of a process that only estimates, in MB."""
-    return float(_run("-c", MEMORY, str(path)))
+    return float(run_python("-c", MEMORY, str(path)))

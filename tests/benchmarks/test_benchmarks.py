@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import math
 import pkgutil
-import sys
 from typing import TYPE_CHECKING
 
 import pytest
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
 
     from benchmarks.row import Row
 
-STUDIES = {"application", "command_start", "recorder"}
+STUDIES = {"application", "command_start", "reach", "recorder"}
 """Benchmarks that run whole processes for most of a minute."""
 LONG = {"estimate_file", "following"}
 LONG |= {"gaps", "likelihood", "resampler", "spectra"}
@@ -47,17 +46,17 @@ def test_each_runs_in_its_smallest_form(name: str) -> None:
 
 
 def test_one_that_fails_does_not_keep_others_from_running(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "fails.py").write_text("def run():\n    raise NameError('packets')\n")
+    (tmp_path / "hangs.py").write_text("import threading\nrun = threading.Event().wait\n")
     runs = "from benchmarks.row import Row\ndef run():\n    return [Row('speed', 2.0, 'x')]\n"
     (tmp_path / "runs.py").write_text(runs)
     monkeypatch.setattr(benchmarks, "__path__", [*benchmarks.__path__, str(tmp_path)])
-    try:
-        assert main(["fails", "runs"]) == 1
-    finally:
-        for name in ("fails", "runs"):
-            sys.modules.pop(f"benchmarks.{name}", None)
-    shown = capsys.readouterr().out
+    assert main(["runs"]) == 0
+    monkeypatch.setattr("benchmarks.__main__.LONGEST", 2.0)
+    assert main(["fails", "hangs", "runs"]) == 1
+    shown = capfd.readouterr().out
     assert "NameError: packets" in shown
+    assert "hangs: FAILED\nnot at its end after 2 s" in shown
     assert "speed" in shown
