@@ -178,3 +178,26 @@ def test_curves_are_paths_where_the_axes_have_them() -> None:
     shown = [(x, y + 0.25 * height), (x + width / 3, y + 1.25 * height)]
     np.testing.assert_allclose(points, shown, atol=0.01)
     assert any(" 1 0 0 rg" in line and line.endswith("f Q") for line in words)
+
+
+def test_curves_of_three_and_four_points_are_drawn() -> None:
+    """As arrows and round ends have them: pen down at one end, and lifted at the other."""
+
+    def panel(axes: Axes) -> None:
+        bent = {"arrowstyle": "-|>", "connectionstyle": "arc3,rad=0.5", "color": "#00ff00"}
+        axes.annotate("", (1.0, 1.0), (0.0, 0.0), arrowprops=bent)
+        axes.plot([0.5], [0.5], "o", color="#0000ff")
+        axes.set(xlim=(0, 1), ylim=(0, 1))
+
+    plot = Plot("", (panel,), n_columns=1, height=1.0, alt="an arrow")
+    report = Report("Plots", "", Paragraph("drawn"), (Section("One", (plot,)),))
+    content = PdfReader(paper_of(report)).pages[0].get_contents()
+    assert content is not None
+    lines = content.get_data().decode("latin-1").splitlines()
+    (bend, *_) = (line for line in lines if " 0 1 0 RG" in line and " c " in line)
+    numbers = re.findall(r"[-\d.]+ [-\d.]+", bend.split(" m ")[1])
+    first, second, last = (np.array(each.split(), float) for each in numbers[:3])
+    start = np.array(re.findall(r"([-\d.]+) ([-\d.]+) m ", bend)[0], float)
+    corner = (3 * first - start) / 2  # of the curve of three points
+    np.testing.assert_allclose(corner, (3 * second - last) / 2, atol=0.01)
+    assert any(" 0 0 1 rg" in line and line.count(" c ") == 8 for line in lines)

@@ -6,6 +6,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from matplotlib.backend_bases import RendererBase
 from matplotlib.path import Path
 
@@ -106,10 +107,16 @@ class _Renderer(RendererBase):
             words += [self._place(*clip.p0), *_numbers(*clip.size), "re W n"]
         if face is not None and inside:
             words += [*_numbers(*face[:3]), "rg"]
+        end = np.zeros(2)
         for points, code in path.iter_segments(transform):
-            if code != Path.CLOSEPOLY:
-                words += map(self._place, points[::2], points[1::2])
-            words.append(_OPERATORS[code])
+            at, own = points.reshape(-1, 2), code
+            if code == Path.CURVE3:  # as the curve of four points that is the same
+                at = np.stack([end + 2 / 3 * (at[0] - end), at[1] + 2 / 3 * (at[0] - at[1]), at[1]])
+                own = Path.CURVE4
+            if own != Path.CLOSEPOLY:
+                words += (self._place(x, y) for x, y in at)
+                end = at[-1]
+            words.append(_OPERATORS[own])
         words += [_PAINT[inside > 0, along > 0], "Q"]
         paler = {"fill_opacity": inside or None, "stroke_opacity": along or None}
         is_pale = {inside, along} - {0.0, 1.0}
