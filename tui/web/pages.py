@@ -8,7 +8,6 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.results.comparison import compare
-from daq.results.facts.fact import MARKS
 from tui.application.result_view.result_text import difference_text
 from tui.application.test_view.channels import channel_table
 from tui.web.chart import choice_of
@@ -47,7 +46,6 @@ def about_test(state: State, settings_table: Mapping[str, Any]) -> dict[str, Any
         if state.reference is None or differences is not None
         else "The two tests cannot be compared: no channel, method, unit or band in common.",
         "facts": result.facts,
-        "marks": MARKS,
         "nothing_to_do": NOTHING_TO_DO,
         "limits": [] if verdict is None else [limit_line(each) for each in verdict.limits],
         "settings": [(name, _value(value)) for name, value in settings_table.items()],
