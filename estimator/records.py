@@ -13,6 +13,7 @@ from dataclasses import MISSING, FrozenInstanceError, dataclass, fields
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar, dataclass_transform
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from dataclasses import Field
 
 Seconds: TypeAlias = float
@@ -23,6 +24,8 @@ Decibels: TypeAlias = float
 Degrees: TypeAlias = float
 UNITS = {"Seconds": "s", "Hertz": "hz", "Share": "share", "Decibels": "db", "Degrees": "deg"}
 """Of fields with these types: what is behind their names in JSON."""
+NOT_IN_JSON: Mapping[str, None] = {"key": None}
+"""Metadata of a field that JSON leaves out; "key" is the name of another."""
 _UNIT = re.compile(rf"\b({'|'.join(UNITS)})\b")
 
 _Record = TypeVar("_Record", bound="Record")
@@ -78,7 +81,13 @@ class Record:
         return [(name, getattr(self, name)) for name in names]
 
 
-def json_key(each: Field[Any]) -> str:
-    """Return the name of a field in JSON: its own, with the unit that its type names."""
+def json_key(each: Field[Any]) -> str | None:
+    """Return the name of a field in JSON: its own with the unit that its type names, or its "key".
+
+    None of a field that JSON leaves out.
+    """
+    if "key" in each.metadata:
+        name: str | None = each.metadata["key"]
+        return name
     found = _UNIT.search(str(each.type))
     return f"{each.name}_{UNITS[found[1]]}" if found else each.name

@@ -171,7 +171,7 @@ class ClockSetting:
     """
 
     utc_ns: int
-    step: float
+    step: float = field(metadata={"key": "step_s"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,18 +219,18 @@ class ClockState:
 
     sensor: str
     source: ClockSource
-    offset: float
-    ppm: float
-    ppm_std: float
+    offset: float = field(metadata={"key": "offset_s"})
+    ppm: float = field(metadata={"key": "rate_ppm"})
+    ppm_std: float = field(metadata={"key": "rate_std_ppm"})
     wander_ppm: float
-    residual: float
-    n_epochs: int
-    refined: bool = False
+    residual: float = field(metadata={"key": "residual_s"})
+    n_epochs: int = field(metadata={"key": None})
+    refined: bool = field(default=False, metadata={"key": "is_refined"})
     shared_clock: str = ""
     offset_source: OffsetSource | None = None
-    corrected: float = 0.0
+    corrected: float = field(default=0.0, metadata={"key": "corrected_s"})
     drifts: bool = False
-    unchecked: bool = False
+    unchecked: bool = field(default=False, metadata={"key": "is_unchecked"})
     is_understood: bool = True
     slips: tuple[Uncounted, ...] = ()
     settings: tuple[ClockSetting, ...] = ()

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from daq.clocks.clock_model import ClockState
     from daq.protocols.block import Event
     from daq.recording.interface import ReadableSensor
+    from estimator.records import Hertz, Seconds, Share
     from estimator.self_noise.result import SelfNoise
     from estimator.spectra.multiresolution import Band
     from estimator.spectra.parts import Parts
@@ -52,17 +53,17 @@ class SensorTotals:
     """How much of a sensor has been recorded so far."""
 
     name: str
-    sampling_rate: float
-    n_samples: int
-    n_gaps: int
-    n_missing: int
-    last_seen: float
+    sampling_rate: Hertz
+    n_samples: int = field(metadata={"key": "samples"})
+    n_gaps: int = field(metadata={"key": "gaps"})
+    n_missing: int = field(metadata={"key": "missing_samples"})
+    last_seen: float = field(metadata={"key": "last_seen_utc_s"})
     """UTC of the last committed block, in seconds since 1970; NaN before the first."""
     is_lost: bool = False
     """Whether the sensor has sent nothing, or was lost after its last block."""
-    n_damaged: int = 0
+    n_damaged: int = field(default=0, metadata={"key": "damaged_blocks"})
     """Number of its blocks whose checksum is wrong; the estimate leaves them out as gaps."""
-    began: float = float("nan")
+    began: float = field(default=float("nan"), metadata={"key": "began_utc_s"})
     """UTC of the first sample to within the delay of its block, as `last_seen`."""
 
     @classmethod
@@ -97,13 +98,14 @@ class SensorTotals:
 class Octave:
     """What frequencies up to `high` (Hz) rest on, where each octave has its own segments."""
 
-    low: float
-    high: float
-    segment: float
-    """Seconds."""
-    n_segments: int
-    n_effective: float
-    left_out: Mapping[Reason, int] = field(default_factory=dict)
+    low: Hertz
+    high: Hertz
+    segment: Seconds
+    n_segments: int = field(metadata={"key": "segments"})
+    n_effective: float = field(metadata={"key": "effective_averages"})
+    left_out: Mapping[Reason, int] = field(
+        default_factory=dict, metadata={"key": "excluded_by_reason"}
+    )
     """Its segments that do not count, by reason; clipped ones count as gaps."""
 
     @classmethod
@@ -154,9 +156,9 @@ class Bridged:
         What their windows bring in from other frequencies, as a fraction of the noise.
     """
 
-    n_segments: int
-    lost: float
-    leakage: FloatArray
+    n_segments: int = field(metadata={"key": "segments"})
+    lost: Share
+    leakage: FloatArray = field(metadata={"key": "leakage_share"})
 
 
 @dataclass(frozen=True, slots=True, eq=False)

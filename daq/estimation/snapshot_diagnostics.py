@@ -86,11 +86,11 @@ class EdgeLeakage:
         they were not found from.
     """
 
-    left: FloatArray
-    whole: FloatArray
-    unseen: FloatArray
-    share: FloatArray
-    whole_share: FloatArray
+    left: FloatArray = field(metadata={"key": "left_psd"})
+    whole: FloatArray = field(metadata={"key": "without_equalisation_psd"})
+    unseen: FloatArray = field(metadata={"key": "unseen_psd"})
+    share: FloatArray = field(metadata={"key": "left_share"})
+    whole_share: FloatArray = field(metadata={"key": "without_equalisation_share"})
     sources: tuple[str, ...] = ()
     unproven: tuple[int, ...] = ()
 

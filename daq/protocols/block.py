@@ -15,7 +15,7 @@ exact; otherwise the block has the flag ``BlockFlag.MISSING_ESTIMATED``. Gaps ar
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from enum import IntFlag, StrEnum
 from typing import Any, TypeAlias
@@ -161,8 +161,8 @@ class Uncounted:
     """
 
     utc_ns: int
-    within: float
-    n_samples: int
+    within: float = field(metadata={"key": "within_s"})
+    n_samples: int = field(metadata={"key": "samples"})
 
     def is_that(self, other: Uncounted) -> bool:
         """Whether both may be one, found twice."""

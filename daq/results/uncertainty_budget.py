@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from statistics import NormalDist
 from typing import TYPE_CHECKING
 
@@ -24,6 +24,7 @@ from daq.bench.sensitivity import KnownSensitivity
 from daq.results.band_summary import Estimate
 from estimator.levels.bands import band_edges, third_octaves
 from estimator.levels.interval import NORMAL_95
+from estimator.records import NOT_IN_JSON
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -61,11 +62,11 @@ class Component:
     """
 
     source: str
-    kind: str
+    kind: str = field(metadata={"key": "type"})
     distribution: str
-    relative: float
-    dof: float = STATED
-    reach: tuple[float, float] = (math.nan, math.nan)
+    relative: float = field(metadata={"key": "relative_standard_uncertainty"})
+    dof: float = field(default=STATED, metadata={"key": "degrees_of_freedom"})
+    reach: tuple[float, float] = field(default=(math.nan, math.nan), metadata=NOT_IN_JSON)
 
 
 @dataclass(frozen=True, slots=True)

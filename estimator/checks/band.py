@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from estimator.likelihood.goodness_of_fit import BandTest
+    from estimator.records import Hertz
     from estimator.types import BoolArray, FloatArray
 
 
@@ -37,8 +38,8 @@ class BandDiagnosis:
     n_frequencies : int
     """
 
-    low: float
-    high: float
+    low: Hertz
+    high: Hertz
     coherence: float
     condition: float
     dimension: float
@@ -46,4 +47,4 @@ class BandDiagnosis:
     noise_lost: BoolArray
     test: BandTest
     shared: FloatArray
-    n_frequencies: int
+    n_frequencies: int = field(metadata={"key": "frequencies"})

@@ -37,6 +37,7 @@ from estimator.self_noise.coherency import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from estimator.records import Hertz, Seconds
     from estimator.self_noise.coherency import Coherency
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
@@ -154,8 +155,8 @@ class RelativeResponse:
 
     first: int
     second: int
-    low: float
-    high: float
+    low: Hertz
+    high: Hertz
     matrix: FloatArray
     rotation: FloatArray
     rotation_deg: float
@@ -167,8 +168,8 @@ class RelativeResponse:
     nonorthogonality_deg: float
     nonorthogonality_error_deg: float
     reversed_channels: tuple[int, ...]
-    delay: float
-    delay_error: float
+    delay: Seconds
+    delay_error: Seconds
     is_ambiguous: bool
     coherence: float
 

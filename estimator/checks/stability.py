@@ -12,7 +12,7 @@ import functools
 import math
 import operator
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -37,6 +37,7 @@ from estimator.likelihood import fisher
 from estimator.likelihood.goodness_of_fit import critical_value
 from estimator.likelihood.score_test import usable
 from estimator.median import median
+from estimator.records import NOT_IN_JSON
 from estimator.spectra.parts import grouped, joined_parts
 
 if TYPE_CHECKING:
@@ -116,10 +117,10 @@ class Scatter:
         Bartlett's, chi-squared with ``n_parts - 1`` degrees for steady noise.
     """
 
-    n_parts: int
-    deviation: FloatArray
-    expected: FloatArray
-    statistic: FloatArray
+    n_parts: int = field(metadata={"key": "parts"})
+    deviation: FloatArray = field(metadata={"key": "deviation_share"})
+    expected: FloatArray = field(metadata={"key": "expected_share"})
+    statistic: FloatArray = field(metadata=NOT_IN_JSON)
 
     @classmethod
     def joined(cls, found: Sequence[Scatter]) -> Scatter:

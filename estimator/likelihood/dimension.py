@@ -7,7 +7,7 @@ then further factors of the same model.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -40,6 +40,7 @@ from estimator.self_noise.coherency import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from estimator.records import Hertz
     from estimator.self_noise.coherency import Presence
     from estimator.types import ComplexArray, FloatArray, IntArray
 
@@ -112,17 +113,17 @@ class BandDimension:
         `estimator.likelihood.gradients`.
     """
 
-    low: float
-    high: float
-    n_factors: int
-    usual: int
-    accepted: bool
+    low: Hertz
+    high: Hertz
+    n_factors: int = field(metadata={"key": "dimensions"})
+    usual: int = field(metadata={"key": "usual_dimensions"})
+    accepted: bool = field(metadata={"key": "is_accepted"})
     test: BandTest
     tried: tuple[BandTest, ...]
     cov: float
     usual_cov: float
-    n_sensors: int = MIN_DETERMINED_SENSORS
-    gradients: bool = False
+    n_sensors: int = field(default=MIN_DETERMINED_SENSORS, metadata={"key": "sensors"})
+    gradients: bool = field(default=False, metadata={"key": "are_gradients"})
 
     @property
     def is_undetermined(self) -> bool:

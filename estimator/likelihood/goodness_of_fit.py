@@ -11,7 +11,7 @@ that of ``huddle estimate`` for a recording of four minutes. The tests compare t
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -168,7 +168,7 @@ class BandTest:
     statistic: float
     degrees: float
     p_value: float
-    n_frequencies: int
+    n_frequencies: int = field(metadata={"key": "frequencies"})
     spread: float = 1.0
     """Variance of the sum over that of independent statistics."""
 

@@ -13,13 +13,14 @@ estimates. The estimate is not clipped: negative values count like the others.
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.errors import EstimatorError, InsufficientDataError
+from estimator.records import NOT_IN_JSON
 
 if TYPE_CHECKING:
     from estimator.types import BoolArray, FloatArray, IntArray
@@ -80,9 +81,9 @@ class NoiseParameters:
         Estimate over model in this band, and their difference in standard errors.
     """
 
-    values: FloatArray
-    errors: FloatArray
-    covariance: FloatArray
+    values: FloatArray = field(metadata=NOT_IN_JSON)
+    errors: FloatArray = field(metadata=NOT_IN_JSON)
+    covariance: FloatArray = field(metadata=NOT_IN_JSON)
     low: float
     high: float
     n_frequencies: int

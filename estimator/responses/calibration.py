@@ -14,13 +14,14 @@ common.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.checks.relative_response import relative_response
 from estimator.errors import InsufficientDataError
+from estimator.records import NOT_IN_JSON
 from estimator.responses.derived_quantities import Value, with_errors
 from estimator.self_noise.coherency import other_channels, own_channels
 
@@ -72,10 +73,10 @@ class SensorCalibration:
     n_frequencies : int
     """
 
-    sensor: int
-    reference: int
-    low: float
-    high: float
+    sensor: int = field(metadata=NOT_IN_JSON)
+    reference: int = field(metadata=NOT_IN_JSON)
+    low: float = field(metadata=NOT_IN_JSON)
+    high: float = field(metadata=NOT_IN_JSON)
     matrix: Value
     gain: Value
     cross_axis: Value
@@ -87,7 +88,7 @@ class SensorCalibration:
     is_ambiguous: bool
     excess: float
     dof: float
-    n_frequencies: int
+    n_frequencies: int = field(metadata=NOT_IN_JSON)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

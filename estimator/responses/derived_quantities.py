@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,7 +25,7 @@ class Value:
     """
 
     value: FloatArray
-    error: FloatArray
+    error: FloatArray = field(metadata={"key": "standard_error"})
 
 
 def derived(matrix: FloatArray) -> dict[str, FloatArray]:

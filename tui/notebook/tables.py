@@ -69,7 +69,12 @@ def to_xarray(
         "trace": [label.name for label in labels],
         "sensor": ("trace", [label.sensor for label in labels]),
         "channel": ("trace", [label.channel for label in labels]),
-        "frequency": ("frequency", snapshot.frequency, {"units": "Hz"}),
+        "frequency": (
+            "frequency",
+            snapshot.frequency,
+            {"units": "Hz", "long_name": "frequency"},
+            {"_FillValue": None},  # CF forbids one of coordinates
+        ),
     }
     if matrix:
         csm = np.moveaxis(snapshot.csm, 0, -1)

@@ -21,17 +21,12 @@ from estimator.records import json_key
 from estimator.self_noise.result import Flag
 from tui import __version__
 from tui.output.calibration import channels_of
-from tui.output.json_diagnostics import (
-    diagnostics_document,
-    dimension_document,
-    setting_document,
-    slip_document,
-)
-from tui.output.json_values import plain
+from tui.output.json_diagnostics import diagnostics_document
+from tui.output.json_values import json_text, plain
 from tui.output.noise_parameters import noise_parameters_document
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Sequence
 
     from daq.estimation.snapshot import Snapshot
     from daq.results.calibration import Calibration
@@ -39,8 +34,6 @@ if TYPE_CHECKING:
     from daq.results.noise_parameters import ChannelNoise
     from daq.results.result import Result
     from daq.results.sources import Source
-    from estimator.responses.calibration import SensorCalibration
-    from estimator.responses.derived_quantities import Value
 
 SCHEMA_VERSION = 2
 """Rises when a key is removed or changes its meaning; new keys do not change it."""
@@ -104,7 +97,7 @@ def document(
 
 
 def provenance(result: Result, *, with_recordings: bool = True) -> dict[str, str]:
-    """Return what made an estimate, as texts that files of other programs can hold.
+    """Return what made an estimate and what is known of it, as texts for files of other programs.
 
     Checksums of recordings take as long as reading them.
     """
@@ -119,7 +112,11 @@ def provenance(result: Result, *, with_recordings: bool = True) -> dict[str, str
         "source": f"huddle-bench {__version__}",
         "time_coverage_start": _instant(start_ns),
         "time_coverage_end": _instant(start_ns + round(snapshot.elapsed * 1e9)),
+        "history": f"estimated by huddle-bench {__version__}",
         "confidence_of_intervals": "0.95",
+        "unit_of_densities": f"({snapshot.unit})²/Hz",
+        "verdict": "none" if result.verdict is None else result.verdict.verdict,
+        "facts": json_text(facts_document(result.all_facts)),
         "simulated": str(snapshot.simulated).lower(),
         "flags": json.dumps({str(flag.name).lower(): int(flag) for flag in Flag}),
         "settings": json.dumps(_settings(result), ensure_ascii=False),
@@ -280,21 +277,9 @@ def verdict_document(found: TestVerdict | None) -> dict[str, Any]:
             },
         },
         "limits": [
-            {
-                "limit": each.limit,
-                "sensor": each.sensor,
-                "channel": each.channel,
-                "method": each.method,
-                "verdict": each.verdict,
-                "obstacle": each.obstacle,
-                "limit_hz": list(each.covers),
-                "judged_hz": list(each.judged),
-                "frequency_hz": each.frequency,
-                "noise_psd": each.noise_psd,
-                "noise_psd_low": each.low,
-                "noise_psd_high": each.high,
+            plain(each)
+            | {
                 "k": found.k,
-                "limit_psd": each.limit_psd,
                 "margin_db": each.margin_db,
                 "margin_low_db": each.margin_low_db,
                 "margin_high_db": each.margin_high_db,
@@ -332,34 +317,12 @@ def _numbers(fact: Fact) -> dict[str, Any]:
     """Return the fields of a fact beyond those of all; findings with theirs."""
     if isinstance(fact, Finding):
         return {"findings": [_finding(each) for each in fact.findings]}
-    return _with_units(fact, Fact) | {
-        name: [document(each) for each in getattr(fact, name)]
-        for name, document in _PARTS.items()
-        if hasattr(fact, name)
-    }
+    return _beyond(Fact, fact)
 
 
-def _with_units(found: Fact | Advice, base: type) -> dict[str, Any]:
-    common = {each.name for each in fields(base)}
-    return {
-        json_key(each): plain(getattr(found, each.name))
-        for each in fields(found)
-        if each.name not in common and each.name not in _PARTS
-    }
-
-
-def _transients(octave: tuple[float, float, int]) -> dict[str, Any]:
-    low, high, n_segments = octave
-    return {"low_hz": low, "high_hz": high, "segments": n_segments}
-
-
-_PARTS: Mapping[str, Callable[[Any], dict[str, Any]]] = {
-    "choices": dimension_document,
-    "settings": setting_document,
-    "slips": slip_document,
-    "transients_by_octave": _transients,
-}
-"""Fields of facts that hold lists of things with several numbers each."""
+def _beyond(base: type[Fact | Advice], found: Fact | Advice) -> dict[str, Any]:
+    common = {json_key(each) for each in fields(base)}
+    return {key: value for key, value in plain(found).items() if key not in common}
 
 
 def _finding(advice: Advice) -> dict[str, Any]:
@@ -368,7 +331,7 @@ def _finding(advice: Advice) -> dict[str, Any]:
         "level": _LEVELS[advice.rank],
         "sensors": list(advice.sensors),
         "band_hz": advice.band,
-        "numbers": _with_units(advice, Advice),
+        "numbers": _beyond(Advice, advice),
     }
 
 
@@ -379,16 +342,7 @@ def calibration_document(found: Calibration, snapshot: Snapshot) -> dict[str, An
     return {
         "reference": names[found.reference],
         "is_absolute": bool(found.certificates),
-        "certificates": [
-            {
-                "value": each.value,
-                "expanded_uncertainty": each.expanded_uncertainty,
-                "k": each.k,
-                "date": None if each.date is None else each.date.isoformat(),
-                "number": each.number,
-            }
-            for each in found.certificates
-        ],
+        "certificates": found.certificates,
         "confidence": found.confidence,
         "refused": {names[sensor]: why for sensor, why in found.refused.items()},
         "without_noise": [label.name for label in found.without_noise],
@@ -397,16 +351,10 @@ def calibration_document(found: Calibration, snapshot: Snapshot) -> dict[str, An
                 "sensor": names[each.sensor],
                 "channels": channels_of(snapshot, each.sensor),
                 "band_hz": [each.low, each.high],
-                "is_ambiguous": each.is_ambiguous,
-                "excess": each.excess,
-                "dof": each.dof,
                 "relative_time": relative_time(
                     snapshot, names[each.sensor], names[found.reference]
                 ),
-                **{
-                    key: {"value": value.value, "standard_error": value.error}
-                    for key, value in _calibrated(each).items()
-                },
+                **plain(each),
                 "curve": {
                     "frequency_hz": curves[each.sensor].frequency,
                     "real": curves[each.sensor].matrix.real,
@@ -424,16 +372,7 @@ def calibration_document(found: Calibration, snapshot: Snapshot) -> dict[str, An
                 "is_absolute": each.is_absolute,
                 "band_hz": [each.low, each.high],
                 "value": each.value,
-                "components": [
-                    {
-                        "source": part.source,
-                        "type": part.kind,
-                        "distribution": part.distribution,
-                        "relative_standard_uncertainty": part.relative,
-                        "degrees_of_freedom": part.dof,
-                    }
-                    for part in each.components
-                ],
+                "components": each.components,
                 "combined_relative": each.combined,
                 "effective_degrees_of_freedom": each.dof,
                 "k": each.k,
@@ -441,17 +380,4 @@ def calibration_document(found: Calibration, snapshot: Snapshot) -> dict[str, An
             }
             for each in found.budgets
         ],
-    }
-
-
-def _calibrated(each: SensorCalibration) -> dict[str, Value]:
-    return {
-        "matrix": each.matrix,
-        "gain": each.gain,
-        "cross_axis": each.cross_axis,
-        "rotation_deg": each.rotation_deg,
-        "angle_deg": each.angle_deg,
-        "orthogonality_deg": each.orthogonality_deg,
-        "delay": each.delay,
-        "skew": each.skew,
     }

@@ -5,27 +5,39 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic_core import to_json
 
+from estimator.records import json_key
 
-def plain(value: Any) -> Any:  # noqa: ANN401 - any result
-    """Return dataclasses, enumerations and arrays as what JSON knows."""
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from estimator.types import FloatArray
+
+
+def plain(value: Any, *, array: Callable[[Any], Any] = np.ndarray.tolist) -> Any:  # noqa: ANN401
+    """Return any result as what JSON knows: fields under the names that they declare.
+
+    Arrays become what `array` makes of them; complex ones their real and imaginary parts.
+    """
     if is_dataclass(value) and not isinstance(value, type):
-        value = {field.name: getattr(value, field.name) for field in fields(value)}
-    if isinstance(value, np.ndarray | np.generic):
-        if np.iscomplexobj(value):
-            value = {"real": value.real, "imag": value.imag}
-        else:
-            return value.tolist()
+        keys = ((json_key(each), each.name) for each in fields(value))
+        value = {key: getattr(value, name) for key, name in keys if key is not None}
+    if isinstance(value, np.generic):
+        value = np.asarray(value) if np.iscomplexobj(value) else value.item()
+    if isinstance(value, np.ndarray):
+        if not np.iscomplexobj(value):
+            return array(value)
+        value = {"real": value.real, "imag": value.imag}
     if isinstance(value, Enum):
         return value.value
     if isinstance(value, Mapping):
-        return {str(plain(key)): plain(entry) for key, entry in value.items()}
+        return {str(plain(key)): plain(entry, array=array) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(entry) for entry in value]
+        return [plain(entry, array=array) for entry in value]
     return value
 
 
@@ -40,9 +52,9 @@ def json_text(document: Any) -> str:  # noqa: ANN401 - any result
     PydanticSerializationError
         The document holds what is no result, or a text that is not Unicode.
     """
-    return to_json(document, inf_nan_mode="null", fallback=_by_row).decode()
+    declared = plain(document, array=lambda each: each)
+    return to_json(declared, inf_nan_mode="null", fallback=_by_row).decode()
 
 
-def _by_row(value: Any) -> Any:  # noqa: ANN401 - any result
-    is_table = isinstance(value, np.ndarray) and value.ndim > 1 and not np.iscomplexobj(value)
-    return list(value) if is_table else plain(value)
+def _by_row(values: FloatArray) -> list[Any]:
+    return list(values) if values.ndim > 1 else values.tolist()

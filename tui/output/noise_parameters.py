@@ -176,19 +176,7 @@ def noise_parameters_document(found: Sequence[ChannelNoise]) -> list[dict[str, A
                 for term in Term
             },
             "covariance": None if each.parameters is None else each.parameters.covariance,
-            "fit": None
-            if each.parameters is None
-            else {
-                "low": each.parameters.low,
-                "high": each.parameters.high,
-                "n_frequencies": each.parameters.n_frequencies,
-                "n_lines": each.parameters.n_lines,
-                "chi_square": each.parameters.chi_square,
-                "worst_low": each.parameters.worst_low,
-                "worst_high": each.parameters.worst_high,
-                "worst_ratio": each.parameters.worst_ratio,
-                "worst_score": each.parameters.worst_score,
-            },
+            "fit": each.parameters,
             "refused": each.refused or None,
             "allan_deviation": each.allan,
             "quantisation_psd": each.quantisation_psd,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from daq.bench.units import decibels
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from daq.results.decision.facts import WrongSensitivity
     from daq.results.facts.fact import Fact
     from estimator.decision.verdict import Prediction
+    from estimator.records import Hertz
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,14 +47,14 @@ class LimitResult:
     sensor: str
     channel: str
     method: str
-    frequency: float
+    frequency: Hertz
     noise_psd: float
-    low: float
-    high: float
+    low: float = field(metadata={"key": "noise_psd_low"})
+    high: float = field(metadata={"key": "noise_psd_high"})
     limit_psd: float
     verdict: Verdict
-    covers: tuple[float, float]
-    judged: tuple[float, float]
+    covers: tuple[float, float] = field(metadata={"key": "limit_hz"})
+    judged: tuple[Hertz, Hertz]
     obstacle: Obstacle | None = None
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -12,7 +13,7 @@ from daq.results.vocabulary import REASONS
 from estimator.checks.advice import Rank
 from estimator.records import record
 from estimator.spectra.segment_rejection import Reason
-from estimator.wording import Words, listed, percent, several
+from estimator.wording import Words, listed, percent, several, span
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -59,6 +60,15 @@ class NoSegmentUsable(Fact):
         return Words(f"{text} {do}".rstrip("."), text, do)
 
 
+@dataclass(frozen=True, slots=True)
+class DisturbedOctave:
+    """Lowest and highest frequency of an octave, and its segments with transients."""
+
+    low: Hertz
+    high: Hertz
+    n_segments: int = field(metadata={"key": "segments"})
+
+
 @record
 class SegmentsExcluded(Fact):
     """Segments are excluded.
@@ -67,15 +77,14 @@ class SegmentsExcluded(Fact):
     ----------
     n_segments : int
     reasons : mapping of Reason to int
-    transients_by_octave : tuple of (float, float, int)
-        Lowest and highest frequency (Hz), and segments with transients, where each octave has its
-        own segments.
+    transients_by_octave : tuple of DisturbedOctave
+        Where each octave has its own segments.
     """
 
     name: ClassVar[str] = "segments-excluded"
     n_segments: int
     reasons: Mapping[Reason, int]
-    transients_by_octave: tuple[tuple[float, float, int], ...] = ()
+    transients_by_octave: tuple[DisturbedOctave, ...] = ()
 
     def _words(self) -> Words:
         parts = []
@@ -88,8 +97,8 @@ class SegmentsExcluded(Fact):
             parts.append(f"{several(self.n_segments, 'segment')} excluded{why}")
         if self.transients_by_octave:
             each = ", ".join(
-                f"{count} at {low:.3g}–{high:.3g} Hz"
-                for low, high, count in self.transients_by_octave
+                f"{each.n_segments} at {span(each.low, each.high)}"
+                for each in self.transients_by_octave
             )
             parts.append(f"segments with transients excluded: {each}")
         text = "; ".join(parts)
@@ -209,7 +218,7 @@ def facts_of_segments(snapshot: Snapshot) -> Iterator[Fact]:
             longest=why.longest,
         )
     disturbed = tuple(
-        (octave.low, octave.high, octave.left_out[Reason.TRANSIENT])
+        DisturbedOctave(octave.low, octave.high, octave.left_out[Reason.TRANSIENT])
         for octave in snapshot.octaves
         if octave.left_out.get(Reason.TRANSIENT)
     )

@@ -409,6 +409,8 @@ def said_by_file(folder: Path, kind: str, path: Path) -> dict[str, str]:
             assert found.attrs["Conventions"] == "CF-1.11"
             meanings = found["flags"].attrs["flag_meanings"].split()
             masks = np.asarray(found["flags"].attrs["flag_masks"]).tolist()
+            assert found.attrs["history"]
+            assert "_FillValue" not in found["frequency"].encoding
             assert dict(zip(meanings, masks, strict=True))["dead_channel"] == 4
             return dict(found.attrs)
     if kind == "mat":
@@ -439,6 +441,11 @@ def test_every_export_says_what_made_it(recording: Path, tmp_path: Path, kind: s
     assert said["time_coverage_start"] == "2026-11-21T03:00:00.000007000Z"
     assert said["time_coverage_end"].startswith("2026-11-21T03:01:20")
     assert said["confidence_of_intervals"] == "0.95"
+    assert said["unit_of_densities"] == "(m/s²)²/Hz"
+    made = huddle.estimate(recording, segment="5s")
+    kinds = [(each["kind"], each["line"]) for each in json.loads(said["facts"])]
+    assert kinds == [(each.name, each.words.line) for each in made.result.all_facts]
+    assert said["verdict"] == "none"
     assert json.loads(said["flags"])["dead_channel"] == 4
     assert run(recording, "--format", kind, "-o", path).exit_code == ExitCode.DONE  # replaced
 
