@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from functools import partial
 from importlib.metadata import version as installed
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -22,6 +23,8 @@ from docutils import nodes
 from sphinx.util.docutils import SphinxDirective
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from sphinx.application import Sphinx
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -65,13 +68,15 @@ class Reference(SphinxDirective):
         sys.path.insert(0, str(ROOT))
         from docs import reference  # noqa: PLC0415 - needs the root on the path
 
-        make = {
+        make: dict[str, Callable[[], str]] = {
             "commands": reference.commands,
             "bench_file": reference.bench_file,
             "troubleshooting": reference.troubleshooting,
             "facts": reference.facts,
             "findings": reference.findings,
+            "packages": reference.packages,
             "result": reference.result,
+            **{name: partial(reference.values, name) for name in reference.VALUES},
         }
         found: list[nodes.Node] = self.parse_text_to_nodes(
             make[self.arguments[0]](), allow_section_headings=True

@@ -12,6 +12,7 @@ import textwrap
 from dataclasses import fields
 from importlib import resources
 from itertools import chain
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin
 
@@ -21,17 +22,22 @@ from pydantic_core import PydanticUndefined
 from daq.bench.durations import format_duration, parse_duration
 from daq.bench.estimate_settings import OPTIONS, EstimateSettings, table_keys
 from daq.bench.model import TABLES, Bench
+from daq.protocols.block import EventKind
+from daq.recording.sensor_state import SensorState
 from daq.results.facts.fact import MARKS, Fact, Finding
 from estimator.checks.advice import Advice, Names, Rank
+from estimator.decision.verdict import Obstacle
 from estimator.records import json_key
 from tests.tui.wording.advice_examples import EXAMPLES as ADVICE
 from tests.tui.wording.fact_examples import EXAMPLES as FACTS
 from tests.tui.wording.fact_examples import kinds
 from tui.commands.help import PANELS, subcommand
+from tui.service.records.run_state import RunState
 from tui.wording.facts import RANKS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from enum import StrEnum
 
 _WRITTEN = {"[[schedule.runs]]": "[[schedule]]"}
 """Tables that a person writes by another name than that of their model."""
@@ -40,6 +46,14 @@ _DURATION = "duration, such as `90s` or `2h`"
 _BLANK = "\n\n"
 _ATTRIBUTE = re.compile(r"^(\w[\w, ]*) : .*((?:\n +.*)*)", re.MULTILINE)
 """Names and meaning of attributes of one entry of a numpydoc section."""
+ROOT = Path(__file__).resolve().parents[1]
+VALUES: dict[str, type[StrEnum]] = {
+    "events": EventKind,
+    "obstacles": Obstacle,
+    "runs": RunState,
+    "states": SensorState,
+}
+"""Kinds of values that recordings, JSON and lists of runs have."""
 _NAMES = {str: "text", float: "number", int: "whole number", bool: "true or false"}
 
 
@@ -93,6 +107,24 @@ def result() -> str:
         table = "\n".join(["| key | meaning |", "|---|---|", *rows])
         parts.append(f"#### `{name}`\n\n{about}{table}\n")
     return "\n".join(parts)
+
+
+def values(name: str) -> str:
+    """Return a table of the values of one of `VALUES`, by their docstrings."""
+    kind = VALUES[name]
+    said = explanations(kind)
+    rows = [f"| `{each.value}` | {_plain(said[each.name])} |" for each in kind]
+    return "\n".join(["| value | meaning |", "|---|---|", *rows])
+
+
+def packages() -> str:
+    """Return a table of the packages, with the first sentence of each."""
+    rows = ["| package | |", "|---|---|"]
+    for room in ("daq", "estimator", "sim_devices", "tui"):
+        for path in sorted((ROOT / room).glob("*/__init__.py")):
+            about = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+            rows.append(f"| `{room}.{path.parent.name}` | {_plain(about.partition(_BLANK)[0])} |")
+    return "\n".join(rows)
 
 
 def facts() -> str:
@@ -171,14 +203,15 @@ def _section(path: str, model: type[BaseModel]) -> str:
     return f"## {heading}\n\n{_plain(about.partition(_BLANK)[0])}\n\n{table}\n"
 
 
-def explanations(model: type[BaseModel]) -> dict[str, str]:
-    """Return what the docstrings below the keys of a table say."""
+def explanations(model: type[Any]) -> dict[str, str]:
+    """Return what the docstrings below the keys of a table, or the values of a kind, say."""
     tree = ast.parse(textwrap.dedent(inspect.getsource(model))).body[0]
     assert isinstance(tree, ast.ClassDef)  # noqa: S101 - for the types
     found, key = {}, ""
     for node in tree.body:
-        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            key = node.target.id
+        target = getattr(node, "target", None) or getattr(node, "targets", [None])[0]
+        if isinstance(target, ast.Name):
+            key = target.id
         elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and key:
             found[key] = inspect.cleandoc(str(node.value.value))
     return found

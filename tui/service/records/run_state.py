@@ -34,6 +34,7 @@ class RunState(StrEnum):
     DUE = "due"
     """Planned, or waiting for another run to end."""
     RECORDING = "recording"
+    """Its window is being recorded."""
     ESTIMATING = "estimating"
     """Recorded, and being repaired, estimated and reported."""
     DONE = "done"
