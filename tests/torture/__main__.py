@@ -71,10 +71,8 @@ TAIL = """
   `huddle verify` calls intact, plain h5py must read, within ten seconds.
 - *Database*: one bit or page of 300 runs, or the end, is changed. The next start must have all
   runs. SQLite has no checksums: a changed bit of a number is not seen.
-- *Bench files*: one to three lines are lost, repeated, exchanged, or get another value or byte.
 - *Clocks*, *day*: at 20 times real time the clock is set by −25 to 30 min; the day has a leap
   second and the end of summer time. Each due time has one row; growth is at most 50 kB a run.
-- *Starved recorder*: a busy process for each processor beside recorder and played devices.
 """
 
 
@@ -196,7 +194,7 @@ def _history(share: float, folder: Path) -> Iterator[Row]:
 def _clocks(share: float, _: Path) -> Iterator[Row]:
     n = _share(CLOCK_STEPS, share)
     found, remarks = soak(60.0 * n, n_steps=n)
-    yield Row("clock set while a service runs", n, found, f" ({'; '.join(remarks)})")
+    yield Row("clock set while a service runs", n, found, f" ({_brief(remarks)})")
 
 
 def _starved(share: float, _: Path) -> Iterator[Row]:
@@ -209,7 +207,7 @@ def _day(share: float, _: Path) -> Iterator[Row]:
     seconds = DAY / RATE * share
     found, remarks = soak(seconds, n_steps=round(STEPS_OF_DAY * share))
     hours = seconds * RATE / 3600
-    yield Row(f"service of {hours:.1f} h, accelerated", 1, found, f" ({'; '.join(remarks)})")
+    yield Row(f"service of {hours:.1f} h, accelerated", 1, found, f" ({_brief(remarks)})")
 
 
 _KINDS = {
@@ -225,6 +223,11 @@ _KINDS = {
     "accelerated day": _day,
 }
 _WAITING = ("clocks", "accelerated day")
+
+
+def _brief(remarks: list[str]) -> str:
+    """Return the remarks of a service that the page shows."""
+    return "; ".join(each for each in remarks if not each.startswith(("kills", "reasons")))
 
 
 def _share(n: int, share: float) -> int:

@@ -22,7 +22,7 @@ from estimator.self_noise.result import Flag
 from tui import __version__
 from tui.output.calibration import channels_of
 from tui.output.json_diagnostics import diagnostics_document
-from tui.output.json_values import plain
+from tui.output.json_values import json_text, plain
 from tui.output.noise_parameters import noise_parameters_document
 
 if TYPE_CHECKING:
@@ -103,9 +103,6 @@ def provenance(result: Result, *, with_recordings: bool = True) -> dict[str, str
     """
     snapshot = result.snapshot
     start_ns = snapshot.start_utc_ns
-    facts = [  # an attribute of HDF5 has 64 KiB
-        {"kind": each.name, "rank": each.rank, "line": each.words.line} for each in result.all_facts
-    ]
     recordings = [
         {"file": each.path.name, "run_id": each.run_id, "sha256": each.sha256 or None}
         for each in (result.sources if with_recordings else ())
@@ -118,8 +115,8 @@ def provenance(result: Result, *, with_recordings: bool = True) -> dict[str, str
         "history": f"estimated by huddle-bench {__version__}",
         "confidence_of_intervals": "0.95",
         "unit_of_densities": f"({snapshot.unit})²/Hz",
-        "verdict": "none" if result.verdict is None else result.verdict.verdict.value,
-        "facts": json.dumps(facts, ensure_ascii=False),
+        "verdict": "none" if result.verdict is None else result.verdict.verdict,
+        "facts": json_text(facts_document(result.all_facts)),
         "simulated": str(snapshot.simulated).lower(),
         "flags": json.dumps({str(flag.name).lower(): int(flag) for flag in Flag}),
         "settings": json.dumps(_settings(result), ensure_ascii=False),

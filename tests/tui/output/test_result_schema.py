@@ -138,15 +138,6 @@ def test_a_script_has_the_document_of_the_command(written: Written) -> None:
     assert document["verdict"] == written.document["verdict"]
 
 
-def test_saved_curves_have_the_verdict_and_the_facts(written: Written, tmp_path: Path) -> None:
-    huddle.estimate(written.recording, segment="1s").save(tmp_path / "night.nc")
-    said = huddle.load(tmp_path / "night.nc").attrs
-    assert said["verdict"] == written.document["verdict"] == "not-decided"
-    keys = ("kind", "rank", "line")
-    wanted = [{key: fact[key] for key in keys} for fact in written.document["facts"]]
-    assert json.loads(said["facts"]) == wanted
-
-
 def test_it_says_what_it_was_made_from(written: Written) -> None:
     (recording,) = written.document["recordings"]
     content = written.recording.read_bytes()
