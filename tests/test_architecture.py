@@ -68,7 +68,7 @@ def test_headless_commands_never_load_textual_nor_what_only_terminals_need(comma
 ARRAYS_IN = {"notebook", "report", "simulation", "studies"}
 """Packages of the front ends that take or draw arrays."""
 ARRAYS_OF = {
-    "application/bench_view/sensors.py",
+    "application/bench_view/sensors.py", "application/signal_view/picture.py",
     "application/test_view/braille.py", "application/test_view/clocks.py",
     "application/test_view/curves.py",
     "application/test_view/panels.py", "application/test_view/plot.py",

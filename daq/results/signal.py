@@ -116,7 +116,7 @@ class Mark:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SignalView:
+class Waveforms:
     """A span of a recording; `marks` are in the order of their beginnings."""
 
     begin: float
@@ -133,11 +133,10 @@ class SignalView:
         """Return the column of a time, which may lie outside."""
         return int(np.floor((time - self.begin) / (self.end - self.begin) * self.n_columns))
 
-    def near(self, time: float) -> Mark | None:
-        """Return the mark in the column of a time: the shortest one."""
+    def near(self, time: float) -> list[Mark]:
+        """Return the marks in the column of a time."""
         column = self.column_of(time)
-        here = [m for m in self.marks if self.column_of(m.begin) <= column <= self.column_of(m.end)]
-        return min(here, key=lambda mark: mark.end - mark.begin, default=None)
+        return [m for m in self.marks if self.column_of(m.begin) <= column <= self.column_of(m.end)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,6 +173,29 @@ class Spectrogram:
             return 0.0, 1.0
         low, high = (float(each) for each in np.percentile(known, (2, 99)))
         return low, max(high, low + 1.0)
+
+    def grid(
+        self, begin: float, end: float, n_columns: int, n_rows: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return what a picture of a span shows.
+
+        Returns
+        -------
+        frequency : float64, shape (n_rows,)
+            Of the middle of each row, ascending.
+        share : float64, shape (n_rows, n_columns)
+            Level from 0 to 1 of `range_db`; NaN where it is not known.
+        """
+        times = begin + (np.arange(n_columns) + 0.5) * (end - begin) / n_columns
+        edges = np.geomspace(self.frequency[0], self.frequency[-1], n_rows + 1)
+        middle = np.sqrt(edges[1:] * edges[:-1])
+        part = np.searchsorted(self.times, times, side="right") - 1
+        band = np.searchsorted(self.frequency, middle, side="right") - 1
+        inside = (part >= 0) & (part < len(self.psd))
+        level = np.full((n_rows, n_columns), np.nan)
+        level[:, inside] = self.level_db[part[inside]][:, np.minimum(band, self.psd.shape[1] - 1)].T
+        low, high = self.range_db
+        return middle, np.clip((level - low) / (high - low), 0, 1)
 
 
 class _Sensor:
@@ -284,7 +306,7 @@ class Signal:
         """Events, gaps, and stretches at the end of the range, in order."""
         return self._marks
 
-    def view(self, begin: float, end: float, n_columns: int) -> SignalView:
+    def view(self, begin: float, end: float, n_columns: int) -> Waveforms:
         """Return a span in columns.
 
         Raises
@@ -309,7 +331,7 @@ class Signal:
                     )
                 )
         here = [mark for mark in self._marks if mark.begin < end and mark.end >= begin]
-        return SignalView(begin, end, tuple(traces), joined(here, (end - begin) / n_columns))
+        return Waveforms(begin, end, tuple(traces), joined(here, (end - begin) / n_columns))
 
     def _all_marks(self) -> Iterable[Mark]:
         monotonic_ns, utc_ns = self._created
@@ -491,3 +513,34 @@ def in_bands(found: Spectrogram, n_bands: int) -> Spectrogram:
         inside = found.psd[:, : edges[-1]]
         psd = np.add.reduceat(inside, edges[:-1], axis=1) / np.diff(edges)
     return replace(found, frequency=found.frequency[edges], psd=psd)
+
+
+SHORTEST = 0.02
+"""Seconds that are shown at least."""
+
+
+def zoomed(
+    span: tuple[float, float], whole: tuple[float, float], factor: float, about: float | None = None
+) -> tuple[float, float]:
+    """Return a span this factor as long: closer about a time, no shorter than `SHORTEST`."""
+    begin, end = span
+    about = (begin + end) / 2 if about is None else min(max(about, begin), end)
+    factor = max(factor, SHORTEST / (end - begin))
+    return fitting((about - factor * (about - begin), about + factor * (end - about)), whole)
+
+
+def fitting(span: tuple[float, float], whole: tuple[float, float]) -> tuple[float, float]:
+    """Return a span moved into the whole, or else the whole."""
+    length = span[1] - span[0]
+    if length >= whole[1] - whole[0]:
+        return whole
+    begin = min(max(span[0], whole[0]), whole[1] - length)
+    return begin, begin + length
+
+
+def panned(
+    span: tuple[float, float], whole: tuple[float, float], share: float
+) -> tuple[float, float]:
+    """Return a span moved by a share of its length."""
+    shift = share * (span[1] - span[0])
+    return fitting((span[0] + shift, span[1] + shift), whole)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from textual.app import ComposeResult
 
 GLOBAL_KEYS = (
-    ("1 2 3 4", "the views: bench, test, result, recordings"),
+    ("1 … 5", "the views: bench, test, result, recordings, signal"),
     ("ctrl+p", "all commands by name"),
     ("q", "quit, as Ctrl-C does; a recording continues, and is found again"),
 )
@@ -110,18 +110,20 @@ class TextScreen(ModalScreen[None]):
 class MarkScreen(ModalScreen[str | None]):
     """Asks what to write beside a mark."""
 
+    TITLE_TEXT, HINT = "mark", "what happened, such as: door slammed"
+    DOES, EMPTY = "marks", "mark"
     BINDINGS: ClassVar[list[BindingType]] = [Binding("escape,ctrl+c", "dismiss(None)", "Cancel")]
 
     def compose(self) -> ComposeResult:
         """Lay out the question."""
-        entry = Input(placeholder="what happened, such as: door slammed", max_length=200)
-        entry.border_title = "mark"
-        entry.border_subtitle = "enter marks · esc cancels"
+        entry = Input(placeholder=self.HINT, max_length=200)
+        entry.border_title = self.TITLE_TEXT
+        entry.border_subtitle = f"enter {self.DOES} · esc cancels"
         yield entry
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
         """Hand over the remark."""
-        self.dismiss(event.value.strip() or "mark")
+        self.dismiss(event.value.strip() or self.EMPTY)
 
 
 class QuestionScreen(ModalScreen[bool]):

@@ -34,6 +34,8 @@ from tui.application.messages import (
 from tui.application.recordings_view.view import RecordingsView
 from tui.application.reference import reference_of
 from tui.application.result_view.view import ResultView
+from tui.application.signal_view.source import SignalSource
+from tui.application.signal_view.view import SignalView
 from tui.application.state import BENCH, RESULT, TEST, TITLES, VIEWS, State
 from tui.application.test_view.panels import note
 from tui.application.test_view.recent_motion import RecentMotion, with_advice
@@ -57,6 +59,7 @@ if TYPE_CHECKING:
     from tui.application.controls import Controls
 
 Outcome = TypeVar("Outcome")
+KINDS: tuple[type[View], ...] = (BenchView, TestView, ResultView, RecordingsView, SignalView)
 CURVE_GROWTH = 0.01  # of the segments, from which on curves change to the eye
 DIAGNOSES = 0.4  # of the cost of estimates: five triaxial sensors are diagnosed within a minute
 
@@ -89,8 +92,8 @@ class FollowingApp(ThemedApp[None]):
         self._recent, self._is_moved = RecentMotion(), False
         self._bench = controls.bench
         self._reading = threading.Lock()  # HDF5 shares what it knows of a file among its readers
-        views: tuple[type[View], ...] = (BenchView, TestView, ResultView, RecordingsView)
-        for view in views:
+        self._signals = SignalSource()
+        for view in KINDS:
             self.add_mode(view.VIEW, partial(self._new_view, view))
         self.set_reactive(FollowingApp.state, self._state_of(None))
 
@@ -109,12 +112,15 @@ class FollowingApp(ThemedApp[None]):
     def _new_view(self, kind: type[View]) -> View:
         if kind is BenchView:
             return BenchView(self.state, self._controls)
+        if kind is SignalView:
+            return SignalView(self.state, self._signals)
         return kind(self.state)
 
     def on_unmount(self) -> None:
         """Stop following the recording; its recorder continues."""
         self._quitting.set()
         self._ended.set()
+        self._signals.close()
 
     # ---------------------------------------------------------------------- views
 
@@ -133,7 +139,7 @@ class FollowingApp(ThemedApp[None]):
         for name in VIEWS:
             title = f"View: {TITLES[name]}"
             yield SystemCommand(title, f"Show the {name} view", partial(self.action_view, name))
-        for view in (BenchView, TestView, ResultView, RecordingsView):
+        for view in KINDS:
             for title, action in view.TASKS:
                 target = self if action.startswith("app.") else screen
                 is_here = target is self or getattr(screen, "VIEW", "") == view.VIEW
@@ -178,6 +184,7 @@ class FollowingApp(ThemedApp[None]):
                     cancelled=ended,
                     growth=CURVE_GROWTH,
                     of_diagnoses=DIAGNOSES,
+                    look=self._signals.look,
                 )
             except (HuddleError, EstimatorError, OSError) as error:
                 messenger.error(error)

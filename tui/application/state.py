@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from daq.recording.monitor import RecordingStatus
     from daq.results.result import Result
 
-BENCH, TEST, RESULT, RECORDINGS = VIEWS = ("bench", "test", "result", "recordings")
-TITLES: Final = {BENCH: "Bench", TEST: "Test", RESULT: "Result", RECORDINGS: "Recordings"}
+VIEWS = ("bench", "test", "result", "recordings", "signal")
+BENCH, TEST, RESULT, RECORDINGS, SIGNAL = VIEWS
+TITLES: Final = {name: name.capitalize() for name in VIEWS}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

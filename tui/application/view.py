@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 MUTED, BAD = "#9aa5b8", "bold #ff6b6b"
 TALL = 34  # rows from which there is room for remarks and air
-ALL_TABS = 60  # columns from which the titles of all views fit
+ALL_TABS = 70  # columns from which the titles of all views fit
 
 
 COMMON_KEYS: tuple[Binding, ...] = (

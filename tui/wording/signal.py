@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from datetime import UTC, datetime
+from datetime import UTC, datetime, time
 from typing import TYPE_CHECKING
 
 from daq.results.signal import CLIPPED, EXCLUDED, GAP
 from tui.wording.formatting import readings
 
 if TYPE_CHECKING:
-    from daq.results.signal import Mark, SignalView, Trace
+    from collections.abc import Sequence
+
+    from daq.results.signal import Mark, Trace, Waveforms
 
 STEPS = (
     *(s * 10.0**e for e in (-3, -2, -1) for s in (1, 2, 5)),
@@ -20,7 +22,7 @@ STEPS = (
 )
 """Seconds between ticks of time; beyond them whole days."""
 _DAY = 86400.0
-SHORT = {"mark": "▼", EXCLUDED: "✗", GAP: "░", CLIPPED: "▲"}
+SIGNS = {"mark": "▼", EXCLUDED: "✗", GAP: "░", CLIPPED: "▲"}
 """Signs of marks; of all other kinds `EVENT`."""
 EVENT = "◆"
 
@@ -33,22 +35,40 @@ def time_ticks(begin: float, end: float, most: int) -> list[tuple[float, str]]:
     return [(n * step, _label(n * step, step)) for n in range(first, math.floor(end / step) + 1)]
 
 
-def _label(time: float, step: float) -> str:
-    moment = datetime.fromtimestamp(round(time, 3), UTC)
+def _label(at: float, step: float) -> str:
+    of = datetime.fromtimestamp(round(at, 3), UTC)
     if step >= _DAY:
-        return f"{moment:%m-%d}"
+        return f"{of:%m-%d}"
     if step >= 60:
-        return f"{moment:%H:%M}"
+        return f"{of:%H:%M}"
     digits = max(0, math.ceil(-math.log10(step) - 1e-9))
-    return f"{moment:%H:%M:%S}" + f".{moment.microsecond:06d}"[: digits + 1] * bool(digits)
+    return f"{of:%H:%M:%S}" + f".{of.microsecond:06d}"[: digits + 1] * bool(digits)
 
 
-def moment(time: float, *, fine: bool = False) -> str:
+def moment(at: float, *, fine: bool = False) -> str:
     """Return a time as date and time of UTC to the second, or to the millisecond."""
-    return f"{datetime.fromtimestamp(time, UTC):%Y-%m-%d %H:%M:%S.%f}"[: 23 if fine else 19]
+    return f"{datetime.fromtimestamp(at, UTC):%Y-%m-%d %H:%M:%S.%f}"[: 23 if fine else 19]
 
 
-def title(view: SignalView) -> str:
+def time_of(text: str, near: float, whole: tuple[float, float]) -> float | None:
+    """Return a time of UTC; of a time of day without a date, the first after that of `near`.
+
+    None where it is none, or not within the whole.
+    """
+    begin, end = whole
+    try:
+        at = datetime.fromisoformat(text.strip()).replace(tzinfo=UTC).timestamp()
+    except ValueError:
+        day = datetime.fromtimestamp(near, UTC).date()
+        try:
+            at = datetime.combine(day, time.fromisoformat(text.strip()), UTC).timestamp()
+        except ValueError:
+            return None
+        at = next((each for each in (at, at + _DAY, at - _DAY) if begin <= each <= end), at)
+    return at if begin <= at <= end else None
+
+
+def title(view: Waveforms) -> str:
     """Return the span of a view."""
     begin, end = moment(view.begin), moment(view.end)
     return f"{begin} to {end[11:] if begin[:10] == end[:10] else end} UTC"
@@ -63,9 +83,15 @@ def words(mark: Mark) -> str:
     return " ".join(filter(None, parts)) + (f": {mark.text}" if mark.text else "")
 
 
+def most_first(marks: Sequence[Mark]) -> list[Mark]:
+    """Return remarks, what is excluded, gaps, and clipped stretches, in this order, then events."""
+    order = list(SIGNS)
+    return sorted(marks, key=lambda m: order.index(m.kind) if m.kind in SIGNS else len(order))
+
+
 def sign(mark: Mark) -> str:
     """Return the sign of a mark."""
-    return SHORT.get(mark.kind, EVENT)
+    return SIGNS.get(mark.kind, EVENT)
 
 
 def extent(trace: Trace) -> str:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from daq.estimation.snapshot import Snapshot
-    from daq.results.signal import Mark, Signal, SignalView, Spectrogram, Trace
+    from daq.results.signal import Mark, Signal, Spectrogram, Trace, Waveforms
 
 COLUMNS, TIMES, BANDS, TICKS = 1200, 160, 60, 6
 TRACE_HEIGHT, SPECTRUM_HEIGHT = 0.36, 0.7
@@ -87,7 +87,7 @@ def _time_axis(axes: Axes, span: tuple[float, float], most: int = TICKS) -> None
     axes.xaxis.set_major_formatter(FuncFormatter(lambda at, _: ticks.get(at, "")))
 
 
-def _draw_waveforms(view: SignalView, axes: Axes) -> None:
+def _draw_waveforms(view: Waveforms, axes: Axes) -> None:
     times = np.linspace(view.begin, view.end, 2 * view.n_columns + 1)[1::2]
     for row, trace in enumerate(view.traces):
         low, high = trace.scaled

@@ -1,0 +1,165 @@
+"""The Signal view: what is drawn of a recording, and what keys and the mouse do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.recording.reader import Recording
+from daq.results.signal import Signal
+from tests.tui.application.screen_text import assert_looks_as_before, resized, screen_text
+from tests.tui.example_snapshot import ProgressCallback
+from tests.tui.night_recording import record
+from tests.waiting import limit
+from tui.application.app import HuddleApp
+from tui.application.messages import RecordingOpened
+from tui.application.signal_view.picture import Drawn, Look, picture
+from tui.application.signal_view.view import SignalView
+from tui.wording.signal import time_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from textual.app import App
+    from textual.pilot import Pilot
+
+SIZES = {"small": (40, 12), "narrow": (80, 24), "middle": (120, 36), "wide": (160, 45)}
+START = 1_468_458_000.0
+"""UTC of the first sample: 2016-07-14 01:00."""
+
+
+def shown_view(app: App[None]) -> SignalView:
+    """Return the Signal view, which is shown."""
+    found = app.screen_stack[0]
+    assert isinstance(found, SignalView)
+    return found
+
+
+async def reached(pilot: Pilot[None], what: Callable[[], bool]) -> None:
+    """Wait until something is the case, which a thread brings about."""
+    for _ in range(round(limit(30) / 0.02)):
+        await pilot.pause(0.02)
+        if what():
+            return
+    pytest.fail("not reached")
+
+
+async def opened(pilot: Pilot[None], app: HuddleApp, path: Path) -> SignalView:
+    """Open a recording in the Signal view, and wait until it is estimated and drawn."""
+    app.post_message(RecordingOpened(path))
+    await reached(pilot, lambda: app.state.has_result)
+    await pilot.press("5")
+    await reached(pilot, lambda: "A.X" in screen_text(app))
+    return shown_view(app)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return record(tmp_path / "night.h5")
+
+
+@pytest.mark.parametrize("name", SIZES)
+async def test_pictures(path: Path, name: str) -> None:
+    """The whole recording; then a gap, closer up."""
+    app = HuddleApp(ProgressCallback(path))
+    async with app.run_test(size=SIZES[name]) as pilot:
+        view = await opened(pilot, app, path)
+        await assert_looks_as_before(pilot, f"{name}-signal")
+        if name == "narrow":
+            await pilot.press(*("t", *"01:00:10", "enter", "+", "+", "+", "+", "g"))
+            await reached(pilot, lambda: "A.X recorded" in screen_text(app))
+            await reached(pilot, lambda: view.look.span is not None)
+            await assert_looks_as_before(pilot, "narrow-signal-spectrum")
+            await resized(pilot, SIZES["wide"])
+            assert "01:00:10" in screen_text(app)
+
+
+async def test_keys_look_closer_and_go_along(path: Path) -> None:
+    """A zoom is about the cursor; escape shows all."""
+    app = HuddleApp(ProgressCallback(path))
+    async with app.run_test(size=SIZES["narrow"]) as pilot:
+        view = await opened(pilot, app, path)
+        await pilot.press("t", *"01:00:30", "enter")
+        assert view.look.cursor == START + 30
+        await pilot.press("+", "+")
+        assert view.look.span == pytest.approx((START + 22.5, START + 37.5), abs=0.1)
+        await pilot.press("right")
+        assert view.look.span == pytest.approx((START + 26.25, START + 41.25), abs=0.1)
+        await pilot.press("-", "-", "-")
+        assert view.look.span is None  # all of it again
+        await pilot.press("down", "down")
+        assert view.look.channel == 2
+        await pilot.press("escape")
+        assert view.look == Look(channel=2)
+
+
+async def test_the_next_mark_is_read_off(path: Path) -> None:
+    """At the cursor: when, what, which sensor."""
+    app = HuddleApp(ProgressCallback(path))
+    async with app.run_test(size=SIZES["middle"]) as pilot:
+        view = await opened(pilot, app, path)
+        await pilot.press("+", "t", *"01:00:09.5", "enter", "n")
+        await reached(pilot, lambda: "B gap: cable" in screen_text(app))
+        assert view.look.cursor == pytest.approx(START + 10, abs=0.1)
+        await pilot.press("N")
+        assert view.look.cursor == pytest.approx(START + 9, abs=0.1)
+
+
+async def test_the_mouse_zooms_drags_and_places_the_cursor(path: Path) -> None:
+    """About the pointer, as far as it is moved, where it clicks."""
+    app = HuddleApp(ProgressCallback(path))
+    async with app.run_test(size=SIZES["narrow"]) as pilot:
+        view = await opened(pilot, app, path)
+        await pilot.click("#signal", offset=(17 + 31, 5))
+        assert view.look.cursor == pytest.approx(START + 30, abs=1)
+        view.action_zoom(0.25, START + 30)
+        before = view.look.span
+        assert before is not None
+        await pilot.mouse_down("#signal", offset=(40, 5))
+        await pilot.hover("#signal", offset=(30, 5))
+        await pilot.mouse_up("#signal", offset=(30, 5))
+        after = view.look.span
+        assert after is not None
+        moved = 10 / 62 * (before[1] - before[0])
+        assert after == pytest.approx((before[0] + moved, before[1] + moved), abs=0.1)
+        assert view.look.cursor == pytest.approx(START + 30, abs=1)  # that was no click
+
+
+async def test_without_a_recording_it_says_where_there_are_some(tmp_path: Path) -> None:
+    """And offers no keys that do nothing."""
+    app = HuddleApp(ProgressCallback(tmp_path / "run.h5"))
+    async with app.run_test(size=SIZES["narrow"]) as pilot:
+        await pilot.press("5")
+        await pilot.pause()
+        text = screen_text(app)
+        assert "4 lists them" in text
+        assert "Zoom" not in text
+
+
+def test_a_spike_is_drawn_where_it_is(path: Path) -> None:
+    """And nothing where a sensor has no samples."""
+    with Recording.open(path) as recording:
+        waves = Signal(recording).view(START, START + 60, 2 * 64)
+    found = picture(Drawn(waves), Look(cursor=START + 10.5), 80, 24).plain.splitlines()
+    row = next(line for line in found if line[1:].startswith("B.X"))
+    columns = [n for n, character in enumerate(row[16:]) if character == " "]
+    assert np.array(columns) * 60 / 64 == pytest.approx(np.full(len(columns), 10.65), abs=1.5)
+    assert found[-3][16:].strip()
+    assert "no sample" not in found[-1]
+    other = replace(Look(channel=2), cursor=START + 10.5)
+    assert "B.X no sample" in picture(Drawn(waves), other, 80, 24).plain.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("01:00:30", 30), ("2016-07-14 01:00:30", 30), ("02:00", None), ("soon", None)],
+)
+def test_a_time_as_people_write_it(text: str, seconds: float | None) -> None:
+    """Within the recording; of another day if that is in it."""
+    found = time_of(text, START, (START, START + 60))
+    assert found == (None if seconds is None else START + seconds)
+    assert time_of("00:30", START, (START, START + 86400)) == START + 23.5 * 3600

@@ -1,0 +1,1 @@
+"""The Signal view: a recording against time."""
