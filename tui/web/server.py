@@ -63,6 +63,7 @@ from tui.web.html import page
 from tui.web.live import Live
 from tui.web.months import Months
 from tui.web.pages import about_test
+from tui.web.signal import Look, Opened, drawn, steps
 from tui.web.tests import PAGE, NoSuchTestError, Tests, compared, content_of
 from tui.web.work import TooMuchWorkError, Work
 from tui.wording.verdict_text import WORDS
@@ -312,6 +313,8 @@ class Server:
             ("/tests", read, self._list, "GET"),
             (test, read, self._test, "GET"),
             (f"{test}/curves", read, self._test_curves, "GET"),
+            (f"{test}/signal", read, self._signal, "GET"),
+            (f"{test}/signal/picture", read, self._signal_picture, "GET"),
             (f"{test}/report.html", read, self._report, "GET"),
             (f"{test}/report.pdf", read, self._report, "GET"),
             (f"{test}/result.json", read, self._json, "GET"),
@@ -574,6 +577,60 @@ class Server:
         if state is None:
             return Response("the estimate is being made", HTTPStatus.SERVICE_UNAVAILABLE)
         return await self._curves(state, request.query_params)
+
+    async def _looked(self, request: Request, asked: Mapping[str, str]) -> dict[str, Any] | None:
+        """Return what is asked to be seen of a recording against time.
+
+        None while it is read, or estimated where a spectrogram is asked for.
+
+        Raises
+        ------
+        ValueError
+            If nothing of it is asked for.
+        """
+        key = await run_in_threadpool(self._tests.key_of, request.path_params["name"])
+        act = partial(Opened.of, key[0])
+        opened = await self._made(request, self._tests.work, ("signal", key), act, PATIENCE)
+        if opened is None:
+            return None
+        look = Look.of(opened.signal, asked)
+        snapshot = None
+        if look.spectrum:
+            state = await self._state(request)
+            if state is None:
+                return None
+            snapshot = state.snapshot
+        found = await run_in_threadpool(drawn, opened, look, snapshot)
+        return {**found, "is_simulated": opened.signal.recording.simulated}
+
+    async def _signal(self, request: Request) -> Response:
+        problem = ""
+        try:
+            about = await self._looked(request, request.query_params)
+        except (ValueError, OverflowError, IndexError) as error:
+            problem, about = str(error), await self._looked(request, {})
+        if about is None:
+            return self._later(request)
+        name = request.path_params["name"]
+        return self._page(
+            request,
+            "signal",
+            title=f"{name.removesuffix('.h5')}, signal",
+            test=name.removesuffix(".h5"),
+            base=f"/tests/{quote(name)}",
+            steps=steps(about["look"].span, about["whole"]),
+            problem=problem,
+            **about,
+        )
+
+    async def _signal_picture(self, request: Request) -> Response:
+        try:
+            about = await self._looked(request, request.query_params)
+        except (ValueError, OverflowError, IndexError) as error:
+            return Response(str(error), HTTPStatus.BAD_REQUEST)
+        if about is None:
+            return Response("the recording is being read", HTTPStatus.SERVICE_UNAVAILABLE)
+        return HTMLResponse(about["picture"])
 
     async def _report(self, request: Request) -> Response:
         suffix = ".pdf" if request.scope["path"].endswith(".pdf") else ".html"

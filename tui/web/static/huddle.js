@@ -144,6 +144,76 @@ function curves() {
   return load;
 }
 
+/* ------------------------------------------------- a recording against time */
+
+function signal() {
+  const box = byId("signal");
+  if (!box) return;
+  const form = byId("looking"), LEFT = Number(box.dataset.left), LEAST = 0.02;
+  const whole = box.dataset.whole.split(" ").map(Number);
+  let span = box.dataset.span.split(" ").map(Number), isLoading = false, isOld = false, drag = null;
+  byId("how").hidden = false;
+
+  const query = () => new URLSearchParams({ from: span[0], to: span[1], channel: form.elements.channel.value, spectrum: form.elements.spectrum.value });
+
+  async function load() {
+    if (isLoading) { isOld = true; return; }
+    isLoading = true;
+    do {
+      isOld = false;
+      const asked = query();
+      const answer = await fetch(`${box.dataset.source}?${asked}`).catch(() => null);
+      if (!answer || !answer.ok) continue;
+      box.innerHTML = await answer.text(); // escaped by the server
+      box.dataset.span = span.join(" ");
+      history.replaceState(null, "", `?${asked}`);
+    } while (isOld);
+    isLoading = false;
+  }
+
+  function show(begin, end) {
+    const length = Math.min(end - begin, whole[1] - whole[0]);
+    const first = Math.min(Math.max(begin, whole[0]), whole[1] - length);
+    span = [first, first + length];
+    [form.elements.from.value, form.elements.to.value] = span;
+    load();
+  }
+
+  function zoom(factor, about = (span[0] + span[1]) / 2) {
+    const used = Math.max(factor, LEAST / (span[1] - span[0]));
+    show(about - used * (about - span[0]), about + used * (span[1] - about));
+  }
+
+  const share = (event) => {
+    const { left, width } = box.querySelector("svg").getBoundingClientRect();
+    return ((event.clientX - left) / width - LEFT) / (1 - LEFT);
+  };
+  const inPicture = (event) => event.target.closest("svg") && share(event) >= 0;
+  const pan = (by) => show(span[0] + by * (span[1] - span[0]), span[1] + by * (span[1] - span[0]));
+
+  box.addEventListener("wheel", (event) => {
+    if (!inPicture(event)) return;
+    event.preventDefault();
+    zoom(event.deltaY > 0 ? 2 : 0.5, span[0] + share(event) * (span[1] - span[0]));
+  }, { passive: false });
+  box.addEventListener("pointerdown", (event) => {
+    if (!inPicture(event)) return;
+    drag = { at: share(event), span };
+    box.setPointerCapture(event.pointerId);
+  });
+  box.addEventListener("pointermove", (event) => {
+    if (!drag) return;
+    const by = (drag.at - share(event)) * (drag.span[1] - drag.span[0]);
+    show(drag.span[0] + by, drag.span[1] + by);
+  });
+  for (const end of ["pointerup", "pointercancel"]) box.addEventListener(end, () => { drag = null; });
+  box.addEventListener("keydown", (event) => {
+    const act = { ArrowLeft: () => pan(-0.25), ArrowRight: () => pan(0.25), "+": () => zoom(0.5), "=": () => zoom(0.5), "-": () => zoom(2), Escape: () => show(...whole) }[event.key];
+    if (act && !event.ctrlKey && !event.metaKey) { event.preventDefault(); act(); }
+  });
+  form.addEventListener("change", (event) => { if (event.target.name !== "at") load(); });
+}
+
 /* ------------------------------------------------------------- the running test */
 
 function live(reload) {
@@ -208,3 +278,4 @@ function live(reload) {
 }
 
 live(curves());
+signal();

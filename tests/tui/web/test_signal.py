@@ -1,0 +1,129 @@
+"""The page of a recording against time: as HTML, and in a browser with wheel, drag and keys."""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from markupsafe import escape
+
+from tests.tui.night_recording import HOSTILE
+from tests.tui.web.conftest import SIZES, opened
+from tests.tui.web.pages import Server, Visit
+from tests.waiting import wait_until
+from tui.web.signal import png
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+PAGE = "tests/night.h5/signal"
+START = 1_468_458_000.0
+
+
+def span(page: Page) -> tuple[float, float]:
+    """Return the span that is shown, in s after the start."""
+    begin, end = str(page.locator("#signal").get_attribute("data-span")).split()
+    return float(begin) - START, float(end) - START
+
+
+def test_the_picture_has_every_channel_and_the_gap(server: Server) -> None:
+    """As text of a vector graphic; names of sensors cannot write tags."""
+    visit = Visit(server.url)
+    text = visit.get(f"/{PAGE}").text
+    assert text.count('class="wave') == 8
+    assert "B gap: cable pulled" in text
+    assert "<script>alert" not in text
+    assert str(escape(HOSTILE)) in text
+    closer = visit.get(f"/{PAGE}?from={START + 20}&to={START + 30}").text
+    assert "2016-07-14 01:00:20 to 01:00:30 UTC" in closer
+    assert "cable pulled" not in closer
+
+
+def test_a_time_is_found_and_nonsense_is_answered(server: Server) -> None:
+    """With the whole recording and why; pictures of nonsense are refused."""
+    visit = Visit(server.url)
+    assert "01:00:00 to 01:00:59" in visit.get(f"/{PAGE}?at=01:00:30").text
+    answer = visit.get(f"/{PAGE}?at=soon")
+    assert answer.status == 200
+    assert "expected a time as 03:12" in answer.text
+    for asked in ("from=1e300&to=nan", "from=5&to=5", "channel=99", "channel=-1", "spectrum=x"):
+        assert visit.get(f"/{PAGE}/picture?{asked}").status == 400
+        assert visit.get(f"/{PAGE}?{asked}").status == 200
+    assert visit.get("/tests/other.h5/signal").status == 404
+
+
+def test_a_spectrogram_is_a_picture_in_the_page(server: Server) -> None:
+    """With its frequencies and levels in text."""
+    visit = Visit(server.url)
+    wait_until(
+        lambda: "data:image/png" in visit.get(f"/{PAGE}?spectrum=recorded").text, "it is estimated"
+    )
+    text = visit.get(f"/{PAGE}?spectrum=recorded&channel=2").text
+    assert re.search(r"−\d+ to −\d+ dB re 1 \(m/s²\)²/Hz", text)
+    assert " Hz</text>" in text
+
+
+def test_the_png_is_one() -> None:
+    """Its lines have as many pixels as it says; what is not known is transparent."""
+    content = png(np.array([[0.0, 0.5, 1.0], [np.nan, 1.0, 0.0]]))
+    width, height = struct.unpack(">II", content[16:24])
+    assert (width, height) == (3, 2)
+    data = content[content.index(b"IDAT") + 4 : content.index(b"IEND") - 8]
+    rows = np.frombuffer(zlib.decompress(data), np.uint8).reshape(2, 13)
+    assert rows[:, 0].tolist() == [0, 0]
+    assert rows[:, 4::4].tolist() == [[255, 255, 255], [0, 255, 255]]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_it_fits_and_has_no_barrier(
+    server: Server, browser: Browser, wrong: list[str], size: str
+) -> None:
+    """On a desk and a phone."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+    page = opened(browser, wrong, size)
+    page.goto(server.url + PAGE)
+    assert page.evaluate("document.documentElement.scrollWidth") <= SIZES[size][0]
+    found = axe.run(page).response["violations"]
+    assert [(each["id"], each["nodes"][0]["html"]) for each in found] == []
+
+
+def test_wheel_drag_and_keys(server: Server, browser: Browser, wrong: list[str]) -> None:
+    """The picture follows; the address is that of what is seen."""
+    page = opened(browser, wrong)
+    page.goto(server.url + PAGE)
+    box = page.locator("svg.signal").bounding_box()
+    assert box is not None
+    left, width = box["x"] + 0.11 * box["width"], 0.89 * box["width"]
+    page.mouse.move(left + width / 2, box["y"] + 50)
+    page.mouse.wheel(0, -100)
+    wait_until(lambda: span(page)[1] - span(page)[0] < 31, "it is zoomed")
+    assert span(page) == pytest.approx((15, 45), abs=0.5)
+    page.mouse.wheel(0, -100)
+    wait_until(lambda: span(page)[1] - span(page)[0] < 16, "it is zoomed")
+    page.mouse.down()
+    page.mouse.move(left + width / 4, box["y"] + 50, steps=4)
+    page.mouse.up()
+    wait_until(lambda: span(page)[0] > 26, "it is dragged")
+    assert span(page) == pytest.approx((26.25, 41.25), abs=0.5)
+    assert "01:00:26" in str(page.locator("svg.signal").get_attribute("aria-label"))
+    assert "from=" in page.url
+    page.locator("#signal").focus()
+    page.keyboard.press("Escape")
+    wait_until(lambda: span(page)[0] < 1, "all of it is back")
+
+
+def test_without_a_script_links_lead_on(server: Server, browser: Browser, wrong: list[str]) -> None:
+    """Closer, later, all."""
+    page = opened(browser, wrong, script=False)
+    page.goto(server.url + PAGE)
+    page.locator("a:text('Closer')").click()
+    assert span(page) == pytest.approx((15, 45), abs=0.5)
+    page.locator("a:text('Later')").click()
+    assert span(page) == pytest.approx((30, 60), abs=0.5)
+    page.locator("input[name=at]").fill("01:00:10")
+    page.locator("button:text('Show')").click()
+    assert span(page) == pytest.approx((0, 60), abs=0.5)

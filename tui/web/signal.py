@@ -1,0 +1,207 @@
+"""The page of a recording against time: a picture of each span, drawn here and replaced there."""
+
+from __future__ import annotations
+
+import base64
+import math
+import struct
+import threading
+import zlib
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from markupsafe import Markup
+
+from daq.recording.reader import Recording
+from daq.results.signal import Signal, fitting, panned, zoomed
+from tui.web.html import page
+from tui.web.work import check_wanted
+from tui.wording.signal import extent, most_first, sign, time_of, time_ticks, title, words
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from daq.estimation.snapshot import Snapshot
+    from daq.results.signal import Spectrogram, Waveforms
+    from estimator.types import FloatArray
+
+WIDTH, LEFT, ROW, TOP, LANE, AXIS = 1000, 110, 44, 6, 18, 24
+"""Of a picture in its own units: width, room for names, height of a waveform, and of the rest."""
+COLUMNS, SPECTRUM, BANDS = 445, 264, 66
+TICKS, FREQUENCIES = 7, 5
+MARKS = 40
+"""Marks that are listed below a picture."""
+AROUND = 300.0
+"""Seconds before and after a time that is asked for."""
+SPECTRA = {"": "waveforms", "recorded": "spectrogram, recorded", "noise": "spectrogram, noise"}
+_RAMP = ((17, 21, 28), (40, 60, 110), (45, 130, 160), (120, 200, 120), (253, 231, 76))
+"""Colours of levels from 0 to 1."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Opened:
+    """A recording whose signal is drawn by one visitor at a time."""
+
+    signal: Signal
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    @classmethod
+    def of(cls, path: Path) -> Opened:
+        """Open a recording. Blocks.
+
+        Raises
+        ------
+        HuddleError
+            If it cannot be read.
+        """
+        return cls(Signal(Recording.open(path), check_wanted))
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What a request asks to see: a span in s of UTC, a channel by number, a key of `SPECTRA`."""
+
+    span: tuple[float, float]
+    channel: int
+    spectrum: str
+
+    @classmethod
+    def of(cls, signal: Signal, asked: Mapping[str, str]) -> Look:
+        """Return what is asked for.
+
+        Raises
+        ------
+        ValueError
+            If that is nothing of the recording.
+        """
+        whole = signal.span
+        begin, end = (
+            float(asked.get(name, at)) for name, at in zip(("from", "to"), whole, strict=True)
+        )
+        if not (math.isfinite(begin) and math.isfinite(end) and begin < end):
+            raise ValueError("no such span")
+        span = zoomed(fitting((begin, end), whole), whole, 1.0)
+        if wanted := asked.get("at", "").strip():
+            at = time_of(wanted, span[0], whole)
+            if at is None:
+                raise ValueError(f"{wanted}: expected a time as 03:12, within the recording")
+            span = fitting((at - AROUND, at + AROUND), whole)
+        channel, spectrum = int(asked.get("channel", 0)), asked.get("spectrum", "")
+        if spectrum not in SPECTRA or channel < 0:
+            raise ValueError("no such channel or spectrum")
+        signal.channel(channel)
+        return cls(span, channel, spectrum)
+
+
+def drawn(opened: Opened, look: Look, snapshot: Snapshot | None) -> dict[str, Any]:
+    """Return what the page shows of a look. Blocks."""
+    with opened.lock:
+        signal = opened.signal
+        waves = signal.view(*look.span, COLUMNS)
+        found = None
+        if look.spectrum:
+            is_noise = look.spectrum == "noise"
+            found = signal.spectrogram(
+                look.channel, look.span, COLUMNS // 3, BANDS, snapshot=snapshot, noise=is_noise
+            )
+    body = SPECTRUM if look.spectrum else ROW * len(waves.traces)
+    values = {
+        "title": title(waves),
+        "width": WIDTH,
+        "left": LEFT,
+        "bottom": TOP + body,
+        "height": TOP + body + LANE + AXIS,
+        "row": ROW,
+        "top": TOP,
+        "look": look,
+        "traces": [] if look.spectrum else _traces(waves),
+        "spectrum": None if found is None else _spectrum(found, look.span),
+        "marks": _marks(waves),
+        "ticks": [(_x(waves, at), label) for at, label in time_ticks(*look.span, TICKS)],
+        "listed": [f"{sign(mark)} {words(mark)}" for mark in most_first(waves.marks)[:MARKS]],
+        "n_marks": len(waves.marks),
+    }
+    return {
+        "picture": Markup(page("signal_picture", **values)),  # noqa: S704 - it escapes all text
+        "look": look,
+        "whole": signal.span,
+        "channels": [trace.name for trace in waves.traces],
+        "spectra": SPECTRA,
+        "left": LEFT / WIDTH,
+    }
+
+
+def steps(span: tuple[float, float], whole: tuple[float, float]) -> list[tuple[str, float, float]]:
+    """Return what leads on from a span without a script: names, begins and ends."""
+    found = {
+        "Earlier": panned(span, whole, -0.5),
+        "Later": panned(span, whole, 0.5),
+        "Closer": zoomed(span, whole, 0.5),
+        "Further": zoomed(span, whole, 2.0),
+        "All": whole,
+    }
+    return [(name, *ends) for name, ends in found.items()]
+
+
+def _x(waves: Waveforms, at: float) -> float:
+    return LEFT + (WIDTH - LEFT) * (at - waves.begin) / (waves.end - waves.begin)
+
+
+def _traces(waves: Waveforms) -> list[tuple[str, str, str]]:
+    """Return name, extent, and a path of each channel: down and up in each column."""
+    x = LEFT + (np.arange(waves.n_columns) + 0.5) * (WIDTH - LEFT) / max(waves.n_columns, 1)
+    found = []
+    for number, trace in enumerate(waves.traces):
+        middle = TOP + ROW * (number + 0.5)
+        low, high = (middle - 0.46 * ROW * each for each in trace.scaled)
+        ends = zip(x, high, low, strict=True)
+        path = "".join(f"M{at:.1f} {a:.1f}V{b + 0.6:.1f}" for at, a, b in ends if math.isfinite(a))
+        found.append((trace.name, extent(trace), path))
+    return found
+
+
+def _marks(waves: Waveforms) -> list[tuple[float, float, str, str]]:
+    """Return begin and width of each mark, whether it is a moment, and its words."""
+    found = []
+    for mark in waves.marks:
+        begin, end = max(LEFT, _x(waves, mark.begin)), min(WIDTH, _x(waves, mark.end))
+        found.append((begin, max(2.0, end - begin), sign(mark), words(mark)))
+    return found
+
+
+def _spectrum(found: Spectrogram, span: tuple[float, float]) -> dict[str, Any]:
+    frequency, share = found.grid(*span, COLUMNS, BANDS)
+    rows = np.linspace(0, BANDS - 1, FREQUENCIES).round().astype(int).tolist()
+    low, high = found.range_db
+    return {
+        "image": base64.b64encode(png(share[::-1])).decode(),
+        "height": SPECTRUM,
+        "rows": [
+            (TOP + SPECTRUM * (1 - (row + 0.5) / BANDS), f"{frequency[row]:.3g} Hz") for row in rows
+        ],
+        "scale": f"{low:.0f} to {high:.0f} dB re 1 ({found.unit})²/Hz".replace("-", "−"),
+    }
+
+
+def png(share: FloatArray) -> bytes:
+    """Return values from 0 to 1, shape (n_rows, n_columns), as a picture in colours.
+
+    What is not known is transparent.
+    """
+    ramp = np.array(_RAMP, dtype=np.float64)
+    place = np.nan_to_num(share) * (len(ramp) - 1)
+    below = np.minimum(place.astype(int), len(ramp) - 2)
+    part = (place - below)[..., None]
+    colour = ramp[below] * (1 - part) + ramp[below + 1] * part
+    alpha = np.where(np.isfinite(share), 255, 0)[..., None]
+    pixels = np.concatenate([colour, alpha], axis=2).round().astype(np.uint8)
+    rows = np.pad(pixels.reshape(len(pixels), -1), ((0, 0), (1, 0)))  # each begins with a filter
+    size = struct.pack(">IIBBBBB", share.shape[1], share.shape[0], 8, 6, 0, 0, 0)
+    chunks = ((b"IHDR", size), (b"IDAT", zlib.compress(rows.tobytes(), 6)), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(content)) + kind + content
+        + struct.pack(">I", zlib.crc32(kind + content))
+        for kind, content in chunks
+    )  # fmt: skip
