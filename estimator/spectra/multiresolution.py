@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from functools import cache
 from itertools import takewhile
 from typing import TYPE_CHECKING
 
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 LOW, HIGH = 0.2, 0.4  # octave of a stage, as fractions of its rate
 TAPS = 89  # odd; stop-band from 0.3 of the rate above, 120 dB down
 KAISER_BETA = 12.3
+BLOCK = 64  # samples of the next stage that one product makes
 PART_BINS, PART_BINS_BELOW = 96, 32
 """Frequencies of a stage that are kept in parts of time: from its octave on, and below it."""
 
@@ -348,16 +350,13 @@ class _Stage:
 
     def halve(self, samples: FloatArray, present: BoolArray) -> tuple[FloatArray, BoolArray]:
         """Return the new samples at half the rate, and which channels have them."""
-        from scipy.signal import upfirdn  # noqa: PLC0415 - takes a second to import
-
         samples = np.concatenate([self._tail[0], samples])
         present = np.concatenate([self._tail[1], present])
         n = max(0, (len(samples) - TAPS) // 2 + 1)
         self._tail = samples[2 * n :], present[2 * n :]
         if n == 0:
             return samples[:0], present[:0]
-        filtered = upfirdn(_taps(), samples, down=2, axis=0)[TAPS // 2 : TAPS // 2 + n]
-        return np.asarray(filtered), _whole(present, 2 * np.arange(n), TAPS)
+        return _filtered(samples, n), _whole(present, 2 * np.arange(n), TAPS)
 
 
 def _kept_in_parts(n_freqs: int) -> IntArray:
@@ -377,6 +376,34 @@ def _whole(present: BoolArray, starts: IntArray, length: int) -> BoolArray:
     return np.asarray(missing[starts + length] == missing[starts])
 
 
+def _filtered(samples: FloatArray, n: int) -> FloatArray:
+    """Return n samples at half the rate, shape (n, n_channels).
+
+    But for the middle one, taps of a half-band filter are zero at every second sample. The others
+    are a banded matrix, which is multiplied by stretches of every second sample.
+    """
+    length = BLOCK + TAPS // 2
+    n_blocks = -(-n // BLOCK)
+    others = np.zeros((n_blocks * BLOCK + TAPS // 2, samples.shape[1]))
+    every_second = samples[(TAPS // 2 + 1) % 2 :: 2][: len(others)]
+    others[: len(every_second)] = every_second
+    stretches = np.lib.stride_tricks.sliding_window_view(others, length, axis=0)[::BLOCK]
+    found = (_banded() @ stretches.swapaxes(1, 2)).reshape(-1, samples.shape[1])[:n]
+    middle = samples[TAPS // 2 :: 2][:n]
+    return np.asarray(found + _taps()[TAPS // 2] * middle)
+
+
+@cache
+def _banded() -> FloatArray:
+    """Return the taps beside the middle one for `BLOCK` samples, one after the other."""
+    others = _taps()[(TAPS // 2 + 1) % 2 :: 2]
+    banded = np.zeros((BLOCK, BLOCK + TAPS // 2))
+    for row in range(BLOCK):
+        banded[row, row : row + len(others)] = others
+    return banded
+
+
+@cache
 def _taps() -> FloatArray:
     """Return the half-band low-pass filter, with unit gain at 0 Hz."""
     n = np.arange(TAPS) - TAPS // 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import signal
 
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.self_noise.three_sensor import three_sensor
@@ -231,3 +232,22 @@ def test_undisturbed_octaves_do_not_depend_on_the_division_of_samples() -> None:
         assert both.left_out == one.left_out + one.left_out
     with pytest.raises(EstimatorError, match="judged"):
         once.merge(pieces)
+
+
+@pytest.mark.parametrize("n_pieces", [1, 7, 61])
+def test_each_stage_is_the_one_above_filtered_and_halved(n_pieces: int) -> None:
+    samples = noise(5_000, 3, seed=8)
+    offsets = np.arange(89) - 44
+    taps = np.sinc(offsets / 2) * np.kaiser(89, 12.3)
+    taps /= taps.sum()
+    filtered = signal.upfirdn(taps, np.vstack([np.zeros((88, 3)), samples]), down=2, axis=0)
+    halved = filtered[44 : 44 + len(samples) // 2]
+    below = WelchSettings(50.0, 200)
+    expected = CrossSpectra(below, 3)
+    # the first segment has samples from before the start
+    expected.add(halved, np.arange(below.hop, len(halved) - 199, below.hop))
+    found = ladder(samples, n_stages=2, n_pieces=n_pieces).bands()[0]
+    turn = 2 * np.pi * found.frequencies[:, None] / 100 * offsets
+    gain = (np.cos(turn) @ taps)[:, None, None]
+    inside = slice(0, len(found.frequencies))
+    np.testing.assert_allclose(found.csm, expected.csm()[inside] / gain**2, rtol=1e-9, atol=1e-12)
