@@ -237,11 +237,14 @@ class SelectedSpectra:
         """
         shape = (self.settings.segment_length, samples.shape[1])
         frames = np.lib.stride_tricks.sliding_window_view(samples, shape)[rows, 0]
-        step = np.abs(np.diff(frames, axis=1)).max(axis=1, keepdims=True)
+        steps = np.diff(frames, axis=1)
+        np.abs(steps, out=steps)
+        step = steps.max(axis=1, keepdims=True)
+        still = np.stack([_longest_still(each) for each in steps])
         frames -= frames.mean(axis=1, keepdims=True)
-        spectra = np.fft.rfft(frames * self._window, axis=1)
+        frames *= self._window
+        spectra = np.fft.rfft(frames, axis=1)
         power = np.add.reduceat(spectra.real**2 + spectra.imag**2, self._bands, axis=1)
-        still = np.stack([_longest_still(samples[row : row + shape[0]]) for row in rows])
         levels = np.concatenate([power, step**2, still[:, None]], axis=1)
         return np.asarray(np.log(np.maximum(levels, np.finfo(np.float64).tiny)))
 
@@ -325,8 +328,13 @@ class _Held:
     levels: FloatArray
 
 
-def _longest_still(segment: FloatArray) -> FloatArray:
+def _longest_still(steps: FloatArray) -> FloatArray:
     """Return the longest time for which each channel is nearly constant.
+
+    Parameters
+    ----------
+    steps : float64, shape (segment_length - 1, n_channels)
+        Magnitudes of the differences of consecutive samples.
 
     Returns
     -------
@@ -334,7 +342,6 @@ def _longest_still(segment: FloatArray) -> FloatArray:
         In samples, not below half of `FLATLINE_SAMPLES`; the length of the segment for a constant
         channel; NaN for a channel with NaN.
     """
-    steps = np.abs(np.diff(segment, axis=0))
     limit = 1e-3 * np.sqrt(np.mean(steps**2, axis=0))  # resampling blurs the ends
     place = np.arange(1, len(steps) + 1, dtype=np.int32)[:, None]
     last_moved = np.maximum.accumulate(np.where(steps > limit, place, 0), axis=0)
