@@ -73,7 +73,8 @@ def plot(
 
     The curves are those of the report: recorded spectrum, self-noise with its
     95 % interval, every other method with --method all, limits of the bench
-    file, and noise models.
+    file, and noise models. With --signal the figure is of the first recording
+    against time: what happened, and when.
     """
     from daq.bench.masks.mask_file import masks_named
     from tui.output.console import check_places, console, notices

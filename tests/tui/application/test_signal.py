@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from daq.recording.reader import Recording
 from daq.results.signal import Signal
+from tests.daq.clocks.recordings import Sensor, blocks, counts, create
 from tests.tui.application.screen_text import assert_looks_as_before, resized, screen_text
 from tests.tui.example_snapshot import ProgressCallback
 from tests.tui.night_recording import record
@@ -17,6 +19,7 @@ from tests.waiting import limit
 from tui.application.app import HuddleApp
 from tui.application.messages import RecordingOpened
 from tui.application.signal_view.picture import Drawn, Look, picture
+from tui.application.signal_view.source import SignalSource
 from tui.application.signal_view.view import SignalView
 from tui.wording.signal import time_of
 
@@ -138,6 +141,33 @@ async def test_without_a_recording_it_says_where_there_are_some(tmp_path: Path) 
         text = screen_text(app)
         assert "4 lists them" in text
         assert "Zoom" not in text
+
+
+def test_a_growing_recording_is_shown_by_the_thread_that_follows_it(tmp_path: Path) -> None:
+    """Only where somebody looks; once it is closed, it is opened for the view."""
+    sensor, path = Sensor(counts(3000, 1, 1)), tmp_path / "run.h5"
+    writer, pieces, source = create(path, {"A": sensor}), blocks("A", sensor), SignalSource()
+    for block in pieces[:20]:
+        writer.append(block)
+    writer.commit()
+    ask = partial(source.signal, path, progress=lambda *_: None)
+    with Recording.open(path) as followed:
+        source.look(followed)
+        assert ask(is_growing=True) is None
+        source.is_wanted = True
+        source.look(followed)
+        signal = ask(is_growing=True)
+        assert signal is not None
+        assert signal.recording is followed
+        assert signal.span[1] - signal.span[0] == pytest.approx(9.99, abs=0.01)
+        for block in pieces[20:]:
+            writer.append(block)
+        writer.close()
+    signal = ask(is_growing=False)
+    assert signal is not None
+    assert signal.recording is not followed
+    assert signal.span[1] - signal.span[0] == pytest.approx(29.99, abs=0.01)
+    source.close()
 
 
 def test_a_spike_is_drawn_where_it_is(path: Path) -> None:

@@ -56,7 +56,8 @@ def signal_plots(
     height = TRACE_HEIGHT * (len(view.traces) + 0.7)
     alt = f"Waveforms of {len(view.traces)} channels, {title(view)}"
     draw = partial(_draw_waveforms, view)
-    plots = [Plot(f"Recorded, {title(view)}", (draw,), 1, height, alt)]
+    recorded = "Recorded, simulated" if signal.recording.simulated else "Recorded"
+    plots = [Plot(f"{recorded}, {title(view)}", (draw,), 1, height, alt)]
     for number, trace in enumerate(view.traces):
         if not trace.is_auxiliary:
             plots.extend(_spectra(signal, snapshot, number, trace, (begin, end)))
