@@ -21,7 +21,7 @@ from tui.commands.options import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rich.console import Console, JustifyMethod
+    from rich.console import Console
 
 _GAP = 2
 """Characters between columns."""
@@ -110,22 +110,22 @@ def _show(
 ) -> None:
     """Print a table; columns that do not fit beside the others follow below it."""
     from rich.cells import cell_len
-    from rich.table import Table
-    from rich.text import Text
+
+    from tui.page.table import Table
+    from tui.page.terminal import terminal_table
 
     header, rows = content
     if not rows:
         return
     if heading:
-        screen.print(Text(heading, "bold"))
+        screen.print(heading, style="bold")
     widths = [max(map(cell_len, column)) + _GAP for column in zip(header, *rows, strict=True)]
     for columns in side_by_side(widths, screen.width, n_keys=2 if header[1] == "channel" else 1):
-        table = Table(box=None, pad_edge=False, padding=(0, _GAP, 0, 0))
-        for number in columns:
-            justify: JustifyMethod = "left" if header[number] in {"sensor", "channel"} else "right"
-            table.add_column(Text(header[number]), justify=justify, no_wrap=True)
-        for row in rows:
-            table.add_row(*(Text(row[number]) for number in columns))
+        cells = ([row[n] for n in columns] for row in rows)
+        right = {*header} - {"sensor", "channel"}
+        table = terminal_table(
+            Table.of([header[n] for n in columns], cells, right=right), wraps=False
+        )
         needed = sum(widths[number] for number in columns)
         screen.print(table, width=max(needed, screen.width), crop=False)
 

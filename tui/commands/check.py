@@ -19,11 +19,10 @@ from tui.commands.devices import summaries
 from tui.commands.options import JsonOption, examples
 from tui.output import check_list
 from tui.output.exit_codes import ExitCode
+from tui.page.table import Table
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-
-    from rich.table import Table
 
     from daq.bench.model import Bench
     from daq.preflight.device_check import DiscoveredDevice, Examination, SensorCheck
@@ -225,18 +224,18 @@ def check_port(port: str, *, json: str | None) -> None:
             f"port {port}: no reply as {search_description(port)}; check power and cable; for other"
             " devices, rates or addresses write a bench file"
         )
-    table = _table(["driver", "settings", "device"])
+    rows = []
     for device in found:
         about = device.information
         remark = device.remark
         if about is not None:
             remark = f"{about.model} {about.serial_number} {about.firmware} {remark}".strip()
         settings = ", ".join(f"{key} = {value}" for key, value in device.settings.items())
-        table.add_row(device.driver, settings, remark)
+        rows.append((device.driver, settings, remark))
     screen = for_people(json)
     if simulated:
         screen.print(SIMULATED)
-    screen.print(table)
+    screen.print(Table.of(("driver", "settings", "device"), rows))
     for device in found:
         if device.driver == "text":
             screen.print("\nFor the bench file, with names and sensitivities to be filled in:\n")
@@ -279,31 +278,21 @@ def _drivers(bench: Bench) -> str:
     return "".join(f"  driver    {name}: {texts[name]}\n" for name in names)
 
 
-def _table(columns: Sequence[str]) -> Table:
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for column in columns:
-        table.add_column(column)
-    return table
-
-
 def _device_table(found: Sequence[SensorCheck]) -> Table:
-    table = _table(
-        ("sensor", "model", "serial number", "firmware", "rate", "measured", "temperature")
+    names = ("sensor", "model", "serial number", "firmware", "rate", "measured", "temperature")
+    return Table.of(
+        names,
+        (
+            (
+                *(about.sensor, about.model, about.serial_number, about.firmware),
+                "" if about.sampling_rate is None else f"{about.sampling_rate:g} Hz",
+                "" if entry.measured_rate is None else f"{entry.measured_rate:.1f} Hz",
+                "" if about.temperature is None else f"{about.temperature:.1f} °C",
+            )
+            for entry in found
+            for about in [entry.information]
+        ),
     )
-    for entry in found:
-        device = entry.information
-        table.add_row(
-            device.sensor,
-            device.model,
-            device.serial_number,
-            device.firmware,
-            "" if device.sampling_rate is None else f"{device.sampling_rate:g} Hz",
-            "" if entry.measured_rate is None else f"{entry.measured_rate:.1f} Hz",
-            "" if device.temperature is None else f"{device.temperature:.1f} °C",
-        )
-    return table
 
 
 def remarks(entry: SensorCheck, serial_number: str) -> Iterator[str]:
@@ -333,7 +322,6 @@ def remarks(entry: SensorCheck, serial_number: str) -> Iterator[str]:
 def _channel_table(found: Sequence[SensorCheck]) -> Table:
     from tui.wording.formatting import readings
 
-    table = _table(("channel", "mean", "rms", "range", "unit", ""))
     values: dict[str, list[float]] = {}
     for channel in (channel for entry in found for channel in entry.channels):
         values.setdefault(channel.unit, []).extend(
@@ -341,15 +329,11 @@ def _channel_table(found: Sequence[SensorCheck]) -> Table:
         )
     shown = {unit: readings(known, unit) for unit, known in values.items()}
     texts = {unit: iter(of_unit) for unit, (of_unit, _) in shown.items()}
+    rows = []
     for entry in found:
         for channel in entry.channels:
             mean, rms, least, most = itertools.islice(texts[channel.unit], 4)
-            table.add_row(
-                f"{entry.information.sensor}.{channel.name}",
-                mean,
-                rms,
-                f"{least} … {most}",
-                shown[channel.unit][1],
-                "constant: nothing connected?" if channel.is_stuck else "",
-            )
-    return table
+            stuck = "constant: nothing connected?" if channel.is_stuck else ""
+            name = f"{entry.information.sensor}.{channel.name}"
+            rows.append((name, mean, rms, f"{least} … {most}", shown[channel.unit][1], stuck))
+    return Table.of(("channel", "mean", "rms", "range", "unit", ""), rows)

@@ -21,11 +21,10 @@ from tui.commands.options import JsonOption, examples, with_logging
 from tui.commands.options import duration as read_duration
 from tui.commands.run import result_of
 from tui.output.exit_codes import ExitCode
+from tui.page.table import Cell, Table
 
 if TYPE_CHECKING:
     from typing import Any
-
-    from rich.table import Table
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
@@ -233,35 +232,27 @@ def _percent(share: float) -> str:
 
 def comparison_table(compared: list[NoiseComparison], result: Result) -> Table:
     """Return a row per channel: truth, each method's estimate, and whether that covers it."""
-    from rich.table import Table
-    from rich.text import Text
-
     from tui.wording.formatting import level, level_with_error
 
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for name in ("channel", "data", "true noise"):
-        table.add_column(name, justify="left" if name == "channel" else "right")
-    for method in METHODS:
-        table.add_column(method, justify="right")
+    rows = []
     for column, label in enumerate(result.snapshot.channels):
         found = {
             entry.method: entry
             for entry in compared
             if (entry.sensor, entry.channel) == (label.sensor, label.channel)
         }
-        row = [Text(label.name), Text(level(float(result.data[column])))]
-        row.append(Text(level(found[METHODS[0]].true_psd)))
+        row = [label.name, level(float(result.data[column])), level(found[METHODS[0]].true_psd)]
         for method in METHODS:
             entry = found[method]
-            colour, mark = ("green", "✓") if entry.covers else ("red", "✗")
+            mark = "✓" if entry.covers else "✗"
             estimate = (
                 f"{level(entry.noise_psd)} withdrawn"
                 if entry.withdrawn
                 else level_with_error(entry.noise_psd, entry.high)
             )
-            row.append(Text(f"{estimate} {mark}", colour))
-        table.add_row(*row)
-    return table
+            row.append(Cell(f"{estimate} {mark}", "good" if entry.covers else "bad"))
+        rows.append(tuple(row))
+    return Table(("channel", "data", "true noise", *METHODS), tuple(rows))
 
 
 def verdict(compared: list[NoiseComparison]) -> list[str]:

@@ -12,6 +12,7 @@ import typer
 from daq.bench.driver_settings import settings_of
 from daq.errors import DriverError
 from tui.commands.options import JsonOption, SpeedOption, examples, with_logging
+from tui.page.table import Table
 
 
 @examples(
@@ -86,9 +87,6 @@ def devices(
 
 def list_ports(*, json: str | None) -> None:
     """Print the ports of this computer."""
-    from rich.table import Table
-    from rich.text import Text
-
     from daq.devices.registry import present_ports
     from daq.transport.serial_ports import serial_ports
     from tui.output.console import for_people, write_json
@@ -100,13 +98,8 @@ def list_ports(*, json: str | None) -> None:
     present = [dict(zip(keys, row, strict=True)) for row in rows]
     write_json(json, {"present": present, "not_listed": reasons})
     screen = for_people(json)
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for column in keys:
-        table.add_column(column)
-    for row in rows:
-        table.add_row(*map(Text, row))
     if rows:
-        screen.print(table)
+        screen.print(Table.of(keys, rows))
     else:
         screen.print("This computer has no serial port, and no other port that drivers list.")
     for driver, reason in reasons.items():
@@ -121,9 +114,6 @@ def list_settings(name: str, *, json: str | None) -> None:
     typer.BadParameter
         The driver is not installed.
     """
-    from rich.table import Table
-    from rich.text import Text
-
     from daq.devices.registry import driver_names, driver_type
     from tui.output.console import for_people, write_json
 
@@ -135,13 +125,8 @@ def list_settings(name: str, *, json: str | None) -> None:
     write_json(json, {"driver": name, "summary": driver.summary, "settings": settings})
     screen = for_people(json)
     screen.print(f"{name}: {driver.summary}\n", markup=False, highlight=False)
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for column in ("setting", "values", "default", "meaning"):
-        table.add_column(column)
-    for one in settings:
-        cells = (one["name"], one["values"], one["default"], one["meaning"])
-        table.add_row(*(Text(cell) for cell in cells))
-    screen.print(table)
+    rows = ((one["name"], one["values"], one["default"], one["meaning"]) for one in settings)
+    screen.print(Table.of(("setting", "values", "default", "meaning"), rows))
 
 
 def summaries() -> dict[str, str]:

@@ -301,10 +301,9 @@ def show_result(
 
 def _show_parameters(screen: Console, found: Sequence[ChannelNoise], unit: str) -> None:
     """Print the noise parameters as tables."""
-    from rich.table import Table
-    from rich.text import Text
-
     from tui.output.noise_parameters import allan_table, notes, sheet_table, term_table
+    from tui.page.table import Table
+    from tui.page.terminal import terminal_table
 
     for title, (header, rows) in (
         (f"Noise terms at 1 Hz, dB re 1 ({unit})²/Hz, with standard errors", term_table(found)),
@@ -312,12 +311,7 @@ def _show_parameters(screen: Console, found: Sequence[ChannelNoise], unit: str) 
         ("Data sheet", sheet_table(found)),
     ):
         if rows:
-            table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-            for number, name in enumerate(header):
-                table.add_column(name, justify="right" if number else "left", no_wrap=True)
-            for row in rows:
-                table.add_row(*map(Text, row))
-            screen.print(Text(title, "bold"))
-            screen.print(table)
+            screen.print(title, style="bold")
+            screen.print(terminal_table(Table(header, tuple(rows)), wraps=False))
     for line in notes(found):
         screen.print(line)

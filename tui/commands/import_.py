@@ -26,6 +26,7 @@ from tui.commands.options import (
     with_logging,
 )
 from tui.output.exit_codes import ExitCode
+from tui.page.table import Table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -298,27 +299,22 @@ def _by_sensor(names: Sequence[str]) -> str:
 
 
 def _show(result: ImportResult, out: Path, json: str | None) -> None:
-    from rich.table import Table
-
     from daq.bench.durations import format_duration
     from estimator.wording import several
     from tui.output.console import for_people
     from tui.wording.formatting import utc
 
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for column in ("sensor", "channels", "rate", "start (UTC)", "samples", "gaps"):
-        table.add_column(column, justify="right" if column in {"samples", "gaps"} else "left")
-    for entry in result.sensors:
-        table.add_row(
-            entry.sensor,
-            " ".join(entry.channels),
-            f"{entry.sampling_rate:g} Hz",
-            utc(entry.start_utc_ns),
-            str(entry.n_samples),
+    rows = (
+        (
+            *(entry.sensor, " ".join(entry.channels), f"{entry.sampling_rate:g} Hz"),
+            *(utc(entry.start_utc_ns), entry.n_samples),
             f"{entry.n_gaps} ({several(entry.missing, 'sample')})" if entry.n_gaps else "none",
         )
+        for entry in result.sensors
+    )
+    titles = ("sensor", "channels", "rate", "start (UTC)", "samples", "gaps")
     screen = for_people(json)
-    screen.print(table)
+    screen.print(Table.of(titles, rows, right=titles[-2:]))
     for entry in result.sensors:
         if entry.resampled:
             screen.print(

@@ -24,6 +24,7 @@ from tui.commands.options import (
 )
 from tui.commands.verify import known_to_services
 from tui.output.extras import require
+from tui.page.table import Table
 
 
 @examples(
@@ -183,8 +184,6 @@ def issues(
 
     The exit code is 3 if the ledger was changed, or if a certificate is missing.
     """
-    from rich.table import Table
-
     from daq.recording.reader import Recording
     from tui.output.console import for_people, write_json
 
@@ -197,16 +196,15 @@ def issues(
             about = recording.bench
         ledger = ledger_of(source, about)
     entries = ledger.entries()
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for title in ("number", "revision", "state", "date", "by", "recording", "reason"):
-        table.add_column(title, overflow="fold")
-    for each in entries:
-        recorded = ", ".join(file for file, _, _ in each.recordings)
-        table.add_row(
-            *(each.number, str(each.revision), each.state, f"{each.at:%Y-%m-%d}"),
-            *(each.by, recorded, each.reason),
+    rows = (
+        (
+            *(each.number, each.revision, each.state, f"{each.at:%Y-%m-%d}", each.by),
+            *(", ".join(file for file, _, _ in each.recordings), each.reason),
         )
-    for_people(json).print(table)
+        for each in entries
+    )
+    names = ("number", "revision", "state", "date", "by", "recording", "reason")
+    for_people(json).print(Table.of(names, rows))
     write_json(
         json,
         {

@@ -10,6 +10,7 @@ import typer
 
 from daq.errors import RecordingError
 from tui.commands.options import FileArgument, JsonOption, examples
+from tui.page.table import Table
 
 
 @examples("huddle repair killed.h5", "huddle repair night.h5 --check --json -")
@@ -25,27 +26,17 @@ def repair(
     """
     from dataclasses import asdict
 
-    from rich.table import Table
-
     from daq.recording.repair import repair, verify
     from tui.output.console import for_people, write_json
 
     report = verify(path) if check else repair(path)
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    table.add_column("sensor")
-    for name in ("samples", "blocks", "gaps", "damaged blocks", "unacknowledged rows"):
-        table.add_column(name, justify="right")
-    for sensor in report.sensors:
-        table.add_row(
-            sensor.name,
-            str(sensor.n_samples),
-            str(sensor.n_blocks),
-            str(sensor.n_gaps),
-            str(len(sensor.bad_blocks)),
-            str(sensor.n_uncommitted),
-        )
+    numbers = ("samples", "blocks", "gaps", "damaged blocks", "unacknowledged rows")
+    rows = (
+        (s.name, s.n_samples, s.n_blocks, s.n_gaps, len(s.bad_blocks), s.n_uncommitted)
+        for s in report.sensors
+    )
     screen = for_people(json)
-    screen.print(table)
+    screen.print(Table.of(("sensor", *numbers), rows, right=numbers))
     state = "being written" if report.being_written else "closed" if report.closed else "not closed"
     screen.print(f"{path}: {state}")
     write_json(json, asdict(report) | {"path": str(path)})

@@ -12,14 +12,20 @@ import typer
 from daq.errors import HuddleError
 from tui.commands.options import CsvOption, JsonOption, examples
 from tui.output.csv_text import csv_text
+from tui.page.table import Cell, Table
 from tui.service.records.run_state import RunState, utc_text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from tui.page.table import Tone
     from tui.service.records.run_state import Run
 
-_STYLES = {RunState.FAILED: "red", RunState.MISSED: "yellow", RunState.DONE: "green"}
+_TONES: dict[RunState, Tone] = {
+    RunState.FAILED: "bad",
+    RunState.MISSED: "doubtful",
+    RunState.DONE: "good",
+}
 PAGE = 100
 """Runs that are listed unless another number is given."""
 _COLUMNS = (
@@ -52,8 +58,6 @@ def runs(
 
     A run is due, recording, estimating, done, failed or missed.
     """
-    from rich.table import Table
-
     from tui.output.console import check_places, for_people, write_json, write_text
     from tui.service.records.places import Place
 
@@ -63,21 +67,9 @@ def runs(
     runs = place.runs(last=PAGE + 1 if is_page else last)
     is_page = is_page and len(runs) > PAGE
     runs = runs[-PAGE:] if is_page else runs
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for name in ("due (UTC)", "entry", "state", "verdict", "recording", "reason"):
-        table.add_column(name, overflow="fold")
-    for run in runs:
-        kept = ", ".join(run.parts) or "-"
-        marks = {"simulated": run.simulated, "pinned": run.pinned, "removed": run.removed}
-        notes = [name for name, holds in marks.items() if holds]
-        table.add_row(
-            *(f"{run.due:%Y-%m-%d %H:%M}", run.entry, run.state, run.verdict or "-"),
-            kept + (f" ({', '.join(notes)})" if notes else ""),
-            run.reason,
-            style=_STYLES.get(run.state),
-        )
     screen = for_people(json, csv)
-    screen.print(table)
+    names = ("due (UTC)", "entry", "state", "verdict", "recording", "reason")
+    screen.print(Table.of(names, map(_row, runs)))
     if is_page:
         screen.print(f"The last {PAGE} runs; --last N shows more, --csv and --json all.")
     write_json(json, {"runs": [run.document() for run in runs]})
@@ -114,6 +106,14 @@ class RunNotFoundError(HuddleError):
     """No run has this recording or due time."""
 
     is_usage_error = True
+
+
+def _row(run: Run) -> list[Cell]:
+    marks = {"simulated": run.simulated, "pinned": run.pinned, "removed": run.removed}
+    notes = ", ".join(name for name, holds in marks.items() if holds)
+    kept = (", ".join(run.parts) or "-") + (f" ({notes})" if notes else "")
+    about = (f"{run.due:%Y-%m-%d %H:%M}", run.entry, run.state, run.verdict or "-")
+    return [Cell(each, _TONES.get(run.state, "plain")) for each in (*about, kept, run.reason)]
 
 
 def _cells(run: Run) -> list[object]:

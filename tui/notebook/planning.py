@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.table import Table
 
 from daq.bench.durations import format_duration
 from daq.devices.bench_file import load
@@ -29,6 +28,7 @@ from estimator.wording import percent, signed
 from tui.notebook.options import settings_of
 from tui.notebook.text import rendered
 from tui.notebook.waves import Waves, waves_across
+from tui.page.table import Table
 from tui.simulation.devices import scenario_of
 
 if TYPE_CHECKING:
@@ -178,13 +178,8 @@ class RecordingPlan(Mapping[str, MethodPlan]):
 
     def table(self) -> Table:
         """Return the needs of every method as a table."""
-        table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-        table.add_column("method")
-        for name in ("duration", "segments", "remaining bias", "efficiency"):
-            table.add_column(name, justify="right")
-        for entry in self.values():
-            table.add_row(entry.method, *_row(entry))
-        return table
+        names = ("method", "duration", "segments", "remaining bias", "efficiency")
+        return Table(names, tuple((entry.method, *_row(entry)) for entry in self.values()))
 
     @property
     def remarks(self) -> list[str]:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import io
 from html import escape
-from itertools import chain, repeat
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from estimator.decision.verdict import Verdict
 from estimator.errors import BandError
 from tui.output.results import averages_line, result_table, result_title
+from tui.page.html import html_table
+from tui.page.table import Table
+from tui.page.terminal import terminal_table
 from tui.wording.facts import brief
 from tui.wording.formatting import level, level_with_error
 from tui.wording.verdict_text import Decision
@@ -33,7 +34,7 @@ _WIDTH = 100
 def text(result: Result) -> str:
     """Return the table that ``huddle estimate`` prints, and where the advice is."""
     try:
-        parts: list[RenderableType] = [
+        parts: list[RenderableType | Table] = [
             *(Text(line) for line in _decision(result)),
             result_title(result),
             Text(averages_line(result.snapshot)),
@@ -55,29 +56,13 @@ def _decision(result: Result) -> list[str]:
 def html(result: Result) -> str:
     """Return the table that ``huddle estimate`` prints, as HTML."""
     try:
-        title, table = (
-            result_title(result),
-            result_table(result),
-        )
+        title, table = result_title(result), result_table(result)
     except BandError as error:
         return f"<p>Self-noise: {escape(str(error))}</p>"
-    columns = [[column.header, *column.cells] for column in table.columns]
-    header, *rows = [
-        "".join(f"<{tag}>{escape(_plain(cell))}</{tag}>" for cell in row)
-        for tag, row in zip(chain(["th"], repeat("td")), zip(*columns, strict=True), strict=False)
-    ]
-    body = "".join(f"<tr>{row}</tr>" for row in rows)
     lines = (averages_line(result.snapshot), *(each.line for each in result.facts))
     below = "".join(f"<p>{escape(line)}</p>" for line in lines)
     above = "".join(f"<p>{escape(line)}</p>" for line in _decision(result))
-    return (
-        f"{above}<table><caption>{escape(title.plain)}</caption><thead><tr>{header}</tr></thead>"
-        f"<tbody>{body}</tbody></table>{below}"
-    )
-
-
-def _plain(cell: object) -> str:
-    return cell.plain if isinstance(cell, Text) else str(cell)
+    return f"{above}{html_table(table, caption=title.plain)}{below}"
 
 
 def band(
@@ -91,14 +76,16 @@ def band(
     confidence: float = 0.95,
 ) -> str:
     """Return a table of channels with their means over a band."""
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    table.add_column("sensor")
-    table.add_column("channel")
-    table.add_column("data", justify="right")
-    table.add_column(method, justify="right")
-    for label, data, mean, high in zip(labels, data_psd, noise_psd, noise_high, strict=True):
-        cells = (label.sensor, label.channel, level(float(data)))
-        table.add_row(*map(Text, (*cells, level_with_error(float(mean), float(high)))))
+    rows = (
+        (
+            label.sensor,
+            label.channel,
+            level(float(data)),
+            level_with_error(float(mean), float(high)),
+        )
+        for label, data, mean, high in zip(labels, data_psd, noise_psd, noise_high, strict=True)
+    )
+    table = Table.of(("sensor", "channel", "data", method), rows, right=("data", method))
     title = (
         f"Self-noise, mean over {span[0]:.3g} to {span[1]:.3g} Hz, dB re 1"
         f" ({labels[0].unit})²/Hz, with its {100 * confidence:g} % interval"
@@ -106,10 +93,10 @@ def band(
     return rendered([Text(title), table])
 
 
-def rendered(parts: Sequence[RenderableType]) -> str:
+def rendered(parts: Sequence[RenderableType | Table]) -> str:
     """Return what a terminal without colours would show."""
     screen = Console(file=io.StringIO(), width=_WIDTH, color_system=None, markup=False, emoji=False)
     with screen.capture() as shown:
         for part in parts:
-            screen.print(part)
+            screen.print(terminal_table(part) if isinstance(part, Table) else part)
     return "\n".join(line.rstrip() for line in shown.get().splitlines())

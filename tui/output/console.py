@@ -13,13 +13,15 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+import rich.table
 import typer
 from rich.console import Console
 from rich.segment import Segment
-from rich.table import Table
 
 from daq.whole_file import written
 from tui.output.exit_codes import ExitCode
+from tui.page.table import Table
+from tui.page.terminal import terminal_table
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -48,15 +50,16 @@ class PlainConsole(Console):
 
     def print(self, *objects: Any, **options: Any) -> None:  # noqa: ANN401 - the library's own
         """Print texts and tables; unbroken where no terminal shows them."""
+        shown = [terminal_table(one) if isinstance(one, Table) else one for one in objects]
         if self.is_terminal:
-            super().print(*objects, **options)
+            super().print(*shown, **options)
             return
         usual = self.width
-        if any(isinstance(each, Table) for each in objects):
+        if any(isinstance(each, rich.table.Table) for each in shown):
             self.width = WIDTH_OF_TABLES
         else:
             options.setdefault("soft_wrap", True)
-        super().print(*objects, **options)
+        super().print(*shown, **options)
         self.width = usual
 
     def on_broken_pipe(self) -> None:

@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from rich.table import Table
 from rich.text import Text
 
 from estimator.spectra.segment_rejection import Reason
 from estimator.wording import degrees, ratio, signed
+from tui.page.table import Table
+from tui.page.terminal import terminal_table
 from tui.wording.facts import RANKS
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
+    import rich.table
     from rich.console import RenderableType
 
     from daq.estimation.snapshot import Snapshot
@@ -57,75 +59,69 @@ def _heading(text: str) -> Text:
     return Text(text, style="bold")
 
 
-def _table(*columns: str) -> Table:
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for name in columns:
-        table.add_column(name, justify="left" if name == "sensors" else "right")
-    return table
+def _table(*columns: str, rows: Iterable[Iterable[str]]) -> rich.table.Table:
+    return terminal_table(Table.of(columns, rows, right={*columns} - {"sensors"}))
 
 
-def _bands(found: Diagnosis) -> Table:
-    table = _table("band (Hz)", "coherence", "condition", "dimension", "SNR", "model test", "p")
+def _bands(found: Diagnosis) -> rich.table.Table:
+    rows = []
     for band in found.bands:
         known = [float(value) for value in band.snr if math.isfinite(value)]
         statistic = band.test.statistic / band.test.degrees if band.test.degrees else math.nan
-        table.add_row(
-            f"{band.low:.3g}–{band.high:.3g}",
-            _known(band.coherence, ".4f"),
-            _known(band.condition, ".3g"),
-            _known(band.dimension, ".0f"),
-            f"{ratio(min(known))}…{ratio(max(known))}" if known else "?",
-            _known(statistic, ".3f"),
-            _known(band.test.p_value, ".2g"),
-        )
-    return table
+        cells = [f"{band.low:.3g}–{band.high:.3g}", _known(band.coherence, ".4f")]
+        cells += [_known(band.condition, ".3g"), _known(band.dimension, ".0f")]
+        cells.append(f"{ratio(min(known))}…{ratio(max(known))}" if known else "?")
+        rows.append([*cells, _known(statistic, ".3f"), _known(band.test.p_value, ".2g")])
+    names = ("band (Hz)", "coherence", "condition", "dimension", "SNR", "model test", "p")
+    return _table(*names, rows=rows)
 
 
 def _known(value: float, spec: str) -> str:
     return "?" if math.isnan(value) else signed(value, spec)
 
 
-def _octaves(snapshot: Snapshot) -> Table:
-    table = _table("octave (Hz)", "segment", "segments", "excluded: gap", "transient", "averages")
-    for octave in snapshot.octaves:
-        table.add_row(
-            f"{octave.low:.3g}–{octave.high:.3g}",
-            f"{octave.segment:.4g} s",
-            str(octave.n_segments),
-            str(octave.left_out.get(Reason.GAP, 0)),
-            str(octave.left_out.get(Reason.TRANSIENT, 0)),
-            f"{octave.n_effective:.0f}",
+def _octaves(snapshot: Snapshot) -> rich.table.Table:
+    names = ("octave (Hz)", "segment", "segments", "excluded: gap", "transient", "averages")
+    rows = (
+        (
+            *(f"{each.low:.3g}–{each.high:.3g}", f"{each.segment:.4g} s", str(each.n_segments)),
+            *(str(each.left_out.get(why, 0)) for why in (Reason.GAP, Reason.TRANSIENT)),
+            f"{each.n_effective:.0f}",
         )
-    return table
+        for each in snapshot.octaves
+    )
+    return _table(*names, rows=rows)
 
 
-def _repeatability(found: Stability, names: Names) -> tuple[str, Table]:
+def _repeatability(found: Stability, names: Names) -> tuple[str, rich.table.Table]:
     """Return what is compared, and the scatter of each channel's noise beside that of steady noise.
 
     Recordings where there are several, parts of the recording otherwise.
     """
     scatter = found.parts if found.runs is None else found.runs
-    table = _table("band (Hz)", *names.channels, "if steady")
+    rows = []
     for low, high, deviation, expected in zip(
         found.low, found.high, scatter.deviation, scatter.typically_expected, strict=True
     ):
         numbers = [*deviation.tolist(), float(expected)]
         cells = ["?" if math.isnan(each) else f"{100 * each:.1f} %" for each in numbers]
-        table.add_row(f"{low:.3g}–{high:.3g}", *cells)
+        rows.append((f"{low:.3g}–{high:.3g}", *cells))
     what = "parts of the recording" if found.runs is None else "recordings"
-    return f"{scatter.n_parts} {what} (standard deviation)", table
+    return f"{scatter.n_parts} {what} (standard deviation)", _table(
+        "band (Hz)", *names.channels, "if steady", rows=rows
+    )
 
 
-def _pairs(found: Diagnosis, names: Sequence[str]) -> Table:
-    table = _table("sensors", "rotation", "horizontal", "±", "gains", "delay", "not orthogonal")
-    for pair in found.responses:
-        table.add_row(
-            Text(f"{names[pair.first]} → {names[pair.second]}"),
-            degrees(pair.rotation_deg),
-            degrees(pair.horizontal_deg),
-            degrees(pair.angle_error_deg),
+def _pairs(found: Diagnosis, names: Sequence[str]) -> rich.table.Table:
+    columns = ("sensors", "rotation", "horizontal", "±", "gains", "delay", "not orthogonal")
+    rows = (
+        (
+            f"{names[pair.first]} → {names[pair.second]}",
+            *map(degrees, (pair.rotation_deg, pair.horizontal_deg, pair.angle_error_deg)),
             " ".join(f"{gain:.4f}" for gain in pair.gains),
             "?" if math.isnan(pair.delay) else f"{signed(pair.delay * 1e6, '.1f')} µs",
             f"{pair.nonorthogonality_deg:.2f}°",
         )
-    return table
+        for pair in found.responses
+    )
+    return _table(*columns, rows=rows)

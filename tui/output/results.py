@@ -6,13 +6,13 @@ import io
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.table import Table
 from rich.text import Text
 
 from daq.results.band_summary import data_interval
 from daq.results.vocabulary import FLAG_WORDS, PARTNER_WORDS
 from estimator.self_noise.result import Flag
 from estimator.wording import clock_time, several
+from tui.page.table import Table
 from tui.wording.formatting import level, level_with_error, utc
 
 if TYPE_CHECKING:
@@ -35,12 +35,7 @@ def result_title(result: Result) -> Text:
 def result_table(result: Result) -> Table:
     """Return the noise of every channel in the band, by each method."""
     snapshot = result.snapshot
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    table.add_column("sensor")
-    table.add_column("channel")
-    table.add_column("data", justify="right")
-    for method in snapshot.results:
-        table.add_column(method, justify="right")
+    rows = []
     columns = [result.means(method) for method in snapshot.results]
     data, alone = result.data, result.alone
     ends = None if columns else data_interval(result)
@@ -59,8 +54,9 @@ def result_table(result: Result) -> Table:
             row.append(
                 level_with_error(float(mean.mean[0]), float(mean.high[0]), float(mean.low[0]))
             )
-        table.add_row(*map(Text, row))
-    return table
+        rows.append(row)
+    names = ("data", *snapshot.results)
+    return Table.of(("sensor", "channel", *names), rows, right=names)
 
 
 def averages_line(snapshot: Snapshot) -> str:

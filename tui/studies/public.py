@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import typer
-from rich.table import Table
 from scipy.stats import chi2
 
 from daq.bench.units import is_motion
@@ -32,6 +31,7 @@ from daq.results.result import Result
 from estimator.self_noise.result import Flag
 from tui.output.console import check_places, for_people, notices, write_json
 from tui.output.extras import require
+from tui.page.table import Table
 from tui.studies.study import Curve, Panel, Study
 
 if TYPE_CHECKING:
@@ -283,9 +283,7 @@ def _print(found: Sequence[Level], json: str | None) -> None:
     """Print an octave a row, the mean of all channels that have a level."""
     methods = list(dict.fromkeys(each.method for each in found))
     unit = found[0].unit
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for heading in ("band", "samples", *methods):
-        table.add_column(heading, justify="right")
+    rows = []
     for low, high in dict.fromkeys((each.low_hz, each.high_hz) for each in found):
         band = [each for each in found if each.low_hz == low]
         cells = [f"{low:.3g}–{high:.3g} Hz", f"{_median([each.data for each in band]):.1f}"]
@@ -295,10 +293,10 @@ def _print(found: Sequence[Level], json: str | None) -> None:
             level = _median([each.noise for each in own])
             text = f"{level:.1f}" if isfinite(level) else "–"
             cells.append(f"{text} ({above} above)" if above else text)
-        table.add_row(*cells)
+        rows.append(tuple(cells))
     screen = for_people(json)
     screen.print(f"{found[0].test}: medians over the channels, dB re 1 ({unit})²/Hz")
-    screen.print(table)
+    screen.print(Table(("band", "samples", *methods), tuple(rows), left=frozenset()))
     n_above = sum(each.contradicts for each in found)
     screen.print(
         f"{n_above} of {sum(each.method != BOUND for each in found)} levels, of one channel and"

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 import typer
 from rich.progress import Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
-from rich.text import Text
 
 from sim_devices.errors import ScenarioError
 from tui.output.console import check_places, for_people, progress, write_json
 from tui.output.extras import require
+from tui.page.table import Cell, Table
 from tui.studies.laboratory import LABORATORY, Laboratory
 from tui.studies.numerical import NUMERICAL, Ingredients
 from tui.studies.study import TOLERANCE
@@ -171,17 +170,14 @@ class _Progress:
 
 
 def _print(console: Console, studies: list[Study], folder: Path, elapsed: float) -> None:
-    table = Table(box=None, pad_edge=False, padding=(0, 1))
-    table.add_column("")
-    for heading in ("", "at", "measured", "theory", "off"):
-        table.add_column(heading, justify="right")
+    rows: list[tuple[str, ...]] = []
     for study in studies:
-        table.add_row(Text.assemble((study.name, "bold"), f"  {study.title}"))
+        rows.append((Cell(f"{study.name}  {study.title}", strong=True),))
         for panel, series in study.series():
             letter = panel.title[:4] if panel.title.startswith("(") else ""
             label = series.title.removeprefix(letter)
-            table.add_row(f"  {letter}{label}", series.quantity, *_row(series))
-    console.print(table)
+            rows.append((f"  {letter}{label}", series.quantity, *_row(series)))
+    console.print(Table(("", "", "at", "measured", "theory", "off"), tuple(rows)))
     deviations = np.concatenate([study.deviations for study in studies])
     console.print(
         f"\nEach row shows the point of a curve where theory expects most, ± one standard error;"
@@ -193,7 +189,7 @@ def _print(console: Console, studies: list[Study], folder: Path, elapsed: float)
     )
 
 
-def _row(series: Series) -> tuple[str | Text, ...]:
+def _row(series: Series) -> tuple[str, ...]:
     point, worst = series.telling, series.worst
     off = f"{worst.deviation:+.1f}"
     return (
@@ -201,5 +197,5 @@ def _row(series: Series) -> tuple[str | Text, ...]:
         f"{point.measured:.4g} ± {point.error:.1g}",
         (f"{point.theory:.4g}" if abs(point.theory) > 1e-9 else "0")
         + (f" ± {point.allowed:g}" if point.allowed else ""),
-        off if worst.agrees else Text(f"{off} NO", "red"),
+        off if worst.agrees else Cell(f"{off} NO", "bad"),
     )

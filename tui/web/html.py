@@ -10,23 +10,20 @@ from markupsafe import Markup
 from rich.text import Text
 
 from estimator.checks.advice import Rank
-from estimator.decision.verdict import Verdict
 from estimator.wording import clock_time, several
+from tui.page.html import html_table
 from tui.wording.formatting import utc
+from tui.wording.verdict_text import TONES
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
-    from rich.table import Table
+
+    from tui.page.table import Table
 
 _TONES = {"#ff6b6b": "bad", "red": "bad", "yellow": "doubtful", "green": "good", "#9aa5b8": "muted"}
 """Classes for what the colours of the application mean; all else is plain."""
-_VERDICTS = {
-    None: "",
-    Verdict.PASS: "good",
-    Verdict.FAIL: "bad",
-    Verdict.NOT_DECIDED: "doubtful",
-}
 _RANKS = {Rank.INVALIDATES: "bad", Rank.DELAYS: "doubtful", Rank.TO_KNOW: ""}
+_WIDE = Markup('<div class="wide" tabindex="0" role="region" aria-label="{}">{}</div>')
 _CELL = Markup('<{name} class="{tone}"{scope}>{text}</{name}>')
 
 
@@ -47,7 +44,7 @@ def environment() -> Environment:
         "rich": line,
         "several": several,
         "table": table,
-        "tone_of": _VERDICTS.get,
+        "tone_of": lambda verdict: "" if verdict is None else TONES[verdict],
         "utc": utc,
     }
     return made
@@ -72,35 +69,9 @@ def line(text: RenderableType) -> Markup:
 
 
 def table(made: Table) -> Markup:
-    """Return a table of the application; the first cell of a row names it."""
-    columns = [
-        (_plain(column.header), column.justify == "right", list(column.cells))
-        for column in made.columns
-    ]
-    head = Markup("").join(
-        _CELL.format(name="th", tone="number" * right, scope=Markup(' scope="col"'), text=title)
-        for title, right, _ in columns
-    )
-    rows = []
-    for number in range(len(made.rows)):
-        cells = []
-        for at, (_, right, column) in enumerate(columns):
-            cell = column[number]
-            cells.append(
-                _CELL.format(
-                    name="td" if at else "th",
-                    tone=f"{tone(cell)} {'number' * right}".strip(),
-                    scope="" if at else Markup(' scope="row"'),
-                    text=_plain(cell),
-                )
-            )
-        rows.append(Markup("<tr>{}</tr>").format(Markup("").join(cells)))
-    return Markup(
-        '<div class="wide" tabindex="0" role="region" aria-label="{}">'
-        "<table><thead><tr>{}</tr></thead><tbody>{}</tbody></table></div>"
-    ).format(
-        ", ".join(title for title, _, _ in columns if title.strip()), head, Markup("").join(rows)
-    )
+    """Return a table of the application, which scrolls where it is too wide."""
+    names = ", ".join(title for title in made.header if title.strip())
+    return _WIDE.format(names, Markup(html_table(made)))  # noqa: S704 - it escapes all text
 
 
 def _plain(text: RenderableType) -> str:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from rich.table import Table
-from rich.text import Text
-
 from daq.results.comparison import compare
-from tui.application.result_view.result_text import difference_text
+from tui.application.result_view.result_text import difference_cell
 from tui.application.test_view.channels import channel_table
+from tui.page.table import Table
 from tui.web.chart import choice_of
 from tui.web.live import WIDE, band_means, of_band
 from tui.wording.facts import NOTHING_TO_DO
@@ -59,12 +57,8 @@ def _differences(state: State) -> Table | None:
     found = compare(state.result, state.reference.result)
     if not found:
         return None
-    table = Table()
-    table.add_column("channel")
-    table.add_column("difference, dB", justify="right")
-    for (sensor, channel), difference in found.items():
-        table.add_row(Text(f"{sensor}.{channel}"), difference_text(difference))
-    return table
+    rows = ((".".join(name), difference_cell(each)) for name, each in found.items())
+    return Table(("channel", "difference, dB"), tuple(rows))
 
 
 def _value(value: object) -> str:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from daq.results.decision.end import Remaining
     from daq.results.decision.verdict import LimitResult, TestVerdict
     from daq.results.result import Result
+    from tui.page.table import Tone
 
 WORDS: Mapping[Verdict, str] = {
     Verdict.PASS: "PASS",
@@ -31,6 +32,11 @@ STYLES: Mapping[Verdict, str] = {
     Verdict.PASS: "bold green",
     Verdict.FAIL: "bold red",
     Verdict.NOT_DECIDED: "bold yellow",
+}
+TONES: Mapping[Verdict, Tone] = {
+    Verdict.PASS: "good",
+    Verdict.FAIL: "bad",
+    Verdict.NOT_DECIDED: "doubtful",
 }
 MARKS: Mapping[Verdict, str] = {Verdict.PASS: "✓", Verdict.FAIL: "✗", Verdict.NOT_DECIDED: "?"}
 YOUNG = "#9aa5b8"

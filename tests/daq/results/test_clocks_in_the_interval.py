@@ -60,9 +60,9 @@ def test_tables_show_both_halves_where_the_lower_one_is_wider() -> None:
     assert level_with_error(100.0, 10**0.01, 1.0) == "below 0.10"  # a bound beneath it
     assert level_with_error(1.0, math.inf, 0.5) == "not known"
     table = result_table(Result(made_snapshot(clock_share=0.05), SETTINGS))
-    assert "+" in str(next(iter(table.columns[3].cells)))
+    assert "+" in table.rows[0][3]
     table = result_table(Result(made_snapshot(clock_share=0.0001), SETTINGS))
-    assert "±" in str(list(table.columns[3].cells)[-1])  # the first has an uneven scatter
+    assert "±" in table.rows[-1][3]  # the first has an uneven scatter
 
 
 def test_short_levels_say_the_same() -> None:

@@ -28,6 +28,7 @@ from estimator.spectra.segment_rejection import Reason
 from tests.tui.example_snapshot import SETTINGS, STRANGER, diagnosed, made_snapshot, rotation, said
 from tui.output.diagnosis import details
 from tui.output.results import result_table
+from tui.page.terminal import terminal_table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -229,7 +230,7 @@ def test_a_sensor_elsewhere_has_no_noise_level_and_nothing_contradicts_it() -> N
     assert snapshot.diagnostics.diagnosis is not None
     diagnosis = replace(snapshot.diagnostics.diagnosis, advice=(STRANGER,))
     snapshot = replace(snapshot, diagnostics=replace(snapshot.diagnostics, diagnosis=diagnosis))
-    table = shown([result_table(Result(snapshot, SETTINGS))])
+    table = shown([terminal_table(result_table(Result(snapshot, SETTINGS)))])
     assert table.count("no shared motion") == 3 * len(snapshot.results)
     assert table.count("no third sensor") == 6 * len(snapshot.results)
     text = " ".join(said(snapshot))
@@ -241,4 +242,4 @@ def test_a_sensor_elsewhere_has_no_noise_level_and_nothing_contradicts_it() -> N
 def test_a_channel_without_signal_has_no_level() -> None:
     change = np.eye(9)
     change[4, 4] = 0
-    assert "no signal" in shown([result_table(Result(diagnosed(change), SETTINGS))])
+    assert "no signal" in shown([terminal_table(result_table(Result(diagnosed(change), SETTINGS)))])

@@ -187,7 +187,7 @@ def test_simulated_runs_are_compared_with_their_like_only() -> None:
     assert not simulated.changes
     assert (real.sensor, simulated.sensor) == ("a S1", "a S1, simulated")
     assert [series.document()["simulated"] for series in (real, simulated)] == [False, True]
-    assert list(history_table([simulated]).columns[1].cells) == ["a, simulated"]
+    assert [row[1] for row in history_table([simulated]).rows] == ["a, simulated"]
     assert "simulated" in label_lines([simulated])
     (panel,) = history_figure([simulated]).axes
     assert panel.get_title("left") == "a S1, simulated, 1 to 10 Hz"

@@ -17,11 +17,15 @@ from estimator.decision.verdict import Verdict
 from estimator.wording import percent, signed
 from tui.application.test_view.panels import alerts, known_to
 from tui.output.results import averages_line
+from tui.page import table as page
+from tui.page.table import Cell
+from tui.page.terminal import screen_table
 from tui.wording.facts import NOTHING_TO_DO
 from tui.wording.formatting import level, level_with_error
 from tui.wording.verdict_text import (
     MARKS,
     STYLES,
+    TONES,
     Decision,
     limit_line,
     margin,
@@ -104,34 +108,21 @@ def _channels(state: State, result: Result, *, width: int) -> Table:
     data, cov, alone = result.data, result.covs_of(method), result.alone
     means = result.means(method)
     margins, differences = worst_by_channel(result.verdict), _differences(state)
-    table = Table(
-        box=None,
-        pad_edge=False,
-        padding=(0, 2, 0, 0),
-        header_style=f"bold {MUTED}",
-        title=f"{method}, mean over {band[0]:.3g}–{band[1]:.3g} Hz, dB re 1 ({snapshot.unit})²/Hz",
-        title_justify="left",
-        title_style="bold",
-    )
-    is_wide = width >= WIDE
-    table.add_column("channel", no_wrap=True)
+    title = f"{method}, mean over {band[0]:.3g}–{band[1]:.3g} Hz, dB re 1 ({snapshot.unit})²/Hz"
+    is_wide, rows = width >= WIDE, []
     is_full = is_wide or not (margins and differences)
     titles = [*(["data"] if is_wide else []), "noise, 95 %", *(["c.o.v."] if is_full else [])]
     titles += ["margin, dB", *(["at"] if is_full else [])] if margins else ["from", "to"]
     titles += [f"against {_reference(state)}"] if differences else []
-    for title in titles:
-        table.add_column(title, justify="right", no_wrap=True)
     for column, label in enumerate(snapshot.channels):
-        name = Text(label.name, "bold")
+        name = Cell(label.name, strong=True)
         recorded = [level(float(data[column]))] if is_wide else []
         if column in alone:
-            table.add_row(name, *recorded, Text(PARTNER_WORDS[alone[column]], BAD))
+            why = Cell(PARTNER_WORDS[alone[column]], "bad", strong=True)
+            rows.append((name, *recorded, why))
             continue
         low, high = float(means[column].low[0]), float(means[column].high[0])
-        cells: list[str | Text] = [
-            *recorded,
-            level_with_error(float(means[column].mean[0]), high, low),
-        ]
+        cells = [*recorded, level_with_error(float(means[column].mean[0]), high, low)]
         if is_full:
             cells.append("?" if math.isnan(cov[column]) else percent(cov[column]))
         key = label.sensor, label.channel
@@ -139,15 +130,15 @@ def _channels(state: State, result: Result, *, width: int) -> Table:
             cells += [level(low), level(high)]
         elif key in margins:
             worst = margins[key]
-            style = STYLES[worst.verdict].removeprefix("bold ")
-            cells.append(Text(f"{MARKS[worst.verdict]} {margin(worst)}".replace(" dB", ""), style))
+            words = f"{MARKS[worst.verdict]} {margin(worst)}".replace(" dB", "")
+            cells.append(Cell(words, TONES[worst.verdict]))
             cells += [f"{worst.frequency:.3g} Hz" if worst.known else ""] if is_full else []
         else:
-            cells += [Text("no limit", MUTED), *([""] if is_full else [])]
+            cells += [Cell("no limit", "quiet"), *([""] if is_full else [])]
         if differences:
-            cells.append(difference_text(differences.get(key)))
-        table.add_row(name, *cells)
-    return table
+            cells.append(difference_cell(differences.get(key)))
+        rows.append((name, *cells))
+    return screen_table(page.Table(("channel", *titles), tuple(rows), title=title))
 
 
 def _differences(state: State) -> dict[tuple[str, str], Difference]:
@@ -156,12 +147,12 @@ def _differences(state: State) -> dict[tuple[str, str], Difference]:
     return compare(state.result, state.reference.result)
 
 
-def difference_text(difference: Difference | None) -> Text:
+def difference_cell(difference: Difference | None) -> Cell:
     """Return a difference in dB with its interval: bold where the interval excludes equal noise."""
     if difference is None:
-        return Text("no such channel", MUTED)
+        return Cell("no such channel", "quiet")
     if math.isnan(difference.db):
-        return Text("?", MUTED)
+        return Cell("?", "quiet")
     low, high = difference.low_db, difference.high_db
     text = signed(round(difference.db, 2) + 0.0, "+.2f")  # no "-0.00"
     if math.isinf(low) or math.isinf(high):
@@ -169,7 +160,7 @@ def difference_text(difference: Difference | None) -> Text:
     else:
         up, down = high - difference.db, difference.db - low
         text += f" ±{up:.2f}" if down < 1.1 * up else f" +{up:.2f} −{down:.2f}"
-    return Text(text, "bold" if difference.is_certain else "")
+    return Cell(text, strong=difference.is_certain)
 
 
 def _notes(state: State, result: Result) -> Iterator[Text]:

@@ -16,6 +16,8 @@ from tui.application.test_view.channels import channel_table
 from tui.application.test_view.plot import DriftPlot, PsdPlot
 from tui.application.test_view.plotted import Choice, curves, plot_title, read_out, unit_of
 from tui.application.view import TALL
+from tui.page.table import Table
+from tui.page.terminal import screen_table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -88,8 +90,8 @@ class Board(Vertical):
         now, result, choice = shown.now, shown.result, self._choice
         width = self.size.width - 2
         if now is None or result is None:
-            table = Text("") if now is None else panels.state_table(now, shown.trouble)
-            self._write("#table", table, n_lines=-1)
+            table = Table((), ()) if now is None else panels.state_table(now, shown.trouble)
+            self._write("#table", screen_table(table, folded=("port",)), n_lines=-1)
             waiting = "no test yet: s starts one · ? helps" if shown.path is None else "opening …"
             self._write("#progress", Text(shown.note or waiting, MUTED))
             return
@@ -106,7 +108,8 @@ class Board(Vertical):
                 width=width - 1,
                 is_followed=not shown.trouble,
             )
-        self._write("#table", table, n_lines=table.row_count + 1)
+        gap = 2 if choice.channels and not choice.clocks else 1
+        self._write("#table", screen_table(table, gap=gap), n_lines=len(table.rows) + 1)
         if choice.clocks or choice.cursor is None:  # the answer to a key, before the curves
             self._write_title(self._frozen or shown)
         self._write("#clocks", clocks.clock_line(result, width=width))

@@ -6,7 +6,6 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.table import Table
 from rich.text import Text
 
 from daq.clocks.clock_model import ClockSource
@@ -21,6 +20,7 @@ from daq.results.clock_effect import (
 )
 from daq.results.vocabulary import clock_source
 from tui.application.test_view.curves import Line
+from tui.page.table import Cell, Table
 
 if TYPE_CHECKING:
     from daq.clocks.clock_model import ClockState
@@ -79,30 +79,21 @@ def _verdict(result: Result) -> tuple[str, str]:
 def clock_table(result: Result, *, chosen: str, width: int) -> Table:
     """Return a row per sensor: rate, wander, residual, source, effect on the noise."""
     snapshot = result.snapshot
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style=f"bold {MUTED}")
-    table.add_column("clock", no_wrap=True)
     wide = width >= 76
-    for title in ("rate, ppm", *(("wander, ppm",) if wide else ()), "error", "of noise"):
-        table.add_column(title, justify="right", no_wrap=True)
-    table.add_column("known by", no_wrap=True)
+    numbers = ("rate, ppm", *(("wander, ppm",) if wide else ()), "error", "of noise")
+    rows = []
     shares, left = result.clock_effects, residuals(snapshot)
     against = reference(snapshot)
     for number, clock in enumerate(snapshot.clocks):
         share = shares.get(clock.sensor, math.nan)
-        name = Text(f"━ {clock.sensor}", _colour(number))
-        if clock.sensor == chosen:
-            name.stylize("reverse", 2)
+        name = Cell(clock.sensor, chosen=clock.sensor == chosen, colour=_colour(number))
         rate = _ppm(clock.ppm) + (f" ±{_small(clock.ppm_std)}" if clock.ppm_std > 0 else "")
         wander = _small(clock.wander_ppm) if clock.wander_ppm > 0 else "–"
-        table.add_row(
-            name,
-            rate,
-            *((wander,) if wide else ()),
-            microseconds(left[clock.sensor]) if left.get(clock.sensor, 0.0) > 0 else "–",
-            Text("?", MUTED) if math.isnan(share) else Text(percent(share), STYLES[grade(share)]),
-            Text(_source(clock, is_reference=clock.sensor == against)),
-        )
-    return table
+        error = microseconds(left[clock.sensor]) if left.get(clock.sensor, 0.0) > 0 else "–"
+        effect = Cell("?", "quiet") if math.isnan(share) else Cell(percent(share), grade(share))
+        source = _source(clock, is_reference=clock.sensor == against)
+        rows.append((name, rate, *((wander,) if wide else ()), error, effect, source))
+    return Table.of(("clock", *numbers, "known by"), rows, right=numbers)
 
 
 def _source(clock: ClockState, *, is_reference: bool) -> str:

@@ -13,6 +13,9 @@ from daq.results.sources import LoggedEvent, uncounted_events, with_uncounted
 from estimator.wording import clock_time
 from tui.application.test_view.panels import grouped, state
 from tui.output.diagnosis import details as diagnosis_details
+from tui.page import table as page
+from tui.page.table import Cell
+from tui.page.terminal import screen_table
 from tui.wording.formatting import utc
 
 if TYPE_CHECKING:
@@ -43,20 +46,17 @@ def details(now: RecordingStatus, result: Result | None, *, trouble: str) -> Ren
 
 
 def _sensors(now: RecordingStatus) -> Table:
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style=f"bold {MUTED}")
-    for title in ("sensor", "state", "gaps", "missing", "clipped"):
-        table.add_column(title, no_wrap=True)
-    table.add_column("port", overflow="fold")
-    for sensor in now.sensors:
-        table.add_row(
-            Text(sensor.name, "bold"),
-            state(sensor),
-            grouped(sensor.n_gaps),
+    rows = (
+        (
+            *(Cell(sensor.name, strong=True), state(sensor), grouped(sensor.n_gaps)),
             f"{grouped(sensor.n_missing)} samples" if sensor.n_missing else "0",
             f"{grouped(sensor.n_clipped)} blocks" if sensor.n_clipped else "no",
-            Text(sensor.port),
+            sensor.port,
         )
-    return table
+        for sensor in now.sensors
+    )
+    names = ("sensor", "state", "gaps", "missing", "clipped", "port")
+    return screen_table(page.Table.of(names, rows), folded=("port",))
 
 
 def _segments(result: Result) -> Text:

@@ -8,7 +8,6 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.table import Table
 from rich.text import Text
 
 from daq.recording.sensor_state import SensorState
@@ -18,6 +17,7 @@ from daq.results.facts.recordings import SensorsSimulated, facts_of_sensors
 from daq.results.vocabulary import FLAG_WORDS, PARTNER_WORDS
 from estimator.checks.advice import Rank
 from estimator.wording import clock_time, percent, several
+from tui.page.table import Cell, Table, Tone
 from tui.wording.formatting import level_with_error
 from tui.wording.verdict_text import headline, how_long, style_of
 
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from tui.application.test_view.plotted import Choice
 
 MUTED = "#9aa5b8"
+_NUMBERS = ("Hz", "samples", "gaps")
 _STYLES = {Rank.INVALIDATES: "bold #ff6b6b", Rank.DELAYS: "yellow", Rank.TO_KNOW: MUTED}
 MIN_BAR = 6  # cells
 
@@ -56,10 +57,10 @@ def sensor_table(
     Without room, rates are omitted first, then numbers of samples, then of gaps.
     """
     noise = partial(_noise_columns, now, result, choice, means)
-    columns = {"sensor": [Text(sensor.name, "bold") for sensor in now.sensors]}
+    columns = {"sensor": [Cell(sensor.name, strong=True) for sensor in now.sensors]}
     columns["state"] = _states(now, is_followed=is_followed)
-    columns["Hz"] = [Text(f"{sensor.sampling_rate:g}") for sensor in now.sensors]
-    columns["samples"] = [Text(grouped(s.n_samples)) for s in now.sensors]
+    columns["Hz"] = [Cell(f"{sensor.sampling_rate:g}") for sensor in now.sensors]
+    columns["samples"] = [Cell(grouped(s.n_samples)) for s in now.sensors]
     columns["gaps"] = [_gaps(sensor) for sensor in now.sensors]
     columns |= noise(with_error=True)
     for unneeded in ("Hz", "samples", "gaps"):
@@ -68,36 +69,28 @@ def sensor_table(
     if _width(columns) > width:
         columns |= noise(with_error=False)
     if _width(columns) > width:  # the alert says in words what the marks mean
-        marks = [Text(cell.plain[:1], cell.style) for cell in columns.pop("state")]
+        marks = [Cell(c[:1], c.tone, strong=c.strong) for c in columns.pop("state")]
         columns = {"": marks, " ": columns.pop("sensor"), **columns}
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold #9aa5b8")
-    for title in columns:
-        right = title in {"Hz", "samples", "gaps"}
-        table.add_column(title, justify="right" if right else "left", no_wrap=True)
-    for row in zip(*columns.values(), strict=True):
-        table.add_row(*row)
-    return table
+    return Table.of(tuple(columns), zip(*columns.values(), strict=True), right=_NUMBERS)
 
 
 def state_table(now: RecordingStatus, trouble: str) -> Table:
     """Return a row per sensor: how it is, before there is an estimate."""
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold #9aa5b8")
-    for title in ("sensor", "state", "Hz", "samples", "gaps"):
-        right = title in {"Hz", "samples", "gaps"}
-        table.add_column(title, justify="right" if right else "left", no_wrap=True)
-    table.add_column("port", overflow="fold")
-    for sensor, how in zip(now.sensors, _states(now, is_followed=not trouble), strict=True):
-        rate, count = f"{sensor.sampling_rate:g}", grouped(sensor.n_samples)
-        name, port = Text(sensor.name, "bold"), Text(sensor.port)
-        table.add_row(name, how, rate, count, _gaps(sensor), port)
-    return table
+    rows = (
+        (
+            *(Cell(sensor.name, strong=True), how, f"{sensor.sampling_rate:g}"),
+            *(grouped(sensor.n_samples), _gaps(sensor), sensor.port),
+        )
+        for sensor, how in zip(now.sensors, _states(now, is_followed=not trouble), strict=True)
+    )
+    return Table.of(("sensor", "state", *_NUMBERS, "port"), rows, right=_NUMBERS)
 
 
-def _states(now: RecordingStatus, *, is_followed: bool) -> list[Text]:
+def _states(now: RecordingStatus, *, is_followed: bool) -> list[Cell]:
     """Return the state of every sensor: of one that nobody records, that this is so."""
     if is_followed or now.closed:
         return [state(sensor) for sensor in now.sensors]
-    return [Text("■ not recorded", MUTED) for _ in now.sensors]
+    return [Cell("■ not recorded", "quiet") for _ in now.sensors]
 
 
 def _noise_columns(
@@ -107,7 +100,7 @@ def _noise_columns(
     means: Sequence[BandMeans],
     *,
     with_error: bool,
-) -> dict[str, list[Text]]:
+) -> dict[str, list[Cell]]:
     """Return the columns of channels, by their titles."""
     snapshot = result.snapshot
     band, of_sensor = result.band, _columns_of(snapshot)
@@ -115,27 +108,26 @@ def _noise_columns(
     columns, alone = {}, result.alone
     for number in range(max(snapshot.dims)):
         title = titles[number] if number < len(titles) else " " * number
-        cells = columns[title] = [Text("") for _ in now.sensors]
+        cells = columns[title] = [Cell("") for _ in now.sensors]
         for row, sensor in enumerate(now.sensors):
             mine = of_sensor.get(sensor.name, [])
             if number < len(mine):
-                cells[row] = _channel_noise(
-                    snapshot, mine[number], means, alone, with_error=with_error
-                )
-                if mine[number] == choice.channel:
-                    cells[row].stylize("reverse")
+                column = mine[number]
+                text, tone = _channel_noise(snapshot, column, means, alone, with_error=with_error)
+                is_bad = tone == "bad"
+                cells[row] = Cell(text, tone, strong=is_bad, chosen=column == choice.channel)
     return columns
 
 
-def _width(columns: dict[str, list[Text]]) -> int:
+def _width(columns: dict[str, list[Cell]]) -> int:
     widest = (max(len(title), *map(len, cells)) for title, cells in columns.items())
     return sum(widest) + len(columns)
 
 
-def _gaps(sensor: SensorStatus) -> Text:
+def _gaps(sensor: SensorStatus) -> Cell:
     if not sensor.n_gaps:
-        return Text("0")
-    return Text(f"{grouped(sensor.n_gaps)} ({grouped(sensor.n_missing)})", "yellow")
+        return Cell("0")
+    return Cell(f"{grouped(sensor.n_gaps)} ({grouped(sensor.n_missing)})", "doubtful")
 
 
 def grouped(count: int) -> str:
@@ -150,20 +142,19 @@ def _columns_of(snapshot: Snapshot) -> dict[str, list[int]]:
     return columns
 
 
-def state(sensor: SensorStatus) -> Text:
+def state(sensor: SensorStatus) -> Cell:
     """Return the state of a sensor, and for how long it has been overdue."""
     state = sensor.state
     if state.is_overdue:
-        style = "bold #ff6b6b" if state.is_lost else "yellow"
-        return Text(f"○ {state} {clock_time(sensor.overdue_for)}", style)
+        tone: Tone = "bad" if state.is_lost else "doubtful"
+        return Cell(f"○ {state} {clock_time(sensor.overdue_for)}", tone, strong=state.is_lost)
     if state is SensorState.WAITING:
-        return Text(f"○ {state}", "yellow")
+        return Cell(f"○ {state}", "doubtful")
     if sensor.stuck:
-        return Text(f"▲ {' '.join(sensor.stuck)} stuck", "bold #ff6b6b")
+        return Cell(f"▲ {' '.join(sensor.stuck)} stuck", "bad", strong=True)
     if sensor.is_clipping:
-        return Text("▲ clipping", "bold #ff6b6b")
-    ended = state is SensorState.ENDED
-    return Text(f"■ {state}", "#9aa5b8") if ended else Text(f"● {state}", "green")
+        return Cell("▲ clipping", "bad", strong=True)
+    return Cell(f"■ {state}", "quiet") if state is SensorState.ENDED else Cell(f"● {state}", "good")
 
 
 def _channel_noise(
@@ -173,20 +164,20 @@ def _channel_noise(
     alone: Mapping[int, WithoutPartner],
     *,
     with_error: bool,
-) -> Text:
+) -> tuple[str, Tone]:
     name = snapshot.channels[column].channel
-    value, style = "…", ""
+    value = "…"
     if flag := _flagged(snapshot, column):
-        value, style = flag, "bold #ff6b6b"
-    elif column in alone:
-        value, style = PARTNER_WORDS[alone[column]], "bold #ff6b6b"
-    elif means:
+        return f"{name} {flag}", "bad"
+    if column in alone:
+        return f"{name} {PARTNER_WORDS[alone[column]]}", "bad"
+    if means:
         mean, high, low = (
             float(each[0]) for each in (means[column].mean, means[column].high, means[column].low)
         )
         if not math.isnan(mean):
             value = level_with_error(mean, high, low, short=True, bare=not with_error)
-    return Text(f"{name} {value}", style)
+    return f"{name} {value}", "plain"
 
 
 def _flagged(snapshot: Snapshot, column: int) -> str:

@@ -6,12 +6,12 @@ import math
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from rich.table import Table
 from rich.text import Text
 
 from daq.archive.facts import NightsNotCompared, facts_of_archive
 from daq.bench.units import decibels
 from estimator.wording import percent, several, signed, span
+from tui.page.table import Table
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -31,22 +31,16 @@ def day_text(utc_ns: int) -> str:
 
 def stations_table(found: Mapping[str, Mapping[str, Any]]) -> Table:
     """Return a line for each station, of its summary (`daq.archive.task`)."""
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for name in ("station", "channels", "days", "from", "to", "band", "noise (dB)", "changes"):
-        table.add_column(name, justify="right" if name in {"channels", "days"} else "left")
+    rows = []
     for name, each in found.items():
         low, high = each["lowest_db"], each["highest_db"]
-        table.add_row(
-            name,
-            str(each["n_channels"]),
-            str(each["n_days"]),
-            day_text(each["first_day_ns"]),
-            day_text(each["last_day_ns"]),
-            span(*each["band_hz"]),
-            "?" if low is None else f"{low:+.1f} to {high:+.1f} re 1 ({each['unit']})²/Hz",
-            several(each["n_changed"], "channel") if each["n_changed"] else "none",
-        )
-    return table
+        days = (day_text(each["first_day_ns"]), day_text(each["last_day_ns"]))
+        noise = "?" if low is None else f"{low:+.1f} to {high:+.1f} re 1 ({each['unit']})²/Hz"
+        changes = several(each["n_changed"], "channel") if each["n_changed"] else "none"
+        counts = (each["n_channels"], each["n_days"])
+        rows.append((name, *counts, *days, span(*each["band_hz"]), noise, changes))
+    names = ("station", "channels", "days", "from", "to", "band", "noise (dB)", "changes")
+    return Table.of(names, rows, right=("channels", "days"))
 
 
 def course_title(answer: Answer) -> Text:
@@ -61,37 +55,16 @@ def course_title(answer: Answer) -> Text:
 
 def course_table(answer: Answer) -> Table:
     """Return every channel's range, drift and change in the first band."""
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for number, name in enumerate(
-        (
-            "sensor",
-            "channel",
-            "lowest day",
-            "highest day",
-            "drift (dB/year)",
-            "work − night (dB)",
-            "change",
-        )
-    ):
-        table.add_column(name, justify="right" if 1 < number < 6 else "left", no_wrap=True)
+    rows = []
     for column, label in enumerate(answer.pooled.channels):
         levels = [decibels(float(psd)) for psd in answer.levels.mean[:, 0, column]]
         known = [level for level in levels if not math.isnan(level)]
-        table.add_row(
-            *map(
-                Text,
-                (
-                    label.sensor,
-                    label.channel,
-                    signed(min(known), ".2f") if known else "?",
-                    signed(max(known), ".2f") if known else "?",
-                    _interval(answer.courses[column].segments[-1].drift),
-                    _interval(answer.courses[column].segments[-1].contrast),
-                    _change(answer, column),
-                ),
-            )
-        )
-    return table
+        last = answer.courses[column].segments[-1]
+        ends = [signed(end(known), ".2f") if known else "?" for end in (min, max)]
+        course = (_interval(last.drift), _interval(last.contrast), _change(answer, column))
+        rows.append((label.sensor, label.channel, *ends, *course))
+    numbers = ("lowest day", "highest day", "drift (dB/year)", "work − night (dB)")
+    return Table.of(("sensor", "channel", *numbers, "change"), rows, right=numbers)
 
 
 def remarks(answer: Answer, zone: str) -> Iterator[str]:

@@ -6,11 +6,9 @@ from collections import Counter
 from typing import TYPE_CHECKING
 from xml.sax.saxutils import escape
 
-from rich.table import Table
-from rich.text import Text
-
 from daq.bench.units import decibels
 from daq.results.change_test import DECIBEL, NORMAL_95
+from tui.page.table import Table
 from tui.service.history.series import FALSE_ALARMS, SCATTER
 from tui.service.records.run_state import utc_text
 from tui.wording.formatting import level_with_error
@@ -79,43 +77,34 @@ def history_figure(found: Sequence[Series]) -> Figure:
 
 def history_table(found: Sequence[Series]) -> Table:
     """Return a row for each channel and band: its first and last noise, and its changes."""
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for name in ("serial number", "sensor", "channel", "band (Hz)", "unit²/Hz of"):
-        table.add_column(name)
-    for name in ("runs", "first (dB)", "last (dB)"):
-        table.add_column(name, justify="right")
-    table.add_column("changed")
-    for series in found:
-        last = series.last
-        table.add_row(
+    words = ("serial number", "sensor", "channel", "band (Hz)", "unit²/Hz of")
+    numbers = ("runs", "first (dB)", "last (dB)")
+    rows = (
+        (
             last.serial_number or "-",
             f"{last.sensor}, simulated" if series.simulated else last.sensor,
-            last.channel,
-            *(f"{last.low_hz:.3g} to {last.high_hz:.3g}", last.unit, str(len(series.noise))),
-            *(_level(series.noise[0]), _level(last)),
+            *(last.channel, f"{last.low_hz:.3g} to {last.high_hz:.3g}", last.unit),
+            *(len(series.noise), _level(series.noise[0]), _level(last)),
             f"{len(series.changes)} ×" if series.changes else "no",
         )
-    return table
+        for series in found
+        for last in [series.last]
+    )
+    return Table.of((*words, *numbers, "changed"), rows, right=numbers)
 
 
 def tests_table(tests: Sequence[SensorTest]) -> Table:
     """Return a row for each test of a sensor: when, where, firmware, temperature, verdict."""
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for name in ("test of", "bench", "as", "model", "firmware"):
-        table.add_column(name)
-    table.add_column("°C", justify="right")
-    table.add_column("limits")
+    rows = []
     for each in tests:
         verdicts = Counter(verdict for _, _, verdict, _ in each.limits)
         temperature = "-" if each.temperature is None else f"{each.temperature:.1f}"
-        table.add_row(
-            utc_text(each.started),
-            Text(f"{each.bench}, simulated" if each.simulated else each.bench),
-            *map(Text, (each.sensor, each.model or "-", each.firmware or "-")),
-            temperature,
-            ", ".join(f"{n} {verdict}" for verdict, n in verdicts.items()) or "none",
-        )
-    return table
+        bench = f"{each.bench}, simulated" if each.simulated else each.bench
+        device = (each.sensor, each.model or "-", each.firmware or "-")
+        limits = ", ".join(f"{n} {verdict}" for verdict, n in verdicts.items()) or "none"
+        rows.append((utc_text(each.started), bench, *device, temperature, limits))
+    names = ("test of", "bench", "as", "model", "firmware", "°C", "limits")
+    return Table.of(names, rows, right=("°C",))
 
 
 def label_lines(found: Sequence[Series]) -> list[str]:

@@ -1,0 +1,1 @@
+"""What outputs consist of, and a renderer each for terminals and HTML."""

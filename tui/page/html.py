@@ -1,0 +1,37 @@
+"""Tables as HTML: for the pages of the web server and for notebooks."""
+
+from __future__ import annotations
+
+from html import escape
+from typing import TYPE_CHECKING
+
+from tui.page.table import Cell
+
+if TYPE_CHECKING:
+    from tui.page.table import Table
+
+
+_CLASSES = {"quiet": "muted", "plain": ""}
+
+
+def html_table(table: Table, *, caption: str = "") -> str:
+    """Return a table as HTML; the first cell of a row names it. All text is escaped."""
+    names = [_cell("th", n, name, table, scope="col") for n, name in enumerate(table.header)]
+    rows = [
+        "".join(
+            _cell("td" if n else "th", n, cell, table, scope="" if n else "row", row=row)
+            for n, cell in enumerate(cells)
+        )
+        for row, cells in enumerate(table.rows)
+    ]
+    body = "".join(f"<tr>{row}</tr>" for row in rows)
+    above = f"<caption>{escape(caption)}</caption>" if caption else ""
+    return f"<table>{above}<thead><tr>{''.join(names)}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def _cell(tag: str, column: int, text: str, table: Table, *, scope: str, row: int = -1) -> str:
+    tone = text.tone if isinstance(text, Cell) else table.tones.get((row, column), "plain")
+    classes = f"{_CLASSES.get(tone, tone)} {'number' * (column not in table.left)}".strip()
+    about = f' class="{classes}"' if classes else ""
+    about += f' scope="{scope}"' if scope else ""
+    return f"<{tag}{about}>{escape(text)}</{tag}>"

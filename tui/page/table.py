@@ -1,0 +1,85 @@
+"""A table as data: cells are texts that know what they mean."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal, Self
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Mapping, Sequence
+
+Tone = Literal["plain", "good", "bad", "doubtful", "quiet"]
+
+
+class Cell(str):
+    """The text of a cell, and what it means.
+
+    Parameters
+    ----------
+    text : str
+    tone : Tone
+    strong : bool
+        Whether it is emphasised, as the name of a row or a difference that is certain.
+    chosen : bool
+        Whether it names what the rest of a screen shows.
+    colour : str
+        Of the curve that it names, whose line is in front of it.
+    """
+
+    __slots__ = ("chosen", "colour", "strong", "tone")
+    tone: Tone
+    strong: bool
+    chosen: bool
+    colour: str
+
+    def __new__(
+        cls,
+        text: object,
+        tone: Tone = "plain",
+        *,
+        strong: bool = False,
+        chosen: bool = False,
+        colour: str = "",
+    ) -> Self:
+        """Return a cell."""
+        made = super().__new__(cls, f"━ {text}" if colour else text)
+        made.tone, made.strong, made.chosen, made.colour = tone, strong, chosen, colour
+        return made
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows under a header.
+
+    Attributes
+    ----------
+    header : tuple of str
+        Empty texts only: the table is shown without a header.
+    rows : tuple of tuple of str
+        As wide as the header, or shorter. Cells that mean something are `Cell`.
+    left : frozenset of int
+        Columns of words, flush left; the others are numbers, flush right.
+    tones : mapping of (row, column) to Tone
+        Of cells that are plain texts.
+    title : str
+    """
+
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    left: frozenset[int] = frozenset({0})
+    tones: Mapping[tuple[int, int], Tone] = field(default_factory=dict)
+    title: str = ""
+
+    @classmethod
+    def of(
+        cls,
+        header: Sequence[str],
+        rows: Iterable[Iterable[object]],
+        *,
+        right: Collection[str] = (),
+        title: str = "",
+    ) -> Self:
+        """Return a table whose columns are flush left, but for those with a title in ``right``."""
+        left = frozenset(n for n, name in enumerate(header) if name not in right)
+        cells = (tuple(each if isinstance(each, str) else str(each) for each in r) for r in rows)
+        return cls(tuple(header), tuple(cells), left, title=title)

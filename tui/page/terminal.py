@@ -1,0 +1,85 @@
+"""Tables for terminals: the command line, the application, and texts of a notebook."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import rich.table
+from rich.text import Text
+
+from tui.page.table import Cell
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping
+
+    from tui.page.table import Table, Tone
+
+MUTED = "#9aa5b8"
+STYLES: Mapping[Tone, str] = {
+    "plain": "",
+    "good": "green",
+    "bad": "#ff6b6b",
+    "doubtful": "yellow",
+    "quiet": MUTED,
+}
+SCREEN_HEADER = f"bold {MUTED}"
+
+
+def terminal_table(
+    table: Table,
+    *,
+    header_style: str = "bold",
+    gap: int = 2,
+    wraps: bool = True,
+    folded: Collection[str] = (),
+) -> rich.table.Table:
+    """Return a table without rules.
+
+    Parameters
+    ----------
+    table : Table
+    header_style : str
+    gap : int
+        Blanks between columns.
+    wraps : bool
+        Whether cells break into lines where a terminal is narrow; otherwise their ends are cut.
+    folded : collection of str
+        Titles of columns that break nevertheless.
+    """
+    made = rich.table.Table(
+        box=None,
+        pad_edge=False,
+        padding=(0, gap, 0, 0),
+        header_style=header_style,
+        show_header=any(table.header),
+        title=table.title or None,
+        title_justify="left",
+        title_style="bold",
+    )
+    for number, name in enumerate(table.header):
+        made.add_column(
+            Text(name),
+            justify="left" if number in table.left else "right",
+            no_wrap=not wraps and name not in folded,
+            overflow="fold" if wraps or name in folded else "ellipsis",
+        )
+    for row, cells in enumerate(table.rows):
+        made.add_row(
+            *(styled(cell, table.tones.get((row, n), "plain")) for n, cell in enumerate(cells))
+        )
+    return made
+
+
+def screen_table(table: Table, *, gap: int = 2, folded: Collection[str] = ()) -> rich.table.Table:
+    """Return a table as the application shows it: rows are lines."""
+    return terminal_table(table, header_style=SCREEN_HEADER, gap=gap, wraps=False, folded=folded)
+
+
+def styled(cell: str, tone: Tone = "plain") -> Text:
+    """Return a cell in the colours of its meaning."""
+    if not isinstance(cell, Cell):
+        return Text(cell, STYLES[tone])
+    made = Text(cell, f"{'bold ' * cell.strong}{cell.colour or STYLES[cell.tone]}".strip())
+    if cell.chosen:
+        made.stylize("reverse", 2 * bool(cell.colour))
+    return made
