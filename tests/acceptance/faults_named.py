@@ -112,7 +112,7 @@ def seconds_to_name(case: Case, seed: int) -> tuple[float, str]:
                 recording.refresh()
                 estimation.update()
                 status = monitor.status_with_stuck_channels()
-                lines = [line.plain for line in alerts(status, None)]
+                lines = [*alerts(status, None)]
                 if estimation.n_seen >= wanted:
                     wanted = max(estimation.n_seen + 1, estimation.n_seen * (1 + CURVE_GROWTH))
                     snapshot = estimation.snapshot()

@@ -14,7 +14,8 @@ from textual.widgets import Static
 from estimator.wording import clock_time
 from tui.application.dialogs import TextScreen, help_text
 from tui.application.state import TITLES, VIEWS
-from tui.wording.verdict_text import WORDS, style_of
+from tui.page.terminal import styled
+from tui.wording.verdict_text import WORDS, in_tone
 
 if TYPE_CHECKING:
     from textual.app import ComposeResult
@@ -159,7 +160,8 @@ def status_line(state: State, view: str, *, width: int) -> Text:
     if verdict is not None:
         if width < ALL_TABS:  # its sign says the same as its word
             doing = Text.assemble(doing[:1], doing[doing.plain.find("  ") + 1 :])
-        doing.append(f"  {WORDS[verdict.verdict]}", style_of(verdict, grows=not state.has_result))
+        words = f"  {WORDS[verdict.verdict]}"
+        doing.append_text(styled(in_tone(words, verdict, grows=not state.has_result)))
     simulated = Text(" SIMULATED ", f"{BAD} reverse") if state.is_simulated else Text()
     line = _tabs(view, has_titles=width >= ALL_TABS)
     if line.cell_len + simulated.cell_len + doing.cell_len > width - 4 >= ALL_TABS - 4:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from tui.page.table import Cell
 
 if TYPE_CHECKING:
-    from tui.page.table import Table
+    from tui.page.table import Table, Tone
 
 
 _CLASSES = {"quiet": "muted", "plain": ""}
@@ -30,8 +30,14 @@ def html_table(table: Table, *, caption: str = "") -> str:
 
 
 def _cell(tag: str, column: int, text: str, table: Table, *, scope: str, row: int = -1) -> str:
-    tone = text.tone if isinstance(text, Cell) else table.tones.get((row, column), "plain")
-    classes = f"{_CLASSES.get(tone, tone)} {'number' * (column not in table.left)}".strip()
+    named = class_of(text, table.tones.get((row, column), "plain"))
+    classes = f"{named} {'number' * (column not in table.left)}".strip()
     about = f' class="{classes}"' if classes else ""
     about += f' scope="{scope}"' if scope else ""
     return f"<{tag}{about}>{escape(text)}</{tag}>"
+
+
+def class_of(text: str, tone: Tone = "plain") -> str:
+    """Return the class of a text by its tone; a text that is no cell has ``tone``."""
+    meant = text.tone if isinstance(text, Cell) else tone
+    return _CLASSES.get(meant, meant)

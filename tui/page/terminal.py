@@ -18,7 +18,7 @@ MUTED = "#9aa5b8"
 STYLES: Mapping[Tone, str] = {
     "plain": "",
     "good": "green",
-    "bad": "#ff6b6b",
+    "bad": "bold #ff6b6b",
     "doubtful": "yellow",
     "quiet": MUTED,
 }

@@ -7,24 +7,19 @@ from typing import TYPE_CHECKING
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
-from rich.text import Text
 
 from estimator.checks.advice import Rank
 from estimator.wording import clock_time, several
-from tui.page.html import html_table
+from tui.page.html import class_of, html_table
 from tui.wording.formatting import utc
 from tui.wording.verdict_text import TONES
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
-
     from tui.page.table import Table
 
-_TONES = {"#ff6b6b": "bad", "red": "bad", "yellow": "doubtful", "green": "good", "#9aa5b8": "muted"}
-"""Classes for what the colours of the application mean; all else is plain."""
 _RANKS = {Rank.INVALIDATES: "bad", Rank.DELAYS: "doubtful", Rank.TO_KNOW: ""}
 _WIDE = Markup('<div class="wide" tabindex="0" role="region" aria-label="{}">{}</div>')
-_CELL = Markup('<{name} class="{tone}"{scope}>{text}</{name}>')
+_LINE = Markup('<p class="{tone}">{text}</p>')
 
 
 @cache
@@ -39,9 +34,8 @@ def environment() -> Environment:
     )
     made.filters |= {
         "clock_time": clock_time,
-        "plain": _plain,
         "rank_tone": _RANKS.get,
-        "rich": line,
+        "line": line,
         "several": several,
         "table": table,
         "tone_of": lambda verdict: "" if verdict is None else TONES[verdict],
@@ -55,24 +49,12 @@ def page(name: str, /, **values: object) -> str:
     return environment().get_template(f"{name}.html.j2").render(values)
 
 
-def tone(text: RenderableType) -> str:
-    """Return the class for the colour of a text."""
-    styles = (
-        [str(text.style), *(str(s.style) for s in text.spans)] if isinstance(text, Text) else []
-    )
-    return next((tone for word, tone in _TONES.items() for s in styles if word in s), "")
-
-
-def line(text: RenderableType) -> Markup:
+def line(text: str) -> Markup:
     """Return a text of the application as a paragraph."""
-    return _CELL.format(name="p", tone=tone(text), scope="", text=_plain(text))
+    return _LINE.format(tone=class_of(text), text=text)
 
 
 def table(made: Table) -> Markup:
     """Return a table of the application, which scrolls where it is too wide."""
     names = ", ".join(title for title in made.header if title.strip())
     return _WIDE.format(names, Markup(html_table(made)))  # noqa: S704 - it escapes all text
-
-
-def _plain(text: RenderableType) -> str:
-    return text.plain if isinstance(text, Text) else str(text)

@@ -19,8 +19,6 @@ from datetime import UTC, datetime
 from itertools import groupby
 from typing import TYPE_CHECKING
 
-from rich.text import Text
-
 from daq.errors import HuddleError
 from daq.estimation.follow import follow
 from daq.recording.storage.locking import LOCKS_ARE_VISIBLE, is_being_written
@@ -32,6 +30,7 @@ from tui.application.test_view.channels import channel_table
 from tui.application.test_view.clocks import clock_line, clock_table
 from tui.application.test_view.panels import advice, alerts, note, progress_line, state_table
 from tui.application.test_view.recent_motion import RecentMotion, with_advice
+from tui.page.table import Cell
 from tui.runs.estimate_settings import settings_for
 from tui.service.status import status_lines
 from tui.web.chart import choice_of, drawn
@@ -322,7 +321,8 @@ class _Page:
             self._drawn = result
         progress = None
         if now is not None and result is not None:
-            progress = progress_line(now, result, width=1)
+            line = progress_line(now, result, width=1).plain
+            progress = Cell(line, "plain" if result.snapshot.n_segments else "quiet")
         parts = _parts(
             "now_status",
             state=state,
@@ -342,6 +342,7 @@ def _of_estimate(state: State, result: Result) -> dict[str, str]:
     """Return the parts of the page that follow from the estimate."""
     snapshot = result.snapshot
     choice, noise, clocks = choice_of(state, {}), None, None
+    parts = clock_line(result, width=WIDE)
     if snapshot.n_segments:
         noise = channel_table(
             replace(state, now=None), choice, means=band_means(result), width=WIDE
@@ -351,11 +352,11 @@ def _of_estimate(state: State, result: Result) -> dict[str, str]:
     return _parts(
         "now_estimate",
         # Without a verdict, what delays it is among the facts.
-        advice=Text() if result.verdict is None else advice(result, choice),
+        advice="" if result.verdict is None else advice(result, choice),
         facts=[each for each in result.facts if each.needs_action],
         band=of_band(result),
         noise=noise,
-        clock=clock_line(result, width=WIDE),
+        clock=Cell("".join(parts), parts[-1].tone),
         clocks=clocks,
     )
 

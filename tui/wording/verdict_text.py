@@ -11,6 +11,7 @@ from daq.results.decision.facts import LimitUndecided, WrongSensitivity
 from daq.results.decision.verdict import facts_of_verdict
 from estimator.decision.verdict import REMOVED_BY_TIME, Verdict
 from estimator.wording import listed, percent, roughly, several, signed
+from tui.page.table import Cell
 from tui.wording.facts import NOTHING_TO_DO
 from tui.wording.formatting import level
 
@@ -39,8 +40,6 @@ TONES: Mapping[Verdict, Tone] = {
     Verdict.NOT_DECIDED: "doubtful",
 }
 MARKS: Mapping[Verdict, str] = {Verdict.PASS: "✓", Verdict.FAIL: "✗", Verdict.NOT_DECIDED: "?"}
-YOUNG = "#9aa5b8"
-"""Style of a test that only lacks time: nothing is wrong."""
 SEE_FACTS = "The facts below need action."
 REPAIR = "Repair or replace these sensors, or correct the limit."
 """After a limit that is not met."""
@@ -90,10 +89,10 @@ class Decision:
         return cls(found.verdict, headline(found), steps[0] if steps else usual, remarks)
 
 
-def style_of(found: TestVerdict, *, grows: bool) -> str:
-    """Return the style of a verdict: nothing is wrong while a test that grows lacks only time."""
+def in_tone(text: str, found: TestVerdict, *, grows: bool) -> Cell:
+    """Return a text on a verdict: nothing is wrong while a test that grows lacks only time."""
     is_young = grows and REMOVED_BY_TIME.issuperset(found.obstacles or [None])
-    return YOUNG if is_young else STYLES[found.verdict]
+    return Cell(text, "quiet") if is_young else Cell(text, TONES[found.verdict], strong=True)
 
 
 def headline(found: TestVerdict) -> str:

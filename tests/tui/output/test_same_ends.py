@@ -30,6 +30,7 @@ from tui.certificate.dcc import SI, _mean
 from tui.notebook import result as notebooks
 from tui.output.json_document import _band_means
 from tui.output.results import result_table
+from tui.page.terminal import terminal_table
 from tui.report.noise import noise_section
 from tui.report.parts import Table
 from tui.web.chart import _numbers
@@ -107,7 +108,7 @@ def test_table_report_certificate_json_page_curve_verdict_and_budget_have_the_sa
 
     console = Console(width=200, no_color=True)
     with console.capture() as capture:
-        console.print(result_table(Result(snapshot, THIRD)))
+        console.print(terminal_table(result_table(Result(snapshot, THIRD))))
     rows = capture.get().replace("−", "-").splitlines()[1:]
     for row, below, above, mean in zip(rows, low, high, found.mean[0], strict=False):
         up = decibels(float(above)) - decibels(float(mean))

@@ -20,7 +20,7 @@ from tui.commands.estimate import show_result
 from tui.notebook import text
 from tui.report.noise import verdict
 from tui.wording.facts import NOTHING_TO_DO, brief
-from tui.wording.verdict_text import Decision, how_long, style_of
+from tui.wording.verdict_text import Decision, how_long, in_tone
 
 if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
@@ -119,7 +119,7 @@ def test_a_young_test_has_nothing_yellow(n_effective: float) -> None:
     young = replace(young, closed=False)
     result = Result(young, SETTINGS, bench_with(1e-12))
     assert findings(Result(young, SETTINGS), width=200) == []
-    assert "yellow" not in str(advice(Result(young, SETTINGS), Choice()).style)
+    assert advice(Result(young, SETTINGS), Choice()).tone != "doubtful"
     assert result.verdict is not None
     assert result.verdict.verdict is Verdict.NOT_DECIDED
     assert findings(Result(diagnosed(n_effective=5.0), SETTINGS), width=200)  # it has ended
@@ -129,8 +129,8 @@ def test_a_verdict_is_yellow_once_time_alone_does_not_decide() -> None:
     found = Result(made_snapshot(n_effective=15.0), SETTINGS, bench_with(3e-12)).verdict
     assert found is not None
     assert found.verdict is Verdict.NOT_DECIDED
-    assert "yellow" not in style_of(found, grows=True)
-    assert "yellow" in style_of(found, grows=False)
+    assert in_tone("", found, grows=True).tone == "quiet"
+    assert in_tone("", found, grows=False).tone == "doubtful"
 
 
 def test_scatter_is_not_called_how_well_the_noise_is_known() -> None:

@@ -19,7 +19,7 @@ from tui.application.test_view.panels import alerts, known_to
 from tui.output.results import averages_line
 from tui.page import table as page
 from tui.page.table import Cell
-from tui.page.terminal import screen_table
+from tui.page.terminal import screen_table, styled
 from tui.wording.facts import NOTHING_TO_DO
 from tui.wording.formatting import level, level_with_error
 from tui.wording.verdict_text import (
@@ -53,7 +53,7 @@ def result(state: State, *, width: int) -> RenderableType:
         return ""
     snapshot = found.snapshot
     parts: list[RenderableType] = [*_verdict(found)]
-    wrong = [] if now is None else alerts(now, found)
+    wrong = [] if now is None else [*map(styled, alerts(now, found))]
     parts += ["", *wrong] if wrong else []
     parts.append("")
     if snapshot.results:
@@ -118,7 +118,7 @@ def _channels(state: State, result: Result, *, width: int) -> Table:
         name = Cell(label.name, strong=True)
         recorded = [level(float(data[column]))] if is_wide else []
         if column in alone:
-            why = Cell(PARTNER_WORDS[alone[column]], "bad", strong=True)
+            why = Cell(PARTNER_WORDS[alone[column]], "bad")
             rows.append((name, *recorded, why))
             continue
         low, high = float(means[column].low[0]), float(means[column].high[0])

@@ -17,7 +17,7 @@ from tui.application.test_view.plot import DriftPlot, PsdPlot
 from tui.application.test_view.plotted import Choice, curves, plot_title, read_out, unit_of
 from tui.application.view import TALL
 from tui.page.table import Table
-from tui.page.terminal import screen_table
+from tui.page.terminal import screen_table, styled
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -112,17 +112,17 @@ class Board(Vertical):
         self._write("#table", screen_table(table, gap=gap), n_lines=len(table.rows) + 1)
         if choice.clocks or choice.cursor is None:  # the answer to a key, before the curves
             self._write_title(self._frozen or shown)
-        self._write("#clocks", clocks.clock_line(result, width=width))
+        self._write("#clocks", Text.assemble(*map(styled, clocks.clock_line(result, width=width))))
         progress = panels.progress_line(now, result, width=width, is_followed=not shown.trouble)
         self._write("#progress", Text(shown.note, MUTED) if shown.note else progress)
-        self._write("#advice", panels.advice(result, choice))
+        self._write("#advice", styled(panels.advice(result, choice)))
 
     def _noise(self, shown: State) -> tuple[BandMeans, ...]:
         """Return the channels' noise."""
         return () if shown.result is None else panels.noise_in_band(shown.result, self._choice)
 
     def _write_alerts(self, shown: State) -> None:
-        alerts = [] if shown.now is None else panels.alerts(shown.now, shown.result)
+        alerts = [] if shown.now is None else [*map(styled, panels.alerts(shown.now, shown.result))]
         if shown.result is not None and not shown.trouble:
             alerts += panels.findings(
                 shown.result, width=self.size.width - 10, besides=(SensorLost, TargetMissed)

@@ -38,7 +38,7 @@ def channel_table(state: State, choice: Choice, *, means: Sequence[BandMeans], w
         name = Cell(label.name, strong=True, chosen=column == choice.channel)
         cells = {"channel": name, "data": Cell(level(float(data[column])))}
         if column in alone:
-            cells["noise, 95 %"] = Cell(PARTNER_WORDS[alone[column]], "bad", strong=True)
+            cells["noise, 95 %"] = Cell(PARTNER_WORDS[alone[column]], "bad")
         elif means:
             found = means[column]
             mean, low, high = (float(ends[0]) for ends in (found.mean, found.low, found.high))

@@ -6,7 +6,6 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.text import Text
 
 from daq.clocks.clock_model import ClockSource
 from daq.results.clock_effect import (
@@ -27,27 +26,25 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from daq.results.result import Result
 
-MUTED, GOOD, DOUBTFUL, BAD = "#9aa5b8", "green", "yellow", "bold #ff6b6b"
-STYLES = {"good": GOOD, "doubtful": DOUBTFUL, "bad": BAD}
 COLOURS = ("#4cc9f0", "#f4a261", "#c297ff", "#e9d86b", "#7bd88f", "#ff7b9c", "#9aa5b8")
 _MIN_POINTS = 3
 _FREE = {ClockSource.ARRIVAL_TIMES, ClockSource.DEVICE_UTC}
 """Clocks that run freely, each at a rate of its own."""
 
 
-def clock_line(result: Result, *, width: int) -> Text:
-    """Return one line on the clocks: rates, residual, and effect on the noise."""
+def clock_line(result: Result, *, width: int) -> tuple[Cell, Cell]:
+    """Return one line on the clocks: rates and residual, and the effect on the noise."""
     clocks = result.snapshot.clocks
     free = [clock for clock in clocks if clock.source in _FREE]
     if result.settings.clocks == "nominal":
-        return Text("clocks: nominal rates", DOUBTFUL)
+        return Cell(""), Cell("clocks: nominal rates", "doubtful")
     if not clocks:
-        return Text("clocks: not known yet", MUTED)
+        return Cell(""), Cell("clocks: not known yet", "quiet")
     if not free:
         shared = all(clock.source is ClockSource.SHARED_CLOCK for clock in clocks)
         words = "all sensors share one" if shared else "the time of every sample is known"
-        return Text(f"clocks: {words}", MUTED)
-    words, style = _verdict(result)
+        return Cell(""), Cell(f"clocks: {words}", "quiet")
+    words = _verdict(result)
     left = f"within {microseconds(float(np.max(list(residuals(result.snapshot).values()))))}"
     by = "by motion" if any(clock.refined for clock in free) else "by arrival times"
     rates = ", ".join(f"{clock.sensor} {_ppm(clock.ppm)}" for clock in free) + " ppm"
@@ -57,13 +54,13 @@ def clock_line(result: Result, *, width: int) -> Text:
         text = start + ", ".join(part for part in parts if part) + ": "
         if len(text) + len(words) <= width:
             break
-    return Text.assemble((text, MUTED), (words, style))
+    return Cell(text, "quiet"), words
 
 
-def _verdict(result: Result) -> tuple[str, str]:
+def _verdict(result: Result) -> Cell:
     shares = [s for s in result.clock_effects.values() if math.isfinite(s)]
     if not shares:
-        return "effect not known yet", MUTED
+        return Cell("effect not known yet", "quiet")
     worst = max(shares)
     if worst < NO_EFFECT:
         words = f"no effect on noise ({percent(worst)})"
@@ -73,7 +70,7 @@ def _verdict(result: Result) -> tuple[str, str]:
         words = f"small, {percent(worst)} of the noise"
     else:
         words = f"they matter here, {percent(worst)} of the noise"
-    return words, STYLES[grade(worst)]
+    return Cell(words, grade(worst))
 
 
 def clock_table(result: Result, *, chosen: str, width: int) -> Table:

@@ -18,8 +18,9 @@ from daq.results.vocabulary import FLAG_WORDS, PARTNER_WORDS
 from estimator.checks.advice import Rank
 from estimator.wording import clock_time, percent, several
 from tui.page.table import Cell, Table, Tone
+from tui.page.terminal import styled
 from tui.wording.formatting import level_with_error
-from tui.wording.verdict_text import headline, how_long, style_of
+from tui.wording.verdict_text import headline, how_long, in_tone
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -33,7 +34,11 @@ if TYPE_CHECKING:
 
 MUTED = "#9aa5b8"
 _NUMBERS = ("Hz", "samples", "gaps")
-_STYLES = {Rank.INVALIDATES: "bold #ff6b6b", Rank.DELAYS: "yellow", Rank.TO_KNOW: MUTED}
+RANK_TONES: Mapping[Rank, Tone] = {
+    Rank.INVALIDATES: "bad",
+    Rank.DELAYS: "doubtful",
+    Rank.TO_KNOW: "quiet",
+}
 MIN_BAR = 6  # cells
 
 
@@ -69,7 +74,7 @@ def sensor_table(
     if _width(columns) > width:
         columns |= noise(with_error=False)
     if _width(columns) > width:  # the alert says in words what the marks mean
-        marks = [Cell(c[:1], c.tone, strong=c.strong) for c in columns.pop("state")]
+        marks = [Cell(c[:1], c.tone) for c in columns.pop("state")]
         columns = {"": marks, " ": columns.pop("sensor"), **columns}
     return Table.of(tuple(columns), zip(*columns.values(), strict=True), right=_NUMBERS)
 
@@ -114,8 +119,7 @@ def _noise_columns(
             if number < len(mine):
                 column = mine[number]
                 text, tone = _channel_noise(snapshot, column, means, alone, with_error=with_error)
-                is_bad = tone == "bad"
-                cells[row] = Cell(text, tone, strong=is_bad, chosen=column == choice.channel)
+                cells[row] = Cell(text, tone, chosen=column == choice.channel)
     return columns
 
 
@@ -147,13 +151,13 @@ def state(sensor: SensorStatus) -> Cell:
     state = sensor.state
     if state.is_overdue:
         tone: Tone = "bad" if state.is_lost else "doubtful"
-        return Cell(f"○ {state} {clock_time(sensor.overdue_for)}", tone, strong=state.is_lost)
+        return Cell(f"○ {state} {clock_time(sensor.overdue_for)}", tone)
     if state is SensorState.WAITING:
         return Cell(f"○ {state}", "doubtful")
     if sensor.stuck:
-        return Cell(f"▲ {' '.join(sensor.stuck)} stuck", "bad", strong=True)
+        return Cell(f"▲ {' '.join(sensor.stuck)} stuck", "bad")
     if sensor.is_clipping:
-        return Cell("▲ clipping", "bad", strong=True)
+        return Cell("▲ clipping", "bad")
     return Cell(f"■ {state}", "quiet") if state is SensorState.ENDED else Cell(f"● {state}", "good")
 
 
@@ -266,10 +270,10 @@ def _gone_on(now: RecordingStatus, snapshot: Snapshot) -> float:
     return max(0.0, min(new))
 
 
-def alerts(now: RecordingStatus, result: Result | None) -> list[Text]:
+def alerts(now: RecordingStatus, result: Result | None) -> list[Cell]:
     """Return faults of sensors with remedies, the worst first."""
     return [
-        Text(f"▲ {each.words.line}", _STYLES[each.rank])
+        Cell(f"▲ {each.words.line}", RANK_TONES[each.rank])
         for each in facts_of_sensors(now, None if result is None else result.settings)
     ]
 
@@ -285,20 +289,20 @@ def findings(result: Result, *, width: int, besides: tuple[type[Fact], ...] = ()
         if (each.needs_action or isinstance(each, SensorsSimulated))
         and not isinstance(each, besides)
     ]
-    lines = [Text(each.line, _STYLES[each.rank]) for each in needed]
+    lines = [styled(Cell(each.line, RANK_TONES[each.rank])) for each in needed]
     for line in lines:
         line.truncate(width, overflow="ellipsis")
     return lines
 
 
-def advice(result: Result, choice: Choice) -> Text:
+def advice(result: Result, choice: Choice) -> Cell:
     """Return one line on what to know about what is shown: first the verdict so far."""
     snapshot, verdict = result.snapshot, result.verdict
     if verdict is not None:
-        return Text(headline(verdict), style_of(verdict, grows=not snapshot.closed))
+        return in_tone(headline(verdict), verdict, grows=not snapshot.closed)
     refused = [f"{method}: {why}" for method, why in snapshot.refused.items()]
     if refused:
-        return Text(refused[0], "yellow" if snapshot.closed else MUTED)
+        return Cell(refused[0], "doubtful" if snapshot.closed else "quiet")
     for method in choice.methods:
         noise = snapshot.results.get(method)
         if noise is None:
@@ -306,9 +310,9 @@ def advice(result: Result, choice: Choice) -> Text:
         values = noise.noise_psd[1:-1, choice.channel]
         negative = int(np.sum(values <= 0))
         if negative:
-            return Text(
+            return Cell(
                 f"{method}: {negative} of {values.size} values at or below zero (▾ marks the "
                 "upper bound)",
-                "yellow",
+                "doubtful",
             )
-    return Text("")
+    return Cell("")
