@@ -38,11 +38,24 @@ def only(sensors: Sequence[Sensor], why: str) -> Sensor:
 
 
 def inputs_of(
-    sensors: Sequence[Sensor], given: Callable[[Sensor, Collection[_Input]], Sequence[_Input]]
+    sensors: Sequence[Sensor],
+    given: Callable[[Sensor, Collection[_Input]], Sequence[_Input]],
+    *,
+    key: str = "inputs",
+    what: str = "an input",
+    label: str = "{}",
 ) -> dict[str, tuple[_Input, ...]]:
     """Return the inputs of each sensor of a device.
 
-    ``given`` takes a sensor and the inputs of the sensors before it.
+    Parameters
+    ----------
+    sensors : sequence of Sensor
+    given : callable
+        Takes a sensor and the inputs of the sensors before it; returns the inputs of the sensor.
+    key : str
+        Of the setting.
+    what, label : str
+        What an input is called in messages, and the form of its name.
 
     Raises
     ------
@@ -54,13 +67,13 @@ def inputs_of(
     for sensor in sensors:
         inputs, expected = tuple(given(sensor, used.keys())), ""
         if len(inputs) != len(sensor.channels):
-            expected = f"expected {len(sensor.channels)} inputs, one for each channel"
+            expected = f"expected one for each of the sensor's {len(sensor.channels)} channels"
         for one in inputs:
             if one in used and not expected:
-                expected = f"{one} is an input of {used[one]!r} already"
+                expected = f"{label.format(one)} is already {what} of sensor {used[one]!r}"
             used[one] = sensor.name
         if expected:
-            fault = FileFault("settings.inputs", expected, list(inputs), sensor.name)
+            fault = FileFault(f"settings.{key}", expected, list(inputs), sensor.name)
             raise BenchFileError(fault)
         found[sensor.name] = inputs
     return found

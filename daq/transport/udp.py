@@ -106,7 +106,7 @@ class DatagramStream(asyncio.DatagramProtocol):
             self.log.unread(b"".join(received for received, *_ in self._waiting))
         self._waiting.clear()
 
-    def send(self, payload: bytes) -> None:
+    async def write(self, payload: bytes) -> None:
         """Send a datagram to the server."""
         if self.log is not None:
             self.log.sent(payload)

@@ -33,7 +33,7 @@ import numpy as np
 from daq.devices.epson import canopen as protocol
 from daq.devices.epson import commands
 from daq.devices.epson.commands import BurstFormat, CommandDecoder, Read, Register, Write
-from sim_devices.devices.interface import NEVER, Line
+from sim_devices.devices.interface import NEVER, Endpoint, Line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -69,7 +69,7 @@ def temperature_counts(celsius: NDArray[np.float64]) -> NDArray[np.int64]:
     )
 
 
-class EpsonDevice:
+class EpsonDevice(Endpoint):
     """One accelerometer on a UART; an :class:`~sim_devices.devices.interface.Endpoint`.
 
     Parameters
@@ -108,7 +108,7 @@ class EpsonDevice:
         self._first = self._sent = self._begin = 0
         self._burst = BurstFormat(0)
         self._latency = 0.0
-        self._power_on(0.0)
+        self.reset(0.0)
 
     # --- Endpoint -------------------------------------------------------------------------
 
@@ -116,9 +116,6 @@ class EpsonDevice:
         """Do nothing: a UART has no connections."""
         self.due(now)
         return ()
-
-    def disconnected(self, now: float) -> None:
-        """Do nothing: a UART has no connections."""
 
     def receive(self, received: bytes, now: float) -> Sequence[bytes]:
         """Execute commands; return the replies to reads."""
@@ -154,13 +151,8 @@ class EpsonDevice:
 
     # --- commands -------------------------------------------------------------------------
 
-    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
-        """Simulate a power failure; the device has no buffer to overflow."""
-        if kind == "reset":
-            self._power_on(now)
-        return ()
-
-    def _power_on(self, now: float) -> None:
+    def reset(self, now: float) -> None:
+        """Simulate a power failure."""
         self._window = 0
         self._mode = commands.CONFIGURATION
         self._registers = dict(self._flash)
@@ -253,7 +245,7 @@ class EpsonDevice:
 
     def _global_command(self, command: int, now: float) -> None:
         if command == commands.RESET:
-            self._power_on(now)
+            self.reset(now)
         elif command == commands.FLASH_BACKUP:
             self._flash = dict(self._registers)
         elif command == commands.FACTORY:

@@ -17,7 +17,7 @@ import numpy as np
 from daq.devices.modbus import rtu
 from daq.devices.modbus.fifo_protocol import FIFO_REGISTER, MAX_WORDS, RATE_REGISTER
 from daq.devices.modbus.rtu import RequestFinder
-from sim_devices.devices.interface import NEVER, Line, Samples, whole
+from sim_devices.devices.interface import NEVER, Endpoint, Line, Samples, whole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,7 +30,7 @@ CAPACITY = 24_576
 LOWEST_RATE, HIGHEST_RATE = 1, 20_000
 
 
-class FifoDevice:
+class FifoDevice(Endpoint):
     """One unit on a serial line; an :class:`~sim_devices.devices.interface.Endpoint`."""
 
     def __init__(self, device: DeviceSpec, source: Source) -> None:
@@ -52,10 +52,6 @@ class FifoDevice:
 
     # --- Endpoint ----------------------------------------------------------------------------
 
-    def connected(self, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
-        """Do nothing: a serial line has no connections."""
-        return ()
-
     def disconnected(self, now: float) -> None:  # noqa: ARG002 -- interface
         """Discard unsent replies."""
         self._to_send.clear()
@@ -69,13 +65,11 @@ class FifoDevice:
             self._to_send.append((ready + TURNAROUND + len(reply) * self._byte_time, reply))
         return self.due(now)
 
-    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
+    def reset(self, now: float) -> None:
         """Simulate a power failure: the content of the FIFO is lost."""
-        if kind == "reset":
-            self._advance(now)
-            self._first = self._end = self._next
-            self._holes.clear()
-        return ()
+        self._advance(now)
+        self._first = self._end = self._next
+        self._holes.clear()
 
     def due(self, now: float) -> Sequence[bytes]:
         """Return the completely transmitted replies."""

@@ -24,7 +24,7 @@ from daq.devices.guralp import gcf, scream
 from daq.devices.guralp.brp import Transmitter
 from daq.devices.guralp.gcf import SampleBlock, StatusBlock, SystemId
 from daq.devices.guralp.scream import Packet
-from sim_devices.devices.interface import NEVER, Line, Samples, whole
+from sim_devices.devices.interface import NEVER, Endpoint, Line, Samples, whole
 from sim_devices.errors import ScenarioError
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ class Digitizer:
         return StatusBlock(self._system, stream, start_ns, text)
 
 
-class SerialPort:
+class SerialPort(Endpoint):
     """The digitizer's serial line; an :class:`~sim_devices.devices.interface.Endpoint`."""
 
     def __init__(self, device: DeviceSpec, digitizer: Digitizer) -> None:
@@ -162,13 +162,12 @@ class SerialPort:
             sent += self.due(now)
         return sent
 
-    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
-        """Simulate a power failure: sequence numbers restart. There is no buffer to overflow."""
-        if kind == "reset" and self._until != NEVER:
+    def reset(self, now: float) -> None:
+        """Simulate a power failure: sequence numbers restart."""
+        if self._until != NEVER:
             self._transmitter = Transmitter()
             self._frame = None
             self.connected(now)
-        return ()
 
     def due(self, now: float) -> Sequence[bytes]:
         """Return the frames completely transmitted by ``now``."""
@@ -198,7 +197,7 @@ class SerialPort:
         return self._until
 
 
-class ScreamServer:
+class ScreamServer(Endpoint):
     """A Scream server on one kind of wire; an :class:`~sim_devices.devices.interface.Endpoint`."""
 
     def __init__(
@@ -211,10 +210,6 @@ class ScreamServer:
         self._until = 0.0  # end of the client's request
         self._sequence = 0
         self._received = bytearray()
-
-    def connected(self, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
-        """Wait for a request."""
-        return ()
 
     def disconnected(self, now: float) -> None:  # noqa: ARG002 -- interface
         """Stop sending."""
@@ -255,14 +250,12 @@ class ScreamServer:
             return ()
         return (scream.ACKNOWLEDGED, *self.due(now))
 
-    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
+    def reset(self, now: float) -> None:
         """Simulate a power failure: packet numbers restart, and old packets are lost."""
-        if kind == "reset":
-            self._sequence = 0
-            self._sent.clear()
-            if self._until > now:
-                self._digitizer.start(now)
-        return ()
+        self._sequence = 0
+        self._sent.clear()
+        if self._until > now:
+            self._digitizer.start(now)
 
     def _begin(self, now: float, until: float) -> None:
         if self._until <= now:

@@ -15,7 +15,7 @@ from daq.devices.iio.protocol import (
     ScanLayout,
     mask_of,
 )
-from sim_devices.devices.interface import NEVER, Line, Samples, whole
+from sim_devices.devices.interface import NEVER, Endpoint, Line, Samples, whole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -46,7 +46,7 @@ BUFFER_SECONDS = 4.0
 _NS = 1_000_000_000
 
 
-class Iiod:
+class Iiod(Endpoint):
     """The server; an :class:`~sim_devices.devices.interface.Endpoint`."""
 
     def __init__(self, device: DeviceSpec, source: Source) -> None:
@@ -58,9 +58,10 @@ class Iiod:
         self._rate, self._utc_ns = device.sampling_rate, device.utc_ns
         self._name = device.model or "adxl355"
         self._samples = Samples(source, device.sensors)
-        self._forget()
+        self.reset(0.0)
 
-    def _forget(self) -> None:
+    def reset(self, now: float) -> None:  # noqa: ARG002 -- interface
+        """Close the buffer, and forget the request."""
         self._received = b""
         self._layout: ScanLayout | None = None
         self._mask = ""
@@ -68,14 +69,9 @@ class Iiod:
         self._next = 0
         self._to_write = 0
 
-    def connected(self, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
-        """Wait for commands."""
-        self._forget()
-        return ()
-
-    def disconnected(self, now: float) -> None:  # noqa: ARG002 -- interface
+    def disconnected(self, now: float) -> None:
         """Close the buffer."""
-        self._forget()
+        self.reset(now)
 
     def receive(self, received: bytes, now: float) -> Sequence[bytes]:
         """Process commands; return the replies."""
@@ -143,13 +139,10 @@ class Iiod:
         offset, scale = 25.0 * COUNTS_PER_DEGREE - COUNTS_AT_25, 1000.0 / COUNTS_PER_DEGREE
         return dict(zip(OF_TEMPERATURE, (f"{raw}", f"{offset:.6f}", f"{scale:.6f}"), strict=True))
 
-    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:
-        """Lose the scans of an overflow; a restart closes the buffer and forgets the request."""
-        if kind == "reset":
-            self._forget()
-        if kind == "overflow" and self._layout is not None:
-            self._next = max(self._next, self._samples.first_after(now + duration))
-        return ()
+    def overflow(self, until: float) -> None:
+        """Lose the scans."""
+        if self._layout is not None:
+            self._next = max(self._next, self._samples.first_after(until))
 
     def due(self, now: float) -> Sequence[bytes]:
         """Return the buffer that is full."""

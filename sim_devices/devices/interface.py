@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -33,37 +33,46 @@ Kind: TypeAlias = Literal["pty", "tcp", "udp", "udp-server"]
 NEVER = math.inf
 
 
-class Endpoint(Protocol):
-    """One end of a line: bytes in, bytes out; ``now`` is world time in seconds."""
+class Endpoint:
+    """One end of a line: bytes in, bytes out; ``now`` is world time in seconds.
+
+    By default it sends nothing by itself, and nothing belongs to a client.
+    """
 
     def connected(self, now: float) -> Sequence[bytes]:
         """Handle a client that opened the line."""
-        ...
+        self.disconnected(now)
+        return ()
 
     def receive(self, received: bytes, now: float) -> Sequence[bytes]:
         """Process received bytes; return the reply."""
-        ...
+        del received
+        return self.due(now)
 
     def due(self, now: float) -> Sequence[bytes]:
         """Return the units that the device has sent by itself since the last call."""
-        ...
+        del now
+        return ()
 
     def next_due(self) -> float:
         """Return the world time of the next unit of :meth:`due`; ``NEVER`` before a request."""
-        ...
+        return NEVER
 
     def disconnected(self, now: float) -> None:
         """Handle the last client that closed the line."""
-        ...
 
+    def fault(self, kind: str, now: float, duration: float) -> None:
+        """Perform a fault of the device's own: "reset" or "overflow"."""
+        if kind == "reset":
+            self.reset(now)
+        elif kind == "overflow":
+            self.overflow(now + duration)
 
-@runtime_checkable
-class Faulty(Protocol):
-    """An endpoint of a device with faults of its own."""
+    def reset(self, now: float) -> None:
+        """Simulate a power failure."""
 
-    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:
-        """Perform the fault "reset" or "overflow"; return the bytes that it sends immediately."""
-        ...
+    def overflow(self, until: float) -> None:
+        """Lose what is sampled until then; a device without buffer loses nothing."""
 
 
 @dataclass(frozen=True, slots=True)

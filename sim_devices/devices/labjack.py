@@ -36,7 +36,7 @@ from daq.devices.labjack.stream import (
     SCAN_OVERLAP,
 )
 from daq.protocols.errors import RemoteProtocolError
-from sim_devices.devices.interface import NEVER, Line, Samples, whole
+from sim_devices.devices.interface import NEVER, Endpoint, Line, Samples, whole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -470,20 +470,16 @@ def _t8_calibrations() -> list[reg.Calibration]:
     ]
 
 
-class ControlPort:
+class ControlPort(Endpoint):
     """Port 502; an :class:`~sim_devices.devices.interface.Endpoint`."""
 
     def __init__(self, labjack: LabJack) -> None:
         self._labjack = labjack
         self._finder = AduFinder()
 
-    def connected(self, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
-        """Wait for requests."""
+    def disconnected(self, now: float) -> None:  # noqa: ARG002 -- interface
+        """Forget the request; a stream continues."""
         self._finder = AduFinder()
-        return ()
-
-    def disconnected(self, now: float) -> None:
-        """Do nothing: a stream continues."""
 
     def receive(self, received: bytes, now: float) -> Sequence[bytes]:
         """Process requests; return the replies."""
@@ -493,21 +489,12 @@ class ControlPort:
             return ()
         return [self._labjack.answer(adu, now) for adu in requests]
 
-    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:
+    def fault(self, kind: str, now: float, duration: float) -> None:
         """Pass a fault of its own on to the device."""
         self._labjack.fault(kind, now, duration)
-        return ()
-
-    def due(self, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
-        """Return nothing: the port only replies."""
-        return ()
-
-    def next_due(self) -> float:
-        """Return ``NEVER``: the port only replies."""
-        return NEVER
 
 
-class StreamPort:
+class StreamPort(Endpoint):
     """Port 702; an :class:`~sim_devices.devices.interface.Endpoint`."""
 
     LOOK_INTERVAL = 0.05
@@ -528,14 +515,9 @@ class StreamPort:
         """Keep the samples: the buffer may overflow."""
         self._connected = False
 
-    def receive(self, received: bytes, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
-        """Ignore received bytes: the port only sends."""
-        return self.due(now)
-
-    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:
+    def fault(self, kind: str, now: float, duration: float) -> None:
         """Pass a fault of its own on to the device."""
         self._labjack.fault(kind, now, duration)
-        return ()
 
     def due(self, now: float) -> Sequence[bytes]:
         """Return the full packets."""

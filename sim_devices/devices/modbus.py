@@ -22,7 +22,7 @@ from daq.devices.modbus.registers_protocol import (
     WITMOTION_UNLOCK,
     RegisterMap,
 )
-from sim_devices.devices.interface import NEVER, Line
+from sim_devices.devices.interface import Endpoint, Line
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Mapping, Sequence
@@ -57,7 +57,7 @@ class Slave(Protocol):
         ...
 
 
-class ModbusEndpoint:
+class ModbusEndpoint(Endpoint):
     """Slaves on one line; an :class:`~sim_devices.devices.interface.Endpoint`.
 
     Requests to other slaves get no reply on RTU, as on a real bus, and exception 11 on TCP, as from
@@ -72,31 +72,20 @@ class ModbusEndpoint:
         self._waiting = b""
         self._now = 0.0
 
-    def connected(self, now: float) -> Sequence[bytes]:
-        """Discard an incomplete request."""
-        self._now, self._waiting = now, b""
-        return ()
-
     def disconnected(self, now: float) -> None:
         """Discard an incomplete request."""
         self._now, self._waiting = now, b""
 
-    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
+    def reset(self, now: float) -> None:
         """Restart the slaves, which have one supply; an incomplete request is lost."""
-        if kind == "reset":
-            self._now, self._waiting = now, b""
-            for slave in self._slaves.values():
-                slave.restart(now)
-        return ()
+        self.disconnected(now)
+        for slave in self._slaves.values():
+            slave.restart(now)
 
     def due(self, now: float) -> Sequence[bytes]:
         """Return nothing: slaves only reply."""
         self._now = now
         return ()
-
-    def next_due(self) -> float:
-        """Return ``NEVER``: slaves only reply."""
-        return NEVER
 
     def receive(self, received: bytes, now: float) -> Sequence[bytes]:
         """Process requests; return the replies."""

@@ -25,7 +25,7 @@ from daq.devices.seedlink.packets import (
     encode_packet,
 )
 from daq.devices.seedlink.records import WaveRecord, encode_log, encode_record
-from sim_devices.devices.interface import NEVER, Line, Samples, whole
+from sim_devices.devices.interface import NEVER, Endpoint, Line, Samples, whole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -147,7 +147,7 @@ def _alike(code: str, pattern: str) -> bool:
     )
 
 
-class SeedLinkServer:
+class SeedLinkServer(Endpoint):
     """The server; an :class:`~sim_devices.devices.interface.Endpoint`."""
 
     def __init__(self, device: DeviceSpec, source: Source) -> None:
@@ -156,9 +156,10 @@ class SeedLinkServer:
         path = device.settings.get("credentials")
         words = Path(path).expanduser().read_text(encoding="utf-8").split() if path else []
         self._wanted = ["USERPASS" if len(words) == 2 else "JWT", *words] if words else None
-        self._forget()
+        self.disconnected(0.0)
 
-    def _forget(self) -> None:
+    def disconnected(self, now: float) -> None:  # noqa: ARG002 -- interface
+        """Stop sending, and wait for commands."""
         self._is_known = self._wanted is None
         self._received = b""
         self._version: Version = 3
@@ -167,24 +168,13 @@ class SeedLinkServer:
         self._next: dict[int, int] = {}
         self._sends = False
 
-    def connected(self, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
-        """Wait for commands."""
-        self._forget()
-        return ()
-
-    def disconnected(self, now: float) -> None:  # noqa: ARG002 -- interface
-        """Stop sending."""
-        self._forget()
-
-    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
+    def reset(self, now: float) -> None:
         """Restart with an empty ring."""
-        if kind == "reset":
-            for station in self._stations:
-                station.began = station.turn_at(now)
-                key = id(station)
-                if key in self._next:
-                    self._next[key] = station.began * station.n_channels
-        return ()
+        for station in self._stations:
+            station.began = station.turn_at(now)
+            key = id(station)
+            if key in self._next:
+                self._next[key] = station.began * station.n_channels
 
     def receive(self, received: bytes, now: float) -> Sequence[bytes]:
         """Process commands; return the replies."""

@@ -20,7 +20,7 @@ from daq.devices.text.format import (
     encode_row,
     encode_time,
 )
-from sim_devices.devices.interface import NEVER, Line, Samples, whole
+from sim_devices.devices.interface import NEVER, Endpoint, Line, Samples, whole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -50,7 +50,7 @@ def format_of(device: DeviceSpec) -> TextFormat:
     return format_ if format_.columns else replace(format_, columns=tuple(range(len(names))))
 
 
-class TextDevice:
+class TextDevice(Endpoint):
     """One device; an :class:`~sim_devices.devices.interface.Endpoint`."""
 
     def __init__(self, device: DeviceSpec, source: Source) -> None:
@@ -89,11 +89,10 @@ class TextDevice:
                 self._begin(now)
         return self.due(now)
 
-    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
-        """Simulate a power failure: the counter restarts. There is no buffer to overflow."""
-        if kind == "reset" and self._sends:
+    def reset(self, now: float) -> None:
+        """Simulate a power failure: the counter restarts."""
+        if self._sends:
             self._next = self._counted_from = self._samples.first_after(now)
-        return ()
 
     def _begin(self, now: float) -> None:
         if not self._sends:

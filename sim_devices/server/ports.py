@@ -16,6 +16,7 @@ import socket
 import ssl
 import tempfile
 import tty
+from abc import ABC, abstractmethod
 from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
 from pathlib import Path
@@ -49,40 +50,52 @@ class Listener(Protocol):
         """Handle the last reader that closed the line."""
 
 
-class DevicePort(Protocol):
+class DevicePort(ABC):
     """A line as its server sees it."""
 
-    address: str
-    settings: dict[str, Any]
-    """Settings that its driver needs."""
+    def __init__(self, listener: Listener, scheme: str = "") -> None:
+        self._listener = listener
+        self._scheme = scheme
+        self._down = False
+        self.address = ""
+        self.settings: dict[str, Any] = {}
+        """Settings that its driver needs."""
 
+    @abstractmethod
     async def open(self) -> None:
         """Make the line; it can be opened from elsewhere after this."""
 
+    @abstractmethod
     def send(self, units: Iterable[bytes]) -> list[bytes]:
         """Send each unit, or lose it whole; return those that were sent."""
 
     def n_unsent(self) -> int:
-        """Return the number of bytes that wait in this process; a hang-up loses them."""
+        """Return the number of bytes that wait in this process; a hang-up loses them.
+
+        By default 0: a datagram does not wait.
+        """
+        return 0
 
     def hang_up(self) -> None:
         """Hang up on the reader; the line cannot be opened until :meth:`restore`."""
+        self._down = True
 
     def restore(self) -> None:
         """Plug the cable in again."""
+        self._down = False
 
+    @abstractmethod
     async def close(self) -> None:
         """Take the line away."""
 
 
-class PseudoTerminal:
+class PseudoTerminal(DevicePort):
     """A serial port. Its address survives a hang-up."""
 
     def __init__(self, listener: Listener) -> None:
-        self._listener = listener
+        super().__init__(listener)
         self._folder = tempfile.mkdtemp(prefix="huddle-")
         self.address = str(Path(self._folder) / "tty")
-        self.settings: dict[str, Any] = {}
         self._master = -1
         self._open = False
         self._waiting = bytearray()
@@ -194,7 +207,7 @@ class PseudoTerminal:
         shutil.rmtree(self._folder)
 
 
-class TcpPort:
+class TcpPort(DevicePort):
     """A TCP port that serves one connection at a time, as serial servers do.
 
     ``number`` is the port number; 0 for any free one. With ``tls`` it has a certificate of its own.
@@ -203,16 +216,12 @@ class TcpPort:
     def __init__(
         self, listener: Listener, scheme: str, number: int = 0, *, tls: bool = False
     ) -> None:
+        super().__init__(listener, scheme)
         self._tls = tls
         self._folder = ""
-        self._listener = listener
-        self._scheme = scheme
         self._number = number
         self._server: asyncio.Server | None = None
         self._writer: asyncio.StreamWriter | None = None
-        self._down = False
-        self.address = ""
-        self.settings: dict[str, Any] = {}
 
     async def open(self) -> None:
         """Listen on a port of this machine."""
@@ -279,10 +288,6 @@ class TcpPort:
         if self._writer is not None:
             self._writer.transport.abort()
 
-    def restore(self) -> None:
-        """Accept connections again."""
-        self._down = False
-
     async def close(self) -> None:
         """Stop listening."""
         self.hang_up()
@@ -293,15 +298,8 @@ class TcpPort:
             shutil.rmtree(self._folder)
 
 
-class UdpPort:
+class UdpPort(DevicePort):
     """Sends each unit as a datagram to its own address, on which the driver must listen."""
-
-    def __init__(self, listener: Listener, scheme: str) -> None:
-        self._listener = listener
-        self._scheme = scheme
-        self._down = False
-        self.address = ""
-        self.settings: dict[str, Any] = {}
 
     async def open(self) -> None:
         """Select a free port of this machine and start to send to it."""
@@ -322,35 +320,19 @@ class UdpPort:
                 sent.append(unit)
         return sent
 
-    def n_unsent(self) -> int:
-        """Return 0: a datagram does not wait."""
-        return 0
-
-    def hang_up(self) -> None:
-        """Send nothing."""
-        self._down = True
-
-    def restore(self) -> None:
-        """Send again."""
-        self._down = False
-
     async def close(self) -> None:
         """Stop sending."""
         self._socket.close()
         self._listener.disconnected()
 
 
-class UdpServer(asyncio.DatagramProtocol):
+class UdpServer(DevicePort, asyncio.DatagramProtocol):
     """A UDP port that receives requests and sends each unit to the last client."""
 
     def __init__(self, listener: Listener, scheme: str) -> None:
-        self._listener = listener
-        self._scheme = scheme
+        super().__init__(listener, scheme)
         self._transport: asyncio.DatagramTransport | None = None
         self._to: tuple[str, int] | None = None
-        self._down = False
-        self.address = ""
-        self.settings: dict[str, Any] = {}
 
     async def open(self) -> None:
         """Listen on a free port of this machine."""
@@ -377,17 +359,9 @@ class UdpServer(asyncio.DatagramProtocol):
             self._transport.sendto(unit, self._to)
         return sent
 
-    def n_unsent(self) -> int:
-        """Return 0: a datagram does not wait."""
-        return 0
-
     def hang_up(self) -> None:
         """Ignore datagrams, and forget the last client."""
         self._down, self._to = True, None
-
-    def restore(self) -> None:
-        """Receive again."""
-        self._down = False
 
     async def close(self) -> None:
         """Stop listening."""

@@ -52,7 +52,6 @@ from sim_devices.devices.interface import (
     ChannelSpec,
     DeviceSpec,
     Endpoint,
-    Faulty,
     Line,
     Source,
 )
@@ -224,8 +223,8 @@ class Served:
             if fault.kind == "disconnect" and not self._down:
                 self._down = self._muted = True
                 self._pending_hang_up = self._loop.call_later(HANG_UP_DELAY, self._hang_up)
-            elif isinstance(self._endpoint, Faulty):
-                self._send(self._endpoint.fault(fault.kind, now, fault.duration))
+            else:
+                self._endpoint.fault(fault.kind, now, fault.duration)
         for at, fault in self._faults.struck:
             self._tell_fault(at, fault)
         self._faults.struck.clear()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sim_devices.devices.interface import NEVER, Line
+from sim_devices.devices.interface import NEVER, Endpoint, Line
 from sim_devices.faults import LineFaults, parse
 from sim_devices.server.ports import PseudoTerminal, TcpPort
 from sim_devices.server.serve import Served, WorldClock
@@ -96,7 +96,7 @@ async def test_a_client_that_connects_before_its_end_is_read_is_served() -> None
     await port.close()
 
 
-class _Flood:
+class _Flood(Endpoint):
     """Sends without end while somebody is connected."""
 
     def __init__(self) -> None:

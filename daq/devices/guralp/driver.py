@@ -26,7 +26,7 @@ from daq.devices.guralp.gcf import component, serial_number
 from daq.devices.guralp.links import GuralpSettings, open_link
 from daq.devices.guralp.streams import FULL_SCALE_COUNTS
 from daq.devices.interface import DeviceInformation, Driver, Session
-from daq.devices.port_rules import port_label, require_address
+from daq.devices.port_rules import inputs_of, port_label, require_address
 from daq.errors import (
     ABSENT,
     BenchFileError,
@@ -38,7 +38,14 @@ from daq.errors import (
 from daq.protocols.block import Block, DeviceItem, Event, EventKind
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping, Sequence
+    from collections.abc import (
+        AsyncGenerator,
+        AsyncIterator,
+        Callable,
+        Collection,
+        Mapping,
+        Sequence,
+    )
 
     from daq.bench.model import Sensor
     from daq.devices.guralp.links import Link
@@ -155,27 +162,20 @@ def _stream_ids(
     sensors: Sequence[Sensor], every: Mapping[str, GuralpSettings]
 ) -> dict[str, tuple[str, ...]]:
     """Return the stream IDs of each sensor; a single sensor may have none, to be discovered."""
-    ids: dict[str, tuple[str, ...]] = {}
-    taken: dict[str, str] = {}
-    for sensor in sensors:
-        settings = every[sensor.name]
-        if settings.streams is None and len(sensors) == 1:
-            return {sensor.name: ()}
-        if settings.streams is None or len(settings.streams) != len(sensor.channels):
+    if len(sensors) == 1 and every[sensors[0].name].streams is None:
+        return {sensors[0].name: ()}
+
+    def given(sensor: Sensor, used: Collection[str]) -> Sequence[str]:
+        del used
+        streams = every[sensor.name].streams
+        if streams is None:
             expected = (
                 f"expected a stream ID for each of the sensor's {len(sensor.channels)} channels"
             )
-            given = ABSENT if settings.streams is None else list(settings.streams)
-            raise BenchFileError(FileFault("settings.streams", expected, given, sensor.name))
-        for stream in settings.streams:
-            if stream in taken:
-                expected = f"{stream} is already a stream of sensor {taken[stream]!r}"
-                raise BenchFileError(
-                    FileFault("settings.streams", expected, list(settings.streams), sensor.name)
-                )
-            taken[stream] = sensor.name
-        ids[sensor.name] = settings.streams
-    return ids
+            raise BenchFileError(FileFault("settings.streams", expected, ABSENT, sensor.name))
+        return streams
+
+    return inputs_of(sensors, given, key="streams", what="a stream")
 
 
 async def _discover(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import TYPE_CHECKING, Annotated, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import AfterValidator, Field, PositiveFloat
 
@@ -64,17 +64,24 @@ FIRST_RETRY, MAX_RETRY = 5.0, 300.0
 """Delay of the next recovery after a failed one, s; doubled after each failure."""
 
 
-class Link(Protocol):
+class Link:
     """A link that delivers blocks."""
+
+    def __init__(
+        self, stream: ByteStream | DatagramStream, decoder: SerialDecoder | ScreamDecoder
+    ) -> None:
+        self._stream = stream
+        self._decoder = decoder
 
     @property
     def streams(self) -> Streams:
         """The received streams."""
-        ...
+        return self._decoder.streams
 
     async def receive(self) -> list[DeviceItem]:
         """Wait for the next bytes and decode them."""
-        ...
+        received, at = await self._stream.read()
+        return self._decoder.receive(received, at)
 
     async def respond(self) -> list[DeviceItem]:
         """Send what the other end needs, once the received blocks are handed on.
@@ -82,23 +89,11 @@ class Link(Protocol):
         Return the blocks that this recovers. A port that is lost meanwhile raises no error here:
         the next :meth:`receive` returns what had arrived, and then raises.
         """
-        ...
+        return []
 
 
-class _SerialLink:
-    def __init__(
-        self, stream: ByteStream, ids: dict[str, tuple[str, ...]], *, replies: bool
-    ) -> None:
-        self._stream = stream
-        self._decoder = SerialDecoder(ids, replies=replies)
-
-    @property
-    def streams(self) -> Streams:
-        return self._decoder.streams
-
-    async def receive(self) -> list[DeviceItem]:
-        received, at = await self._stream.read()
-        return self._decoder.receive(received, at)
+class _SerialLink(Link):
+    _decoder: SerialDecoder
 
     async def respond(self) -> list[DeviceItem]:
         replies = self._decoder.take_replies()
@@ -108,25 +103,9 @@ class _SerialLink:
         return []
 
 
-class _TcpLink:
-    def __init__(self, stream: ByteStream, ids: dict[str, tuple[str, ...]]) -> None:
-        self._stream = stream
-        self._decoder = ScreamDecoder(ids, patience=0)  # TCP preserves order
+class _UdpLink(Link):
+    _decoder: ScreamDecoder
 
-    @property
-    def streams(self) -> Streams:
-        return self._decoder.streams
-
-    async def receive(self) -> list[DeviceItem]:
-        received, at = await self._stream.read()
-        return self._decoder.receive(received, at)
-
-    async def respond(self) -> list[DeviceItem]:
-        """Send nothing."""
-        return []
-
-
-class _UdpLink:
     def __init__(
         self,
         stream: DatagramStream,
@@ -134,7 +113,7 @@ class _UdpLink:
         clock: HostClock,
         recovery: tuple[str, int] | None,
     ) -> None:
-        self._stream = stream
+        super().__init__(stream, ScreamDecoder(ids))
         self._clock = clock
         self._recovery = recovery
         self._delay = FIRST_RETRY
@@ -142,11 +121,6 @@ class _UdpLink:
         self._at: HostTime | None = None  # arrival of the last datagram
         self._recovered: list[DeviceItem] = []  # not yet handed on
         self._name = next(iter(ids)) if len(ids) == 1 else ""
-        self._decoder = ScreamDecoder(ids)
-
-    @property
-    def streams(self) -> Streams:
-        return self._decoder.streams
 
     async def receive(self) -> list[DeviceItem]:
         received, at = await self._stream.read()
@@ -225,14 +199,14 @@ async def open_link(
     async with open_port(port, clock, label=label, baud_rate=settings.baud_rate) as stream:
         if settings.link == "scream":
             await stream.write(scream.TCP_SEND)
-            yield _TcpLink(stream, ids)
+            yield Link(stream, ScreamDecoder(ids, patience=0))  # TCP preserves order
         else:
-            yield _SerialLink(stream, ids, replies=settings.acknowledge)
+            yield _SerialLink(stream, SerialDecoder(ids, replies=settings.acknowledge))
 
 
 async def _keep_asking(stream: DatagramStream) -> None:
     while True:
-        stream.send(scream.SEND)
+        await stream.write(scream.SEND)
         await asyncio.sleep(SEND_INTERVAL)
 
 
@@ -240,4 +214,4 @@ async def _stop_asking(asking: asyncio.Task[None], stream: DatagramStream) -> No
     asking.cancel()
     with contextlib.suppress(asyncio.CancelledError):
         await asking
-    stream.send(scream.STOP)
+    await stream.write(scream.STOP)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
+from daq.devices import port_rules
 from daq.devices.interface import DEFAULT_PATIENCE, DeviceInformation
 from daq.devices.labjack import registers as reg
 from daq.devices.labjack import stream as labjack
@@ -21,7 +22,7 @@ from daq.protocols.sample_counter import CLOCK_TOLERANCE, SLACK
 from daq.transport.address import USUAL_NUMBERS, host_and_port
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
 
     from daq.bench.model import Sensor
     from daq.devices.labjack.registers import Command
@@ -132,43 +133,26 @@ def inputs_of(
     BenchFileError
         If an input appears twice, or the number of inputs and channels differ.
     """
-    inputs: dict[str, tuple[int, ...]] = {}
-    taken: dict[int, str] = {}
+
+    def given(sensor: Sensor, used: Collection[int]) -> Sequence[int]:
+        following = range(len(used), len(used) + len(sensor.channels))
+        return following if (own := settings[sensor.name].inputs) is None else own
+
+    inputs = port_rules.inputs_of(sensors, given, label="AIN{}")
+    taken = {number: name for name, numbers in inputs.items() for number in numbers}
     for sensor in sensors:
-        own = settings[sensor.name]
-        n_channels = len(sensor.channels)
-        numbers = own.inputs
-        if numbers is None:
-            numbers = tuple(range(len(taken), len(taken) + n_channels))
-        for what, given in (("inputs", numbers), ("negative_inputs", own.negative_inputs)):
-            if given is not None and len(given) != n_channels:
-                expected = f"expected one for each of the sensor's {n_channels} channels"
-                raise BenchFileError(
-                    FileFault(f"settings.{what}", expected, list(given), sensor.name)
-                )
-        for number in numbers:
-            if number in taken:
-                expected = f"AIN{number} is already an input of sensor {taken[number]!r}"
-                raise BenchFileError(
-                    FileFault("settings.inputs", expected, list(numbers), sensor.name)
-                )
-            taken[number] = sensor.name
-        if sensor.sampling_rate != sensors[0].sampling_rate:
-            expected = (
-                f"expected {sensors[0].sampling_rate:g}, as for all sensors on port {sensor.port}"
-            )
+        negative = settings[sensor.name].negative_inputs
+        if negative is None:
+            continue
+        expected = ""
+        if len(negative) != len(sensor.channels):
+            expected = f"expected one for each of the sensor's {len(sensor.channels)} channels"
+        for number in set(negative) & taken.keys():
+            expected = f"AIN{number} is already an input of sensor {taken[number]!r}"
+        if expected:
             raise BenchFileError(
-                FileFault("sampling_rate", expected, sensor.sampling_rate, sensor.name)
+                FileFault("settings.negative_inputs", expected, list(negative), sensor.name)
             )
-        inputs[sensor.name] = numbers
-    for sensor in sensors:
-        negative = settings[sensor.name].negative_inputs or ()
-        for number in negative:
-            if number in taken:
-                expected = f"AIN{number} is already an input of sensor {taken[number]!r}"
-                raise BenchFileError(
-                    FileFault("settings.negative_inputs", expected, list(negative), sensor.name)
-                )
     return inputs
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import contextlib
 from dataclasses import fields, replace
 from ipaddress import ip_address
-from typing import TYPE_CHECKING, Annotated, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, PositiveFloat, PositiveInt, Strict, field_validator
 
@@ -184,16 +184,10 @@ def _check_format(format_: TextFormat, sensor: Sensor) -> None:
             raise BenchFileError(FileFault(f"settings.{key}", expected, value, sensor.name))
 
 
-class _Source(Protocol):
-    """Source of the text."""
+class _Source:
+    """Source of the text: a stream of bytes."""
 
-    async def receive(self) -> list[DeviceItem]: ...
-    async def send(self, payload: bytes) -> None: ...
-    def discard(self) -> None: ...
-
-
-class _StreamSource:
-    def __init__(self, stream: ByteStream, decoder: TextDecoder) -> None:
+    def __init__(self, stream: ByteStream | DatagramStream, decoder: TextDecoder) -> None:
         self._stream = stream
         self._decoder = decoder
 
@@ -208,10 +202,11 @@ class _StreamSource:
         self._stream.discard()
 
 
-class _DatagramSource:
+class _DatagramSource(_Source):
+    _stream: DatagramStream
+
     def __init__(self, stream: DatagramStream, decoder: TextDecoder, sensor: str) -> None:
-        self._stream = stream
-        self._decoder = decoder
+        super().__init__(stream, decoder)
         self._sensor = sensor
         self._told: set[str] = set()
 
@@ -225,12 +220,6 @@ class _DatagramSource:
             text = f"datagrams from {host} are ignored: another device sends to this port"
             found.append(Event(self._sensor, EventKind.STATUS, text, at))
         return found
-
-    async def send(self, payload: bytes) -> None:
-        """Do nothing: the source only listens."""
-
-    def discard(self) -> None:
-        self._stream.discard()
 
 
 class TextSession(Session):
@@ -342,7 +331,7 @@ async def _opened(
         async with open_port(
             port, clock, label=label, baud_rate=settings.baud_rate, parity=settings.parity
         ) as stream:
-            yield _StreamSource(stream, decoder)
+            yield _Source(stream, decoder)
 
 
 DRIVER = TextDriver()

@@ -159,8 +159,8 @@ def test_clipping_is_flagged() -> None:
     ("port", "inputs", "said"),
     [
         ("/dev/snd", None, "expected audio://"),
-        ("audio://", (1,), "expected 2 inputs"),
-        ("audio://", (1, 1), "1 is an input of 'A' already"),
+        ("audio://", (1,), "one for each of the sensor's"),
+        ("audio://", (1, 1), "1 is already an input of sensor 'A'"),
     ],
 )
 def test_impossible_settings_are_refused(
