@@ -34,6 +34,8 @@ def _cell(tag: str, column: int, text: str, table: Table, *, scope: str, row: in
     classes = f"{named} {'number' * (column not in table.left)}".strip()
     about = f' class="{classes}"' if classes else ""
     about += f' scope="{scope}"' if scope else ""
+    title = table.header[column] if tag == "td" else ""
+    about += f' data-title="{escape(title)}"' if title.strip() else ""  # for narrow pages
     return f"<{tag}{about}>{escape(text)}</{tag}>"
 
 

@@ -6,14 +6,17 @@ The curves are those of the application, made where it makes them.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daq.bench.masks.mask import NOISE_MODELS
+from daq.bench.units import is_motion
 from tui.application.test_view.curves import level_limits
 from tui.application.test_view.plotted import (
+    MODEL_STYLE,
     Choice,
     curves,
     plot_title,
@@ -32,6 +35,10 @@ if TYPE_CHECKING:
     from tui.application.test_view.curves import Curve
     from tui.application.test_view.units import SpectrumUnit
 
+MODEL_RANGE_DB = 60.0
+"""By how many dB noise models may widen the vertical scale at either end; as in the report."""
+_DASHES = {"▽": (8, 3), "△": (2, 3)}
+"""Of noise models, by their marks in the application."""
 POINTS = 240
 """Points of a curve over all frequencies."""
 _WIDTH, _HEIGHT = 900, 420
@@ -79,7 +86,7 @@ def numbers(state: State, choice: Choice) -> dict[str, Any]:
     snapshot = state.snapshot
     if snapshot is None or not (found := drawn(state, choice)):
         return {"curves": []}
-    unit, low_high = unit_of(snapshot, choice), level_limits(found)
+    unit, low_high = unit_of(snapshot, choice), _levels(found)
     return {
         "title": plot_title(snapshot, choice),
         "unit": unit.name,
@@ -92,12 +99,27 @@ def numbers(state: State, choice: Choice) -> dict[str, Any]:
     }
 
 
+def with_models(state: State) -> State:
+    """Return a state that shows the noise models of the ground, where its unit is of motion."""
+    if state.models or state.snapshot is None or not is_motion(state.snapshot.unit):
+        return state
+    return replace(state, models=(NOISE_MODELS["nlnm"], NOISE_MODELS["nhnm"]))
+
+
+def _levels(found: Sequence[Curve]) -> tuple[float, float]:
+    """Return limits in dB that hold the curves, and of models what is not too far from them."""
+    low, high = level_limits([each for each in found if each.style != MODEL_STYLE])
+    whole = level_limits(found)
+    return max(whole[0], low - MODEL_RANGE_DB), min(whole[1], high + MODEL_RANGE_DB)
+
+
 def _numbers(curve: Curve, unit: SpectrumUnit, floor: float) -> dict[str, Any]:
     has_interval = bool(np.isfinite(curve.high_db).any())
     low = np.where(np.isnan(curve.low_db) & np.isfinite(curve.high_db), floor, curve.low_db)
     return {
         "label": curve.label,
         "colour": curve.style,
+        "dash": _DASHES.get(curve.marker, ()),
         "frequency": [float(f"{10**each:.6g}") for each in curve.log_frequency],
         "level": _values(curve.level_db, unit),
         "low": _values(low, unit) if has_interval else [],
@@ -157,7 +179,7 @@ def picture(state: State, choice: Choice) -> str:
     if snapshot is None or not (found := drawn(state, choice)):
         return ""
     unit = unit_of(snapshot, choice)
-    axes = _Axes(choice.span or whole_span(snapshot), level_limits(found))
+    axes = _Axes(choice.span or whole_span(snapshot), _levels(found))
     ticks = unit.ticks(*axes.levels)
     return page(
         "picture",
@@ -174,6 +196,7 @@ def picture(state: State, choice: Choice) -> str:
             {
                 "label": each.label,
                 "colour": each.style,
+                "dash": " ".join(map(str, _DASHES.get(each.marker, ()))),
                 "path": axes.path(each.log_frequency, each.level_db),
                 "band": axes.band(each),
             }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -39,7 +40,8 @@ def environment() -> Environment:
         "several": several,
         "table": table,
         "tone_of": lambda verdict: "" if verdict is None else TONES[verdict],
-        "utc": utc,
+        "instant": instant,
+        "utc": lambda ns: instant(datetime.fromtimestamp(ns / 1e9, UTC), text=utc(ns)),
     }
     return made
 
@@ -47,6 +49,16 @@ def environment() -> Environment:
 def page(name: str, /, **values: object) -> str:
     """Return a page, or a part of one."""
     return environment().get_template(f"{name}.html.j2").render(values)
+
+
+def instant(at: datetime, form: str = "%H:%M:%S UTC", text: str = "") -> Markup:
+    """Return an instant in UTC, to which a script adds the time of the browser."""
+    moment = at.astimezone(UTC)
+    return Markup('<time datetime="{}"{}>{}</time>').format(
+        f"{moment:%Y-%m-%dT%H:%M:%SZ}",
+        Markup(" data-precise") if text or "%S" in form else "",
+        text or f"{moment:{form}}",
+    )
 
 
 def line(text: str) -> Markup:

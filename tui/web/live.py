@@ -33,8 +33,8 @@ from tui.application.test_view.recent_motion import RecentMotion, with_advice
 from tui.page.table import Cell
 from tui.runs.estimate_settings import settings_for
 from tui.service.status import status_lines
-from tui.web.chart import choice_of, drawn
-from tui.web.html import page
+from tui.web.chart import choice_of, drawn, with_models
+from tui.web.html import instant, page
 from tui.web.traces import traces
 
 if TYPE_CHECKING:
@@ -298,7 +298,7 @@ class _Page:
         """Take a new estimate."""
         moved = () if snapshot.closed else self._recent.strangers(snapshot)
         result = Result(with_advice(snapshot, moved), settings, self._bench)
-        self.state = replace(self.state, result=result, note="")
+        self.state = with_models(replace(self.state, result=result, note=""))
         self._live.taken(self.state, is_new=True)
         self.draw()
 
@@ -335,7 +335,7 @@ class _Page:
             sensors=None if now is None else state_table(now, state.trouble),
         )
         at = datetime.now(UTC)
-        self._live.publish({**self._of_estimate, **parts, "at": f"{at:%H:%M:%S} UTC"})
+        self._live.publish({**self._of_estimate, **parts, "at": str(instant(at))})
 
 
 def _of_estimate(state: State, result: Result) -> dict[str, str]:

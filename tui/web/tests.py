@@ -17,6 +17,7 @@ from tui.certificate.ledger import ledger_of
 from tui.output.json_document import document
 from tui.runs.catalogue import Entry, catalogue
 from tui.runs.estimate_settings import settings_for
+from tui.web.chart import with_models
 from tui.web.work import Work, check_wanted
 
 if TYPE_CHECKING:
@@ -140,12 +141,8 @@ class Tests:
             snapshot = estimate([path], settings, progress=check_wanted)
         except NoResultError as error:
             snapshot = error.snapshot
-        return State(
-            path.stem,
-            bench,
-            path=path,
-            result=Result(snapshot, settings, bench, (path,)),
-        )
+        result = Result(snapshot, settings, bench, (path,))
+        return with_models(State(path.stem, bench, path=path, result=result))
 
     def document(self, state: State) -> dict[str, Any]:
         """Return the result as `huddle estimate --json` writes it. Blocks."""

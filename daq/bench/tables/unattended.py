@@ -5,7 +5,7 @@ from __future__ import annotations
 import ipaddress
 import re
 from datetime import UTC, datetime
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from cronsim import CronSim, CronSimError
@@ -13,6 +13,9 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from daq.bench.end_condition import EndCondition
 from daq.bench.tables.fields import Duration, Name, PositiveNumber, Table
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping
 
 _BYTES = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "tb": 10**12}
 _SIZE = re.compile(r"(\d+(?:\.\d*)?)\s*([a-z]*)", re.ASCII)
@@ -72,7 +75,7 @@ class ScheduledRun(Table):
     """One ``[[schedule]]`` table: when runs are due, and how long they record."""
 
     name: Name = "runs"
-    """In lists of runs; its place in the file, if not given."""
+    """In lists of runs; its times, such as ``daily 22:00``, if not given."""
     cron: CronLine | None = None
     """When runs are due, such as ``0 22 * * *``; or ``at``."""
     at: datetime | None = None
@@ -114,6 +117,32 @@ class ScheduledRun(Table):
         return ZoneInfo(self.time_zone or "UTC")
 
 
+_DAILY = re.compile(r"(\d{1,2}) (\d{1,2}) \* \* (\S+)")
+_LONGEST_NAME = 40
+_DAYS = ("Sun", "Mon", "Tue", "Wed", "Thu", "Fri", "Sat")
+
+
+def _name_of(run: Mapping[str, object], taken: Collection[str]) -> str:
+    """Return a name that says when a run is due: ``daily 22:00``, or its cron line; a free one."""
+    at, cron = run.get("at"), " ".join(str(run.get("cron", "")).split())
+    name = f"cron {cron}".replace("/", "÷")[:_LONGEST_NAME]
+    if found := _DAILY.fullmatch(cron):
+        minute, hour, days = found.groups()
+        time = f"{int(hour):02}:{int(minute):02}"
+        name = f"daily {time}" if days == "*" else f"{time} on {_in_words(days)}"
+    elif at is not None:
+        name = f"at {at:%Y-%m-%d %H:%M}" if isinstance(at, datetime) else f"at {at}"
+        name = name.replace("/", "÷")[:_LONGEST_NAME]
+    free = (name, *(f"{name} ({number})" for number in range(2, 1000)))
+    return next(each for each in free if each not in taken)
+
+
+def _in_words(days: str) -> str:
+    """Return days of the week of a cron line by their names: ``Mon-Fri``."""
+    named = re.sub(r"\d", lambda found: _DAYS[int(found[0]) % 7], days)
+    return named.replace("/", "÷")[:_LONGEST_NAME]
+
+
 class Schedule(Table):
     """When ``huddle serve`` starts a run: ``[[schedule]]`` tables, or cron lines in one table."""
 
@@ -125,14 +154,16 @@ class Schedule(Table):
     @model_validator(mode="before")
     @classmethod
     def _name_all(cls, table: object) -> object:
-        """Take a list as `runs`, and name those that have no name by their position."""
+        """Take a list as `runs`, and name those that have no name by their times."""
         table = {"runs": table} if isinstance(table, (list, tuple)) else table
         if not isinstance(table, dict) or not isinstance(table.get("runs"), (list, tuple)):
             return table
-        named = [
-            {"name": str(number), **run} if isinstance(run, dict) else run
-            for number, run in enumerate(table["runs"], 1)
-        ]
+        named: list[object] = []
+        taken: set[str] = set()
+        for run in table["runs"]:
+            given = {"name": _name_of(run, taken), **run} if isinstance(run, dict) else run
+            taken |= {str(given["name"])} if isinstance(given, dict) else set()
+            named.append(given)
         return table | {"runs": named}
 
     @model_validator(mode="after")
@@ -146,10 +177,12 @@ class Schedule(Table):
     @property
     def entries(self) -> tuple[ScheduledRun, ...]:
         """All entries, the cron lines of the one table included."""
-        lines = (
-            ScheduledRun(name=f"cron {number}", cron=line, time_zone=self.time_zone)
-            for number, line in enumerate(self.cron, 1)
-        )
+        taken = {run.name for run in self.runs}
+        lines = []
+        for line in self.cron:
+            name = _name_of({"cron": line}, taken)
+            taken.add(name)
+            lines.append(ScheduledRun(name=name, cron=line, time_zone=self.time_zone))
         return (*lines, *self.runs)
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from datetime import UTC, datetime
 from itertools import islice
 
@@ -22,7 +23,8 @@ def test_entries_are_merged_in_order() -> None:
     found = [
         (due.strftime("%d %H:%M"), run.name) for due, run in islice(all_due(schedule, START), 3)
     ]
-    assert found == [("21 13:00", "cron 1"), ("21 13:00", "cron 2"), ("21 13:30", "cron 2")]
+    often = "cron *÷30 13 * * *"
+    assert found == [("21 13:00", "daily 13:00"), ("21 13:00", often), ("21 13:30", often)]
 
 
 def test_a_one_shot_is_due_once_and_in_its_zone() -> None:
@@ -67,3 +69,26 @@ def test_a_time_that_never_occurs_is_refused() -> None:
 
 def test_without_entries_no_run_is_due() -> None:
     assert list(all_due(Schedule(), START)) == []
+
+
+@pytest.mark.parametrize(
+    ("runs", "names"),
+    [
+        (['cron = "0 22 * * *"'], ["daily 22:00"]),
+        (['cron = "5 6 * * 1-5"'], ["06:05 on Mon-Fri"]),
+        (['cron = "0 9 * * 0,7"'], ["09:00 on Sun,Sun"]),
+        (['cron = "*/15 * * * *"'], ["cron *÷15 * * * *"]),
+        (["at = 2026-12-01T22:00:00Z"], ["at 2026-12-01 22:00"]),
+        (['cron = "0 22 * * *"', 'cron = "0 22 * * *"'], ["daily 22:00", "daily 22:00 (2)"]),
+        (['cron = "0 22 * * *"\nname = "night"'], ["night"]),
+    ],
+)
+def test_runs_without_a_name_are_called_by_their_times(runs: list[str], names: list[str]) -> None:
+    text = "".join(f'[[schedule]]\ntime_zone = "UTC"\nduration = "1h"\n{run}\n' for run in runs)
+    schedule = Schedule.model_validate(tomllib.loads(text)["schedule"])
+    assert [each.name for each in schedule.entries] == names
+
+
+def test_cron_lines_of_one_table_are_called_by_their_times_too() -> None:
+    schedule = Schedule(cron=("0 6 * * *", "0 18 * * *"))
+    assert [each.name for each in schedule.entries] == ["daily 06:00", "daily 18:00"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import pytest
 
@@ -129,3 +129,50 @@ def test_a_wrong_password_is_refused_and_a_right_one_leads_on(
         assert "Ada, may look" in page.locator("header").inner_text()
         page.locator("button:text('Log out')").click()
         page.wait_for_url("**/login?next=**")
+
+
+@pytest.mark.parametrize("asked", ["light", "dark"])
+def test_pages_follow_the_system_and_a_choice_is_kept(
+    server: Server, browser: Browser, wrong: list[str], asked: Literal["light", "dark"]
+) -> None:
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+    page = opened(browser, wrong, "phone")
+    page.emulate_media(color_scheme=asked)
+    back = "getComputedStyle(document.body).backgroundColor"
+    found = []
+    for _ in range(2):
+        page.goto(f"{server.url}tests")
+        found.append(page.evaluate(back))
+        violations = axe.run(page).response["violations"]
+        assert [(each["id"], each["nodes"][0]["html"]) for each in violations] == []
+        page.locator("#theme").click()
+    light, dark = "rgb(255, 255, 255)", "rgb(17, 21, 28)"
+    assert found == ([light, dark] if asked == "light" else [dark, light])
+
+
+def test_local_time_is_beside_utc(server: Server, browser: Browser) -> None:
+    page = browser.new_context(timezone_id="Asia/Kathmandu").new_page()
+    page.goto(f"{server.url}tests")
+    assert page.locator("td time").first.inner_text() == "2016-07-14 01:00 (06:45 GMT+5:45)"
+
+
+def test_a_phone_shows_tables_as_lists_with_the_verdict_whole(
+    server: Server, browser: Browser, wrong: list[str]
+) -> None:
+    page = opened(browser, wrong, "phone")
+    page.goto(f"{server.url}tests")
+    for region in page.locator(".wide").all():
+        assert region.evaluate("each => each.scrollWidth <= each.clientWidth")
+    box = page.locator("td[data-title=verdict]").first.bounding_box()
+    assert box is not None
+    assert box["x"] + box["width"] <= SIZES["phone"][0]
+
+
+def test_curves_have_the_noise_models(server: Server, browser: Browser, wrong: list[str]) -> None:
+    page = opened(browser, wrong)
+    page.goto(f"{server.url}tests/night.h5")
+    page.wait_for_selector("#chart[data-drawn~=NLNM]")
+    dashes = page.locator(".key path").evaluate_all(
+        "all => all.map((each) => each.getAttribute('stroke-dasharray'))"
+    )
+    assert {"8 3", "2 3"} <= set(dashes)

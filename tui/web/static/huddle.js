@@ -4,6 +4,39 @@
 
 const byId = (id) => document.getElementById(id);
 
+/* ------------------------------------------------------- colours and local time */
+
+/* Without a choice the pages are as light or dark as the system; a choice is kept in this browser. */
+function theme() {
+  const root = document.documentElement, button = byId("theme"), KEY = "huddle-theme";
+  const asked = () => matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark";
+  const now = () => root.dataset.theme || asked();
+  const name = () => { button.textContent = now() === "light" ? "Dark page" : "Light page"; };
+  try { const kept = localStorage.getItem(KEY); if (kept) root.dataset.theme = kept; } catch { /* none is kept */ }
+  if (!button) return;
+  button.hidden = false;
+  name();
+  matchMedia("(prefers-color-scheme: light)").addEventListener("change", name);
+  button.addEventListener("click", () => {
+    root.dataset.theme = now() === "light" ? "dark" : "light";
+    try { localStorage.setItem(KEY, root.dataset.theme); } catch { /* until the next page */ }
+    name();
+  });
+}
+
+/* Each instant is written in UTC; the time of this browser stands beside it where it differs. */
+function localTimes(root) {
+  for (const time of root.querySelectorAll("time[datetime]")) {
+    const at = new Date(time.dateTime);
+    if (time.querySelector("small") || !at.getTimezoneOffset()) continue;
+    const sameDay = at.getDate() === at.getUTCDate();
+    const day = sameDay ? {} : { month: "short", day: "numeric" };
+    const seconds = time.dataset.precise === undefined ? {} : { second: "2-digit" };
+    const text = at.toLocaleString("en-GB", { ...day, hour: "2-digit", minute: "2-digit", ...seconds, timeZoneName: "short" });
+    time.append(Object.assign(document.createElement("small"), { textContent: ` (${text})` }));
+  }
+}
+
 /* -------------------------------------------------------------------- curves */
 
 function curves() {
@@ -46,7 +79,7 @@ function curves() {
     const tables = [], series = [{}], bands = [], words = [];
     for (const curve of found.curves) {
       const columns = [curve.frequency, curve.level], at = series.length;
-      const style = { stroke: curve.colour, width: 1.5, points: { show: false } };
+      const style = { stroke: curve.colour, width: 1.5, dash: curve.dash, points: { show: false } };
       series.push({ ...style, label: curve.label });
       if (curve.high.length) {
         columns.push(curve.high, curve.low);
@@ -120,7 +153,7 @@ function curves() {
     const mark = document.createElementNS(space, "svg"), line = document.createElementNS(space, "path");
     mark.setAttribute("viewBox", "0 0 20 6");
     mark.setAttribute("aria-hidden", "true");
-    for (const [name, value] of [["d", "M0 3H20"], ["stroke", curve.colour], ["stroke-width", "3"]]) line.setAttribute(name, value);
+    for (const [name, value] of [["d", "M0 3H20"], ["stroke", curve.colour], ["stroke-width", "3"], ["stroke-dasharray", curve.dash.join(" ")]]) line.setAttribute(name, value);
     mark.append(line);
     item.append(mark, ` ${curve.label}${curve.high.length ? ", with its 95 % interval" : ""}`);
     return item;
@@ -244,7 +277,8 @@ function live(reload) {
     for (const [name, html] of Object.entries(parts)) {
       const place = byId(name);
       if (!place || place.contains(document.activeElement) && document.activeElement !== document.body) continue;
-      if (name === "at") place.textContent = html; else place.innerHTML = html; // escaped by the server
+      place.innerHTML = html; // escaped by the server
+      localTimes(place);
     }
     if (now !== version) { version = now; reload(); }
   }
@@ -277,5 +311,7 @@ function live(reload) {
   connect();
 }
 
+theme();
+localTimes(document);
 live(curves());
 signal();
