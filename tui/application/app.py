@@ -137,6 +137,8 @@ class HuddleApp(FollowingApp):
     ) -> None:
         super().__init__(controls, models, driver)
         self._given = path
+        self._authority = ""
+        self._asked_of: dict[Path, Mapping[str, str]] = {}
         self._start_at_once = start
 
     def on_mount(self) -> None:
@@ -295,10 +297,12 @@ class HuddleApp(FollowingApp):
 
         def issue(wanted: Mapping[str, str] | None) -> None:
             if wanted is not None:
+                self._asked_of[path] = wanted
                 self.notify("verifying the recording, making the certificate …", timeout=5)
                 self._issue(path, result, wanted)
 
-        self.push_screen(IssueForm(path.name), issue)
+        usual = {"by": self._authority} if self._authority else {}
+        self.push_screen(IssueForm(path.name, self._asked_of.get(path, usual)), issue)
 
     @work(thread=True, group="control")
     def _issue(self, path: Path, result: Result, wanted: Mapping[str, str]) -> None:
@@ -308,6 +312,8 @@ class HuddleApp(FollowingApp):
         except (HuddleError, OSError) as error:
             self.call_from_thread(self._refused, wanted, f"{error}")
             return
+        self._authority = wanted["by"] or self._authority
+        self._asked_of.pop(path, None)  # a revision has another reason
         what = "Certificate issued" if wanted["by"] else "Specimen made"
         self.call_from_thread(self.notify, f"{made}", title=what, timeout=15, markup=False)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from textual.widgets import Input
 
 from daq.bench.model import Limit
 from daq.results.result import Result
@@ -185,7 +186,11 @@ async def test_i_asks_who_authorises_and_issues_or_makes_a_specimen(
             ("i", "escape"),
             ("i", *"Nobody", "enter"),
         ):
-            await pilot.press(*keys)
+            await pilot.press(*keys[:1])
+            await shown(pilot, app)
+            kept = app.screen.query_one("#by", Input).value
+            assert kept == ("Ada" if "escape" in keys or "N" in keys else "")
+            await pilot.press(*keys[1:])
             await app.workers.wait_for_complete()
             await shown(pilot, app)
         assert "sensors were simulated" in screen_text(app)

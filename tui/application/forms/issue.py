@@ -20,13 +20,15 @@ class IssueForm(Form[Mapping[str, str]]):
     ----------
     name : str
         Of the recording.
+    kept : mapping of str to str
+        What was given before, by field.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, kept: Mapping[str, str]) -> None:
         fields = [
-            Field("by", "authorised by", placeholder="empty: a specimen"),
-            Field("reason", "reason of a revision"),
-            Field("despite", "despite"),
+            Field("by", "authorised by", kept.get("by", ""), "empty: a specimen"),
+            Field("reason", "reason of a revision", kept.get("reason", "")),
+            Field("despite", "despite", kept.get("despite", "")),
         ]
         super().__init__(f"certificate of {name}", fields, does="makes it")
 
