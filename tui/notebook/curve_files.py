@@ -23,6 +23,7 @@ from daq.results.band_summary import known_range
 from daq.whole_file import replaced, write_whole, wrong_content
 from tui.notebook.tables import to_frame, to_xarray
 from tui.output.csv_text import csv_text, write_metadata
+from tui.output.curves import CURVES
 from tui.output.extras import load
 
 if TYPE_CHECKING:
@@ -37,8 +38,8 @@ if TYPE_CHECKING:
     Said: TypeAlias = dict[str, str]
 
 MINISEED = "mseed"
-_COLUMNS = ("noise_psd", "noise_low", "noise_high", "cov", "flags")
-_FIELDS = ("noise_psd", "low", "high", "cov", "flags")
+_COLUMNS = (*(curve.name for curve in CURVES), "flags")
+_FIELDS = (*(curve.field for curve in CURVES), "flags")
 _PSD = 9
 _DOUBLE = 4
 _DIRECTIONS = {"X": 1, "Y": 2, "Z": 3, "E": 1, "N": 2, "1": 1, "2": 2, "3": 3}
@@ -169,8 +170,9 @@ def _write_uff(snapshot: Snapshot, path: Path, said: Said) -> None:
     for column, label in enumerate(snapshot.channels):
         curves = {"data": snapshot.data_psd[:, column]}
         for method, noise in snapshot.results.items():
-            for name, field in zip(_COLUMNS[:3], _FIELDS[:3], strict=True):
-                curves[f"{method} {name}"] = getattr(noise, field)[:, column]
+            for each in CURVES:
+                if each.is_density:
+                    curves[f"{method} {each.name}"] = getattr(noise, each.field)[:, column]
         for name, values in curves.items():
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")

@@ -8,6 +8,7 @@ import numpy as np
 
 from daq.bench.units import cf_unit
 from estimator.self_noise.result import Flag
+from tui.output.curves import CURVES
 from tui.output.extras import load
 
 if TYPE_CHECKING:
@@ -19,14 +20,9 @@ if TYPE_CHECKING:
     from daq.bench.channel import Channel
     from daq.estimation.snapshot import Snapshot
 
-_CURVES = {"noise_psd": "noise_psd", "noise_low": "low", "noise_high": "high", "cov": "cov"}
-"""Attributes of `estimator.self_noise.result.SelfNoise`, by name of the variable."""
 _LONG_NAMES = {
-    "noise_psd": "one-sided power spectral density of the self-noise",
-    "noise_low": "lower end of the 95 % interval of the self-noise",
-    "noise_high": "upper end of the 95 % interval of the self-noise",
+    **{curve.name: curve.meaning for curve in CURVES},
     "data_psd": "one-sided power spectral density of the samples",
-    "cov": "coefficient of variation of the self-noise",
     "flags": "sum of flags",
     "csm_real": "real part of E[X conj(Y)], X of trace and Y of other_trace, one-sided",
     "csm_imag": "imaginary part of E[X conj(Y)], X of trace and Y of other_trace, one-sided",
@@ -61,7 +57,7 @@ def to_xarray(
     density = f"({cf_unit(snapshot.unit)})2 Hz-1"
     variables: dict[str, Any] = {
         name: (_AXES, np.stack([getattr(each, field).T for each in results]))
-        for name, field in {**_CURVES, "flags": "flags"}.items()
+        for name, field in (*((curve.name, curve.field) for curve in CURVES), ("flags", "flags"))
     }
     variables["data_psd"] = (_AXES[1:], snapshot.data_psd.T)
     coords: dict[str, Any] = {
@@ -108,13 +104,12 @@ def to_xarray(
             "unit_of_motion": snapshot.unit,
         },
     )
+    numbers = {curve.name for curve in CURVES if not curve.is_density} | {"coherence"}
+    densities = {curve.name for curve in CURVES} - numbers | {"data_psd", "csm_real", "csm_imag"}
     for name in variables:
         found[name].attrs["long_name"] = _LONG_NAMES[name]
-        if name.endswith(("psd", "low", "high")) or name.startswith("csm"):
-            found[name].attrs["units"] = density
-    for name in ("cov", "coherence"):
-        if name in variables:
-            found[name].attrs["units"] = "1"
+        if name in densities | numbers:
+            found[name].attrs["units"] = density if name in densities else "1"
     if "response_phase" in variables:
         found["response_phase"].attrs["units"] = "rad"
     masks = np.array([int(flag) for flag in Flag], found["flags"].dtype)
@@ -137,7 +132,7 @@ def to_frame(snapshot: Snapshot) -> pd.DataFrame:
                 "channel": np.repeat(label.channel, n_freqs),
                 "frequency": snapshot.frequency,
                 "data_psd": snapshot.data_psd[:, column],
-                **{name: getattr(noise, field)[:, column] for name, field in _CURVES.items()},
+                **{each.name: getattr(noise, each.field)[:, column] for each in CURVES},
                 "flags": noise.flags[:, column],
             }
         )

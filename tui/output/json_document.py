@@ -21,6 +21,7 @@ from estimator.records import json_key
 from estimator.self_noise.result import Flag
 from tui import __version__
 from tui.output.calibration import channels_of
+from tui.output.curves import CURVES
 from tui.output.json_diagnostics import diagnostics_document
 from tui.output.json_values import json_text, plain
 from tui.output.noise_parameters import noise_parameters_document
@@ -54,10 +55,7 @@ def result_document(snapshot: Snapshot, method: str) -> dict[str, Any]:
                 "channel": label.channel,
                 "unit": label.unit,
                 "data_psd": data[:, column],
-                "noise_psd": noise.noise_psd[:, column],
-                "noise_psd_low": noise.low[:, column],
-                "noise_psd_high": noise.high[:, column],
-                "cov": noise.cov[:, column],
+                **{each.key: getattr(noise, each.field)[:, column] for each in CURVES},
                 "flags": noise.flags[:, column],
             }
             for column, label in enumerate(snapshot.channels)

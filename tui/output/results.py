@@ -12,6 +12,7 @@ from daq.results.band_summary import data_interval
 from daq.results.vocabulary import FLAG_WORDS, PARTNER_WORDS
 from estimator.self_noise.result import Flag
 from estimator.wording import clock_time, several
+from tui.output.curves import CURVES
 from tui.page.table import Table
 from tui.wording.formatting import level, level_with_error, utc
 
@@ -88,11 +89,9 @@ def curves_csv(snapshot: Snapshot) -> str:
         header.append(f"{name} data {unit}")
         columns.append(snapshot.data_psd[:, number])
         for method, noise in snapshot.results.items():
-            header += [f"{name} {method} {what} {unit}" for what in ("noise", "low", "high")]
-            header.append(f"{name} {method} cov")
-            columns += [
-                values[:, number] for values in (noise.noise_psd, noise.low, noise.high, noise.cov)
-            ]
+            for each in CURVES:
+                header.append(f"{name} {method} {each.word}{f' {unit}' * each.is_density}")
+                columns.append(getattr(noise, each.field)[:, number])
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(map(_not_a_formula, header))
