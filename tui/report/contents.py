@@ -71,8 +71,8 @@ def calibration_section(result: Result) -> Section | None:
     found = replace(found, budgets=sensitivities, without_noise=())  # Uncertainty has the noise
     tables = [
         ("Sensitivity, delay and misalignment", sensitivity_table(found, snapshot)),
-        ("Rotation about the axes of the reference", angle_table(found, snapshot)),
         ("Relative response, cross-axis included", matrix_table(found, snapshot)),
+        ("Rotation about the axes of the reference", angle_table(found, snapshot)),
         ("Uncertainty budget of the sensitivities", budget_table(found.whole_band("sensitivity"))),
     ]
     parts: list[Part] = [Paragraph(f"{title(found, snapshot)}. {remarks(found, snapshot)[0]}")]
@@ -156,6 +156,8 @@ def report_of(
             None if by_rule is None else by_rule.certificate,
         ),
         noise_section(result, models),
+    ]
+    annex = [
         facts_section(facts),
         uncertainty_section(result, about),
         parameters_section(result),
@@ -180,7 +182,14 @@ def report_of(
         title="Calibration certificate: self-noise" if issue else "Calibration report: self-noise",
         subtitle=f"Huddle test {name}" + (f", {utc_time(start)}" if is_known(start) else ""),
         verdict=sentence,
-        sections=tuple(by_sensor(section, snapshot) for section in sections if section is not None),
+        sections=(
+            *(by_sensor(each, snapshot) for each in sections if each is not None),
+            *(
+                replace(by_sensor(each, snapshot), is_annex=True)
+                for each in annex
+                if each is not None
+            ),
+        ),
         notices=(*notices(found, result, about, issue), *invalidating(facts)),
         watermark=watermark(found, issue),
         number="" if issue is None else issue.name,

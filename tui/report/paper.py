@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import singledispatchmethod
 from pathlib import Path
@@ -23,28 +24,72 @@ from tui.report.figures.curves import WIDTH as INNER
 from tui.report.parts import Facts, Items, Paragraph, Plot, Signatures, Table
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
     from typing import BinaryIO
 
     from tui.report.parts import Part, Report, Tone
 
-MARGIN, TOP, BOTTOM = 0.58, 0.6, 0.75
-TEXT, SMALL, TABLE, HEADING, TITLE = 8.5, 7.5, 7.0, 11.0, 17.0
-LINE = 1.4
-"""Distance of lines over the size of letters."""
-NAMES = 1.45
-"""Width of the names of facts."""
-GAP = 0.05
-"""Between columns, to either side."""
+MARGIN, TOP, BOTTOM = 0.58, 0.5, 0.65
+TITLE, VERDICT = 17.0, 10.0
+SINGLE = 3.3
+"""Least width of a plot with one panel."""
+GUTTER = 0.14
+"""Between what is side by side."""
 TOGETHER = 2.6
 """Tables that are lower are not broken."""
-BOX = 0.75
+BOX = 0.42
 """Height of a box to be filled in."""
-HEAD = 0.45
-"""Height of the title of a section."""
 LONGEST = 1500
 """Characters of a cell: a row must fit on a page."""
 _FAMILY = "DejaVu"
+
+
+@dataclass(frozen=True, slots=True)
+class _Sizes:
+    """Sizes of letters in points, and what follows from them in inches.
+
+    Attributes
+    ----------
+    text, small, table, heading : float
+        Letters of text, of quiet text, of tables, and of titles of sections.
+    line : float
+        Distance of lines over the size of letters.
+    above, below : float
+        Room at the title of a section.
+    row, part : float
+        Room at a row of a table, and below a part.
+    names : float
+        Width of the names of facts.
+    gap : float
+        Beside a cell, to either side.
+    columns : int
+        Of facts.
+    plot : float
+        Height of plots, over that on the first page.
+    """
+
+    text: float
+    small: float
+    table: float
+    heading: float
+    line: float
+    above: float
+    below: float
+    row: float
+    part: float
+    names: float
+    gap: float
+    columns: int
+    plot: float
+
+    @property
+    def head(self) -> float:
+        """Return the height of the title of a section."""
+        return self.above + self.below + self.heading * 1.2 / 72 + 0.08
+
+
+_RESULT = _Sizes(8.5, 7.5, 7.0, 11.0, 1.4, 0.16, 0.05, 0.03, 0.12, 1.45, 0.05, 1, 0.8)
+_ANNEX = _Sizes(7.0, 6.2, 6.0, 9.0, 1.25, 0.08, 0.03, 0.016, 0.06, 1.1, 0.02, 2, 0.6)
 _COLOURS: dict[Tone, str] = {
     "plain": drawing.INK,
     "quiet": "#5c6670",
@@ -78,10 +123,13 @@ def write_paper(
     paper.add_page()
     paper.heading(report)
     for number, section in enumerate(report.sections, start=1):
+        paper.use(_ANNEX if section.is_annex else _RESULT)
         needed = paper.least(section.parts)
         if number == len(report.sections) - 1:  # no page with nothing but signatures
             last_two = report.sections[number - 1 :]
-            together = sum(HEAD + sum(map(paper.height, each.parts)) for each in last_two)
+            together = sum(
+                paper.sizes.head + sum(map(paper.height, each.parts)) for each in last_two
+            )
             needed = together if together < paper.eph else needed
         if paper.will_page_break(needed):
             paper.add_page()
@@ -108,11 +156,23 @@ class _Paper(FPDF):
         number = report.number.encode()
         self._identifier = hashlib.sha256(number).hexdigest()[:32].upper() if number else ""
         self.c_margin = 0.0
-        self.set_section_title_styles(
-            TextStyle(_FAMILY, "B", HEADING, color=drawing.INK, t_margin=0.16, b_margin=0.05)
-        )
+        self.use(_RESULT)
         self._foot = f"{report.number}   {report.subtitle}" if report.number else report.subtitle
         self._watermark = report.watermark
+
+    def use(self, sizes: _Sizes) -> None:
+        """Set what follows in these sizes."""
+        self.sizes = sizes
+        self.set_section_title_styles(
+            TextStyle(
+                _FAMILY,
+                "B",
+                sizes.heading,
+                color=drawing.INK,
+                t_margin=sizes.above,
+                b_margin=sizes.below,
+            )
+        )
 
     def file_id(self) -> str:
         """Return an identifier without the time: none for a draft."""
@@ -155,7 +215,7 @@ class _Paper(FPDF):
         self.set_x(MARGIN + indent)
         self.multi_cell(
             width - indent,
-            size * LINE / 72,
+            size * self.sizes.line / 72,
             _shown(text),
             align="L",
             new_x=XPos.LMARGIN,
@@ -167,15 +227,16 @@ class _Paper(FPDF):
         with self._marked_sequence(title=report.title) as title:
             self.lines(report.title, TITLE, bold=True)
         title.s = "/H1"
-        self.lines(report.subtitle, TEXT, "quiet")
+        self.lines(report.subtitle, self.sizes.text, "quiet")
         self.ln(0.12)
         top = self.y
-        self.lines(report.verdict.text, 10.0, report.verdict.tone, bold=True, indent=0.14)
+        self.lines(report.verdict.text, VERDICT, report.verdict.tone, bold=True, indent=0.14)
         with self.local_context(fill_color=_COLOURS[report.verdict.tone]):
             self.rect(MARGIN, top, 0.05, self.y - top, style="F")
         self.ln(0.08)
         for notice in report.notices:
-            self.lines(notice.text, TEXT, notice.tone, bold=notice.tone in {"bad", "doubtful"})
+            bold = notice.tone in {"bad", "doubtful"}
+            self.lines(notice.text, self.sizes.text, notice.tone, bold=bold)
             self.ln(0.06)
 
     def section(self, title: str, parts: Sequence[Part]) -> None:
@@ -188,8 +249,11 @@ class _Paper(FPDF):
         self.set_line_width(0.008)
         self.line(MARGIN, self.y, MARGIN + INNER, self.y)
         self.ln(0.08)
-        for part in parts:
-            self.part(part)
+        for beside in self._beside(parts):
+            if len(beside) > 1:
+                self._side_by_side(beside)
+            else:
+                self.part(*beside)
 
     @singledispatchmethod
     def part(self, part: Part) -> None:
@@ -198,43 +262,54 @@ class _Paper(FPDF):
 
     @part.register
     def _(self, part: Paragraph) -> None:
-        self.lines(part.text, SMALL if part.tone == "quiet" else TEXT, part.tone)
-        self.ln(0.05)
+        size = self.sizes.small if part.tone == "quiet" else self.sizes.text
+        self.lines(part.text, size, part.tone)
+        self.ln(0.4 * self.sizes.part)
 
     @part.register
     def _(self, part: Items) -> None:
+        size = self.sizes.text
         for entry in part.entries:
-            if self.will_page_break(TEXT * LINE / 72):
+            if self.will_page_break(self._line):
                 self.add_page()
-            self._style(TEXT, entry.tone)
-            self.text(MARGIN + 0.02, self.y + 0.85 * TEXT * LINE / 72, "•")
-            self.lines(entry.text, TEXT, entry.tone, indent=0.14)
+            self._style(size, entry.tone)
+            self.text(MARGIN + 0.02, self.y + 0.85 * self._line, "•")
+            self.lines(entry.text, size, entry.tone, indent=0.14)
             self.ln(0.03)
 
     @part.register
     def _(self, part: Facts) -> None:
-        for name, value in part.rows:
-            if self.will_page_break(2 * TEXT * LINE / 72):
+        size, names = self.sizes.text, self.sizes.names
+        for pair, wide in self._facts(part):
+            if self.will_page_break(max(self._facts_height(row, wide) for row in pair)):
                 self.add_page()
-            top = self.y
-            self.lines(name, TEXT, "quiet", width=NAMES - GAP)
-            below, self.y = self.y, top
-            self.lines(value, TEXT, indent=NAMES)
-            self.y = max(self.y, below) if self.y > top else self.y
-        self.ln(0.1)
+            top = below = self.y
+            for column, (name, value) in enumerate(pair):
+                left = column * (wide + GUTTER)
+                self.y = top
+                self.lines(name, size, "quiet", indent=left, width=left + names - self.sizes.gap)
+                below, self.y = max(below, self.y), top
+                self.lines(value, size, indent=left + names, width=left + wide)
+                below = max(below, self.y)
+            self.y = below
+        self.ln(0.8 * self.sizes.part)
 
     @part.register
     def _(self, part: Plot) -> None:
-        height = drawing.height_of(part)
-        title = TEXT * LINE / 72 + 0.05 if part.title else 0.0
-        if self.will_page_break(title + height):
+        if self.will_page_break(self.height(part)):
             self.add_page()
+        self._plot(part, INNER)
+
+    def _plot(self, part: Plot, width: float) -> None:
+        """Set a plot from the left margin on."""
+        part = replace(part, height=self.sizes.plot * part.height)
         if part.title:
-            self.lines(part.title, TEXT, bold=True)
+            left = self.l_margin - MARGIN
+            self.lines(part.title, self.sizes.text, bold=True, indent=left, width=left + width)
+        page = on_paper.Page(self, _FAMILY, self._out)
         with self._marked_sequence(alt_text=part.alt):
-            page = on_paper.Page(self, _FAMILY, self._out)
-            on_paper.draw(part, page, left=MARGIN, top=self.y, width=INNER)
-        self.set_xy(MARGIN, self.y + height)
+            on_paper.draw(part, page, left=self.l_margin, top=self.y, width=width)
+        self.set_xy(MARGIN, self.y + drawing.height_of(part))
 
     @part.register
     def _(self, part: Signatures) -> None:
@@ -243,7 +318,7 @@ class _Paper(FPDF):
         self.ln(0.08)
         width = (INNER - 0.15 * (len(part.labels) - 1)) / len(part.labels)
         self.set_draw_color(_COLOURS["quiet"])
-        self._style(SMALL, "quiet")
+        self._style(self.sizes.small, "quiet")
         for number, label in enumerate(part.labels):
             x = MARGIN + number * (width + 0.15)
             self.rect(x, self.y, width, BOX)
@@ -252,26 +327,68 @@ class _Paper(FPDF):
 
     @part.register
     def _(self, part: Table) -> None:
-        self._style(TABLE)
-        widths = self._column_widths(part)
         height = self.height(part)
         if height < TOGETHER and self.will_page_break(height):
             self.add_page()
+        self._table(part, self._column_widths(part), INNER)
+
+    def _beside(self, parts: Sequence[Part]) -> Iterator[list[Part]]:
+        """Yield parts; in the annex, those together that fit side by side."""
+        held: list[Part] = []
+        for part in parts:
+            together = [*held, part]
+            widths = sum(map(self._least_width, together)) + GUTTER * (len(together) - 1)
+            if held and (widths > INNER or self.sizes.columns == 1):
+                yield held
+                held = [part]
+            else:
+                held = together
+        if held:
+            yield held
+
+    def _least_width(self, part: Part) -> float:
+        """Return the width that a part takes at least; of most, all there is."""
+        if isinstance(part, Table):
+            return sum(self._words(part))
+        return SINGLE if isinstance(part, Plot) and len(part.panels) == 1 else INNER
+
+    def _side_by_side(self, parts: Sequence[Part]) -> None:
+        least = [self._least_width(part) for part in parts]
+        spare = (INNER - GUTTER * (len(parts) - 1) - sum(least)) / len(parts)
+        if self.will_page_break(max(map(self.height, parts))):
+            self.add_page()
+        top = below = self.y
+        for part, width in zip(parts, least, strict=True):
+            self.y = top
+            if isinstance(part, Table):
+                self._table(part, self._words(part), width + spare)
+            elif isinstance(part, Plot):
+                self._plot(part, width + spare)
+            below = max(below, self.y)
+            self.set_left_margin(self.l_margin + width + spare + GUTTER)
+        self.set_left_margin(MARGIN)
+        self.set_xy(MARGIN, below)
+
+    def _table(self, part: Table, widths: Sequence[float], width: float) -> None:
+        """Set a table from the left margin on; what room there is goes to all columns."""
+        size, room = self.sizes.table, max(0.0, width - sum(widths)) / len(widths)
+        widths, gap = [each + room for each in widths], self.sizes.gap + min(0.03, room / 2)
         if part.title:
-            self.lines(part.title, TABLE, bold=True)
+            self.lines(part.title, size, bold=True, indent=self.l_margin - MARGIN)
             self.ln(0.03)
-        self._style(TABLE)
+        self._style(size)
         self.set_draw_color(drawing.GRID)
         self.set_line_width(0.006)
         with self.table(
             borders_layout=TableBordersLayout.HORIZONTAL_LINES,
             col_widths=widths,
             headings_style=FontFace(emphasis="BOLD"),
-            line_height=TABLE * LINE / 72,
-            padding=(0.015, GAP),
+            line_height=size * self.sizes.line / 72,
+            padding=(self.sizes.row / 2, gap),
             text_align=tuple("LEFT" if n in part.left else "RIGHT" for n in range(len(widths))),
             v_align="TOP",
-            width=INNER,
+            width=width,
+            align="LEFT",
             wrapmode=WrapMode.WORD,
         ) as table:
             table.row(part.header, v_align="BOTTOM")
@@ -283,43 +400,76 @@ class _Paper(FPDF):
                         emphasis=None if tone == "plain" else "BOLD", color=_COLOURS[tone]
                     )
                     row.cell(_shown(cell), style=style)
-        self.ln(0.12)
+        self.ln(self.sizes.part)
 
     def height(self, part: Part) -> float:
         """Return about how high a part is."""
-        self._style(TEXT)
-        line = TEXT * LINE / 72
+        sizes, line = self.sizes, self._line
+        self._style(sizes.text)
         match part:
             case Paragraph():
-                return 0.05 + line * self._n_lines(part.text, INNER)
+                return 0.4 * sizes.part + line * self._n_lines(part.text, INNER)
             case Items():
                 return sum(0.03 + line * self._n_lines(e.text, INNER) for e in part.entries)
             case Facts():
-                return 0.1 + sum(
-                    line
-                    * max(self._n_lines(name, NAMES - GAP), self._n_lines(value, INNER - NAMES))
-                    for name, value in part.rows
+                return 0.8 * sizes.part + sum(
+                    max(self._facts_height(row, wide) for row in pair)
+                    for pair, wide in self._facts(part)
                 )
             case Plot():
-                return drawing.height_of(part) + (line + 0.05 if part.title else 0.0)
+                shown = replace(part, height=sizes.plot * part.height)
+                return drawing.height_of(shown) + (line + 0.05 if part.title else 0.0)
             case Signatures():
                 return BOX + 0.08
             case Table():
                 pass
         widths = self._column_widths(part)
+        self._style(sizes.table)
         n_lines = [
             max(
-                self._n_lines(cell, width - 2 * GAP)
+                self._n_lines(cell, width - 2 * self.sizes.gap, spare=0.99)
                 for cell, width in zip(row, widths, strict=True)
             )
             for row in (part.header, *part.rows)
         ]
         title = 0.17 if part.title else 0.0
-        return title + sum(0.03 + n * TABLE * LINE / 72 for n in n_lines) + 0.12
+        each = sizes.table * sizes.line / 72
+        return title + sum(sizes.row + n * each for n in n_lines) + sizes.part
+
+    @property
+    def _line(self) -> float:
+        """Return the height of a line of text."""
+        return self.sizes.text * self.sizes.line / 72
+
+    def _facts(self, part: Facts) -> Iterator[tuple[list[tuple[str, str]], float]]:
+        """Yield facts that stand side by side, with their width; a long one stands alone."""
+        n = self.sizes.columns
+        wide = (INNER - GUTTER * (n - 1)) / n
+        held: list[tuple[str, str]] = []
+        for row in part.rows:
+            is_long = n > 1 and self._facts_height(row, wide) > 2 * self._line
+            if held and (is_long or len(held) == n):
+                yield held, wide
+                held = []
+            if is_long:
+                yield [row], INNER
+            else:
+                held.append(row)
+        if held:
+            yield held, wide
+
+    def _facts_height(self, row: tuple[str, str], wide: float) -> float:
+        """Return about how high a fact is in a column."""
+        self._style(self.sizes.text)
+        name, value = row
+        names = self.sizes.names
+        return self._line * max(
+            self._n_lines(name, names - self.sizes.gap), self._n_lines(value, wide - names)
+        )
 
     def least(self, parts: Sequence[Part]) -> float:
         """Return about what must fit for the beginning of a section to stay together."""
-        height = HEAD
+        height = self.sizes.head
         for part in parts:
             one = self.height(part)
             height += min(TOGETHER, one) if isinstance(part, Table) else one
@@ -327,25 +477,16 @@ class _Paper(FPDF):
                 break
         return min(height, self.eph)
 
-    def _n_lines(self, text: str, width: float) -> int:
-        """Return about how many lines a text takes."""
-        return max(1, math.ceil(1.03 * float(self.get_string_width(_shown(text))) / width))
+    def _n_lines(self, text: str, width: float, *, spare: float = 1.03) -> int:
+        """Return about how many lines a text takes; `spare` for what is left at their ends."""
+        return max(1, math.ceil(spare * float(self.get_string_width(_shown(text))) / width))
 
     def _column_widths(self, table: Table) -> list[float]:
         """Return widths that fit the page: as wide as the text, columns of words cut where needed.
 
         Headers wrap at their words; the widest columns of words give way first.
         """
-
-        def width(text: str, *, bold: bool) -> float:
-            self._style(TABLE, bold=bold)
-            return float(self.get_string_width(text)) + 2 * GAP + 0.01
-
-        widths: list[float] = []
-        for column, word in enumerate(table.header):
-            head = max(width(part, bold=True) for part in word.split() or [""])
-            bold = any(place == column for _, place in table.tones)
-            widths.append(max([head, *(width(row[column], bold=bold) for row in table.rows)]))
+        widths = self._words(table)
         if sum(widths) > INNER:
             # names are read first: their column gives way only if it is the only one of words
             words = [c for c in range(len(widths)) if c in table.left]
@@ -358,10 +499,24 @@ class _Paper(FPDF):
                 give = [c for c in give if c != column]
         else:
             for column, word in sorted(enumerate(table.header), key=lambda entry: len(entry[1])):
-                whole = width(word, bold=True)  # headers in one line where there is room
+                whole = self._width(word, bold=True)  # headers in one line where there is room
                 if 0 < whole - widths[column] <= INNER - sum(widths):
                     widths[column] = whole
         return widths
+
+    def _words(self, table: Table) -> list[float]:
+        """Return the widths of columns whose headers wrap at every word, and nothing else."""
+        widths: list[float] = []
+        for column, word in enumerate(table.header):
+            head = max(self._width(part, bold=True) for part in word.split() or [""])
+            bold = any(place == column for _, place in table.tones)
+            widths.append(max([head, *(self._width(row[column], bold=bold) for row in table.rows)]))
+        return widths
+
+    def _width(self, text: str, *, bold: bool) -> float:
+        """Return how wide a cell is."""
+        self._style(self.sizes.table, bold=bold)
+        return float(self.get_string_width(text)) + 2 * self.sizes.gap + 0.01
 
 
 def _shown(text: str) -> str:

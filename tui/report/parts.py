@@ -106,10 +106,11 @@ Part: TypeAlias = Paragraph | Items | Facts | Table | Plot | Signatures
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """Parts under a title."""
+    """Parts under a title; those of the annex are set closer on paper."""
 
     title: str
     parts: tuple[Part, ...]
+    is_annex: bool = False
 
 
 @dataclass(frozen=True, slots=True)

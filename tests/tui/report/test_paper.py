@@ -135,8 +135,8 @@ def test_one_channel_a_sensor_and_fifteen_sensors_fit(reported: Reported, tmp_pa
     )
     plots = [part for s in report.sections for part in s.parts if isinstance(part, Plot)]
     assert (
-        sum(len(plot.panels) for plot in plots) == 15 + 15 + 1
-    )  # spectra, Allan deviations, the model test
+        sum(len(plot.panels) for plot in plots) == 15 + 15 + 1 + 15 + 2
+    )  # spectra, Allan deviations, the model test, sketches of axes, coherence of pairs
     for page in PdfReader(paper_of(report)).pages:
         places = places_of(page)
         assert places
@@ -172,7 +172,7 @@ def test_curves_are_paths_where_the_axes_have_them() -> None:
     assert clip is not None
     x, y, width, height = map(float, clip.groups())
     assert (width, height) == pytest.approx(
-        (72 * places[0].width * WIDTH, 72 * plot.height), abs=0.01
+        (72 * places[0].width * WIDTH, 72 * 0.8 * plot.height), abs=0.01
     )
     points = np.array(found.groups(), float).reshape(2, 2)
     shown = [(x, y + 0.25 * height), (x + width / 3, y + 1.25 * height)]
@@ -201,3 +201,32 @@ def test_curves_of_three_and_four_points_are_drawn() -> None:
     corner = (3 * first - start) / 2  # of the curve of three points
     np.testing.assert_allclose(corner, (3 * second - last) / 2, atol=0.01)
     assert any(" 0 0 1 rg" in line and line.count(" c ") == 8 for line in lines)
+
+
+def test_tables_of_the_annex_stand_side_by_side_where_they_fit() -> None:
+    narrow = Table(("channel", "noise (dB)"), (("A.X", "-120.1"), ("A.Y", "-119.7")), title="Short")
+    wide = Table(("what", "in words"), (("a", "word " * 30),), left=frozenset({0, 1}))
+    facts = Facts((("One", "first"), ("Two", "second"), ("Long", "word " * 60), ("Four", "last")))
+    parts = (narrow, narrow, wide, narrow, facts)
+
+    def placed(*, is_annex: bool) -> dict[str, list[tuple[float, float]]]:
+        section = Section("Numbers", parts, is_annex)
+        report = Report("Tables", "", Paragraph("set"), (section,))
+        (page,) = PdfReader(paper_of(report)).pages
+        places: dict[str, list[tuple[float, float]]] = {}
+
+        def note(text: str, _m: object, place: list[float], _f: object, _s: float) -> None:
+            places.setdefault(text.strip(), []).append((place[4], round(place[5], 1)))
+
+        page.extract_text(visitor_text=note)
+        return places
+
+    below, beside = placed(is_annex=False), placed(is_annex=True)
+    assert len({y for _, y in below["Short"]}) == 3
+    (left, top), (right, same), (again, lower) = beside["Short"]
+    assert top == same > lower
+    assert left == again < right
+    (one,), (two,), (long,), (four,) = (beside[name] for name in ("One", "Two", "Long", "Four"))
+    assert one[1] == two[1] > long[1] > four[1]
+    assert one[0] == long[0] == four[0] < two[0]
+    assert below["One"][0][0] == below["Two"][0][0]
