@@ -132,7 +132,7 @@ def test_a_schedule_without_a_usable_duration_is_a_fault_of_the_file(tmp_path: P
         accepted(path, {})
     said = str(caught.value)
     assert 'schedule["a"].duration: is missing' in said
-    assert 'schedule["2"].duration: too short' in said
+    assert 'schedule["daily 01:00"].duration: too short' in said
 
 
 def test_a_lock_ends_with_its_holder(tmp_path: Path) -> None:
