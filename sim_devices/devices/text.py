@@ -12,8 +12,7 @@ from dataclasses import fields, replace
 from typing import TYPE_CHECKING
 
 from daq.devices.text.format import (
-    LILY,
-    RASPBERRY_SHAKE,
+    PRESETS,
     SINCE_START,
     TextFormat,
     encode_fields,
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
 
     from sim_devices.devices.interface import DeviceSpec, Source
 
-PRESETS = {"raspberry-shake": RASPBERRY_SHAKE, "lily": LILY, "none": TextFormat()}
 PACKET_SAMPLES = 25
 LILY_TAIL = ("194.25", "", "", "N9655")
 """Azimuth, temperature, supply, serial number."""

@@ -6,15 +6,18 @@ as HTML and `paper` as PDF, so both say the same. All text is plain: who writes 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+from tui.page import table as page
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
     from matplotlib.axes import Axes
 
-Tone = Literal["plain", "good", "bad", "doubtful", "quiet"]
+Tone: TypeAlias = page.Tone
+Table: TypeAlias = page.Table
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,28 +40,6 @@ class Facts:
     """Names and what they are, a line each."""
 
     rows: tuple[tuple[str, str], ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Table:
-    """Rows under a header.
-
-    Attributes
-    ----------
-    header : tuple of str
-    rows : tuple of tuple of str
-        As wide as the header.
-    left : frozenset of int
-        Columns of words, flush left; the others are numbers, flush right.
-    tones : mapping of (row, column) to Tone
-    title : str
-    """
-
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    left: frozenset[int] = frozenset({0})
-    tones: Mapping[tuple[int, int], Tone] = field(default_factory=dict)
-    title: str = ""
 
 
 @dataclass(frozen=True, slots=True)

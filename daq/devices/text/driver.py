@@ -27,8 +27,7 @@ from daq.devices.interface import (
 from daq.devices.port_rules import only, port_label
 from daq.devices.text.decoder import TextDecoder
 from daq.devices.text.format import (
-    LILY,
-    RASPBERRY_SHAKE,
+    PRESETS,
     SINCE_START,
     TextFormat,
     is_readable,
@@ -48,8 +47,6 @@ if TYPE_CHECKING:
     from daq.host_clock import HostClock
     from daq.transport.byte_stream import ByteStream
     from daq.transport.udp import DatagramStream
-
-PRESETS = {"raspberry-shake": RASPBERRY_SHAKE, "lily": LILY, "none": TextFormat()}
 
 
 class TextSettings(DriverSettings, strict=True):

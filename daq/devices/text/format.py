@@ -108,6 +108,7 @@ LILY = TextFormat(
     supply_column=6,
 )
 """Fields: tilt X and Y in µrad; then azimuth, temperature, supply voltage, serial number."""
+PRESETS = {"raspberry-shake": RASPBERRY_SHAKE, "lily": LILY, "none": TextFormat()}
 
 
 def nmea_checksum(text: str) -> int:
