@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 STUDIES = {"application", "command_start", "reach", "recorder"}
 """Benchmarks that run whole processes for most of a minute."""
 LONG = {"estimate_file", "following"}
-LONG |= {"gaps", "likelihood", "resampler", "spectra"}
+LONG |= {"gaps", "likelihood", "resampler", "signal", "spectra"}
 """Those that take half a second and more."""
 NAMES = sorted(
     {module.name for module in pkgutil.iter_modules(benchmarks.__path__) if not module.ispkg}
