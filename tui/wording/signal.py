@@ -6,7 +6,7 @@ import math
 from datetime import UTC, datetime, time
 from typing import TYPE_CHECKING
 
-from daq.results.signal import CLIPPED, EXCLUDED, GAP
+from daq.results.signal import CLIPPED, GAP
 from tui.wording.formatting import readings
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ STEPS = (
 )
 """Seconds between ticks of time; beyond them whole days."""
 _DAY = 86400.0
-SIGNS = {"mark": "▼", EXCLUDED: "✗", GAP: "░", CLIPPED: "▲"}
+SIGNS = {"mark": "▼", GAP: "░", CLIPPED: "▲"}
 """Signs of marks; of all other kinds `EVENT`."""
 EVENT = "◆"
 
@@ -84,7 +84,7 @@ def words(mark: Mark) -> str:
 
 
 def most_first(marks: Sequence[Mark]) -> list[Mark]:
-    """Return remarks, what is excluded, gaps, and clipped stretches, in this order, then events."""
+    """Return remarks, gaps and clipped stretches, in this order, then events."""
     order = list(SIGNS)
     return sorted(marks, key=lambda m: order.index(m.kind) if m.kind in SIGNS else len(order))
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from estimator.types import FloatArray, IntArray
 
 MUTED, CHOSEN, PLAIN, BAD = "#9aa5b8", "#4cc9f0", "#c5cedb", "bold #ff6b6b"
-CURSOR, PICKED = "on #26324a", "on #5a2a33"
+CURSOR = "on #26324a"
 SHADES = " ░▒▓█"
 COLOURS = ("#3b4252", "#41557b", "#3f74a8", "#3f97b8", "#58b7a5", "#8fce82", "#cfdc6a", "#fde74c")
 """Of a spectrogram from the lowest level to the highest; its shades say the same without colour."""
@@ -40,15 +40,14 @@ class Look:
         Number of the chosen trace.
     spectrum : str
         `RECORDED` or `NOISE` for a spectrogram of the channel; empty for waveforms of all.
-    cursor, anchor : float or None
-        Where values are read off, and the other end of a stretch that is being chosen.
+    cursor : float or None
+        Where values are read off.
     """
 
     span: tuple[float, float] | None = None
     channel: int = 0
     spectrum: str = ""
     cursor: float | None = None
-    anchor: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,12 +77,12 @@ def picture(drawn: Drawn, look: Look, width: int, height: int) -> Text:
     lines = [_title(drawn, look, width), *body]
     lines += [Text("", MUTED)] * (rows + 1 - len(lines))
     lines += [_lane(waves, left, columns), _axis(waves, left, columns)]
-    for at, style in ((look.cursor, CURSOR), (look.anchor, PICKED)):
-        if at is not None and waves.begin <= at <= waves.end:
-            column = left + min(int((at - waves.begin) / _cell(waves, columns)), columns - 1)
-            for line in lines[1:-1]:
-                line.pad_right(max(0, column + 1 - line.cell_len))
-                line.stylize(style, column, column + 1)
+    at = look.cursor
+    if at is not None and waves.begin <= at <= waves.end:
+        column = left + min(int((at - waves.begin) / _cell(waves, columns)), columns - 1)
+        for line in lines[1:-1]:
+            line.pad_right(max(0, column + 1 - line.cell_len))
+            line.stylize(CURSOR, column, column + 1)
     lines.append(_read_off(waves, look, width))
     return Text("\n").join(lines)
 
@@ -200,6 +199,4 @@ def _read_off(waves: Waveforms, look: Look, width: int) -> Text:
     text = f"{at}  {trace.name} {values}".replace("-", "−")
     for mark in most_first(waves.near(look.cursor)):
         text += f"  {sign(mark)} {words(mark)}"
-    if look.anchor is not None:
-        text = f"✗ {abs(look.cursor - look.anchor):.4g} s: x excludes, esc cancels  {text}"
     return Text(text[:width])

@@ -100,7 +100,7 @@ class SignalView(View):
         ("n N", "next and previous mark, event or gap"),
         (", .  < >", "cursor left and right, and far; a click places it"),
         ("esc", "the whole recording, without a cursor"),
-        ("▼ ◆ ░ ▲ ✗", "remark, event, gap, end of the range, excluded segments"),
+        ("▼ ◆ ░ ▲", "remark, event, gap, end of the range"),
     )
 
     def __init__(self, state: State, source: SignalSource) -> None:
@@ -167,7 +167,7 @@ class SignalView(View):
         if self._path is None or now is None:
             return
         snapshot = None if result is None or not result.snapshot.closed else result.snapshot
-        look = replace(self._look, cursor=None, anchor=None)
+        look = replace(self._look, cursor=None)
         key = self._path, look, self._room, self._source.version, snapshot, now.closed
         if key == self._key:
             return
@@ -274,7 +274,7 @@ class SignalView(View):
 
     def action_whole(self) -> None:
         """Show the whole recording without a cursor."""
-        self._change(span=None, cursor=None, anchor=None)
+        self._change(span=None, cursor=None)
 
     def action_mark(self, step: int = 1) -> None:
         """Go to the next or previous mark."""

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from daq.protocols.block import EventKind
-from daq.results.signal import CLIPPED, EXCLUDED, GAP
+from daq.results.signal import CLIPPED, GAP
 from tui.report.figures import drawing
 from tui.report.parts import Plot
 from tui.wording.signal import extent, moment, time_ticks, title
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 COLUMNS, TIMES, BANDS, TICKS = 1200, 160, 60, 6
 TRACE_HEIGHT, SPECTRUM_HEIGHT = 0.36, 0.7
 """Of each waveform and each spectrogram, in inches."""
-_COLOURS = {GAP: drawing.LIMIT, CLIPPED: drawing.LINES[1], EXCLUDED: drawing.QUANTISATION}
+_COLOURS = {GAP: drawing.LIMIT, CLIPPED: drawing.LINES[1]}
 _MOST_REMARKS = 12
 _CYCLE = 0.42
 """Half height of a waveform, of the distance from one to the next."""
