@@ -9,7 +9,7 @@ import numpy as np
 
 from estimator.errors import EstimatorError, UnknownMethodError
 from estimator.levels.interval import unpredicted
-from estimator.levels.pooled import ENOUGH, pooled_noise, unresolved_blocks
+from estimator.levels.pooled import pooled_noise
 from estimator.likelihood.maximum_likelihood import maximum_likelihood
 from estimator.self_noise.coherency import coherency
 from estimator.self_noise.result import Flag, SelfNoise
@@ -27,9 +27,6 @@ __all__ = ["METHODS", "Flag", "Method", "SelfNoise", "self_noise"]
 
 SMOOTH = 400.0
 """Averages on which the course of the noise in a block rests."""
-AT_ZERO = 0.05
-"""Share of a block's bins at which the likelihood is largest at zero noise, from which neighbours
-count."""
 
 EQUATIONS = 2
 """Equations of like channels over their number, from which pooled directions of further dimensions
@@ -58,6 +55,7 @@ def self_noise(
     real: BoolArray | None = None,
     blocks: IntArray | None = None,
     correlation: FloatArray | None = None,
+    known: SelfNoise | None = None,
     **options: Any,  # noqa: ANN401 - each method's own
 ) -> SelfNoise:
     """Return the self-noise PSD of every channel by a named method.
@@ -80,11 +78,13 @@ def self_noise(
         frequency (`estimator.spectra.welch.WelchSettings.real`). Default: nowhere.
     blocks : int64, shape (n_freqs,), optional
         Block of neighbours of every frequency (`estimator.levels.pooled.blocks_of`). With it,
-        `three-sensor` and `maximum-likelihood` take the directions of the motion from neighbours
-        where single frequencies do not resolve them; flag POOLED.
+        `three-sensor` and `maximum-likelihood` give the levels of the engine
+        (`estimator.levels.pooled`), with the flag POOLED where a bin does not resolve the motion.
     correlation : float64, shape (n_lags,), optional
         Of the power of neighbouring frequencies (`estimator.levels.bands.bin_correlation`);
         default: independent.
+    known : SelfNoise, optional
+        What the method gives without `blocks`, if that is estimated already.
     **options
         Options of the method.
 
@@ -101,13 +101,19 @@ def self_noise(
     """
     if method not in METHODS:
         raise UnknownMethodError(f"method {method!r}: expected one of {', '.join(METHODS)}")
-    found = METHODS[method](csm, dims=dims, n_effective=n_effective, correct=correct, **options)
     is_real = np.zeros(len(csm), np.bool_) if real is None else np.asarray(real)
     if is_real.shape != (len(csm),) or is_real.dtype != np.bool_:
         raise EstimatorError(
             f"real of shape {is_real.shape} and type {is_real.dtype}, expected bool of"
             f" ({len(csm)},)"
         )
+    found = known
+    if found is None:
+        found = METHODS[method](csm, dims=dims, n_effective=n_effective, correct=correct, **options)
+        if is_real.any():
+            # half the degrees of freedom: a coefficient of a real series has no imaginary part
+            scale = np.where(is_real, np.array([[2.0], [4.0], [8.0]]), 1.0)[:, :, None]
+            found = SelfNoise.of(method, found.noise_psd, scale * found.cumulants, found.flags)
     if blocks is not None and method in {"three-sensor", "maximum-likelihood"}:
         found = _with_neighbours(
             found,
@@ -119,11 +125,7 @@ def self_noise(
             correct=correct,
             correlation=np.ones(1) if correlation is None else correlation,
         )
-    if not is_real.any():
-        return found
-    # half the degrees of freedom: a Fourier coefficient of a real series has no imaginary part
-    scale = np.where(is_real, np.array([[2.0], [4.0], [8.0]]), 1.0)[:, :, None]
-    return SelfNoise.of(method, found.noise_psd, scale * found.cumulants, found.flags)
+    return found
 
 
 def _dimensions(n_factors: int | IntArray | None, dims: tuple[int, ...], n_freqs: int) -> IntArray:
@@ -171,13 +173,10 @@ def _with_neighbours(
     correct: bool,
     correlation: FloatArray,
 ) -> SelfNoise:
-    """Return a result whose bins take the directions of the motion from neighbours where needed.
+    """Return a result with the levels of the engine, `estimator.levels.pooled`.
 
-    They do in blocks whose bins do not resolve all dimensions, by maximum likelihood where sensors
-    have several channels, whose noise is a matrix, where the likelihood of a channel is
-    largest at zero noise at some, and where motion has more dimensions than sensors have channels,
-    if the sensors are enough: bins alone do not divide the noise well among channels then. `blocks`
-    is negative at bins that have no neighbours.
+    All do, unless motion has more dimensions than sensors have channels and the sensors are too
+    few to divide the noise well among channels. `blocks` is negative at bins without neighbours.
     """
     missing = Flag.DEAD_CHANNEL | Flag.DUPLICATE | Flag.NO_COUNTERPART
     given = coherency(csm, dims)
@@ -212,36 +211,24 @@ def _with_neighbours(
     amplitude = np.sqrt(psd / scale)
     matrix *= amplitude[:, :, None]
     matrix *= amplitude[:, None, :]
-    share = found.noise_psd[rows[:, None], columns] / scale
-    scatter = found.cumulants[0][rows[:, None], columns] / scale**2
-    unresolved = unresolved_blocks(
-        matrix, number, n_dims[rows], share, scatter, dims=live, n_effective=n_effective
-    )
-    at_zero = ((found.flags[rows] & (Flag.BOUNDARY | Flag.UNRESOLVED)) != 0).any(axis=1)
-    often = np.bincount(number, at_zero) > AT_ZERO * np.bincount(number)
-    # a likelihood of each channel by itself takes what the channels of a sensor share for motion
-    shares = found.method == "maximum-likelihood" and usual > 1 and n_effective >= ENOUGH
-    wanted = (unresolved | often)[number] | further[rows] | shares
-    if not wanted.any():
-        return found
-    if not wanted.all():
-        matrix = matrix[wanted]
     pooled = pooled_noise(
         matrix,
-        number[wanted],
-        n_dims[rows][wanted],
+        number,
+        n_dims[rows],
         dims=live,
         n_effective=n_effective,
         correlation=correlation,
     )
     known = np.isfinite(pooled.noise).all(axis=1)
-    here = rows[wanted][known]
+    here = rows[known]
     at = np.ix_(here, columns)
     gain = 1.0 if correct else (1 - n_dims[here] / n_effective)[:, None]
     noise, cumulants, flags = found.noise_psd.copy(), found.cumulants.copy(), found.flags.copy()
-    unit = scale[wanted][known] * gain
+    unit = scale[known] * gain
     noise[at] = pooled.noise[known] * unit
     for m in range(3):
         cumulants[m][at] = pooled.cumulants[m, known] * unit ** (m + 2)
-    flags[at] = np.where(noise[at] <= 0, int(Flag.POOLED | Flag.NEGATIVE), int(Flag.POOLED))
+    flags[at] = np.where(noise[at] <= 0, int(Flag.NEGATIVE), 0)
+    shared = pooled.shared[known] | further[here]  # bins alone do not divide the noise then
+    flags[at] |= np.where(shared[:, None], int(Flag.POOLED), 0)
     return SelfNoise.of(found.method, noise, cumulants, flags)

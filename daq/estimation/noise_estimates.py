@@ -268,7 +268,7 @@ def with_sets(
     frequency : float64, shape (n_freqs,)
         Of the estimates, in Hz.
     """
-    settings = settings.for_sensors(dims)
+    chosen, settings = "auto" in settings.methods, settings.for_sensors(dims)
     wanted = ALL_METHODS if "all" in settings.methods else settings.methods
     wanted = tuple(name for name in wanted if name in BY_MOTION)
     sensor_of, usual = np.repeat(np.arange(len(dims)), dims), max(dims)
@@ -284,7 +284,11 @@ def with_sets(
             q = settings.dimension if isinstance(settings.dimension, int) else usual
             its = replace(settings, methods=("maximum-likelihood",), dimension=q)
         found = noise_estimates(
-            each.bands, its, dims=tuple(int(n) for n in left if n), gains=gains[columns]
+            each.bands,
+            its,
+            dims=tuple(int(n) for n in left if n),
+            gains=gains[columns],
+            chosen=chosen,
         )
         refused = {**found.refused, **refused}
         for name in wanted:
@@ -482,6 +486,7 @@ def noise_estimates(
     known: Mapping[str, Sequence[SelfNoise]] | None = None,
     maxima: Maxima | None = None,
     shared: Sequence[tuple[int, int]] = (),
+    chosen: bool = False,
 ) -> Estimates:
     """Estimate by every method that is wanted.
 
@@ -502,8 +507,11 @@ def noise_estimates(
         Fits of the same averages, to share.
     shared : sequence of (int, int)
         Pairs of sensors whose noise may be shared.
+    chosen : bool
+        Whether the methods replace `auto`, so that all levels are those of the engine; by name,
+        three-sensor is the paper's formula.
     """
-    chosen, known = "auto" in settings.methods, known or {}
+    chosen, known = chosen or "auto" in settings.methods, known or {}
     settings = settings.for_sensors(dims)
     results: dict[str, SelfNoise] = {}
     refused: dict[str, str] = {}
@@ -526,7 +534,9 @@ def noise_estimates(
                     options = [{"n_factors": q} for q in dimensions.n_factors]
                 if method == "maximum-likelihood":
                     options = [option | {"maxima": maxima} for option in options]
-                parts = list(known.get(method, ())) or [
+                engine = chosen or method == "maximum-likelihood"
+                given: Sequence[SelfNoise | None] = known.get(method, ()) or [None] * len(bands)
+                parts = [
                     self_noise(
                         method,
                         band.csm,
@@ -534,11 +544,12 @@ def noise_estimates(
                         n_effective=band.n_effective,
                         correct=settings.correct,
                         real=band.settings.real(band.frequencies),
-                        blocks=blocks_of(band.frequencies),
+                        blocks=blocks_of(band.frequencies) if engine else None,
                         correlation=_power_correlation(band),
+                        known=before,
                         **option,
                     )
-                    for band, option in zip(bands, options, strict=True)
+                    for band, option, before in zip(bands, options, given, strict=True)
                 ]
                 if method == "maximum-likelihood" and dimensions is not None:
                     parts = _by_gradients(parts, bands, dimensions, dims)

@@ -97,10 +97,13 @@ class Pooled:
         block are too few.
     cumulants : float64, shape (3, n_freqs, n_channels)
         Of `noise`, as `estimator.levels.interval.interval` takes them.
+    shared : bool, shape (n_freqs,)
+        Whether directions are those of several bins: one does not resolve the motion by itself.
     """
 
     noise: FloatArray
     cumulants: FloatArray
+    shared: BoolArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -204,7 +207,8 @@ def pooled_noise(
         Of averages k bins apart, 1 at k = 0.
     """
     n_freqs, p = matrix.shape[:2]
-    found = Pooled(np.full((n_freqs, p), np.nan), np.full((3, n_freqs, p), np.nan))
+    unknown = np.full((4, n_freqs, p), np.nan)
+    found = Pooled(unknown[0], unknown[1:], np.ones(n_freqs, np.bool_))
     edges = np.flatnonzero(np.diff(block, prepend=-1, append=-1))
     sizes = np.diff(edges)
     table = n_effective * worth(int(sizes.max(initial=1)), correlation)
@@ -245,7 +249,7 @@ def _pool(
     fit = _fitted(mean, parts, q, sensor, n_effective=n_effective, resolve=False)
     _read(found, matrix, fit, sensor)
     level, whitener, best = fit.level.copy(), fit.whitener.copy(), fit.resolved.copy()
-    enough = int(np.searchsorted(averages[1:], max(ENOUGH, 1.5 * p))) + 1
+    enough = int(np.searchsorted(averages[1:], max(FEW * q.max(), 1.5 * p))) + 1
     k = np.minimum(enough, sizes)
     largest = k * 2 ** np.log2(np.maximum(sizes // (k * LEAST_PARTS), 1)).astype(np.int64)
     # what the largest sub-blocks do not resolve, smaller ones do not either
@@ -267,56 +271,13 @@ def _pool(
             leaks &= best[more] > 0  # without smaller ones, the whole block leaks most
             better = (fit.resolved > best[more]) & ~leaks
             _read(found, matrix, fit, sensor, better)
+            own = (parts.count == 1) & (better & (fit.resolved == q[more]))[parts.block]
+            found.shared[parts.bins[parts.start[own]]] = False
             here = more[better]
             level[here], whitener[here] = fit.level[better], fit.whitener[better]
             best[here] = fit.resolved[better]
         k[at] *= 2
         at = at[(best[at] < q[at]) & (k[at] <= largest[at])]
-
-
-def unresolved_blocks(
-    matrix: ComplexArray,
-    block: IntArray,
-    n_dims: IntArray,
-    noise: FloatArray,
-    variance: FloatArray,
-    *,
-    dims: tuple[int, ...],
-    n_effective: float,
-) -> BoolArray:
-    """Return in which blocks single bins do not resolve all dimensions of the motion.
-
-    Parameters
-    ----------
-    matrix : complex128, shape (n_freqs, n_channels, n_channels)
-    block : int64, shape (n_freqs,)
-        From 0, without gaps, non-decreasing.
-    n_dims : int64, shape (n_freqs,)
-    noise, variance : float64, shape (n_freqs, n_channels)
-        Estimate of the noise of every bin, in the unit of `matrix`, and its variance.
-
-    Returns
-    -------
-    bool, shape (n_blocks,)
-    """
-    first = np.flatnonzero(np.diff(block, prepend=-1))
-    count = np.diff(first, append=len(block))
-    known = np.isfinite(noise) & np.isfinite(variance)
-    number = np.maximum(np.add.reduceat(known, first, axis=0, dtype=np.int64), 1)
-    mean, error = (
-        np.add.reduceat(np.where(known, part, 0.0), first, axis=0) for part in (noise, variance)
-    )
-    psi = np.maximum(mean / number, np.sqrt(error) / number)
-    psi = np.clip(psi, _FLOOR, None)
-    at = (np.arange(SAMPLED) + 0.5) / SAMPLED
-    sample = first[:, None] + np.floor(at * count[:, None]).astype(np.int64)
-    s = 1 / np.sqrt(psi[block[sample.ravel()]])
-    X = matrix[sample.ravel()] * s[:, :, None] * s[:, None, :]
-    sensor = np.repeat(np.arange(len(dims)), dims)
-    q = n_dims[first]
-    r = _stand_out(X.reshape(*sample.shape, *X.shape[1:]), n_effective, q, sensor)
-    few = n_effective < FEW * q  # directions of their own cost a bin more than a tenth in width
-    return np.asarray((r < q) | few | ~np.logical_or.reduceat(known.all(axis=1), first))
 
 
 def _parts(begin: IntArray, sizes: IntArray, k: IntArray, worth_of: FloatArray) -> _Parts:
@@ -591,14 +552,22 @@ def _shown(
             u = axes[:, :, -number, None]
             off = np.eye(p) - u @ u.conj().swapaxes(1, 2)
             rest, without = off @ rest @ off, off @ without @ off
-        size = np.einsum("bii->b", without).real / np.einsum("bii->b", rest).real
-        error = np.abs(rest * size[:, None, None] - without) ** 2
+        # each sensor by itself as without motion, whatever its noise was taken for
+        alike = _lower(without, apart) @ np.linalg.inv(_lower(rest, apart))
+        error = np.abs(white(rest, alike) - without) ** 2
         degrees = _degrees(sensor, resolved + number)
         statistic = averages * np.where(apart, error, 0.0).sum(axis=(1, 2))
         fits = statistic < degrees + SHOWN * np.sqrt(2 * degrees)
         found = np.where(open_ & fits, np.minimum(found, number), found)
         open_ &= ~fits
     return found
+
+
+def _lower(matrix: ComplexArray, apart: BoolArray) -> ComplexArray:
+    """Return the Cholesky factor of the matrices of each sensor by itself."""
+    own = np.where(apart, 0.0, matrix)
+    least = 1e-9 * np.einsum("bii->b", own).real
+    return np.linalg.cholesky(own + least[:, None, None] * np.eye(len(apart)))
 
 
 def _degrees(sensor: IntArray, q: IntArray) -> FloatArray:

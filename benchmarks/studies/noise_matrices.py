@@ -1,0 +1,152 @@
+"""Levels of `auto` where the noise of a sensor is a matrix: coverage, and width over the bound.
+
+``python -m benchmarks.studies.noise_matrices [DRAWS]`` prints the table of
+``docs/validation/noise-matrices.md``: Wishart matrices of ``A A* + N``, sensors in any direction.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from benchmarks.studies.draws import averaged
+from estimator.levels.bands import band_levels
+from estimator.levels.interval import NORMAL_95
+from estimator.methods import self_noise
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    FloatArray = NDArray[np.float64]
+    ComplexArray = NDArray[np.complex128]
+
+RATIOS = (0.05, 0.1, 0.3, 1.0, 10.0, 100.0, 1e4)
+AVERAGES = (20, 60, 200)
+N_BINS = 40
+DRAWS = 40
+SHARED = (4.0, 2.0, 0.0)
+"""Amplitudes, over that of its own noise, of a source in the channels of the second sensor."""
+INDEPENDENT, WITHIN = "none", "one sensor"
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """What is drawn again and again: a layout, its motion over its noise, and shared noise."""
+
+    n_sensors: int
+    d: int
+    ratio: float
+    n: int
+    shared: str = INDEPENDENT
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Of the intervals of band levels: coverage, median width over the bound; mean over truth."""
+
+    coverage: float
+    of_shared: float
+    width: float
+    mean: float
+    n: int
+
+
+def scene(cell: Cell, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """Return loadings of the motion, shape (p, d), and the noise matrix, of sensors turned anyhow.
+
+    Gains differ by 2 %, and so do the powers of the motion's dimensions, by a factor of two.
+    """
+    d = cell.d
+    turned = [np.linalg.qr(rng.standard_normal((d, d)))[0] for _ in range(cell.n_sensors)]
+    loadings = np.concatenate(turned) * np.sqrt(cell.ratio * np.array([1.0, 1.4, 0.7])[:d])
+    loadings *= 1 + 0.02 * rng.standard_normal((len(loadings), 1))
+    noise = np.eye(len(loadings))
+    if cell.shared == WITHIN:
+        own = slice(d, 2 * d)
+        noise[own, own] += np.outer(SHARED[:d], SHARED[:d])
+    return loadings, noise
+
+
+def bound(loadings: FloatArray, noise: FloatArray, d: int, averages: float) -> FloatArray:
+    """Return the Cramér-Rao bound of the diagonal of the noise: standard deviations, shape (p,).
+
+    The noise is any block-diagonal matrix, and the loadings are unknown. By derivatives of the
+    covariance along every real parameter, of which the information is ``n tr(C D C E)``, with C the
+    inverse covariance.
+    """
+    p = len(noise)
+    inverse = np.linalg.inv(loadings @ loadings.T + noise)
+    basis: list[ComplexArray] = []
+    for a, b in product(range(p), range(p)):
+        if a // d == b // d and a <= b:
+            for unit in (1.0,) if a == b else (1.0, 1j):
+                D = np.zeros((p, p), np.complex128)
+                D[a, b] += unit
+                D[b, a] += np.conj(unit) if a != b else 0.0
+                basis.append(D)
+    n_noise = len(basis)
+    for a, k, unit in product(range(p), range(loadings.shape[1]), (1.0, 1j)):
+        D = np.zeros((p, p), np.complex128)
+        D[a] = unit * loadings[:, k]
+        basis.append(D + D.conj().T)
+    along = np.array([inverse @ D for D in basis]).reshape(len(basis), -1)
+    back = np.array([(inverse @ D).T for D in basis]).reshape(len(basis), -1)
+    information = averages * (along @ back.T).real
+    # loadings are known up to a rotation only: a pseudo-inverse
+    covariance = np.linalg.pinv(information, rcond=1e-11, hermitian=True)
+    diagonal = [i for i, D in enumerate(basis[:n_noise]) if np.count_nonzero(D) == 1]
+    return np.asarray(np.sqrt(np.diag(covariance)[diagonal]))
+
+
+def study(cell: Cell, n_draws: int, *, seed: int = 46) -> Found:
+    """Return what the intervals of a band are, over all draws and channels."""
+    held, widths, ratios = [], [], []
+    for draw in range(n_draws):
+        rng = np.random.default_rng([seed, draw, cell.n_sensors, cell.d, cell.n])
+        loadings, noise = scene(cell, rng)
+        csm = np.broadcast_to(loadings @ loadings.T + noise, (N_BINS, *noise.shape))
+        found = self_noise(
+            "three-sensor" if cell.n_sensors == 3 else "maximum-likelihood",
+            averaged(csm.astype(np.complex128), cell.n, rng),
+            dims=(cell.d,) * cell.n_sensors,
+            n_effective=float(cell.n),
+            blocks=np.zeros(N_BINS, np.int64),
+        )
+        level = band_levels(found.noise_psd, found.cumulants, np.array([0, N_BINS]), np.ones(1))
+        low, high = level.interval()
+        truth = np.diag(noise)
+        held.append((low[0] <= truth) & (truth <= high[0]))
+        least = NORMAL_95 * bound(loadings, noise, cell.d, cell.n * N_BINS)
+        widths.append((high - low)[0] / 2 / least)
+        ratios.append(level.mean[0] / truth)
+    second = np.array(held)[:, cell.d : 2 * cell.d]
+    return Found(
+        coverage=float(np.mean(held)),
+        of_shared=float(np.mean(second)),
+        width=float(np.median(widths)),
+        mean=float(np.mean(ratios)),
+        n=int(np.size(held)),
+    )
+
+
+def main(n_draws: int) -> None:
+    """Print a row for each layout, number of averages and shared noise, a column for each ratio."""
+    print("| sensors, channels | averages | shared noise | " + " | ".join(f"{r:g}" for r in RATIOS))
+    print("|---|---|---|" + "---|" * len(RATIOS))
+    for (s, d), n, shared in product(
+        ((3, 3), (3, 2), (3, 1), (4, 3), (6, 3), (8, 3)), AVERAGES, (INDEPENDENT, WITHIN)
+    ):
+        if (d == 1 and shared == WITHIN) or n <= s * d:
+            continue
+        draws = max(2, -(-n_draws * 9 // (s * d)))
+        cells = [study(Cell(s, d, ratio, n, shared), draws) for ratio in RATIOS]
+        row = [f"{c.coverage:.3f} {c.width:.2f}" for c in cells]
+        print(f"| {s}, {d} | {n} | {shared} | {' | '.join(row)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else DRAWS)
