@@ -110,7 +110,7 @@ def test_arrays_give_the_numbers_of_the_command_to_the_bit(
 
 def test_the_three_sensor_estimate_is_the_closed_form_of_scipys_spectra() -> None:
     sensors = triaxial(5000)
-    result = huddle.self_noise(sensors, fs=RATE, segment="4s", correct=False)
+    result = huddle.self_noise(sensors, fs=RATE, segment="4s", correct=False, method="three-sensor")
     columns = np.hstack(list(sensors.values()))
     pairs = [
         # scipy takes the conjugate of the first signal, we that of the second

@@ -37,8 +37,8 @@ from estimator.levels.noise_matrices import (
     are_many,
     axes_of,
     coupling_beside,
+    divided_beside,
     inverse,
-    inverse_beside,
     pairs,
     times,
     traces,
@@ -75,13 +75,14 @@ UNSEEN = 0.67
 """Variance of the noise, over that of a PSD, by the square of the motion that does not show: so
 much that the interval holds the noise however much of this motion there is."""
 ROUNDS = 6
-SETTLED = 1e-3
+SETTLED, RESOLVES = 5e-3, 0.03
 """Change of the log of the noise in a round, of weights only, from which there is no further
-round."""
+round; the same where directions stand out, which hardly depend on it."""
 SAMPLED = 15
 """Sub-blocks of a block by which the number of resolved dimensions is decided."""
 _STEP = 1.5  # of the log of the noise in one round
 _FLOOR = 1e-7  # of the noise over the PSD
+_SINGULAR = 1e-15  # of the PSD, added before the inverse at first
 _BYTES_AT_ONCE = 1 << 23  # of the matrices of blocks that are fitted together
 _TRACE_BYTES = 1 << 24  # of products of all channels' differentials that exist together
 
@@ -137,16 +138,17 @@ class _Parts:
 class _Fit:
     """Directions of the motion, and the noise, in some blocks.
 
-    ``motion``, orthonormal columns, and ``white``, the whitened mean matrix, are those of the
-    sub-blocks. ``gain``
-    corrects for the averages that directions take, ``left`` are those that are left. ``resolved``,
-    ``whitener`` W of the weights, which makes the noise ``W N W*`` one, and ``level``, the mean
-    noise, are those of the blocks.
+    ``motion``, orthonormal columns, and ``white``, the whitened mean matrix without motion, are
+    those of the sub-blocks; ``weight`` has those of the elements of ``white`` in the noise of each
+    channel. ``gain`` corrects for the averages that directions take, ``left`` are those left.
+    ``resolved``, ``whitener`` W of the weights, which makes the noise ``W N W*`` one, and
+    ``level``, the mean noise, are those of the blocks.
     """
 
     parts: _Parts
     motion: ComplexArray
     white: ComplexArray
+    weight: ComplexArray
     gain: FloatArray
     left: FloatArray
     resolved: IntArray
@@ -318,12 +320,7 @@ def _fitted(
     own, N, whole = parts.block, parts.averages, parts.whole
     a, b = pairs(sensor)
     r, wanted = np.zeros(len(q), np.int64), q
-    # noise at first: what the other sensors do not predict
-    alone = np.linalg.inv(np.where(sensor[:, None] == sensor, np.linalg.inv(mean), 0))
-    alone *= (N / (N - p * (1 - 1 / (sensor[-1] + 1))))[:, None, None]
-    whitener: ComplexArray = np.asarray(
-        np.linalg.inv(np.linalg.cholesky(parts.mean(alone))), np.complex128
-    )
+    whitener = _start(mean, parts, sensor)
     for turn in range(ROUNDS):
         X = white(mean, whitener[own])
         U = np.zeros((len(own), p, 0), np.complex128)
@@ -352,16 +349,15 @@ def _fitted(
             PA = PA @ np.linalg.inv(np.linalg.cholesky(gram)).conj().swapaxes(1, 2)
             Q, U = P - PA @ PA.conj().swapaxes(1, 2), np.concatenate([U, PA], axis=2)
         loss = 1 + weak / np.maximum(whole - q, 1.0)
-        y = g[:, None] * (Q @ X @ Q)[:, a, b]
-        noise = loss[:, None] * times(
-            inverse(parts.mean(coupling_beside(U, sensor))), parts.mean(y)
-        )
+        rest = Q @ X @ Q
+        y = g[:, None] * rest[:, a, b]
+        noise = loss[:, None] * times(inverse(_mean_coupling(U, Q, parts, sensor)), parts.mean(y))
         kept = parts.mean(np.einsum("bii->bi", Q).real)
         floor = 0.5 / np.maximum(kept, 1e-9) / np.sqrt(whole)[:, None]
         floor = np.maximum(floor, _FLOOR * np.einsum("bii->bi", parts.mean(X)).real)
         size, axes = axes_of(noise, floor, sensor)
         step = np.clip(np.log(size), -_STEP, _STEP)
-        if turn == ROUNDS - 1 or np.abs(step).max() < SETTLED:
+        if turn == ROUNDS - 1 or np.abs(step).max() < (RESOLVES if resolve else SETTLED):
             break
         shorter = (axes * np.exp(-step / 2)[:, None, :]) @ axes.conj().swapaxes(1, 2)
         whitener = shorter @ whitener
@@ -369,18 +365,46 @@ def _fitted(
     n_sensors = sensor[-1] + 1
     hidden = SHOWN * np.sqrt(2 * _degrees(sensor, q)) / ((1 - 1 / n_sensors) * p * n_sensors)
     unseen = 1 + UNSEEN * hidden * (1 - q / np.maximum(wanted, 1)) * (wanted > 0)
-    mean_noise = loss[:, None] * parts.mean(times(inverse_beside(U, sensor), y))
-    root: ComplexArray = np.asarray(np.linalg.inv(whitener), np.complex128)
+    root = np.linalg.inv(whitener)
+    # noise of a bin is linear in the projected matrix
+    weight = divided_beside((root[:, :, a] * root[:, :, b].conj())[own], U, sensor)
     return _Fit(
         parts=parts,
         motion=U,
-        white=X,
+        white=rest,
+        weight=weight,
         gain=g * loss[own],
         left=n_effective * (1 - r[own] / N - weak[own] / whole[own]) / unseen[own],
         resolved=r,
         whitener=whitener,
-        level=times(root[:, :, a] * root[:, :, b].conj(), mean_noise).real,
+        level=loss[:, None] * parts.mean(times(weight, y).real),
     )
+
+
+def _start(mean: ComplexArray, parts: _Parts, sensor: IntArray) -> ComplexArray:
+    """Return whiteners of what the other sensors do not predict; if nothing is left, of all."""
+    p, N = mean.shape[1], parts.averages
+    power = np.einsum("bii->bi", mean).real
+    inverted = np.linalg.inv(mean + _SINGULAR * power[:, :, None] * np.eye(p))
+    alone = np.linalg.inv(np.where(sensor[:, None] == sensor, inverted, 0))
+    alone *= (N / (N - p * (1 - 1 / (sensor[-1] + 1))))[:, None, None]
+    start = parts.mean((alone + alone.conj().swapaxes(1, 2)) / 2)
+    singular = np.linalg.eigvalsh(start)[:, 0] <= 0
+    start[singular] = parts.mean(power)[singular][:, :, None] * np.eye(p)
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(start)), np.complex128)
+
+
+def _mean_coupling(
+    U: ComplexArray, Q: ComplexArray, parts: _Parts, sensor: IntArray
+) -> ComplexArray:
+    """Return the mean coupling of each block; of few sensors, without that of each sub-block."""
+    if are_many(sensor):
+        return parts.mean(coupling_beside(U, sensor))
+    n, p = Q.shape[:2]
+    a, b = pairs(sensor)
+    of, share = (np.split(x, parts.first[1:]) for x in (Q.reshape(n, p * p), parts.share))
+    every = np.stack([(x.T * w) @ x.conj() for x, w in zip(of, share, strict=True)])
+    return np.asarray(every[:, a[:, None] * p + a, b[:, None] * p + b])
 
 
 def _read(
@@ -391,13 +415,10 @@ def _read(
     wanted: BoolArray | None = None,
 ) -> None:
     """Write noise and cumulants of the bins of some blocks: of all, or of the wanted ones."""
-    parts, U = fit.parts, fit.motion
+    parts, U, weight = fit.parts, fit.motion, fit.weight
     Q = np.eye(U.shape[1]) - U @ U.conj().swapaxes(1, 2)
     a, b = pairs(sensor)
     at = np.repeat(np.arange(len(parts.count)), parts.count)
-    root = np.linalg.inv(fit.whitener)[parts.block]
-    # noise of a bin is linear in the projected matrix: the weights of its elements
-    weight = (root[:, :, a] * root[:, :, b].conj()) @ inverse_beside(U, sensor)
     if len(parts.block) == len(parts.first):  # few: directions that all bins of a block share
         n, p = Q.shape[:2]
         G = Q @ fit.whitener[parts.block]
@@ -407,11 +428,13 @@ def _read(
         of = np.split(flat, parts.start[1:])
         taken = per.conj().view(np.float64).swapaxes(1, 2)
         noise = np.concatenate([some @ by for some, by in zip(of, taken, strict=True)])
+    elif parts.count.max() == 1:
+        noise = fit.gain[:, None] * times(weight, fit.white[:, a, b]).real
     else:
         X = white(matrix[parts.bins], fit.whitener[parts.block][at])
         y = (Q[at] @ X @ Q[at])[:, a, b]
         noise = fit.gain[at, None] * times(weight[at], y).real
-    traces = _traces(weight, Q @ fit.white @ Q * fit.gain[:, None, None], sensor)
+    traces = _traces(weight, fit.white * fit.gain[:, None, None], sensor)
     scaled = np.stack([traces[m] / fit.left[:, None] ** (m + 1) for m in range(3)])
     middle = np.add.reduceat(noise, parts.start) / parts.count[:, None]
     cumulants = moved(scaled[:, at], noise - middle[at])
@@ -553,7 +576,7 @@ def _shown(
             off = np.eye(p) - u @ u.conj().swapaxes(1, 2)
             rest, without = off @ rest @ off, off @ without @ off
         # each sensor by itself as without motion, whatever its noise was taken for
-        alike = _lower(without, apart) @ np.linalg.inv(_lower(rest, apart))
+        alike = _power(without, apart, 0.5) @ _power(rest, apart, -0.5)
         error = np.abs(white(rest, alike) - without) ** 2
         degrees = _degrees(sensor, resolved + number)
         statistic = averages * np.where(apart, error, 0.0).sum(axis=(1, 2))
@@ -563,11 +586,11 @@ def _shown(
     return found
 
 
-def _lower(matrix: ComplexArray, apart: BoolArray) -> ComplexArray:
-    """Return the Cholesky factor of the matrices of each sensor by itself."""
-    own = np.where(apart, 0.0, matrix)
-    least = 1e-9 * np.einsum("bii->b", own).real
-    return np.linalg.cholesky(own + least[:, None, None] * np.eye(len(apart)))
+def _power(matrix: ComplexArray, apart: BoolArray, exponent: float) -> ComplexArray:
+    """Return a power of the matrices of each sensor by itself; rounding may leave them singular."""
+    w, u = np.linalg.eigh(np.where(apart, 0.0, matrix))
+    w = np.maximum(w, 1e-9 * np.abs(w).sum(axis=1, keepdims=True))
+    return np.asarray((u * (w**exponent)[:, None, :]) @ u.conj().swapaxes(1, 2))
 
 
 def _degrees(sensor: IntArray, q: IntArray) -> FloatArray:

@@ -220,6 +220,21 @@ def test_too_few_averages_for_a_block_give_nothing() -> None:
     assert np.isnan(found.noise).all()
 
 
+def test_a_channel_that_is_the_sum_of_two_others_stops_nothing() -> None:
+    rng = np.random.default_rng(3)
+    sample = drawn(rng, scene(rng, (1e3,) * 3, np.ones(9)), 40)
+    sum_of = np.eye(9)
+    sum_of[6] = sum_of[0] + sum_of[3]
+    found = self_noise(
+        "three-sensor",
+        np.asarray(sum_of @ sample @ sum_of.T, np.complex128),
+        dims=(3,) * 3,
+        n_effective=40,
+        blocks=np.zeros(N_BINS, np.int64),
+    )
+    assert np.isfinite(found.noise_psd).all()
+
+
 def test_correlated_neighbours_are_worth_fewer_bins() -> None:
     hann = np.array([1.0, 4 / 9, 1 / 36])
     table = worth(100, hann)
