@@ -72,7 +72,7 @@ class EstimateSettings:
             " separated by commas. auto is maximum likelihood with as"
             " many dimensions of the motion as the data show, where the sensors leave room for"
             " them (four with two or three channels, six with one; up to 96 channels), else"
-            " three-sensor; of two sensors multi-part.",
+            " three-sensor, with levels by maximum likelihood; of two sensors multi-part.",
             check=values.methods,
             flags=("--method", "-m"),
             metavar="METHOD",

@@ -156,8 +156,8 @@ def estimate(
         ``"auto"`` (default), ``"three-sensor"``, ``"two-channel"``, ``"three-channel"``,
         ``"maximum-likelihood"``, ``"multi-part"``, or ``"all"`` that apply. ``"auto"`` is maximum
         likelihood with as many dimensions of the motion as the data show where the sensors leave
-        room for them (four with two or three channels, six with one), else three-sensor; of two
-        sensors it is multi-part.
+        room for them (four with two or three channels, six with one), else three-sensor with
+        levels by maximum likelihood; of two sensors it is multi-part.
     segment : str or float
         Length of a segment in seconds, or as in ``"10s"`` (default) or ``"2min"``. It sets the
         frequency resolution.
