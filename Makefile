@@ -27,8 +27,8 @@ demo: $(VENV)/.installed  ## the whole huddle test on a simulated bench, over it
 # The workers share the cores: threads of linear algebra would wait for each other in loops.
 test test-long: export OPENBLAS_NUM_THREADS := 1
 
-test: $(VENV)/.installed-dev  ## the tests but the long ones; four at a time on two cores, for many wait for their devices
-	$(BIN)/pytest -n 4
+test: $(VENV)/.installed-dev  ## the tests but the long ones; three at a time on two cores, for many wait for their devices
+	$(BIN)/pytest -n 3
 
 test-long: $(VENV)/.installed-dev  ## the tests that are studies, endurance or whole sessions
 	$(BIN)/pytest -n 3 -m long
