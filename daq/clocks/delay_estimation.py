@@ -53,6 +53,7 @@ _ALIKE = 2.0  # standard deviations of its height, by which a peak may be lower 
 _WEAK = 0.15  # share from which on noise may make any of several peaks the highest
 _SIGNIFICANT = 50.0  # 2 E / κ: a peak of seven standard deviations
 _LONGEST = 32.0  # samples, in both directions
+_BEYOND = 0.1  # share of the sum that is not noise of P: below, all may be noise
 _FAR_SIGNIFICANT = 400.0  # the same of a peak farther away, of which there are many more
 _MET = 0.3  # share of the predicted motion that a peak explains
 _CLEAR = 1.5  # ratio to the peak nearest zero: the peaks of one line are about equal
@@ -98,6 +99,8 @@ class DelayEstimator:
         Columns of the samples of each sensor, with the preferred reference first.
     n_candidates : int
         Sensors tried as reference.
+    hop : int
+        Samples from one segment to the next; 0: they share none.
     is_wide : bool
         Whether delays of up to half a segment are searched for where none is nearer, once there is
         a frame: times may be off by that much.
@@ -107,6 +110,7 @@ class DelayEstimator:
     window: FloatArray
     columns: tuple[slice, ...]
     n_candidates: int = REFERENCES
+    hop: int = 0
     is_wide: bool = False
     _reference: int = 0
     _frames: dict[int, _Frame] = field(default_factory=dict)
@@ -313,8 +317,9 @@ class DelayEstimator:
         kappa = len(w2) * float(w2 @ w2) / float(w2.sum()) ** 2
         total = energy.sum(axis=0)
         informative = omega**2 @ energy
-        # The share of P's noise, which predicts nothing: d0 dj / n, for Wishart matrices.
-        spurious = x0.shape[2] * xj.shape[2] / frame.n_segments * float(omega @ omega)
+        # The share of P's noise, which predicts nothing: d0 dj / n, over R of fewer averages.
+        n, d0, dj = frame.n_segments, x0.shape[2], xj.shape[2]
+        spurious = d0 * dj / n * float(omega @ omega) * self._inflation(n, d0, dj)
         with np.errstate(divide="ignore", invalid="ignore"):
             share = np.maximum(1 - spurious / informative.mean(), 0.0)
             std = np.sqrt(kappa / (2 * informative)) / share
@@ -326,7 +331,7 @@ class DelayEstimator:
         freedom = max(frame.n_segments - x0.shape[2], 1)
         inflated = freedom / max(freedom - xj.shape[2] - 1, 1)
         std *= math.sqrt(inflated)
-        known = (2 * total / kappa > _SIGNIFICANT) & (met > _MET * total)
+        known = (2 * total / kappa > _SIGNIFICANT) & (met > _MET * total) & (share > _BEYOND)
         known &= is_one | (alike < _WEAK)  # else the cycle is chosen by chance
         # What P predicts without its noise, which no sensor follows. Of few segments that is hardly
         # known: as much as R is off by is taken off beside.
@@ -342,6 +347,14 @@ class DelayEstimator:
             known |= far & (met > _MET * total)
         std = np.where(known, std, np.inf)
         return tau, np.where(far & ~known & (met <= _MET * meant), np.nan, std)
+
+    def _inflation(self, n: int, d0: int, dj: int) -> float:
+        """Return the mean of ``R^-1`` of n segments over that of a known R (complex Wishart)."""
+        w = self.window
+        lags = range(self.hop, len(w), self.hop) if self.hop else ()
+        shared = sum(float(w[:-lag] @ w[lag:]) ** 2 for lag in lags)
+        left = n / (1 + 2 * shared / float(w @ w) ** 2) - d0 - dj
+        return (n - d0) / left if left > 0 else math.inf
 
     def _highest(self, crossed: ComplexArray) -> FloatArray:
         """Return the τ of the highest peak of every column, up to half a segment away."""

@@ -150,7 +150,8 @@ class DelayMeasurement:
             columns = tuple(slice(int(edges[n]), int(edges[n + 1])) for n in sensors)
             window = get_window(self._welch.window, self._welch.segment_length)
             rate, fixed = self._welch.sampling_rate, self._aligned.stated_reference is not None
-            self._meter = DelayEstimator(rate, window, columns, 1 if fixed else REFERENCES)
+            most = 1 if fixed else REFERENCES
+            self._meter = DelayEstimator(rate, window, columns, most, hop=self._welch.hop)
         return self._meter
 
     def measure_with_gaps(

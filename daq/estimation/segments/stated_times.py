@@ -359,6 +359,7 @@ class _Pieces:
                 window,
                 self._columns,
                 1 if fixed else REFERENCES,
+                hop=self._welch.hop,
                 is_wide=True,
             )
             self.first = np.arange(begin, min(begin + n_first, self.total))

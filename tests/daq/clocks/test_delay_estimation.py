@@ -126,3 +126,21 @@ def test_too_few_segments_define_no_frame() -> None:
     measured, std = DelayEstimator(RATE, WINDOW, COLUMNS).measure(samples, np.arange(10) * HOP)
     assert np.isnan(measured).all()
     assert np.isinf(std).all()
+
+
+@pytest.mark.parametrize(("noise", "is_known"), [(None, False), (1.5, True)])
+@pytest.mark.parametrize(("n_segments", "hop"), [(24, 3000), (36, 3000), (200, 3000), (60, 1500)])
+def test_noise_of_many_frequencies_is_no_motion(
+    n_segments: int, hop: int, noise: float | None, *, is_known: bool
+) -> None:
+    """The sum over 2,700 frequencies is significant, and yet all of it is noise of P."""
+    length, three = 6000, (slice(0, 3), slice(3, 6))
+    rng = np.random.default_rng(31)
+    samples = rng.standard_normal((hop * (n_segments - 1) + length, 6))
+    if noise is not None:
+        motion = rng.standard_normal((len(samples), 3))
+        samples = noise * samples + np.hstack([motion, motion])
+    meter = DelayEstimator(100.0, np.hanning(length + 1)[:-1], three, hop=hop)
+    _, std = meter.measure(samples, np.arange(n_segments) * hop)
+    assert np.isfinite(std[:, 1]).all() == is_known
+    assert np.isfinite(std[:, 1]).any() == is_known
