@@ -169,7 +169,9 @@ class AlignedRecording:
         self.dims = tuple(len(main_columns(record)) for record in records)
         self._records = records
         self._sources: list[SensorSource] = []
-        self._origin = self._set_at = (0, 0)
+        created = recording.created_at
+        self._origin = (created.monotonic_ns, created.utc_ns)
+        self._set_at = (0, 0)
         self._grid: Grid | None = None
         self._apart = False  # whether the grid has times without some sensors
         self.n_settings = 0  # of the clocks, so far
@@ -505,8 +507,6 @@ class AlignedRecording:
         if not self._sources:
             if any(record.n_samples == 0 for record in self._records):
                 return
-            created = self._recording.created_at
-            self._origin = (created.monotonic_ns, created.utc_ns)
             self._sources = [SensorSource.of(record, *self._origin) for record in self._records]
             for source in self._sources:
                 source.span = self._limits

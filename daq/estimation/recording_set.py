@@ -59,7 +59,7 @@ def continuations(
     """
     known = {other.run_id for other in others}
     for found in _following(recording):
-        if found.run_id in known or not all(sensor.n_samples for sensor in found.sensors):
+        if found.run_id in known or not any(sensor.n_samples for sensor in found.sensors):
             found.close()
         else:
             yield found

@@ -5,6 +5,7 @@ They are at hand one by one, as far as they are kept.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import Counter
@@ -77,7 +78,7 @@ if TYPE_CHECKING:
     from daq.estimation.noise_estimates import Channels, ChannelSet
     from daq.estimation.segments.segment_pass import Pass
     from daq.estimation.settings import Settings
-    from daq.protocols.block import Reading
+    from daq.protocols.block import Event, Reading
     from daq.recording.interface import ReadableRecording
     from estimator.checks.steadied import Steadied
     from estimator.self_noise.result import SelfNoise
@@ -337,7 +338,7 @@ class SnapshotBuilder:
             n_effective=n_effective,
             elapsed=sum(each.elapsed for each in passes),
             start_utc_ns=first.aligned.start_utc_ns,
-            sensors=tuple(SensorTotals.of(record, events) for record in latest.sensors),
+            sensors=_totals(recordings, events),
             clocks=clock_states(passes),
             drift=last.drift(),
             closed=all(map(is_complete, recordings, (*recordings[1:], None))),
@@ -596,9 +597,29 @@ def _bridged(passes: Sequence[Pass], results: Mapping[str, SelfNoise]) -> Bridge
     )
 
 
+def _totals(
+    recordings: Sequence[ReadableRecording], events: Sequence[Event]
+) -> tuple[SensorTotals, ...]:
+    """Return the sensors of the last recording; one that is silent there was seen before."""
+    seen: dict[str, float] = {}
+    found = []
+    for recording in recordings:
+        found = [SensorTotals.of(record, events) for record in recording.sensors]
+        seen |= {each.name: each.last_seen for each in found if each.n_samples}
+    return tuple(replace(each, last_seen=seen.get(each.name, math.nan)) for each in found)
+
+
 def _shortened(passes: Sequence[Pass]) -> dict[str, tuple[float, float]]:
-    """Return by how many seconds sensors shorten the spans of all recordings together."""
+    """Return by how many seconds sensors shorten the spans of all recordings together.
+
+    A recording in which a sensor is silent counts as a whole; the last one is a loss of its own.
+    """
     found: dict[str, tuple[float, float]] = {}
+    for each in passes[:-1]:
+        seconds = {one.name: one.n_samples / one.sampling_rate for one in each.recording.sensors}
+        for sensor in dict.fromkeys(name for name, _ in each.aligned.channels):
+            if not seconds[sensor]:
+                found[sensor] = found.get(sensor, (0.0, 0.0))[0] + max(seconds.values()), 0.0
     for each in passes:
         for sensor, (late, early) in each.aligned.shortened.items():
             before = found.get(sensor, (0.0, 0.0))

@@ -11,6 +11,7 @@ import numpy as np
 from daq.bench.channel import Channel
 from daq.protocols.block import Block, BlockFlag, HostTime
 from daq.recording.file_format import SensorLayout
+from daq.recording.storage.names import CONTINUES
 from daq.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
@@ -41,7 +42,9 @@ class Sensor:
     nominal: float | None = None
 
 
-def blocks(name: str, sensor: Sensor, block: float = 0.5) -> list[Block]:
+def blocks(
+    name: str, sensor: Sensor, block: float = 0.5, *, origin: HostTime = ORIGIN
+) -> list[Block]:
     """Blocks of a sensor, cut at gaps and restarts."""
     length = round(block * sensor.rate)
     n = len(sensor.counts)
@@ -57,7 +60,7 @@ def blocks(name: str, sensor: Sensor, block: float = 0.5) -> list[Block]:
         if sensor.utc:
             flags = BlockFlag.DEVICE_UTC
             stated = sensor.start + first / sensor.rate + sensor.utc_ahead
-            counter = ORIGIN.utc_ns + round(stated * 1e9)
+            counter = origin.utc_ns + round(stated * 1e9)
         if first == 0 or first in sensor.restarts:
             flags |= BlockFlag.CLOCK_RESTART
         found.append(
@@ -65,7 +68,7 @@ def blocks(name: str, sensor: Sensor, block: float = 0.5) -> list[Block]:
                 name,
                 first,
                 sensor.counts[first:end],
-                HostTime(ORIGIN.monotonic_ns + arrival, ORIGIN.utc_ns + arrival),
+                HostTime(origin.monotonic_ns + arrival, origin.utc_ns + arrival),
                 device_counter=counter,
                 flags=flags,
             )
@@ -73,7 +76,9 @@ def blocks(name: str, sensor: Sensor, block: float = 0.5) -> list[Block]:
     return found
 
 
-def create(path: Path, sensors: dict[str, Sensor]) -> RecordingWriter:
+def create(
+    path: Path, sensors: dict[str, Sensor], *, created: HostTime = ORIGIN, continues: str = ""
+) -> RecordingWriter:
     """Return a writer with these sensors and nothing in it."""
     layouts = []
     for name, sensor in sensors.items():
@@ -94,7 +99,8 @@ def create(path: Path, sensors: dict[str, Sensor]) -> RecordingWriter:
                 clock=sensor.clock,
             )
         )
-    return RecordingWriter.create(path, sensors=layouts, created=ORIGIN)
+    attributes: dict[str, str | float] = {CONTINUES: continues} if continues else {}
+    return RecordingWriter.create(path, sensors=layouts, created=created, attributes=attributes)
 
 
 def write(path: Path, sensors: dict[str, Sensor]) -> Path:

@@ -13,12 +13,13 @@ from daq.clocks.sensor_reader import from_instants
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError
+from daq.protocols.block import HostTime
 from daq.recording.reader import Recording
 from daq.recording.sensor_record import SensorRecord
-from daq.results.facts.recordings import NotInLiveEstimate, SensorLost
+from daq.results.facts.recordings import NotInLiveEstimate, SensorLost, SpanShortened
 from daq.results.result import Result
+from tests.daq.clocks.recordings import ORIGIN, blocks, counts, create, write, write_polled
 from tests.daq.clocks.recordings import Sensor as FreeRunning
-from tests.daq.clocks.recordings import blocks, counts, create, write, write_polled
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -147,6 +148,43 @@ def test_a_sensor_that_never_sent_is_named_and_left_out(tmp_path: Path, names: s
     (lost,) = [each for each in facts if isinstance(each, SensorLost)]
     assert (lost.sensors, lost.never_seen) == (("D",), True)
     assert not [each for each in facts if isinstance(each, NotInLiveEstimate)]
+
+
+@pytest.mark.parametrize(
+    ("silent", "said"),
+    [
+        (("D", "D"), ["sensor-lost True None"]),
+        (("", "D"), ["sensor-lost False 30"]),
+        (("D", ""), ["span-shortened 30"]),
+    ],
+)
+def test_a_sensor_that_is_silent_in_one_of_two_files_is_named(
+    tmp_path: Path, silent: tuple[str, str], said: list[str]
+) -> None:
+    """The recorder went on in a second file: with D silent in both, both count for the others."""
+    run_id = ""
+    for number, without in enumerate(silent):
+        path = tmp_path / ("r.h5", "r-2.h5")[number]
+        sensors = {name: FreeRunning(counts(3000, 3, ord(name) + number)) for name in "ABCD"}
+        later = number * 30 * 10**9
+        at = HostTime(ORIGIN.monotonic_ns + later, ORIGIN.utc_ns + later)
+        writer = create(path, sensors, created=at, continues=run_id)
+        for name, sensor in sensors.items():
+            for block in blocks(name, sensor, origin=at) if name not in without else ():
+                writer.append(block)
+        writer.close()
+        with Recording.open(path) as recording:
+            run_id = recording.run_id
+    settings = Settings(segment=4.0)
+    found = estimate([tmp_path / "r.h5"], settings)
+    assert found.n_segments == (26 if silent == ("D", "D") else 13)
+    facts = Result(found, settings).facts
+    lost = [each for each in facts if isinstance(each, SensorLost)]
+    late = [each for each in facts if isinstance(each, SpanShortened)]
+    assert [
+        *(f"{e.name} {e.never_seen} {None if e.never_seen else round(e.missing)}" for e in lost),
+        *(f"{e.name} {round(e.unused)}" for e in late),
+    ] == said
 
 
 def test_many_gaps_of_free_running_sensors_do_not_increase_the_reads(
