@@ -84,8 +84,9 @@ def ratio(value: float) -> str:
 
 
 def span(low: float, high: float) -> str:
-    """Return a band of frequencies."""
-    return f"{low:.3g}–{high:.3g} Hz"
+    """Return a band of frequencies; one frequency where both ends read alike."""
+    ends = dict.fromkeys((f"{low:.3g}", f"{high:.3g}"))
+    return f"{'–'.join(ends)} Hz"
 
 
 def listed(words: Sequence[str], conjunction: str = "and") -> str:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from daq.bench.channel import Channel
+    from daq.bench.response import PolesZeros, Response
 
 PERIODS = 10
 """Periods of the lower corner in a segment: the window of Hann resolves two."""
@@ -113,7 +114,7 @@ def _pass_band(channels: Sequence[Channel], rate: float) -> tuple[float | None, 
     return low or None, high if channels else None
 
 
-def _passes(response: Any, at: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:  # noqa: ANN401
+def _passes(response: PolesZeros | Response, at: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     with np.errstate(all="ignore"):
         power = np.abs(response.at(at)) ** 2
         return np.asarray(power >= _HALF_POWER * (1 - 1e-9))
