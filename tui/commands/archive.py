@@ -14,16 +14,7 @@ import typer
 
 from daq.errors import ArchiveError
 from tui.commands.options import (
-    FILES_PANEL,
-    ChannelsOption,
-    CsvOption,
-    JsonOption,
-    LocationOption,
-    ModelsOption,
-    NetworkOption,
-    ResponseForOption,
-    ResponseOption,
-    StationOption,
+    OutOption,
     examples,
     with_estimate_options,
     with_logging,
@@ -60,135 +51,30 @@ if TYPE_CHECKING:
 @with_logging
 @with_estimate_options
 def archive(
-    sources: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="SRC",
-            help="Recordings, miniSEED files, folders of either, or sds://ROOT for an archive of"
-            " day files. Without SRC, show what the archive holds.",
-        ),
-    ] = None,
+    sources: list[str] | None = None,
     *,
-    store: Annotated[
-        Path | None,
-        typer.Option(
-            "--store",
-            metavar="FOLDER",
-            help="Folder of the archive (default: huddle-archive beside the recordings).",
-        ),
-    ] = None,
-    stretch: Annotated[
-        str | None,
-        typer.Option(
-            "--stretch",
-            metavar="LENGTH",
-            help="Length of time of each stored spectrum: hour or day, in UTC (default: hour).",
-        ),
-    ] = None,
-    jobs: Annotated[
-        int, typer.Option("--jobs", "-j", metavar="N", min=1, help="Number of processes.")
-    ] = 1,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(
-            "--scheduler",
-            metavar="ADDRESS",
-            help="Use the workers of this Dask scheduler, such as tcp://host:8786. They must see"
-            " recordings and archive under the same paths.",
-        ),
-    ] = None,
-    thin_after: Annotated[
-        int | None,
-        typer.Option(
-            "--thin-after",
-            metavar="DAYS",
-            min=0,
-            help="Keep the matrices of hours for so many days before the last recording; of older"
-            " ones those of days, in single precision.",
-        ),
-    ] = None,
-    thin_hours: Annotated[
-        bool,
-        typer.Option(
-            "--thin-hours",
-            help="With --thin-after: keep also the matrices of older hours, in single precision.",
-        ),
-    ] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            metavar="FOLDER",
-            help="Folder for figures (PNG, SVG, PDF) and their numbers.",
-        ),
-    ] = None,
-    models: ModelsOption = "",
-    time_zone: Annotated[
-        str,
-        typer.Option(
-            "--time-zone",
-            metavar="ZONE",
-            help="Time zone of working hours and nights, such as Europe/London.",
-        ),
-    ] = "UTC",
-    false_alarm: Annotated[
-        float,
-        typer.Option(
-            "--false-alarm",
-            metavar="SHARE",
-            min=1e-4,
-            max=0.5,
-            help="Probability of a false alarm of the test for changes, over all channels, bands"
-            " and days.",
-        ),
-    ] = 0.01,
-    response: ResponseOption = None,
-    response_for: ResponseForOption = None,
-    channels: ChannelsOption = None,
-    net: NetworkOption = "*",
-    sta: StationOption = "*",
-    loc: LocationOption = "*",
-    group: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--group",
-            metavar="NAME=PATTERN",
-            rich_help_panel=FILES_PANEL,
-            help="Sensors of several stations that stand together, as in 'LAB=XX.TST?.*';"
-            " repeatable. Default: the sensors of a station.",
-        ),
-    ] = None,
-    start: Annotated[
-        str | None,
-        typer.Option(
-            "--start",
-            metavar="UTC",
-            rich_help_panel=FILES_PANEL,
-            help="First time to take, such as 2026-11-21; its day is taken whole.",
-        ),
-    ] = None,
-    end: Annotated[
-        str | None,
-        typer.Option(
-            "--end",
-            metavar="UTC",
-            rich_help_panel=FILES_PANEL,
-            help="End of the time to take; the day before it is taken whole.",
-        ),
-    ] = None,
-    file_overlap: Annotated[
-        str,
-        typer.Option(
-            "--file-overlap",
-            metavar="refuse|first|last",
-            rich_help_panel=FILES_PANEL,
-            help="Where files overlap with different samples: refuse the channel of this day, or"
-            " keep the samples of the file that starts first or last.",
-        ),
-    ] = "refuse",
-    json: JsonOption = None,
-    csv: CsvOption = None,
+    store: Path | None = None,
+    stretch: str | None = None,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1)] = 1,
+    scheduler: str | None = None,
+    thin_after: Annotated[int | None, typer.Option(min=0)] = None,
+    thin_hours: bool = False,
+    out: OutOption = None,
+    models: str = "",
+    time_zone: str = "UTC",
+    false_alarm: Annotated[float, typer.Option(min=0.0001, max=0.5)] = 0.01,
+    response: list[Path] | None = None,
+    response_for: list[str] | None = None,
+    channels: list[str] | None = None,
+    net: str = "*",
+    sta: str = "*",
+    loc: str = "*",
+    group: list[str] | None = None,
+    start: str | None = None,
+    end: str | None = None,
+    file_overlap: str = "refuse",
+    json: str | None = None,
+    csv: str | None = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Keep the spectra of months of recordings, and show the noise over time.
@@ -203,6 +89,45 @@ def archive(
     and a day of a station is the unit of work.
 
     Options that shape spectra (--segment, …) cannot be changed later.
+
+    Parameters
+    ----------
+    sources : SRC
+        Recordings, miniSEED files, folders of either, or sds://ROOT for an archive of day files.
+        Without SRC, show what the archive holds.
+    store : FOLDER
+        Folder of the archive (default: huddle-archive beside the recordings).
+    stretch : LENGTH
+        Length of time of each stored spectrum: hour or day, in UTC (default: hour).
+    jobs : N
+        Number of processes.
+    scheduler : ADDRESS
+        Use the workers of this Dask scheduler, such as tcp://host:8786. They must see recordings
+        and archive under the same paths.
+    thin_after : DAYS
+        Keep the matrices of hours for so many days before the last recording; of older ones those
+        of days, in single precision.
+    thin_hours
+        With --thin-after: keep also the matrices of older hours, in single precision.
+    out : FOLDER
+        Folder for figures (PNG, SVG, PDF) and their numbers.
+    time_zone : ZONE
+        Time zone of working hours and nights, such as Europe/London.
+    false_alarm : SHARE
+        Probability of a false alarm of the test for changes, over all channels, bands and days.
+
+    Files of other programs
+    -----------------------
+    group : NAME=PATTERN
+        Sensors of several stations that stand together, as in 'LAB=XX.TST?.*'; repeatable. Default:
+        the sensors of a station.
+    start : UTC
+        First time to take, such as 2026-11-21; its day is taken whole.
+    end : UTC
+        End of the time to take; the day before it is taken whole.
+    file_overlap : refuse|first|last
+        Where files overlap with different samples: refuse the channel of this day, or keep the
+        samples of the file that starts first or last.
     """
     from daq.archive.plan import STRETCHES
     from daq.archive.sources import are_waveforms, folder_for

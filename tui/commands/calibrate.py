@@ -4,16 +4,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from tui.commands.estimate import estimated
 from tui.commands.options import (
-    EndOption,
-    FilesArgument,
-    JsonOption,
-    StartOption,
     examples,
     with_estimate_options,
 )
@@ -33,28 +28,13 @@ _GAP = 2
 )
 @with_estimate_options
 def calibrate(
-    files: FilesArgument,
+    files: list[Path],
     *,
-    reference: Annotated[
-        str | None,
-        typer.Option(
-            "--reference",
-            metavar="SENSOR",
-            help="Sensor to compare with (default: the one with certificates in the bench file, "
-            "otherwise the first).",
-        ),
-    ] = None,
-    confidence: Annotated[
-        float,
-        typer.Option(
-            "--confidence",
-            metavar="P",
-            help="Level of confidence of expanded uncertainties.",
-        ),
-    ] = 0.95,
-    start: StartOption = None,
-    end: EndOption = None,
-    json: JsonOption = None,
+    reference: str | None = None,
+    confidence: float = 0.95,
+    start: str | None = None,
+    end: str | None = None,
+    json: str | None = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Calibrate sensors against one of them by their common motion.
@@ -65,6 +45,14 @@ def calibrate(
     certificate for each channel of the reference.
 
     Options not given come from the bench file inside the recording.
+
+    Parameters
+    ----------
+    reference : SENSOR
+        Sensor to compare with (default: the one with certificates in the bench file, otherwise the
+        first).
+    confidence : P
+        Level of confidence of expanded uncertainties.
     """
     from rich.text import Text
 

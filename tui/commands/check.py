@@ -16,7 +16,7 @@ from daq.bench.editing import set_sensor_values
 from daq.bench.tables.toml_text import to_toml
 from daq.errors import DeviceError, NoAnswerError
 from tui.commands.devices import summaries
-from tui.commands.options import JsonOption, examples
+from tui.commands.options import examples
 from tui.output import check_list
 from tui.output.exit_codes import ExitCode
 from tui.page.table import Table
@@ -43,31 +43,12 @@ Bench file lab.toml: no errors.
 ✓ is right, ✗ must be corrected before a test, ? needs more to decide.""",
 )
 def check(
-    bench: Annotated[
-        Path | None, typer.Argument(metavar="BENCH", help="Bench file (TOML).")
-    ] = None,
+    bench: Path | None = None,
     *,
-    port: Annotated[
-        str | None,
-        typer.Option(
-            "--port",
-            metavar="PORT",
-            help="Search this port for Epson accelerometers, for Modbus devices 1 to 5 and 80 at "
-            "9600 to 115200 baud, and for lines of text.",
-        ),
-    ] = None,
-    devices: Annotated[
-        bool, typer.Option("--devices/--no-devices", help="Also connect to the devices.")
-    ] = True,
-    write: Annotated[
-        bool,
-        typer.Option(
-            "--write",
-            help="Write missing serial numbers and persistent port names (/dev/serial/by-id) into "
-            "the bench file.",
-        ),
-    ] = False,
-    json: JsonOption = None,
+    port: str | None = None,
+    devices: Annotated[bool, typer.Option("--devices/--no-devices")] = True,
+    write: bool = False,
+    json: str | None = None,
 ) -> None:
     """Validate a bench file, then identify every device and make the check list.
 
@@ -75,6 +56,19 @@ def check(
     do not answer. It reads 10 s of samples and checks ports, serial numbers,
     rates, channels, levels, hum, common motion, sensitivities, polarity,
     clocks and disk. The exit code is 1 if a check fails.
+
+    Parameters
+    ----------
+    bench : BENCH
+        Bench file (TOML).
+    port : PORT
+        Search this port for Epson accelerometers, for Modbus devices 1 to 5 and 80 at 9600 to
+        115200 baud, and for lines of text.
+    devices
+        Also connect to the devices.
+    write
+        Write missing serial numbers and persistent port names (/dev/serial/by-id) into the bench
+        file.
     """
     if (bench is None) == (port is None):
         raise typer.BadParameter("expected either a bench file or --port PORT")

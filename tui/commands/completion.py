@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
@@ -23,15 +23,17 @@ if TYPE_CHECKING:
     "huddle completion man > ~/.local/share/man/man1/huddle.1",
 )
 def completion(
-    kind: Annotated[
-        Literal["bash", "zsh", "fish", "man"],
-        typer.Argument(metavar="SHELL", help="bash, zsh or fish; or man: the manual page."),
-    ],
+    kind: Literal["bash", "zsh", "fish", "man"],
 ) -> None:
     """Print what completes commands in a shell, or the manual page.
 
     Load the text in the start file of the shell, or store it where the
     shell looks for completions.
+
+    Parameters
+    ----------
+    kind : SHELL
+        bash, zsh or fish; or man: the manual page.
     """
     if kind == "man":
         typer.echo("\n".join(manual()))

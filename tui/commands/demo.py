@@ -11,14 +11,13 @@ import tempfile
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
 from daq.bench.durations import format_duration
 from daq.bench.end_condition import EndCondition
-from tui.commands.options import JsonOption, examples, with_logging
-from tui.commands.options import duration as read_duration
+from tui.commands.options import DurationOption, SpeedOption, examples, with_logging
 from tui.commands.run import result_of
 from tui.output.exit_codes import ExitCode
 from tui.page.table import Cell, Table
@@ -43,32 +42,11 @@ SHOWN_SHARE = 0.01
 @with_logging
 def demo(
     *,
-    duration: Annotated[
-        float | None,
-        typer.Option(
-            "--duration",
-            "-d",
-            metavar="TIME",
-            parser=read_duration,
-            help="Length of the recording, such as 90s, 20min or 3h (default 5min).",
-        ),
-    ] = None,
-    speed: Annotated[
-        float | None,
-        typer.Option(
-            "--speed",
-            metavar="FACTOR",
-            min=0.01,
-            help="Speed of the simulation relative to real time (default 4).",
-        ),
-    ] = None,
-    keep: Annotated[
-        Path | None, typer.Option("--keep", metavar="FILE", help="Copy the recording to this file.")
-    ] = None,
-    table: Annotated[
-        bool, typer.Option("--table", help="Print the table instead of opening the application.")
-    ] = False,
-    json: JsonOption = None,
+    duration: DurationOption = None,
+    speed: SpeedOption = None,
+    keep: Path | None = None,
+    table: bool = False,
+    json: str | None = None,
 ) -> None:
     """Run a complete huddle test on simulated sensors.
 
@@ -77,6 +55,17 @@ def demo(
     so the table shows which estimate is right.
 
     On a terminal the command opens the application.
+
+    Parameters
+    ----------
+    duration : TIME
+        Length of the recording, such as 90s, 20min or 3h (default 5min).
+    speed : FACTOR
+        Speed of the simulation relative to real time (default 4).
+    keep : FILE
+        Copy the recording to this file.
+    table
+        Print the table instead of opening the application.
     """
     from rich.text import Text
 

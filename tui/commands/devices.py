@@ -5,13 +5,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from daq.bench.driver_settings import settings_of
 from daq.errors import DriverError
-from tui.commands.options import JsonOption, SpeedOption, examples, with_logging
+from tui.commands.options import OutOption, SpeedOption, examples, with_logging
 from tui.page.table import Table
 
 
@@ -24,42 +23,14 @@ from tui.page.table import Table
 )
 @with_logging
 def devices(
-    bench: Annotated[
-        Path | None, typer.Argument(metavar="BENCH", help="Bench file (TOML).")
-    ] = None,
+    bench: Path | None = None,
     *,
-    driver: Annotated[
-        str | None,
-        typer.Option(
-            "--driver",
-            metavar="NAME",
-            help="List the settings of this driver; serve no devices.",
-        ),
-    ] = None,
+    driver: str | None = None,
     speed: SpeedOption = None,
-    faults: Annotated[
-        Path | None,
-        typer.Option(
-            "--faults",
-            metavar="FILE",
-            help="Faults to simulate (TOML; docs/simulation.md).",
-        ),
-    ] = None,
-    log: Annotated[
-        Path | None,
-        typer.Option(
-            "--log",
-            metavar="FILE",
-            help="Log every fault and everything sent, one JSON object per line.",
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out", "-o", metavar="FILE", help="Bench file to write (default: print it)."
-        ),
-    ] = None,
-    json: JsonOption = None,
+    faults: Path | None = None,
+    log: Path | None = None,
+    out: OutOption = None,
+    json: str | None = None,
 ) -> None:
     """List ports, or serve simulated devices of a bench file.
 
@@ -72,6 +43,19 @@ def devices(
     connects to them.
 
     The table simulation of the bench file defines motion and noise.
+
+    Parameters
+    ----------
+    bench : BENCH
+        Bench file (TOML).
+    driver : NAME
+        List the settings of this driver; serve no devices.
+    faults : FILE
+        Faults to simulate (TOML; docs/simulation.md).
+    log : FILE
+        Log every fault and everything sent, one JSON object per line.
+    out : FILE
+        Bench file to write (default: print it).
     """
     if bench is not None and driver is not None:
         raise typer.BadParameter("expected either a bench file or --driver NAME")

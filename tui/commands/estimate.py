@@ -9,21 +9,13 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from daq.foreign_files import import_command, is_foreign
 from tui.commands.options import (
-    ChannelsOption,
-    CsvOption,
-    DiagnosticsOption,
-    EndOption,
-    FilesArgument,
-    JsonOption,
-    ResponseForOption,
-    ResponseOption,
-    StartOption,
+    DetailsOption,
     examples,
     with_estimate_options,
 )
@@ -60,24 +52,17 @@ A.X recorded −90.00 dB, mostly motion; its own noise is between −114.15 and
 )
 @with_estimate_options
 def estimate(
-    files: FilesArgument,
+    files: list[Path],
     *,
-    start: StartOption = None,
-    end: EndOption = None,
-    diagnostics: DiagnosticsOption = False,
-    noise_parameters: Annotated[
-        bool,
-        typer.Option(
-            "--noise-parameters",
-            help="Fit white, flicker, random-walk and f² noise to every channel; show the Allan "
-            "deviation, and compare with the data sheet in the bench file.",
-        ),
-    ] = False,
-    json: JsonOption = None,
-    csv: CsvOption = None,
-    response: ResponseOption = None,
-    response_for: ResponseForOption = None,
-    channels: ChannelsOption = None,
+    start: str | None = None,
+    end: str | None = None,
+    diagnostics: DetailsOption = False,
+    noise_parameters: bool = False,
+    json: str | None = None,
+    csv: str | None = None,
+    response: list[Path] | None = None,
+    response_for: list[str] | None = None,
+    channels: list[str] | None = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Estimate the self-noise of every channel from recordings.
@@ -86,6 +71,12 @@ def estimate(
 
     Files of other programs are read as huddle import reads them, and nothing
     is stored. Segment, band and unit then follow from the responses and rates.
+
+    Parameters
+    ----------
+    noise_parameters
+        Fit white, flicker, random-walk and f² noise to every channel; show the Allan deviation, and
+        compare with the data sheet in the bench file.
     """
     from tui.output.console import check_places, hint
 

@@ -12,10 +12,7 @@ import typer
 
 from tui.commands.estimate import estimated
 from tui.commands.options import (
-    EndOption,
-    FilesArgument,
-    JsonOption,
-    StartOption,
+    OutOption,
     examples,
     with_estimate_options,
     with_logging,
@@ -30,23 +27,13 @@ from tui.commands.options import (
 @with_logging
 @with_estimate_options
 def export(
-    files: FilesArgument,
+    files: list[Path],
     *,
-    kind: Annotated[
-        str,
-        typer.Option(
-            "--format",
-            metavar="FORMAT",
-            help="Samples: mseed. Curves: csv, parquet, netcdf, zarr, mat, npz, uff58.",
-        ),
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="FILE", help="File (default: beside the recording)."),
-    ] = None,
-    start: StartOption = None,
-    end: EndOption = None,
-    json: JsonOption = None,
+    kind: Annotated[str, typer.Option("--format")],
+    out: OutOption = None,
+    start: str | None = None,
+    end: str | None = None,
+    json: str | None = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Write samples or noise curves for other programs.
@@ -60,6 +47,13 @@ def export(
     mat, npz: an array (n_frequencies, n_channels) of each curve.
 
     uff58: a function of type 9 (PSD) for each curve.
+
+    Parameters
+    ----------
+    kind : FORMAT
+        Samples: mseed. Curves: csv, parquet, netcdf, zarr, mat, npz, uff58.
+    out : FILE
+        File (default: beside the recording).
     """
     from estimator.wording import several
     from tui.notebook.curve_files import MINISEED, WRITERS, write_curves

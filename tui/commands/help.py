@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import typer
 from typer.core import TyperArgument, TyperCommand, TyperGroup
 
-from tui.commands.options import ESSENTIAL, ESTIMATE_PANEL, GUIDES, LOG_PANEL, Guide
+from tui.commands.options import ESSENTIAL, ESTIMATE_PANEL, GUIDES, LOG_PANEL, Guide, declared
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -247,7 +247,8 @@ def subcommand(name: str) -> Any:
     module = import_module(f"tui.commands.{_MODULES.get(name, name)}")
     function = getattr(module, name if hasattr(module, name) else f"{name}_")  # import_
     alone = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-    alone.command(name, cls=HelpfulCommand)(function)
+    callback, text = declared(function)
+    alone.command(name, cls=HelpfulCommand, help=text)(callback)
     command: Any = typer.main.get_command(alone)
     command.guide = GUIDES[function.__name__]
     return command

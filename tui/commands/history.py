@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tui.commands.options import CsvOption, JsonOption, examples
+from tui.commands.options import OutOption, examples
 from tui.output.csv_text import csv_text
 from tui.output.extras import require
 from tui.service.records.run_state import utc_text
@@ -44,75 +44,42 @@ def _band(text: str) -> tuple[float, float]:
     "huddle history lab/recordings office/recordings --csv -   (sensors by serial number)",
 )
 def history(
-    sources: Annotated[
-        list[Path] | None,
-        typer.Argument(metavar="BENCH", help="Bench files, or folders of recordings."),
-    ] = None,
+    sources: list[Path] | None = None,
     *,
-    sensor: Annotated[
-        str,
-        typer.Option(
-            "--sensor",
-            metavar="SERIAL",
-            help="Show this sensor only; without BENCH, its tests on all benches, by the ledger.",
-        ),
-    ] = "",
-    band: Annotated[
-        str | None,
-        typer.Option(
-            "--band",
-            metavar="LOW:HIGH",
-            help="Band in Hz that the runs have stored (default: all).",
-        ),
-    ] = None,
-    since: Annotated[
-        datetime | None,
-        typer.Option(
-            "--since",
-            formats=["%Y-%m-%d", "%Y-%m-%dT%H:%M"],
-            metavar="DATE",
-            help="Leave out earlier runs (UTC, such as 2026-11-21).",
-        ),
-    ] = None,
-    scatter: Annotated[
-        float,
-        typer.Option(
-            "--scatter",
-            min=0.0,
-            metavar="DB",
-            help="Standard deviation between runs that does not count as change, in dB.",
-        ),
-    ] = 0.1,
-    false_alarms: Annotated[
-        float,
-        typer.Option(
-            "--false-alarms",
-            min=1e-9,
-            max=0.5,
-            metavar="SHARE",
-            help="Probability of any false alarm in the whole history.",
-        ),
-    ] = 0.01,
-    json: JsonOption = None,
-    csv: CsvOption = None,
-    label: Annotated[
-        Path | None,
-        typer.Option(
-            "--label",
-            metavar="FILE",
-            help="With --sensor: a label to print (.svg, 62 × 29 mm) with its serial number as QR"
-            " code, and its last noise.",
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="FILE", help="Picture: .png, .svg or .pdf."),
-    ] = None,
+    sensor: str = "",
+    band: str | None = None,
+    since: Annotated[datetime | None, typer.Option(formats=["%Y-%m-%d", "%Y-%m-%dT%H:%M"])] = None,
+    scatter: Annotated[float, typer.Option(min=0.0)] = 0.1,
+    false_alarms: Annotated[float, typer.Option(min=1e-09, max=0.5)] = 0.01,
+    json: str | None = None,
+    csv: str | None = None,
+    label: Path | None = None,
+    out: OutOption = None,
 ) -> None:
     """Show the noise of every channel from run to run, and whether it has changed.
 
     Serial numbers identify a sensor across benches and ports. The test
     allows for the uncertainty of each run; its false-alarm rate holds for the whole history.
+
+    Parameters
+    ----------
+    sources : BENCH
+        Bench files, or folders of recordings.
+    sensor : SERIAL
+        Show this sensor only; without BENCH, its tests on all benches, by the ledger.
+    band : LOW:HIGH
+        Band in Hz that the runs have stored (default: all).
+    since : DATE
+        Leave out earlier runs (UTC, such as 2026-11-21).
+    scatter : DB
+        Standard deviation between runs that does not count as change, in dB.
+    false_alarms : SHARE
+        Probability of any false alarm in the whole history.
+    label : FILE
+        With --sensor: a label to print (.svg, 62 × 29 mm) with its serial number as QR code, and
+        its last noise.
+    out : FILE
+        Picture: .png, .svg or .pdf.
     """
     from tui.output.console import check_places, for_people, write_json, write_text
     from tui.service.history.ledger import sensor_tests

@@ -13,13 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from tui.commands.options import (
-    ChannelsOption,
-    JsonOption,
-    LocationOption,
-    NetworkOption,
-    ResponseForOption,
-    ResponseOption,
-    StationOption,
     examples,
     read_option,
     with_estimate_options,
@@ -62,74 +55,23 @@ lab.h5 written; next: huddle estimate lab.h5""",
 @with_logging
 @with_estimate_options
 def import_(
-    sources: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="SRC",
-            help="Files, sds://ROOT for an archive of day files, or"
-            " fdsn://CENTRE/NET.STA.LOC.CHA for a data centre.",
-        ),
-    ],
+    sources: list[str],
     *,
-    out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="FILE", help="Recording to write (.h5).")
-    ],
-    bench: Annotated[
-        Path | None,
-        typer.Option(
-            "--bench", metavar="BENCH", help="Bench file with sensitivities, names and settings."
-        ),
-    ] = None,
-    response: ResponseOption = None,
-    response_for: ResponseForOption = None,
-    sampling_rate: Annotated[
-        float | None,
-        typer.Option(
-            "--sampling-rate",
-            metavar="HZ",
-            min=1e-6,
-            help="Sampling rate, if the files do not give it.",
-        ),
-    ] = None,
-    channels: ChannelsOption = None,
-    start: Annotated[
-        str | None,
-        typer.Option("--start", metavar="UTC", help="First time to import: 2026-11-21T03:00:00."),
-    ] = None,
-    end: Annotated[
-        str | None, typer.Option("--end", metavar="UTC", help="End of the time to import.")
-    ] = None,
-    columns: Annotated[
-        str,
-        typer.Option(
-            "--columns",
-            metavar="NAMES",
-            help="Names of the columns of CSV files, in place of their headers; - leaves one out:"
-            " 'time [s],X [m/s²],Y [m/s²],-'.",
-        ),
-    ] = "",
-    sample_unit: Annotated[
-        str,
-        typer.Option(
-            "--sample-unit",
-            metavar="UNIT",
-            help="Unit of the samples, such as m/s², where files have none and no --response.",
-        ),
-    ] = "",
-    overlap: Annotated[
-        str | None,
-        typer.Option(
-            "--overlap",
-            metavar="refuse|first|last",
-            help="Where files overlap with different samples: refuse the channel (default), or keep"
-            " the samples of the file that starts first or last. A number, such as 0.75, is the"
-            " overlap of segments.",
-        ),
-    ] = None,
-    net: NetworkOption = "*",
-    sta: StationOption = "*",
-    loc: LocationOption = "*",
-    json: JsonOption = None,
+    out: Annotated[Path, typer.Option("--out", "-o")],
+    bench: Path | None = None,
+    response: list[Path] | None = None,
+    response_for: list[str] | None = None,
+    sampling_rate: Annotated[float | None, typer.Option(min=1e-06)] = None,
+    channels: list[str] | None = None,
+    start: str | None = None,
+    end: str | None = None,
+    columns: str = "",
+    sample_unit: str = "",
+    overlap: str | None = None,
+    net: str = "*",
+    sta: str = "*",
+    loc: str = "*",
+    json: str | None = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Convert files of other programs into a recording.
@@ -148,6 +90,31 @@ def import_(
     .wav: a file is a sensor, its channels are numbered.
 
     Also SAC, GSE2, GCF, SEG-2, SEG-Y (extra: formats), UFF 58 and TDMS (extra: vibration).
+
+    Parameters
+    ----------
+    sources : SRC
+        Files, sds://ROOT for an archive of day files, or fdsn://CENTRE/NET.STA.LOC.CHA for a data
+        centre.
+    out : FILE
+        Recording to write (.h5).
+    bench : BENCH
+        Bench file with sensitivities, names and settings.
+    sampling_rate : HZ
+        Sampling rate, if the files do not give it.
+    start : UTC
+        First time to import: 2026-11-21T03:00:00.
+    end : UTC
+        End of the time to import.
+    columns : NAMES
+        Names of the columns of CSV files, in place of their headers; - leaves one out: 'time [s],X
+        [m/s²],Y [m/s²],-'.
+    sample_unit : UNIT
+        Unit of the samples, such as m/s², where files have none and no --response.
+    overlap : refuse|first|last
+        Where files overlap with different samples: refuse the channel (default), or keep the
+        samples of the file that starts first or last. A number, such as 0.75, is the overlap of
+        segments.
     """
     segments = None if overlap in {None, "refuse", "first", "last"} else overlap
     import_recording(

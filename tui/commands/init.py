@@ -34,22 +34,24 @@ QUESTIONS = {
 @examples("huddle init", "huddle init -o lab.toml", "huddle init --discover -o lab.toml")
 def init(
     *,
-    out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="FILE", help="Bench file to write.")
-    ] = Path("bench.toml"),
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
-    discover: Annotated[
-        bool,
-        typer.Option("--discover", help="Search the serial ports, and write the devices found."),
-    ] = False,
-    port: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--port", metavar="PORT", help="With --discover: search this port; may be repeated."
-        ),
-    ] = None,
+    out: Annotated[Path, typer.Option("--out", "-o")] = Path("bench.toml"),
+    force: bool = False,
+    discover: bool = False,
+    port: list[str] | None = None,
 ) -> None:
-    """Write a commented bench file to fill in."""
+    """Write a commented bench file to fill in.
+
+    Parameters
+    ----------
+    out : FILE
+        Bench file to write.
+    force
+        Replace an existing file.
+    discover
+        Search the serial ports, and write the devices found.
+    port : PORT
+        With --discover: search this port; may be repeated.
+    """
     if port and not discover:
         raise typer.BadParameter("--port needs --discover")
     if discover:

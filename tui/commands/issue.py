@@ -14,11 +14,6 @@ import typer
 from tui.certificate.ledger import Ledger, LedgerError, ledger_of, ledgers_of
 from tui.commands.estimate import estimated, exit_with
 from tui.commands.options import (
-    EndOption,
-    FilesArgument,
-    JsonOption,
-    ModelsOption,
-    StartOption,
     examples,
     with_estimate_options,
 )
@@ -36,73 +31,19 @@ from tui.page.table import Table
 )
 @with_estimate_options
 def issue(
-    files: FilesArgument,
+    files: list[Path],
     *,
-    by: Annotated[
-        str,
-        typer.Option(
-            "--by", metavar="NAME", help="Who authorises the certificate; a specimen needs nobody."
-        ),
-    ] = "",
-    reason: Annotated[
-        str,
-        typer.Option(
-            "--reason", metavar="TEXT", help="Why a certificate of the same recording is revised."
-        ),
-    ] = "",
-    bench: Annotated[
-        Path | None,
-        typer.Option(
-            "--bench",
-            metavar="BENCH",
-            help="Bench file with [laboratory], [customer], [certificate] and the manufacturers "
-            "of the sensors (default: the one inside the recording).",
-        ),
-    ] = None,
-    folder: Annotated[
-        Path | None,
-        typer.Option(
-            "--folder",
-            metavar="DIR",
-            help="Folder of the certificates and their ledger (default: folder of [certificate], "
-            "or certificates beside the recording).",
-        ),
-    ] = None,
-    allow_incomplete: Annotated[
-        bool,
-        typer.Option(
-            "--allow-incomplete", help="Issue without all that ISO/IEC 17025 asks for; say so."
-        ),
-    ] = False,
-    despite: Annotated[
-        str,
-        typer.Option(
-            "--despite",
-            metavar="REASON",
-            help="Why a result is certified although a fact invalidates it; printed on page 1.",
-        ),
-    ] = "",
-    is_specimen: Annotated[
-        bool,
-        typer.Option(
-            "--specimen",
-            help="Make a specimen of any recording, simulated ones too: watermarked, without "
-            "number, in no ledger (NAME-specimen.pdf beside the recording, or in --folder).",
-        ),
-    ] = False,
-    sign: Annotated[
-        Path | None,
-        typer.Option(
-            "--sign",
-            metavar="FILE",
-            help="Key of the laboratory (.p12) that signs the PDF, and the ledger as far as this "
-            "certificate. Its passphrase is asked for, "
-            "or taken from HUDDLE_PASSPHRASE. Extra: sign.",
-        ),
-    ] = None,
-    models: ModelsOption = "",
-    start: StartOption = None,
-    end: EndOption = None,
+    by: str = "",
+    reason: str = "",
+    bench: Path | None = None,
+    folder: Path | None = None,
+    allow_incomplete: bool = False,
+    despite: str = "",
+    is_specimen: Annotated[bool, typer.Option("--specimen")] = False,
+    sign: Path | None = None,
+    models: str = "",
+    start: str | None = None,
+    end: str | None = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Issue a numbered certificate of a huddle test as PDF.
@@ -116,6 +57,29 @@ def issue(
 
     Options not given come from the bench file inside the recording.
     The exit code is 1 if a limit is not met, and 4 if that is not decided.
+
+    Parameters
+    ----------
+    by : NAME
+        Who authorises the certificate; a specimen needs nobody.
+    reason : TEXT
+        Why a certificate of the same recording is revised.
+    bench : BENCH
+        Bench file with [laboratory], [customer], [certificate] and the manufacturers of the sensors
+        (default: the one inside the recording).
+    folder : DIR
+        Folder of the certificates and their ledger (default: folder of [certificate], or
+        certificates beside the recording).
+    allow_incomplete
+        Issue without all that ISO/IEC 17025 asks for; say so.
+    despite : REASON
+        Why a result is certified although a fact invalidates it; printed on page 1.
+    is_specimen
+        Make a specimen of any recording, simulated ones too: watermarked, without number, in no
+        ledger (NAME-specimen.pdf beside the recording, or in --folder).
+    sign : FILE
+        Key of the laboratory (.p12) that signs the PDF, and the ledger as far as this certificate.
+        Its passphrase is asked for, or taken from HUDDLE_PASSPHRASE. Extra: sign.
     """
     from daq.bench.masks.mask_file import masks_named
     from daq.devices.bench_file import load
@@ -171,18 +135,18 @@ def issue(
 
 @examples("huddle issues certificates", "huddle issues night.h5 --json -")
 def issues(
-    source: Annotated[
-        Path,
-        typer.Argument(
-            metavar="SOURCE", help="Folder of certificates, or a recording of the laboratory."
-        ),
-    ] = Path("certificates"),
+    source: Path = Path("certificates"),
     *,
-    json: JsonOption = None,
+    json: str | None = None,
 ) -> None:
     """List the certificates of a ledger, with revisions and void numbers.
 
     The exit code is 3 if the ledger was changed, or if a certificate is missing.
+
+    Parameters
+    ----------
+    source : SOURCE
+        Folder of certificates, or a recording of the laboratory.
     """
     from daq.recording.reader import Recording
     from tui.output.console import for_people, write_json

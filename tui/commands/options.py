@@ -1,21 +1,94 @@
-"""Options that several commands share, each defined once; examples in the help of commands."""
+"""How commands declare what they take, and what several of them take.
+
+A command is a function: what it takes by position are arguments, by keyword options. Its docstring
+says of each the form and the help, in sections that are the panels of the help. What it does not
+describe is described here.
+
+Parameters
+----------
+files : FILE
+    Recordings (.h5). Several are estimated together.
+file : FILE
+    Recording (.h5).
+path : BENCH
+    Bench file (TOML); huddle init writes one.
+bench : BENCH
+    Bench file (TOML).
+out : FILE
+    Recording to write (.h5; default: named after bench and time).
+json : FILE
+    Write the result as JSON; - is standard output.
+csv : FILE
+    Write the result as CSV; - is standard output.
+duration : TIME
+    Length of the recording, such as 90s, 20min or 3h (default: from the bench file).
+models : NAMES
+    Noise models to draw, separated by commas: nlnm, nhnm, alnm, ahnm, or CSV files with a header
+    such as: frequency (Hz), noise (µg/√Hz).
+start : T
+    Start of the time span to estimate: UTC such as 2026-11-21T03:00:00, or a time after the start
+    of the recording such as 2h.
+end : T
+    End of the time span to estimate, as --start.
+anyway
+    Record even where the check list fails (see huddle check), or where some sensors of a port do
+    not answer.
+diagnostics
+    Print the complete diagnosis of the test, by band.
+speed : FACTOR
+    Speed of the simulation relative to real time (default: from the bench file).
+
+Files of other programs
+-----------------------
+response : FILE
+    Instrument responses: RESP, StationXML or SACPZ files, or folders of them; repeatable. Each
+    channel takes the response of its code and date.
+response_for : PATTERN=FILE
+    Response for channels of another code, as in 'XX.ABC.*=FILE'; repeatable. A sensor and its
+    digitizer may be in two files.
+channels : PATTERN
+    Channels to take, such as 'HH?' or 'XX.ABC.*.HHZ,XX.DEF.*.HHZ'. Default: all but those of the
+    instrument's state of health.
+net : CODE
+    Network in an SDS archive, or a pattern.
+sta : CODE
+    Station, or a pattern.
+loc : CODE
+    Location, or a pattern; -- if empty.
+
+Log lines on standard error
+---------------------------
+log_level : LEVEL
+    Lowest severity to write: debug, info, warning or error (default info).
+log_format : FORMAT
+    text, or json: one JSON object per line, and no other output on standard error; or journal:
+    entries of systemd's journal (default text).
+log_file : FILE
+    Append log lines to this file (default: write none).
+"""
 
 # ruff: noqa: PLC0415 - what sets up logging is imported when a command runs
 
 import inspect
+import re
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeAlias, TypeVar, get_args
 
 import typer
+from typer.models import ParameterInfo
 
 from daq.bench.durations import parse_duration
 from daq.bench.estimate_settings import OPTIONS, default_text, from_text
 from tui.output.logs.options import LogFormat, LogLevel
 
 ESTIMATE_PANEL = "Estimate (defaults come from the bench file)"
+LOG_PANEL = "Log lines on standard error"
+_SECTION = re.compile(r"^(\S.*)\n-{3,}\n", re.MULTILINE)
+_ENTRY = re.compile(r"\n(?=\S)")
 Command = TypeVar("Command", bound=Callable[..., object])
 
 ESSENTIAL = frozenset({"methods", "segment", "band", "unit"})
@@ -64,128 +137,66 @@ def duration(value: str | float) -> float:
         raise typer.BadParameter(f"{value!r}: {error}") from None
 
 
-FILES_PANEL = "Files of other programs"
-"""Of options about responses and channels of these."""
-
-
-def _of_files(flag: str, metavar: str, text: str) -> Any:  # noqa: ANN401 - as typer has it
-    return typer.Option(flag, metavar=metavar, help=text, rich_help_panel=FILES_PANEL)
-
-
-ResponseOption: TypeAlias = Annotated[
-    list[Path] | None,
-    _of_files(
-        "--response",
-        "FILE",
-        "Instrument responses: RESP, StationXML or SACPZ files, or folders of them; repeatable."
-        " Each channel takes the response of its code and date.",
-    ),
-]
-ResponseForOption: TypeAlias = Annotated[
-    list[str] | None,
-    _of_files(
-        "--response-for",
-        "PATTERN=FILE",
-        "Response for channels of another code, as in 'XX.ABC.*=FILE'; repeatable. A sensor and its"
-        " digitizer may be in two files.",
-    ),
-]
-ChannelsOption: TypeAlias = Annotated[
-    list[str] | None,
-    _of_files(
-        "--channels",
-        "PATTERN",
-        "Channels to take, such as 'HH?' or 'XX.ABC.*.HHZ,XX.DEF.*.HHZ'. Default: all but those of"
-        " the instrument's state of health.",
-    ),
-]
-NetworkOption: TypeAlias = Annotated[
-    str, _of_files("--net", "CODE", "Network in an SDS archive, or a pattern.")
-]
-StationOption: TypeAlias = Annotated[str, _of_files("--sta", "CODE", "Station, or a pattern.")]
-LocationOption: TypeAlias = Annotated[
-    str, _of_files("--loc", "CODE", "Location, or a pattern; -- if empty.")
-]
-BenchArgument: TypeAlias = Annotated[
-    Path, typer.Argument(metavar="BENCH", help="Bench file (TOML); huddle init writes one.")
-]
-FileArgument: TypeAlias = Annotated[Path, typer.Argument(metavar="FILE", help="Recording (.h5).")]
-FilesArgument: TypeAlias = Annotated[
-    list[Path],
-    typer.Argument(metavar="FILE", help="Recordings (.h5). Several are estimated together."),
-]
-OutOption: TypeAlias = Annotated[
-    Path | None,
-    typer.Option(
-        "--out",
-        "-o",
-        metavar="FILE",
-        help="Recording to write (.h5; default: named after bench and time).",
-    ),
-]
-JsonOption: TypeAlias = Annotated[
-    str | None,
-    typer.Option("--json", metavar="FILE", help="Write the result as JSON; - is standard output."),
-]
-CsvOption: TypeAlias = Annotated[
-    str | None,
-    typer.Option("--csv", metavar="FILE", help="Write the result as CSV; - is standard output."),
-]
+OutOption: TypeAlias = Annotated[Path | None, typer.Option("--out", "-o")]
 DurationOption: TypeAlias = Annotated[
-    float | None,
-    typer.Option(
-        "--duration",
-        "-d",
-        metavar="TIME",
-        parser=duration,
-        help="Length of the recording, such as 90s, 20min or 3h (default: from the bench file).",
-    ),
+    float | None, typer.Option("--duration", "-d", parser=duration)
 ]
-ModelsOption: TypeAlias = Annotated[
-    str,
-    typer.Option(
-        "--models",
-        metavar="NAMES",
-        help="Noise models to draw, separated by commas: nlnm, nhnm, alnm, ahnm, or CSV files"
-        " with a header such as: frequency (Hz), noise (µg/√Hz).",
-    ),
-]
-StartOption: TypeAlias = Annotated[
-    str | None,
-    typer.Option(
-        "--start",
-        metavar="T",
-        help="Start of the time span to estimate: UTC such as 2026-11-21T03:00:00, or a time after"
-        " the start of the recording such as 2h.",
-    ),
-]
-EndOption: TypeAlias = Annotated[
-    str | None,
-    typer.Option("--end", metavar="T", help="End of the time span to estimate, as --start."),
-]
-AnywayOption: TypeAlias = Annotated[
-    bool,
-    typer.Option(
-        "--anyway",
-        help="Record even where the check list fails (see huddle check), or where some sensors of"
-        " a port do not answer.",
-    ),
-]
-DiagnosticsOption: TypeAlias = Annotated[
-    bool,
-    typer.Option(
-        "--details", "--diagnostics", help="Print the complete diagnosis of the test, by band."
-    ),
-]
-SpeedOption: TypeAlias = Annotated[
-    float | None,
-    typer.Option(
-        "--speed",
-        metavar="FACTOR",
-        min=0.01,
-        help="Speed of the simulation relative to real time (default: from the bench file).",
-    ),
-]
+DetailsOption: TypeAlias = Annotated[bool, typer.Option("--details", "--diagnostics")]
+SpeedOption: TypeAlias = Annotated[float | None, typer.Option(min=0.01)]
+
+
+class _Described(NamedTuple):
+    """What a docstring says of a parameter: the panel of the help, its form, and what it does."""
+
+    panel: str | None = None
+    form: str | None = None
+    text: str | None = None
+
+
+def _described(docstring: str | None) -> tuple[str, dict[str, _Described]]:
+    """Return a docstring as far as its first section, and what the sections say by parameter."""
+    text, *sections = _SECTION.split(inspect.cleandoc(docstring or ""))
+    found = {}
+    for title, body in zip(sections[::2], sections[1::2], strict=True):
+        for entry in _ENTRY.split(body.strip()):
+            head, _, lines = entry.partition("\n")
+            name, _, form = head.partition(" : ")
+            panel = None if title == "Parameters" else title
+            found[name] = _Described(panel, form or None, " ".join(lines.split()))
+    return text.strip(), found
+
+
+def declared(command: Callable[..., None]) -> tuple[Callable[..., None], str]:
+    """Return a command as typer takes it, and its help without what is said of its parameters."""
+    text, own = _described(command.__doc__)
+    described = _described(__doc__)[1] | own
+    signature = inspect.signature(command, eval_str=True)
+    taken = [_declared(each, described) for each in signature.parameters.values()]
+
+    @wraps(command)
+    def run(**given: Any) -> None:  # noqa: ANN401 - values of options
+        command(**given)
+
+    vars(run)["__signature__"] = signature.replace(parameters=taken)
+    return run, text
+
+
+def _declared(given: inspect.Parameter, described: dict[str, _Described]) -> inspect.Parameter:
+    """Return a parameter with its form and help, unless it has them."""
+    kind, *more = (
+        get_args(given.annotation)
+        if hasattr(given.annotation, "__metadata__")
+        else (given.annotation,)
+    )
+    about: Any = next((copy(each) for each in more if isinstance(each, ParameterInfo)), None)
+    if about is None:
+        is_option = given.kind is given.KEYWORD_ONLY
+        about = typer.Option() if is_option else typer.Argument()
+    if kind is bool and about.default is ...:  # typer would add --no-NAME
+        about.default = f"--{given.name.replace('_', '-')}"
+    if about.help is None and not about.hidden:
+        about.rich_help_panel, about.metavar, about.help = described.get(given.name, _Described())
+    return given.replace(annotation=Annotated[kind, about])
 
 
 def _parameter(name: str) -> inspect.Parameter:
@@ -242,38 +253,8 @@ def with_estimate_options(command: Callable[..., None]) -> Callable[..., None]:
     return with_options
 
 
-LOG_PANEL = "Log lines on standard error"
-
-LogLevelOption: TypeAlias = Annotated[
-    LogLevel,
-    typer.Option(
-        "--log-level",
-        metavar="LEVEL",
-        rich_help_panel=LOG_PANEL,
-        help="Lowest severity to write: debug, info, warning or error (default info).",
-        show_default=False,
-    ),
-]
-LogFormatOption: TypeAlias = Annotated[
-    LogFormat,
-    typer.Option(
-        "--log-format",
-        metavar="FORMAT",
-        rich_help_panel=LOG_PANEL,
-        help="text, or json: one JSON object per line, and no other output on standard error;"
-        " or journal: entries of systemd's journal (default text).",
-        show_default=False,
-    ),
-]
-LogFileOption: TypeAlias = Annotated[
-    Path | None,
-    typer.Option(
-        "--log-file",
-        metavar="FILE",
-        rich_help_panel=LOG_PANEL,
-        help="Append log lines to this file (default: write none).",
-    ),
-]
+LogLevelOption: TypeAlias = Annotated[LogLevel, typer.Option(show_default=False)]
+LogFormatOption: TypeAlias = Annotated[LogFormat, typer.Option(show_default=False)]
 
 
 def _to_standard_error(
@@ -288,7 +269,7 @@ def _to_file(
     *,
     log_level: LogLevelOption = LogLevel.INFO,
     log_format: LogFormatOption = LogFormat.TEXT,
-    log_file: LogFileOption = None,
+    log_file: Path | None = None,
 ) -> None:
     from tui.output.logs.lines import configure
 

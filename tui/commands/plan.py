@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from tui.commands.options import JsonOption, examples
+from tui.commands.options import examples
 
 
 @examples(
@@ -25,50 +25,38 @@ Record for 49 minutes: the noise in the worst third of an octave from 1 Hz on
 then scatters by 5 %, where motion is 1000 times the noise (--snr).""",
 )
 def plan(
-    path: Annotated[
-        Path | None, typer.Argument(metavar="BENCH", help="Bench file; or give --rate.")
-    ] = None,
+    path: Path | None = None,
     *,
-    sensors: Annotated[
-        int, typer.Option("--sensors", metavar="N", min=2, help="Sensors, without a bench file.")
-    ] = 3,
-    channels: Annotated[
-        int, typer.Option("--channels", metavar="N", min=1, max=3, help="Channels of each sensor.")
-    ] = 3,
-    rate: Annotated[
-        float | None,
-        typer.Option("--rate", metavar="HZ", min=1e-3, help="Sampling rate, without a bench file."),
-    ] = None,
-    segment: Annotated[
-        str | None, typer.Option("--segment", metavar="TIME", help="Length of segments.")
-    ] = None,
-    snr: Annotated[
-        float,
-        typer.Option(
-            "--snr",
-            metavar="RATIO",
-            min=1e-6,
-            max=1e9,
-            help="PSD of the motion divided by that of the noise.",
-        ),
-    ] = 1000.0,
-    cov: Annotated[
-        float,
-        typer.Option(
-            "--cov",
-            metavar="COV",
-            min=1e-4,
-            max=1.0,
-            help="Target coefficient of variation at one frequency.",
-        ),
-    ] = 0.05,
-    json: JsonOption = None,
+    sensors: Annotated[int, typer.Option(min=2)] = 3,
+    channels: Annotated[int, typer.Option(min=1, max=3)] = 3,
+    rate: Annotated[float | None, typer.Option(min=0.001)] = None,
+    segment: str | None = None,
+    snr: Annotated[float, typer.Option(min=1e-06, max=1000000000.0)] = 1000.0,
+    cov: Annotated[float, typer.Option(min=0.0001, max=1.0)] = 0.05,
+    json: str | None = None,
 ) -> None:
     """Compute the duration of recording for a target precision, by method.
 
     Two sensors need motion that changes: the table says for how much change.
     Orientations come from the simulation table of the bench file; without
     it all sensors point the same way.
+
+    Parameters
+    ----------
+    path : BENCH
+        Bench file; or give --rate.
+    sensors : N
+        Sensors, without a bench file.
+    channels : N
+        Channels of each sensor.
+    rate : HZ
+        Sampling rate, without a bench file.
+    segment : TIME
+        Length of segments.
+    snr : RATIO
+        PSD of the motion divided by that of the noise.
+    cov : COV
+        Target coefficient of variation at one frequency.
     """
     from tui.notebook.planning import plan as plan_of
     from tui.output.console import for_people, write_json

@@ -11,10 +11,7 @@ import typer
 
 from tui.commands.estimate import estimated
 from tui.commands.options import (
-    EndOption,
-    FilesArgument,
-    ModelsOption,
-    StartOption,
+    OutOption,
     examples,
     with_estimate_options,
 )
@@ -33,40 +30,15 @@ SUFFIXES = (".svg", ".png", ".pdf")
 )
 @with_estimate_options
 def plot(
-    files: FilesArgument,
+    files: list[Path],
     *,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            metavar="FILE",
-            help="Figure to write, .svg, .png or .pdf (default: beside the recording).",
-        ),
-    ] = None,
-    models: ModelsOption = "",
-    width: Annotated[
-        float,
-        typer.Option("--width", metavar="MM", min=80, max=500, help="Width of the figure in mm."),
-    ] = 180.0,
-    signal: Annotated[
-        bool,
-        typer.Option(
-            "--signal",
-            help="Draw the waveforms of all channels with marks, events and gaps, and spectrograms"
-            " of the recorded PSD and of the noise, from --start to --end.",
-        ),
-    ] = False,
-    sensors: Annotated[
-        bool,
-        typer.Option(
-            "--sensors",
-            help="Draw how the sensors stand: the axes of each (rotation, lean, polarity), and the"
-            " coherence of all pairs.",
-        ),
-    ] = False,
-    start: StartOption = None,
-    end: EndOption = None,
+    out: OutOption = None,
+    models: str = "",
+    width: Annotated[float, typer.Option(min=80, max=500)] = 180.0,
+    signal: bool = False,
+    sensors: bool = False,
+    start: str | None = None,
+    end: str | None = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Draw the self-noise of every channel as a figure for publication.
@@ -75,6 +47,19 @@ def plot(
     95 % interval, every other method with --method all, limits of the bench
     file, and noise models. With --signal the figure is of the first recording
     against time: what happened, and when.
+
+    Parameters
+    ----------
+    out : FILE
+        Figure to write, .svg, .png or .pdf (default: beside the recording).
+    width : MM
+        Width of the figure in mm.
+    signal
+        Draw the waveforms of all channels with marks, events and gaps, and spectrograms of the
+        recorded PSD and of the noise, from --start to --end.
+    sensors
+        Draw how the sensors stand: the axes of each (rotation, lean, polarity), and the coherence
+        of all pairs.
     """
     from daq.bench.masks.mask_file import masks_named
     from tui.output.console import check_places, console, notices

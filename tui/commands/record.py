@@ -20,10 +20,7 @@ from daq.errors import HuddleError, WrongSettingError
 from daq.python_process import python_command
 from daq.recording.storage.names import recording_path
 from tui.commands.options import (
-    AnywayOption,
-    BenchArgument,
     DurationOption,
-    JsonOption,
     OutOption,
     examples,
     with_logging,
@@ -51,45 +48,36 @@ Records for 20 minutes. Ctrl-C ends earlier, and what was recorded is kept.""",
 )
 @with_logging
 def record(
-    path: BenchArgument,
+    path: Path,
     *,
     duration: DurationOption = None,
-    operator: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Operator (default: from the bench file)."),
-    ] = None,
-    until: Annotated[
-        str,
-        typer.Option(
-            "--until",
-            metavar="CONDITION",
-            help="Stop by the live estimate: 'decided' once all limits are decided, '5 %' once the"
-            " noise in the worst third of an octave of the band has a c.o.v. of 5 %, or both,"
-            " separated by a comma: the first of them.",
-        ),
-    ] = "",
-    estimate: Annotated[str | None, typer.Option("--estimate", hidden=True)] = None,
-    until_stopped: Annotated[
-        bool,
-        typer.Option("--until-stopped", help="Ignore the duration of the bench file."),
-    ] = False,
-    check: Annotated[
-        bool,
-        typer.Option("--check", help="Make the check list first; record nothing if a check fails."),
-    ] = False,
-    anyway: AnywayOption = False,
-    wire_log: Annotated[
-        Path | None,
-        typer.Option(
-            "--wire-log",
-            metavar="FILE",
-            help="Also log every byte received and sent, for tests of drivers.",
-        ),
-    ] = None,
+    operator: str | None = None,
+    until: str = "",
+    estimate: Annotated[str | None, typer.Option(hidden=True)] = None,
+    until_stopped: bool = False,
+    check: bool = False,
+    anyway: bool = False,
+    wire_log: Path | None = None,
     out: OutOption = None,
-    json: JsonOption = None,
+    json: str | None = None,
 ) -> None:
-    """Record without estimating, until the duration has passed or Ctrl-C."""
+    """Record without estimating, until the duration has passed or Ctrl-C.
+
+    Parameters
+    ----------
+    operator : NAME
+        Operator (default: from the bench file).
+    until : CONDITION
+        Stop by the live estimate: 'decided' once all limits are decided, '5 %' once the noise in
+        the worst third of an octave of the band has a c.o.v. of 5 %, or both, separated by a comma:
+        the first of them.
+    until_stopped
+        Ignore the duration of the bench file.
+    check
+        Make the check list first; record nothing if a check fails.
+    wire_log : FILE
+        Also log every byte received and sent, for tests of drivers.
+    """
     from rich.live import Live
 
     from daq.devices.bench_file import load

@@ -4,25 +4,30 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
-import typer
+from pathlib import Path
 
 from daq.errors import RecordingError
-from tui.commands.options import FileArgument, JsonOption, examples
+from tui.commands.options import examples
 from tui.page.table import Table
 
 
 @examples("huddle repair killed.h5", "huddle repair night.h5 --check --json -")
 def repair(
-    path: FileArgument,
+    path: Path,
     *,
-    check: Annotated[bool, typer.Option("--check", help="Check only; change nothing.")] = False,
-    json: JsonOption = None,
+    check: bool = False,
+    json: str | None = None,
 ) -> None:
     """Verify the checksums of a recording, and close it if a crash left it open.
 
     All acknowledged samples are kept. Samples not acknowledged are removed.
+
+    Parameters
+    ----------
+    path : FILE
+        Recording (.h5).
+    check
+        Check only; change nothing.
     """
     from dataclasses import asdict
 

@@ -5,16 +5,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from tui.commands.estimate import estimated, exit_with
 from tui.commands.options import (
-    EndOption,
-    FilesArgument,
-    ModelsOption,
-    StartOption,
+    OutOption,
     examples,
     with_estimate_options,
 )
@@ -47,24 +44,13 @@ With limits in the bench file the first line is the verdict: PASS or FAIL.""",
 )
 @with_estimate_options
 def report(
-    files: FilesArgument,
+    files: list[Path],
     *,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            metavar="FILE",
-            help="Report to write: .html, .pdf, or .xml for a Digital Calibration Certificate "
-            "(DCC 3.1.2) (default: .html beside the recording).",
-        ),
-    ] = None,
-    models: ModelsOption = "",
-    force: Annotated[
-        bool, typer.Option("--force", help="Replace a file that has other content.")
-    ] = False,
-    start: StartOption = None,
-    end: EndOption = None,
+    out: OutOption = None,
+    models: str = "",
+    force: bool = False,
+    start: str | None = None,
+    end: str | None = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Write the calibration report of a huddle test as HTML or PDF.
@@ -76,6 +62,14 @@ def report(
 
     Options not given come from the bench file inside the recording.
     The exit code is 1 if a limit is not met, and 4 if that is not decided.
+
+    Parameters
+    ----------
+    out : FILE
+        Report to write: .html, .pdf, or .xml for a Digital Calibration Certificate (DCC 3.1.2)
+        (default: .html beside the recording).
+    force
+        Replace a file that has other content.
     """
     from daq.bench.masks.mask_file import masks_named
     from tui.output.console import console

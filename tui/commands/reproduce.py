@@ -4,12 +4,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
-
 import typer
 
-from tui.commands.options import JsonOption, examples, with_logging
+from tui.commands.options import OutOption, examples, with_logging
 from tui.output.exit_codes import ExitCode
 
 
@@ -20,22 +17,10 @@ from tui.output.exit_codes import ExitCode
 )
 @with_logging
 def reproduce(
-    studies: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="STUDY",
-            help="fig4, fig5, fig9, fig12, fig13, setup1, setup2, fig14, waves, two (default: all);"
-            " or public, with the FOLDER of each public huddle test after it.",
-        ),
-    ] = None,
+    studies: list[str] | None = None,
     *,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out", "-o", metavar="FOLDER", help="Folder of the figures (default: reproduced)."
-        ),
-    ] = None,
-    json: JsonOption = None,
+    out: OutOption = None,
+    json: str | None = None,
 ) -> None:
     """Reproduce the figures of the paper and compare them with theory.
 
@@ -47,6 +32,14 @@ def reproduce(
     that needs no model: what all other sensors cannot predict of a channel.
     A folder holds the waveforms of a test, and their responses if there are
     any. The exit code is 1 if an estimate contradicts the bound.
+
+    Parameters
+    ----------
+    studies : STUDY
+        fig4, fig5, fig9, fig12, fig13, setup1, setup2, fig14, waves, two (default: all); or public,
+        with the FOLDER of each public huddle test after it.
+    out : FOLDER
+        Folder of the figures (default: reproduced).
     """
     from tui.studies import public
     from tui.studies.reproduce import DEFAULT_FOLDER, run

@@ -21,12 +21,8 @@ from daq.recording.storage.names import recording_path
 from tui.commands.check import check_before_test
 from tui.commands.estimate import exit_with, show_result
 from tui.commands.options import (
-    AnywayOption,
-    BenchArgument,
-    CsvOption,
-    DiagnosticsOption,
+    DetailsOption,
     DurationOption,
-    JsonOption,
     OutOption,
     examples,
     with_estimate_options,
@@ -70,35 +66,17 @@ is 0 for PASS, 1 for FAIL, 4 for not decided. Ctrl-C ends the test early.""",
 @with_logging
 @with_estimate_options
 def run(
-    path: BenchArgument,
+    path: Path,
     *,
     duration: DurationOption = None,
-    until_cov: Annotated[
-        float | None,
-        typer.Option(
-            "--until-cov",
-            min=0.001,
-            max=1.0,
-            metavar="COV",
-            help="Stop when the noise in the worst third of an octave of the band has this"
-            " coefficient of variation.",
-        ),
-    ] = None,
-    until_decided: Annotated[
-        bool,
-        typer.Option("--until-decided", help="Stop when all limits of the bench are decided."),
-    ] = False,
-    anyway: AnywayOption = False,
+    until_cov: Annotated[float | None, typer.Option(min=0.001, max=1.0)] = None,
+    until_decided: bool = False,
+    anyway: bool = False,
     out: OutOption = None,
-    diagnostics: DiagnosticsOption = False,
-    report: Annotated[
-        Path | None,
-        typer.Option(
-            "--report", metavar="FILE", help="Write the calibration report: .html or .pdf."
-        ),
-    ] = None,
-    json: JsonOption = None,
-    csv: CsvOption = None,
+    diagnostics: DetailsOption = False,
+    report: Path | None = None,
+    json: str | None = None,
+    csv: str | None = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Run one huddle test: record, estimate live, print the result.
@@ -109,6 +87,16 @@ def run(
     The recorder is a separate process; the estimate reads its file.
     Ctrl-C stops the recorder, and the command prints the result. Ctrl-C
     during the final estimate finishes it first; a second Ctrl-C aborts.
+
+    Parameters
+    ----------
+    until_cov : COV
+        Stop when the noise in the worst third of an octave of the band has this coefficient of
+        variation.
+    until_decided
+        Stop when all limits of the bench are decided.
+    report : FILE
+        Write the calibration report: .html or .pdf.
     """
     from daq.devices.bench_file import load
     from daq.estimation.settings import Settings

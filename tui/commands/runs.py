@@ -5,12 +5,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeAlias
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from daq.errors import HuddleError
-from tui.commands.options import CsvOption, JsonOption, examples
+from tui.commands.options import examples
 from tui.output.csv_text import csv_text
 from tui.page.table import Cell, Table
 from tui.service.records.run_state import RunState, utc_text
@@ -34,29 +34,26 @@ _COLUMNS = (
 )
 
 
-PlaceArgument: TypeAlias = Annotated[
-    Path, typer.Argument(metavar="BENCH", help="Bench file, or a folder of recordings.")
-]
-
-
 @examples(
     "huddle runs lab.toml", "huddle runs lab.toml --last 10", "huddle runs recordings --csv -"
 )
 def runs(
-    source: PlaceArgument,
+    source: Path,
     *,
-    last: Annotated[
-        int | None,
-        typer.Option(
-            "--last", min=1, metavar="N", help="The last N runs (default on the screen: 100)."
-        ),
-    ] = None,
-    json: JsonOption = None,
-    csv: CsvOption = None,
+    last: Annotated[int | None, typer.Option(min=1)] = None,
+    json: str | None = None,
+    csv: str | None = None,
 ) -> None:
     """List the runs of a service: state, verdict, recordings, reason.
 
     A run is due, recording, estimating, done, failed or missed.
+
+    Parameters
+    ----------
+    source : BENCH
+        Bench file, or a folder of recordings.
+    last : N
+        The last N runs (default on the screen: 100).
     """
     from tui.output.console import check_places, for_people, write_json, write_text
     from tui.service.records.places import Place
@@ -82,14 +79,22 @@ def runs(
     "huddle pin lab.toml '2026-11-21 22:00' --remove",
 )
 def pin(
-    source: PlaceArgument,
-    names: Annotated[
-        list[str], typer.Argument(metavar="RUN", help="Recording or due time, as in huddle runs.")
-    ],
+    source: Path,
+    names: list[str],
     *,
-    remove: Annotated[bool, typer.Option("--remove", help="Allow their removal again.")] = False,
+    remove: bool = False,
 ) -> None:
-    """Protect runs from removal by the storage limits of the bench file."""
+    """Protect runs from removal by the storage limits of the bench file.
+
+    Parameters
+    ----------
+    source : BENCH
+        Bench file, or a folder of recordings.
+    names : RUN
+        Recording or due time, as in huddle runs.
+    remove
+        Allow their removal again.
+    """
     from tui.output.console import for_people
     from tui.service.records.places import Place
 

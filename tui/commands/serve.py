@@ -9,6 +9,7 @@ import logging
 import signal
 import time
 from itertools import islice
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -18,9 +19,6 @@ from daq.bench.option_fit import shortest_duration
 from daq.errors import BenchFileError, FileFault, HuddleError
 from daq.recorder.schedule import all_due, utc_now
 from tui.commands.options import (
-    AnywayOption,
-    BenchArgument,
-    JsonOption,
     examples,
     with_estimate_options,
     with_logging,
@@ -33,7 +31,6 @@ from tui.service.records.store import RunStore, StoreError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
-    from pathlib import Path
 
     from daq.bench.model import Bench
     from daq.bench.tables.unattended import Web
@@ -57,13 +54,11 @@ SHOWN = 5
 @with_logging
 @with_estimate_options
 def serve(
-    path: BenchArgument,
+    path: Path,
     *,
-    show: Annotated[
-        bool, typer.Option("--list", help="Show the times of the next runs, and exit.")
-    ] = False,
-    anyway: AnywayOption = False,
-    json: JsonOption = None,
+    show: Annotated[bool, typer.Option("--list")] = False,
+    anyway: bool = False,
+    json: str | None = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Run huddle tests on the schedule of the bench file, until Ctrl-C.
@@ -71,6 +66,11 @@ def serve(
     Before each run, the check list of huddle check is made. If a check fails,
     it is tried again for five minutes; then the run fails, and the hook
     on_failed says why. Options of the estimate apply to every run.
+
+    Parameters
+    ----------
+    show
+        Show the times of the next runs, and exit.
     """
     import asyncio
 

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
@@ -18,21 +17,23 @@ from tui.commands.options import examples
     "huddle sign lab.h5 --key ~/lab.key",
 )
 def sign(
-    recordings: Annotated[
-        list[Path] | None, typer.Argument(metavar="RECORDING", help="Closed recordings.")
-    ] = None,
+    recordings: list[Path] | None = None,
     *,
-    key: Annotated[
-        Path | None, typer.Option("--key", metavar="FILE", help="Private key (ed25519, PEM).")
-    ] = None,
-    new_key: Annotated[
-        Path | None,
-        typer.Option("--new-key", metavar="FILE", help="Make a key, and FILE.pub for others."),
-    ] = None,
+    key: Path | None = None,
+    new_key: Path | None = None,
 ) -> None:
     """Sign recordings with a private key, or make one.
 
     A recording is verified before. Its signature is a file beside it (.sig).
+
+    Parameters
+    ----------
+    recordings : RECORDING
+        Closed recordings.
+    key : FILE
+        Private key (ed25519, PEM).
+    new_key : FILE
+        Make a key, and FILE.pub for others.
     """
     from daq.recording.repair import verify
     from daq.recording.signing import make_key, sign

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from tui.commands.options import DurationOption, JsonOption, examples, with_logging
+from tui.commands.options import DurationOption, examples, with_logging
 
 
 @examples(
@@ -23,22 +23,22 @@ The estimate shows the noise that the table [simulation] of lab.toml has.""",
 )
 @with_logging
 def simulate(
-    scenario: Annotated[
-        str,
-        typer.Argument(
-            metavar="SCENARIO",
-            help="Bench file with a [simulation] table, or a scenario of the paper: fig4, fig5, "
-            "fig9, fig12, fig13, setup1, setup2, waves, two.",
-        ),
-    ],
+    scenario: str,
     *,
-    out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="FILE", help="Recording to write (.h5).")
-    ],
+    out: Annotated[Path, typer.Option("--out", "-o")],
     duration: DurationOption = None,
-    json: JsonOption = None,
+    json: str | None = None,
 ) -> None:
-    """Simulate a recording without devices."""
+    """Simulate a recording without devices.
+
+    Parameters
+    ----------
+    scenario : SCENARIO
+        Bench file with a [simulation] table, or a scenario of the paper: fig4, fig5, fig9, fig12,
+        fig13, setup1, setup2, waves, two.
+    out : FILE
+        Recording to write (.h5).
+    """
     from tui.simulation.write_recording import simulate_recording
 
     simulate_recording(scenario, out=out, duration=duration, json=json)

@@ -4,16 +4,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import typer
 
 from daq.recorder.schedule import utc_now
-from tui.commands.options import BenchArgument, JsonOption, examples
+from tui.commands.options import examples
 from tui.output.exit_codes import ExitCode
 from tui.service.records.store import RunStore
 
 
 @examples("huddle status lab.toml", "huddle status lab.toml --json -")
-def status(path: BenchArgument, *, json: JsonOption = None) -> None:
+def status(path: Path, *, json: str | None = None) -> None:
     """Show the state of the service of a bench: runs, sensors, disk, clock.
 
     The exit code is 3 if no service runs.

@@ -15,7 +15,7 @@ import typer
 from daq.errors import BenchFileError, FileFault
 from daq.foreign_files import OWN, SUFFIXES
 from tui.application.terminal.ascii_text import is_ascii_only
-from tui.commands.options import ModelsOption, examples, with_estimate_options, with_log_file
+from tui.commands.options import examples, with_estimate_options, with_log_file
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -36,39 +36,12 @@ BROWSER = "TEXTUAL_DRIVER"
 @with_log_file
 @with_estimate_options
 def tui(
-    source: Annotated[
-        Path | None,
-        typer.Argument(metavar="BENCH", help="Bench file, or a recording to view."),
-    ] = None,
-    on_event: Annotated[
-        str,
-        typer.Option(
-            "--on-event",
-            metavar="COMMAND",
-            help="Command to start when a test ends and when a sensor is lost, with"
-            " the environment variables HUDDLE_EVENT (ended, trouble), HUDDLE_TEXT and"
-            " HUDDLE_RECORDING.",
-        ),
-    ] = "",
-    baud: Annotated[
-        int | None,
-        typer.Option(
-            "--baud",
-            min=1200,
-            help="Baud rate of the line to the terminal, which limits the output (default: that of"
-            " a serial port, otherwise unlimited).",
-        ),
-    ] = None,
-    port: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--port",
-            metavar="PORT",
-            help="Without a bench file: search this port (default: all serial ports); may be"
-            " repeated.",
-        ),
-    ] = None,
-    models: ModelsOption = "",
+    source: Path | None = None,
+    *,
+    on_event: str = "",
+    baud: Annotated[int | None, typer.Option(min=1200)] = None,
+    port: list[str] | None = None,
+    models: str = "",
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Open the application: start, watch and stop a huddle test.
@@ -77,6 +50,19 @@ def tui(
     the running recording. Without a bench file, or with an empty or missing
     one, the first bench opens: it searches the serial ports, and the network
     on request, shows what answers live, and writes the bench file.
+
+    Parameters
+    ----------
+    source : BENCH
+        Bench file, or a recording to view.
+    on_event : COMMAND
+        Command to start when a test ends and when a sensor is lost, with the environment variables
+        HUDDLE_EVENT (ended, trouble), HUDDLE_TEXT and HUDDLE_RECORDING.
+    baud
+        Baud rate of the line to the terminal, which limits the output (default: that of a serial
+        port, otherwise unlimited).
+    port : PORT
+        Without a bench file: search this port (default: all serial ports); may be repeated.
     """
     from tui.runs.first_bench import is_first
 

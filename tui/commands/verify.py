@@ -12,7 +12,7 @@ import typer
 
 from daq.errors import RecordingError
 from tui.certificate.ledger import Ledger
-from tui.commands.options import JsonOption, examples
+from tui.commands.options import examples
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -27,30 +27,11 @@ if TYPE_CHECKING:
     "huddle verify certificates/HT-2026-0042-r0.pdf --key lab.pem",
 )
 def verify(
-    sources: Annotated[
-        list[Path],
-        typer.Argument(metavar="SOURCE", help="Recordings, bench files or folders; certificates."),
-    ],
+    sources: list[Path],
     *,
-    key: Annotated[
-        Path | None,
-        typer.Option(
-            "--key",
-            metavar="FILE",
-            help="Public key that must have signed every recording; of certificates the public key"
-            " or the X.509 certificate (PEM) that must have signed them and their ledger.",
-        ),
-    ] = None,
-    ledgers: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--certificates",
-            metavar="FOLDER",
-            help="Folder of certificates that no bench file names, or ledger of a certificate"
-            " that is elsewhere; may be repeated.",
-        ),
-    ] = None,
-    json: JsonOption = None,
+    key: Path | None = None,
+    ledgers: Annotated[list[Path] | None, typer.Option("--certificates")] = None,
+    json: str | None = None,
 ) -> None:
     """Verify the checksums and signatures of recordings, or of all recordings of a service.
 
@@ -64,6 +45,17 @@ def verify(
 
     The exit code is 3 if a recording is damaged, lost or exchanged, or a certificate or
     signature is not genuine.
+
+    Parameters
+    ----------
+    sources : SOURCE
+        Recordings, bench files or folders; certificates.
+    key : FILE
+        Public key that must have signed every recording; of certificates the public key or the
+        X.509 certificate (PEM) that must have signed them and their ledger.
+    ledgers : FOLDER
+        Folder of certificates that no bench file names, or ledger of a certificate that is
+        elsewhere; may be repeated.
     """
     from tui.certificate.verification import verified
     from tui.output.console import for_people, write_json

@@ -6,22 +6,17 @@ from __future__ import annotations
 
 import math
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tui.commands.estimate import exit_with, show_result
 from tui.commands.options import (
-    EndOption,
-    FileArgument,
-    JsonOption,
-    StartOption,
     examples,
     with_estimate_options,
     with_logging,
 )
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
@@ -33,11 +28,11 @@ if TYPE_CHECKING:
 @with_logging
 @with_estimate_options
 def watch(
-    file: FileArgument,
+    file: Path,
     *,
-    start: StartOption = None,
-    end: EndOption = None,
-    json: JsonOption = None,
+    start: str | None = None,
+    end: str | None = None,
+    json: str | None = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Show the live estimate of a recording that another process writes."""

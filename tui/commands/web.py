@@ -25,40 +25,13 @@ from tui.output.extras import require
 )
 @with_logging
 def web(
-    bench: Annotated[
-        Path | None, typer.Argument(metavar="BENCH", help="Bench file (TOML).")
-    ] = None,
+    bench: Path | None = None,
     *,
-    address: Annotated[
-        str | None,
-        typer.Option(
-            "--address",
-            metavar="IP",
-            help="Address to listen at (default: from the bench file, or 127.0.0.1).",
-        ),
-    ] = None,
-    port: Annotated[
-        int | None,
-        typer.Option(
-            "--port",
-            min=0,
-            max=65535,
-            metavar="N",
-            help="Port (default: from the bench file, or 8040; 0: any free one).",
-        ),
-    ] = None,
-    insecure: Annotated[
-        bool,
-        typer.Option(
-            "--insecure", help="Serve beyond this computer without TLS: others may read passwords."
-        ),
-    ] = False,
-    password: Annotated[
-        bool, typer.Option("--password", help="Ask for a password, and print its hash.")
-    ] = False,
-    token: Annotated[
-        bool, typer.Option("--token", help="Make a random token, and print it with its hash.")
-    ] = False,
+    address: str | None = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535)] = None,
+    insecure: bool = False,
+    password: bool = False,
+    token: bool = False,
 ) -> None:
     """Show a bench in the browser, until Ctrl-C.
 
@@ -66,6 +39,21 @@ def web(
     sensors over months, and an archive. Without a table [web] in the bench
     file, only this computer reaches them, and they start and stop nothing
     (docs/web.md).
+
+    Parameters
+    ----------
+    bench : BENCH
+        Bench file (TOML).
+    address : IP
+        Address to listen at (default: from the bench file, or 127.0.0.1).
+    port : N
+        Port (default: from the bench file, or 8040; 0: any free one).
+    insecure
+        Serve beyond this computer without TLS: others may read passwords.
+    password
+        Ask for a password, and print its hash.
+    token
+        Make a random token, and print it with its hash.
     """
     if [bench is not None, password, token].count(True) != 1:
         raise typer.BadParameter("expected a bench file, or --password, or --token")

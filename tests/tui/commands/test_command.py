@@ -87,6 +87,7 @@ def test_help_shows_what_is_needed_first_and_help_all_the_rest(name: str) -> Non
         *re.findall(r"^  (?:-\w, )?(--[\w-]+)", whole, re.MULTILINE)
     }
     shown = [each for each in subcommand(name).params if not getattr(each, "hidden", False)]
+    assert [each.name for each in shown if not each.help] == []
     declared = chain.from_iterable(each.opts for each in shown)
     assert [each for each in declared if each.startswith("--") and each not in whole] == []
     assert ("--help-all" in short) is (short != whole)
