@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from textual.message import Message
 
 from daq.results.result import Result
-from tui.application.state import TEST
+from tui.application.state import TEST, Reference
 
 if TYPE_CHECKING:
     import threading
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from daq.preflight.preview import SensorPreview
     from daq.recording.monitor import RecordingStatus
-    from tui.application.state import Reference
     from tui.runs.catalogue import Entry
 
 

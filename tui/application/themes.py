@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from rich.segment import Segment
 from rich.style import Style
-from textual.app import App
+from textual.app import App, SystemCommand
 from textual.filter import LineFilter, Monochrome
 from textual.theme import Theme
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from rich.color import Color as RichColor
-    from textual.app import SystemCommand
     from textual.color import Color
     from textual.driver import Driver
     from textual.screen import Screen

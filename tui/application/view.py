@@ -13,7 +13,7 @@ from textual.widgets import Static
 
 from estimator.wording import clock_time
 from tui.application.dialogs import TextScreen, help_text
-from tui.application.state import TITLES, VIEWS
+from tui.application.state import TITLES, VIEWS, State
 from tui.page.terminal import styled
 from tui.wording.verdict_text import WORDS, in_tone
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from textual.app import ComposeResult
     from textual.events import MouseDown, Resize
 
-    from tui.application.state import State
 
 MUTED, BAD = "#9aa5b8", "bold #ff6b6b"
 TALL = 34  # rows from which there is room for remarks and air

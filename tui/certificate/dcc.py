@@ -15,15 +15,16 @@ from typing import TYPE_CHECKING
 from daq.bench.tables.certificate import CertificateTable, Customer, Laboratory
 from daq.bench.units import in_si
 from daq.protocols.block import Quantity
-from daq.results.decision.conformity import Statement, conformity, with_rule
-from daq.results.sources import conditions
-from daq.results.uncertainty_budget import band_budgets, third_octave_budgets
+from daq.results.decision.conformity import Conformity, Statement, conformity, with_rule
+from daq.results.sources import Condition, Source, conditions
+from daq.results.uncertainty_budget import Budget, band_budgets, third_octave_budgets
 from estimator.wording import span
 from tui.report.certificate import (
     PROCEDURE,
     QUANTITIES,
     SCOPE,
     SPECIMEN,
+    Issue,
     manufacturers,
     outside_range,
 )
@@ -33,11 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from daq.bench.model import Bench
-    from daq.results.decision.conformity import Conformity
     from daq.results.result import Result
-    from daq.results.sources import Condition, Source
-    from daq.results.uncertainty_budget import Budget
-    from tui.report.certificate import Issue
 
 DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"
 SCHEMA_VERSION = "3.1.2"

@@ -16,10 +16,10 @@ from daq.estimation.snapshot_builder import sensitivities_at
 from daq.recording.signing import identity
 from daq.results.decision.conformity import conformity, with_rule
 from daq.results.result import Result
-from daq.results.sources import sources
+from daq.results.sources import Source, sources
 from tui.certificate.dcc import NAME as DCC_NAME
 from tui.certificate.dcc import dcc
-from tui.certificate.ledger import HeadSigner
+from tui.certificate.ledger import Entry, HeadSigner, Ledger
 from tui.certificate.verification import JSON_NAME, verified
 from tui.output.json_document import document
 from tui.output.json_values import json_text
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 
     from daq.bench.masks.mask import Mask
     from daq.bench.model import Bench
-    from daq.results.sources import Source
-    from tui.certificate.ledger import Entry, Ledger
     from tui.report.parts import Report
 
 

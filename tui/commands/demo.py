@@ -11,7 +11,7 @@ import tempfile
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -23,8 +23,6 @@ from tui.output.exit_codes import ExitCode
 from tui.page.table import Cell, Table
 
 if TYPE_CHECKING:
-    from typing import Any
-
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.results.result import Result

@@ -12,14 +12,12 @@ import typer
 from daq.errors import HuddleError
 from tui.commands.options import examples
 from tui.output.csv_text import csv_text
-from tui.page.table import Cell, Table
-from tui.service.records.run_state import RunState, utc_text
+from tui.page.table import Cell, Table, Tone
+from tui.service.records.run_state import Run, RunState, utc_text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from tui.page.table import Tone
-    from tui.service.records.run_state import Run
 
 _TONES: dict[RunState, Tone] = {
     RunState.FAILED: "bad",

@@ -20,9 +20,9 @@ from daq.devices.bench_file import parse
 from daq.devices.registry import present_ports
 from daq.errors import BenchFileError, HuddleError, RecordingError
 from daq.host_clock import SystemClock
-from daq.preflight.device_check import discover, network_ports
+from daq.preflight.device_check import DiscoveredDevice, discover, network_ports
 from daq.preflight.findings import Outcome
-from daq.preflight.preview import preview
+from daq.preflight.preview import SensorPreview, preview
 from daq.recording.control import ask
 from daq.recording.reader import Recording
 from daq.recording.storage.names import continuations, continued_name, recording_path
@@ -51,8 +51,6 @@ if TYPE_CHECKING:
     from daq.bench.masks.mask import Mask
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
-    from daq.preflight.device_check import DiscoveredDevice
-    from daq.preflight.preview import SensorPreview
     from daq.results.result import Result
     from tui.application.controls import Preview
     from tui.application.plan import TestPlan

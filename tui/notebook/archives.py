@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, Unpack, overload
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from daq.archive import stations
-from daq.archive.answers import FALSE_ALARM, answer
+from daq.archive.answers import FALSE_ALARM, Answer, answer
 from daq.archive.execution import begun, carried_out, failure_of, tasks_of
 from daq.archive.plan import STRETCHES
 from daq.archive.sources import are_waveforms, folder_for, recordings_in, sort
@@ -22,17 +22,14 @@ from daq.estimation.settings import Settings, check_fit
 from daq.formats.sources import Selection
 from daq.recording.reader import Recording
 from tui.notebook.estimates import PathLike, response_sources
-from tui.notebook.options import called, changes_of, settings_of
+from tui.notebook.options import EstimateOptions, called, changes_of, settings_of
 from tui.notebook.recording import nanoseconds
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
     from datetime import datetime
 
-    from daq.archive.answers import Answer
     from daq.archive.task import Outcome, Task
     from daq.formats.channel_runs import Overlap
-    from tui.notebook.options import EstimateOptions
 
 
 class StationAnswers(Mapping[str, "Answer"]):

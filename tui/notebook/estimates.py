@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, Unpack
@@ -20,8 +20,6 @@ from tui.notebook.options import EstimateOptions, Time, called, moment, settings
 from tui.notebook.result import Result
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from daq.bench.channel import Channel
     from daq.formats.response import Responses
     from daq.recording.interface import ReadableRecording, ReadableSensor

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,7 +33,6 @@ from tui.simulation.devices import scenario_of
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Iterator, Sequence
 
     from daq.bench.model import Bench
     from estimator.planning import Plan

@@ -17,14 +17,14 @@ import numpy as np
 from daq.bench.durations import format_duration
 from daq.bench.units import cf_unit
 from daq.errors import WrongSettingError
-from daq.formats.importer import open_files
+from daq.formats.importer import ImportResult, open_files
 from daq.formats.sources import Selection
-from daq.protocols.block import BlockFlag
-from daq.recording.interface import absences
+from daq.protocols.block import BlockFlag, Event
+from daq.recording.interface import ReadableRecording, ReadableSensor, absences
 from daq.recording.reader import Recording
 from estimator.wording import several
 from tui.notebook.estimates import PathLike, Response, estimate, response_sources, self_noise
-from tui.notebook.options import moment
+from tui.notebook.options import EstimateOptions, Time, moment
 from tui.output.extras import load
 from tui.wording.formatting import utc
 
@@ -38,12 +38,8 @@ if TYPE_CHECKING:
     from daq.bench.channel import Channel
     from daq.bench.model import Bench
     from daq.formats.channel_runs import Overlap
-    from daq.formats.importer import ImportResult
     from daq.formats.memory import RecordingInMemory
-    from daq.protocols.block import Event
-    from daq.recording.interface import ReadableRecording, ReadableSensor
     from estimator.types import FloatArray, IntArray
-    from tui.notebook.options import EstimateOptions, Time
     from tui.notebook.result import Result
 
 _NS_PER_S = 1_000_000_000

@@ -12,7 +12,7 @@ from daq.bench.masks.mask_file import masks_named
 from daq.bench.units import levels_db
 from daq.errors import WrongSettingError
 from daq.results import result as results
-from daq.results.sources import uncounted_events
+from daq.results.sources import LoggedEvent, uncounted_events
 from estimator.levels.bands import band_edges
 from tui.notebook import text
 from tui.output.extras import load
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
         SnapshotDiagnostics,
     )
     from daq.results.facts.fact import Fact
-    from daq.results.sources import LoggedEvent
     from estimator.self_noise.result import SelfNoise
     from estimator.types import ComplexArray, FloatArray, IntArray
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -17,8 +17,6 @@ from sim_devices.world.world import World
 from tui.simulation.write_recording import bench_of, described, write
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from daq.bench.model import Bench
     from estimator.types import FloatArray
 

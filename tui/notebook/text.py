@@ -6,7 +6,7 @@ import io
 from html import escape
 from typing import TYPE_CHECKING
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.text import Text
 
 from estimator.decision.verdict import Verdict
@@ -21,8 +21,6 @@ from tui.wording.verdict_text import Decision
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from rich.console import RenderableType
 
     from daq.estimation.snapshot import ChannelLabel
     from daq.results.result import Result

@@ -14,7 +14,7 @@ import numpy as np
 
 from daq.bench.masks.mask_file import masks_named
 from daq.errors import WrongSettingError
-from daq.results.calibration import CONFIDENCE
+from daq.results.calibration import CONFIDENCE, Calibration
 from daq.results.calibration import calibrate as calibrated
 from tui.notebook.curve_files import MINISEED, WRITERS, write_curves, write_samples
 from tui.notebook.estimates import PathLike, estimate
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import ArrayLike
 
-    from daq.results.calibration import Calibration
     from estimator.types import FloatArray
     from tui.notebook.options import EstimateOptions
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from daq.bench.units import decibels
 from daq.clocks.clock_model import RelativeTime
 from daq.results.clock_effect import relative_time
-from daq.results.uncertainty_budget import student_quantile
+from daq.results.uncertainty_budget import Budget, Component, student_quantile
 from estimator.wording import signed, span
 
 if TYPE_CHECKING:
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
     from daq.estimation.snapshot import Snapshot
     from daq.results.calibration import Calibration
-    from daq.results.uncertainty_budget import Budget, Component
     from estimator.responses.derived_quantities import Value
 
 Rows = tuple[tuple[str, ...], ...]

@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
 
-from daq.preflight.findings import Check, Outcome, Problem
+from daq.preflight.findings import Check, CheckRow, Finding, Outcome, Problem
 from daq.results.vocabulary import CAUSES
 from estimator.wording import listed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from daq.preflight.findings import CheckRow, Finding
 
 MARKS: Mapping[Outcome, str] = {Outcome.PASSED: "✓", Outcome.FAILED: "✗", Outcome.NOT_CHECKED: "?"}
 STYLES: Mapping[Outcome, str] = {

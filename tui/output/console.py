@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import rich.table
 import typer
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 
 from daq.whole_file import written
@@ -26,7 +26,6 @@ from tui.page.terminal import terminal_table
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from rich.console import ConsoleOptions, RenderableType
     from rich.progress import Progress, ProgressColumn
 
 STANDARD_OUTPUT = "-"

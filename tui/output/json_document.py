@@ -14,7 +14,7 @@ from daq.bench.estimate_settings import table_keys
 from daq.protocols.block import Quantity
 from daq.results.clock_effect import relative_time
 from daq.results.facts.fact import Fact, Finding
-from daq.results.sources import conditions
+from daq.results.sources import Source, conditions
 from daq.results.uncertainty_budget import level_budget
 from estimator.checks.advice import Advice, Rank
 from estimator.records import json_key
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from daq.results.decision.verdict import TestVerdict
     from daq.results.noise_parameters import ChannelNoise
     from daq.results.result import Result
-    from daq.results.sources import Source
 
 SCHEMA_VERSION = 2
 """Rises when a key is removed or changes its meaning; new keys do not change it."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Any
@@ -13,8 +13,6 @@ from pydantic_core import to_json
 from estimator.records import json_key
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from estimator.types import FloatArray
 
 

@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daq.results.noise_parameters import QUANTISATION_SHARE, Outcome, Quantity
+from daq.results.noise_parameters import (
+    QUANTISATION_SHARE,
+    ChannelNoise,
+    Comparison,
+    Outcome,
+    Quantity,
+)
 from estimator.noise_parameters.fit import Term
 from estimator.wording import percent, span
 from tui.wording.formatting import level, scientific
@@ -16,7 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from daq.estimation.snapshot import ChannelLabel
-    from daq.results.noise_parameters import ChannelNoise, Comparison
     from estimator.noise_parameters.allan import AllanDeviation
 
 MISFIT = 5.0

@@ -9,7 +9,7 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from daq.results.standing import pair_coherence, stances
+from daq.results.standing import PairCoherence, Stance, pair_coherence, stances
 from estimator.wording import listed, signed
 
 if TYPE_CHECKING:
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from daq.results.result import Result
-    from daq.results.standing import PairCoherence, Stance
     from estimator.types import FloatArray
 
 _WIDTH, _HEIGHT = 17, 7

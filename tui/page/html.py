@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 from html import escape
-from typing import TYPE_CHECKING
 
-from tui.page.table import Cell
-
-if TYPE_CHECKING:
-    from tui.page.table import Table, Tone
-
+from tui.page.table import Cell, Table, Tone
 
 _CLASSES = {"quiet": "muted", "plain": ""}
 

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING
 import rich.table
 from rich.text import Text
 
-from tui.page.table import Cell
+from tui.page.table import Cell, Table, Tone
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
-    from tui.page.table import Table, Tone
 
 MUTED = "#9aa5b8"
 STYLES: Mapping[Tone, str] = {

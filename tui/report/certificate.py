@@ -14,8 +14,8 @@ from daq.bench.estimate_settings import to_table
 from daq.bench.tables.certificate import CertificateTable, Customer, Laboratory
 from daq.estimation.settings import Settings
 from daq.protocols.block import Quantity
-from daq.results.sources import conditions
-from tui.report.parts import Facts, Paragraph, Section, Table
+from daq.results.sources import Condition, Source, conditions
+from tui.report.parts import Facts, Paragraph, Part, Section, Table
 from tui.wording.formatting import plain_number, utc_time
 
 if TYPE_CHECKING:
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from daq.estimation.snapshot import Snapshot
     from daq.results.result import Result
-    from daq.results.sources import Condition, Source
-    from tui.report.parts import Part
 
 _NONE = "not given"
 LEAST_LOST = 0.01

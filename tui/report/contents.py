@@ -8,9 +8,9 @@ from itertools import groupby
 from typing import TYPE_CHECKING
 
 from daq.bench.durations import format_duration
-from daq.bench.estimate_settings import OPTIONS, table_keys
+from daq.bench.estimate_settings import OPTIONS, Option, table_keys
 from daq.estimation.settings import Settings
-from daq.results.calibration import calibrate
+from daq.results.calibration import Calibration, calibrate
 from daq.results.decision.conformity import conformity, with_rule
 from estimator.errors import InsufficientDataError
 from estimator.wording import span
@@ -41,7 +41,7 @@ from tui.report.evidence import (
 )
 from tui.report.noise import limits_section, noise_section, verdict
 from tui.report.parameters import parameters_section
-from tui.report.parts import Facts, Paragraph, Part, Report, Section, Signatures, Table
+from tui.report.parts import Facts, Paragraph, Part, Report, Section, Signatures, Table, Tone
 from tui.report.uncertainty import uncertainty_section
 from tui.wording.formatting import is_known, local_time, utc_time
 
@@ -49,15 +49,12 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from daq.bench.channel import Channel
-    from daq.bench.estimate_settings import Option
     from daq.bench.masks.mask import Mask
     from daq.bench.model import Bench
     from daq.clocks.clock_model import ClockState
     from daq.estimation.snapshot import Snapshot
-    from daq.results.calibration import Calibration
     from daq.results.result import Result
     from daq.results.sources import RecordedSensor, Source
-    from tui.report.parts import Part, Tone
 
 
 def calibration_section(result: Result) -> Section | None:

@@ -11,8 +11,8 @@ import numpy as np
 from daq.bench.units import decibels
 from daq.protocols.block import EventKind
 from daq.results.clock_effect import grade, reference, residuals
-from daq.results.facts.fact import MARKS
-from daq.results.sources import uncounted_events, with_uncounted
+from daq.results.facts.fact import MARKS, Fact
+from daq.results.sources import LoggedEvent, Source, uncounted_events, with_uncounted
 from daq.results.vocabulary import clock_source
 from estimator.checks.advice import Rank
 from estimator.checks.advice_on_sensors import ANY_AXES
@@ -22,7 +22,7 @@ from estimator.wording import several, span
 from tui.report.figures.drift import drift_plot
 from tui.report.figures.model_test import model_test_plot
 from tui.report.figures.standing import standing_plots
-from tui.report.parts import Items, Paragraph, Part, Section, Table
+from tui.report.parts import Items, Paragraph, Part, Section, Table, Tone
 from tui.wording.facts import NOTHING_TO_DO, RANKS
 from tui.wording.formatting import NOTHING, plain_number, probability, scientific, share, utc
 
@@ -31,12 +31,9 @@ if TYPE_CHECKING:
 
     from daq.clocks.clock_model import ClockState
     from daq.estimation.snapshot import Snapshot
-    from daq.results.facts.fact import Fact
     from daq.results.result import Result
-    from daq.results.sources import LoggedEvent, Source
     from estimator.checks.band import BandDiagnosis
     from estimator.checks.relative_response import RelativeResponse
-    from tui.report.parts import Tone
 
 LISTED = 40
 """Most lines of the list of what happened; with more, those of one kind go together."""

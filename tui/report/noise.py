@@ -5,17 +5,17 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from daq.bench.masks.mask import SOURCES
-from daq.bench.tables.certificate import Rule
+from daq.bench.masks.mask import SOURCES, Mask
+from daq.bench.tables.certificate import CertificateTable, Rule
 from daq.bench.units import decibels
-from daq.results.band_summary import known_range
-from daq.results.decision.conformity import Statement
+from daq.results.band_summary import BandMeans, known_range
+from daq.results.decision.conformity import Conformity, Statement
 from daq.results.vocabulary import FLAG_WORDS, PARTNER_WORDS
 from estimator.decision.verdict import Verdict
 from estimator.self_noise.result import Flag
 from estimator.wording import span
 from tui.report.figures.curves import noise_plots
-from tui.report.parts import Paragraph, Part, Section, Table
+from tui.report.parts import Paragraph, Part, Section, Table, Tone
 from tui.wording.formatting import (
     NOT_KNOWN,
     NOTHING,
@@ -29,14 +29,9 @@ from tui.wording.verdict_text import WORDS, Decision, margin
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from daq.bench.masks.mask import Mask
-    from daq.bench.tables.certificate import CertificateTable
     from daq.estimation.snapshot import Snapshot
-    from daq.results.band_summary import BandMeans
-    from daq.results.decision.conformity import Conformity
     from daq.results.decision.verdict import TestVerdict
     from daq.results.result import Result
-    from tui.report.parts import Tone
 
 STATEMENTS: Mapping[Statement, str] = {
     Statement.PASS: "pass",

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import singledispatchmethod
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 import matplotlib as mpl
 from fpdf import FPDF, FontFace, TextStyle
@@ -21,13 +21,11 @@ from fpdf.enums import TableBordersLayout, WrapMode, XPos, YPos
 
 from tui.report.figures import drawing, on_paper
 from tui.report.figures.curves import WIDTH as INNER
-from tui.report.parts import Facts, Items, Paragraph, Plot, Signatures, Table
+from tui.report.parts import Facts, Items, Paragraph, Part, Plot, Report, Signatures, Table, Tone
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from typing import BinaryIO
 
-    from tui.report.parts import Part, Report, Tone
 
 MARGIN, TOP, BOTTOM = 0.58, 0.5, 0.65
 TITLE, VERDICT = 17.0, 10.0

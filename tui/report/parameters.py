@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from daq.results.noise_parameters import noise_parameters, quantisation_shares
+from daq.results.noise_parameters import ChannelNoise, noise_parameters, quantisation_shares
 from tui.output.noise_parameters import (
     allan_table,
     notes,
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from daq.estimation.snapshot import Snapshot
-    from daq.results.noise_parameters import ChannelNoise
     from daq.results.result import Result
 
 HEIGHT = 1.45

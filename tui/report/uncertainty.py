@@ -10,13 +10,13 @@ import numpy as np
 
 from daq.bench.units import in_acceleration
 from daq.results.band_summary import without_sensitivity
-from daq.results.uncertainty_budget import STATED, band_budgets
+from daq.results.uncertainty_budget import STATED, Budget, band_budgets
 from daq.results.vocabulary import SOURCE_WORDS
 from estimator.levels.contributions import Source
 from estimator.wording import span
 from tui.report.figures import drawing
 from tui.report.figures.curves import logarithmic
-from tui.report.parts import Paragraph, Plot, Section, Table
+from tui.report.parts import Paragraph, Part, Plot, Section, Table
 from tui.wording.formatting import NOTHING, level, plain_number, scientific
 
 if TYPE_CHECKING:
@@ -28,9 +28,7 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from daq.estimation.snapshot import Snapshot
     from daq.results.result import Result
-    from daq.results.uncertainty_budget import Budget
     from estimator.types import FloatArray
-    from tui.report.parts import Part
 
 COLUMNS = 9
 """Channels that one table is wide."""

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daq.bench.end_condition import NEVER, EndCondition
-from daq.bench.estimate_settings import to_table
+from daq.bench.estimate_settings import EstimateSettings, to_table
 from daq.errors import HuddleError, RecordingError
 from daq.python_process import python_command
 from daq.recording.control import ask
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from types import FrameType
 
-    from daq.bench.estimate_settings import EstimateSettings
 
 LINES_AT_ONCE, LINES_A_SECOND = 200, 5
 """Lines of a child that are logged at once, and on average: its log must not fill the disk."""

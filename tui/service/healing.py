@@ -15,7 +15,7 @@ import contextlib
 import json
 import logging
 from dataclasses import replace
-from datetime import UTC, timedelta
+from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING
 
 from daq.errors import HuddleError
@@ -28,7 +28,6 @@ from tui.service.records.run_state import RUN, Run, RunState
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from datetime import datetime
     from pathlib import Path
 
     from daq.bench.model import Bench

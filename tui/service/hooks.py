@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from tui.output.json_values import json_text
 from tui.service.records.run_state import Run, RunState
-from tui.service.records.store import StoreError
+from tui.service.records.store import RunStore, StoreError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from daq.bench.tables.unattended import Hooks
     from tui.service.clock import Clock
-    from tui.service.records.store import RunStore
 
 _SHORTEST_SECRET = 4
 _VARIABLE = re.compile(r"\$\{(\w+)\}")

@@ -7,7 +7,7 @@ has one run at most, even where the clock is set back.
 
 from __future__ import annotations
 
-from datetime import UTC, timedelta
+from datetime import UTC, datetime, timedelta
 from itertools import islice, takewhile
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,6 @@ from tui.service.records.run_state import Run
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterator
-    from datetime import datetime
 
     from daq.bench.model import Bench
     from daq.bench.tables.unattended import ScheduledRun

@@ -14,8 +14,8 @@ import asyncio
 import logging
 import math
 from dataclasses import replace
-from datetime import timedelta
-from typing import TYPE_CHECKING
+from datetime import datetime, timedelta
+from typing import TYPE_CHECKING, Any
 
 from daq.errors import HuddleError
 from daq.recording.signing import SigningError, key_of
@@ -24,18 +24,15 @@ from tui.service.hooks import events_of
 from tui.service.planning import GRACE, missed_runs, next_runs
 from tui.service.processes.finish import Outcome, Request, is_of_disk
 from tui.service.records.run_state import Run, RunState
-from tui.service.records.store import StoreError
+from tui.service.records.store import RunStore, StoreError
 from tui.service.window import Window, free_space
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
-    from datetime import datetime
-    from typing import Any
 
     from daq.bench.model import Bench
     from tui.service.clock import Clock
     from tui.service.processes.steps import Steps
-    from tui.service.records.store import RunStore
 
 _LOGGER = logging.getLogger(__name__)
 MAX_SLEEP = 30.0

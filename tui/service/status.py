@@ -11,7 +11,7 @@ from daq.recording.control import ask
 from tui.service.clock import SystemTime
 from tui.service.processes.locks import is_held
 from tui.service.records.places import service_lock
-from tui.service.records.run_state import UNFINISHED, RunState, utc_text
+from tui.service.records.run_state import UNFINISHED, Run, RunState, utc_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.bench.model import Bench
-    from tui.service.records.run_state import Run
 
 
 def service_status(bench: Bench, runs: list[Run], now: datetime) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from daq.whole_file import write_whole
 from sim_devices.errors import ScenarioError
 from sim_devices.faults import check
 from sim_devices.faults import parse as parse_faults
-from sim_devices.server.launch import start
+from sim_devices.server.launch import RunningDevice, start
 from sim_devices.world.scenario import Scenario
 from tui.output.console import console, hint, write_json
 
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.bench.model import Bench, Sensor
-    from sim_devices.server.launch import RunningDevice
 
 _LOGGER = logging.getLogger(__name__)
 

@@ -6,14 +6,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daq.host_clock import SystemClock
+from daq.host_clock import HostClock, SystemClock
 
 if TYPE_CHECKING:
     from asyncio import AbstractEventLoop
     from collections.abc import Callable
 
     from daq.bench.model import Bench
-    from daq.host_clock import HostClock
 
 
 def host_time(bench: Bench) -> tuple[HostClock, Callable[[], AbstractEventLoop] | None]:

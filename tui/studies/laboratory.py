@@ -22,7 +22,7 @@ from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window
 from sim_devices.world import paper_scenarios
 from sim_devices.world.world import World
-from tui.studies.study import Curve, Panel, Point, Series, Study
+from tui.studies.study import Curve, Panel, Point, ProgressCallback, Series, Study
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sim_devices.world.scenario import Scenario
-    from tui.studies.study import ProgressCallback
 
     FloatArray = NDArray[np.float64]
     ComplexArray = NDArray[np.complex128]

@@ -22,14 +22,12 @@ from sim_devices.world.scenario import Scenario
 from sim_devices.world.spectrum import White
 from sim_devices.world.tables import CommonMotion, SensorModel
 from sim_devices.world.world import World
-from tui.studies.study import Panel, Point, Series, Study
+from tui.studies.study import Panel, Point, ProgressCallback, Series, Study
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
-
-    from tui.studies.study import ProgressCallback
 
     FloatArray = NDArray[np.float64]
     ComplexArray = NDArray[np.complex128]

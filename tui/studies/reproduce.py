@@ -17,14 +17,13 @@ from tui.output.extras import require
 from tui.page.table import Cell, Table
 from tui.studies.laboratory import LABORATORY, Laboratory
 from tui.studies.numerical import NUMERICAL, Ingredients
-from tui.studies.study import TOLERANCE
+from tui.studies.study import TOLERANCE, ProgressCallback, Series, Study
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from rich.console import Console
 
-    from tui.studies.study import ProgressCallback, Series, Study
 
 Studies: TypeAlias = "Callable[[ProgressCallback, float], Mapping[str, Callable[[], Study]]]"
 """Takes what reports progress, and the share of the full length to simulate."""

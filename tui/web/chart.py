@@ -14,7 +14,7 @@ import numpy as np
 
 from daq.bench.masks.mask import NOISE_MODELS
 from daq.bench.units import is_motion
-from tui.application.test_view.curves import level_limits
+from tui.application.test_view.curves import Curve, level_limits
 from tui.application.test_view.plotted import (
     MODEL_STYLE,
     Choice,
@@ -24,7 +24,7 @@ from tui.application.test_view.plotted import (
     unit_of,
     whole_span,
 )
-from tui.application.test_view.units import units_of
+from tui.application.test_view.units import SpectrumUnit, units_of
 from tui.web.html import page
 
 if TYPE_CHECKING:
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
     from estimator.types import FloatArray
     from tui.application.state import State
-    from tui.application.test_view.curves import Curve
-    from tui.application.test_view.units import SpectrumUnit
 
 MODEL_RANGE_DB = 60.0
 """By how many dB noise models may widen the vertical scale at either end; as in the report."""

@@ -17,7 +17,7 @@ import time
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import groupby
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from daq.errors import HuddleError
 from daq.estimation.follow import follow
@@ -35,12 +35,11 @@ from tui.runs.estimate_settings import settings_for
 from tui.service.status import status_lines
 from tui.web.chart import choice_of, drawn, with_models
 from tui.web.html import instant, page
-from tui.web.traces import traces
+from tui.web.traces import Trace, traces
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Sequence
     from pathlib import Path
-    from typing import Any
 
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
@@ -50,7 +49,6 @@ if TYPE_CHECKING:
     from daq.recording.reader import Recording
     from daq.results.band_summary import BandMeans
     from tui.application.controls import Controls
-    from tui.web.traces import Trace
 
 _LOGGER = logging.getLogger(__name__)
 LOOK = 1.0

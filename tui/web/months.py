@@ -5,12 +5,12 @@ from __future__ import annotations
 import io
 from typing import TYPE_CHECKING, Any
 
-from daq.archive.answers import answer
+from daq.archive.answers import Answer, answer
 from daq.archive.store import Store
 from tui.output.archive.tables import course_table, course_title, remarks
 from tui.output.results import averages_line, result_table, result_title
 from tui.service.history.ledger import noise_of
-from tui.service.history.series import history
+from tui.service.history.series import Series, history
 from tui.service.history.shown import history_figure, history_lines, history_table
 from tui.service.records.store import RunStore
 from tui.web.work import check_wanted
@@ -18,9 +18,7 @@ from tui.web.work import check_wanted
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from daq.archive.answers import Answer
     from daq.bench.model import Bench
-    from tui.service.history.series import Series
 
 _DPI = 110
 

@@ -41,7 +41,7 @@ from estimator.decision.verdict import Verdict
 from estimator.errors import EstimatorError
 from tui.application.plan import TestPlan
 from tui.application.test_view.units import units_of
-from tui.certificate.ledger import LedgerError
+from tui.certificate.ledger import Entry, LedgerError
 from tui.output.json_values import json_text
 from tui.output.results import averages_line, curves_csv
 from tui.service.records.places import file_name
@@ -78,7 +78,6 @@ if TYPE_CHECKING:
     from daq.bench.tables.unattended import Web
     from tui.application.controls import Controls
     from tui.application.state import State
-    from tui.certificate.ledger import Entry
 
 _LOGGER = logging.getLogger(__name__)
 PATIENCE = 10.0

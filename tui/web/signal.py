@@ -14,7 +14,7 @@ import numpy as np
 from markupsafe import Markup
 
 from daq.recording.reader import Recording
-from daq.results.signal import Signal, fitting, panned, zoomed
+from daq.results.signal import Signal, Spectrogram, Waveforms, fitting, panned, zoomed
 from tui.web.html import page
 from tui.web.work import check_wanted
 from tui.wording.signal import extent, most_first, sign, time_of, time_ticks, title, words
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.estimation.snapshot import Snapshot
-    from daq.results.signal import Spectrogram, Waveforms
     from estimator.types import FloatArray
 
 WIDTH, LEFT, ROW, TOP, LANE, AXIS = 1000, 110, 44, 6, 18, 24

@@ -13,6 +13,7 @@ from daq.estimation.snapshot import NoResultError
 from daq.recording.storage.locking import is_being_written
 from daq.results.result import Result
 from tui.application.state import Reference, State
+from tui.certificate.ledger import Entry as Certificate
 from tui.certificate.ledger import ledger_of
 from tui.output.json_document import document
 from tui.runs.catalogue import Entry, catalogue
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Bench
     from tui.application.controls import Controls
-    from tui.certificate.ledger import Entry as Certificate
 
 PAGE = 50
 """Tests on a page of the list."""

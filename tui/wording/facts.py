@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from daq.results.facts.fact import MARKS
+from daq.results.facts.fact import MARKS, Fact
 from daq.results.facts.recordings import NotInLiveEstimate
 from daq.results.facts.segments import NoSegmentUsable
 from estimator.checks.advice import Rank
@@ -13,7 +13,6 @@ from estimator.wording import several
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from daq.results.facts.fact import Fact
     from daq.results.result import Result
 
 RANKS: Mapping[Rank, str] = {

@@ -6,13 +6,12 @@ import math
 from datetime import UTC, datetime, time
 from typing import TYPE_CHECKING
 
-from daq.results.signal import CLIPPED, GAP
+from daq.results.signal import CLIPPED, GAP, Mark, Trace, Waveforms
 from tui.wording.formatting import readings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from daq.results.signal import Mark, Trace, Waveforms
 
 STEPS = (
     *(s * 10.0**e for e in (-3, -2, -1) for s in (1, 2, 5)),

@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from daq.results.decision.end import Goal
+from daq.results.decision.end import Goal, Remaining
 from daq.results.decision.facts import LimitUndecided, WrongSensitivity
-from daq.results.decision.verdict import facts_of_verdict
+from daq.results.decision.verdict import LimitResult, TestVerdict, facts_of_verdict
 from estimator.decision.verdict import REMOVED_BY_TIME, Verdict
 from estimator.wording import listed, percent, roughly, several, signed
-from tui.page.table import Cell
+from tui.page.table import Cell, Tone
 from tui.wording.facts import NOTHING_TO_DO
 from tui.wording.formatting import level
 
@@ -19,10 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from datetime import datetime
 
-    from daq.results.decision.end import Remaining
-    from daq.results.decision.verdict import LimitResult, TestVerdict
     from daq.results.result import Result
-    from tui.page.table import Tone
 
 WORDS: Mapping[Verdict, str] = {
     Verdict.PASS: "PASS",

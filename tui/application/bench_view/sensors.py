@@ -18,7 +18,7 @@ from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.wording import listed
 from tui.application.test_view.braille import DOTS, FIRST
 from tui.application.test_view.clocks import COLOURS
-from tui.application.test_view.curves import data_curve, mask_curve
+from tui.application.test_view.curves import Curve, data_curve, mask_curve
 from tui.application.test_view.plotted import MARKERS, MODEL_MARKERS
 from tui.output.check_list import sentence
 from tui.wording.formatting import readings
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from daq.preflight.preview import SensorPreview
     from tui.application.state import State
-    from tui.application.test_view.curves import Curve
 
 MUTED = "#9aa5b8"
 SPECTRUM_SEGMENT, SPECTRUM_POINTS = 2.0, 120

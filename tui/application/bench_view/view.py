@@ -28,7 +28,7 @@ from tui.application.forms.bench import BenchForm
 from tui.application.forms.certificate import CertificateForm
 from tui.application.forms.sensor import PortForm, SensorForm, sensor_table
 from tui.application.messages import BenchEdited, ErrorReported, PreviewUpdated
-from tui.application.state import BENCH
+from tui.application.state import BENCH, State
 from tui.application.test_view.plot import PsdPlot
 from tui.application.test_view.units import SpectrumUnit
 from tui.application.view import BAD, MUTED, View
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from daq.preflight.preview import SensorPreview
     from tui.application.controls import Controls, Preview
     from tui.application.forms.form import Form
-    from tui.application.state import State
 
 
 SITES = tuple(NOISE_MODELS[name] for name in ("nlnm", "nhnm"))

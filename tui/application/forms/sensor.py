@@ -11,8 +11,8 @@ from daq.bench.driver_settings import settings_of
 from daq.bench.editing import with_sensor
 from daq.devices.bench_file import parse
 from daq.devices.registry import driver_names, driver_type
-from daq.errors import BenchFileError, HuddleError
-from daq.preflight.device_check import search_description
+from daq.errors import BenchFileError, FileFault, HuddleError
+from daq.preflight.device_check import DiscoveredDevice, search_description
 from daq.transport.serial_ports import serial_ports
 from estimator.wording import listed
 from tui.application.forms.form import Field, Form
@@ -20,8 +20,6 @@ from tui.application.forms.form import Field, Form
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from daq.errors import FileFault
-    from daq.preflight.device_check import DiscoveredDevice
 
 SETTING = "setting-"
 """Before the name of a driver's setting, in the id of its field."""

@@ -21,9 +21,9 @@ from tui.application.messages import (
     PinRequested,
     ReferenceRequested,
 )
-from tui.application.state import RECORDINGS, RESULT, TEST
+from tui.application.state import RECORDINGS, RESULT, TEST, State
 from tui.application.view import MUTED, View
-from tui.runs.catalogue import catalogue
+from tui.runs.catalogue import Entry, catalogue
 from tui.wording.verdict_text import STYLES, WORDS
 
 if TYPE_CHECKING:
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
     from textual.app import ComposeResult
 
-    from tui.application.state import State
-    from tui.runs.catalogue import Entry
 
 BAD = "bold #ff6b6b"
 COLUMNS = ("started, UTC", "verdict", "length", "bench", "size", "file")

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from rich.console import Group
+from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from daq.results.comparison import compare
+from daq.results.comparison import Difference, compare
 from daq.results.facts.precision import TargetMissed
 from daq.results.vocabulary import PARTNER_WORDS
 from estimator.checks.advice import Rank
@@ -35,9 +35,6 @@ from tui.wording.verdict_text import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rich.console import RenderableType
-
-    from daq.results.comparison import Difference
     from daq.results.result import Result
     from tui.application.state import State
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from rich.console import Group
+from rich.console import Group, RenderableType
 from rich.text import Text
 from textual.binding import Binding, BindingType
 from textual.containers import VerticalScroll
@@ -21,7 +21,6 @@ from tui.output.standing import standing
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rich.console import RenderableType
     from textual.app import ComposeResult
     from textual.events import Resize
 

@@ -23,7 +23,7 @@ from tui.application.signal_view.picture import (
     name_width,
     picture,
 )
-from tui.application.state import SIGNAL
+from tui.application.state import SIGNAL, State
 from tui.application.view import MUTED, View
 from tui.wording.signal import time_of
 
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
     from daq.estimation.snapshot import Snapshot
     from tui.application.signal_view.source import SignalSource
-    from tui.application.state import State
 
 ACTIONS = {"pan", "zoom", "channel", "spectrum", "mark", "go", "cursor", "whole"}
 NOT_YET = "once the estimate is made"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.clocks.clock_model import ClockSource
+from daq.clocks.clock_model import ClockSource, ClockState
 from daq.results.clock_effect import (
     NEGLIGIBLE_EFFECT,
     NO_EFFECT,
@@ -22,7 +22,6 @@ from tui.application.test_view.curves import Line
 from tui.page.table import Cell, Table
 
 if TYPE_CHECKING:
-    from daq.clocks.clock_model import ClockState
     from daq.estimation.snapshot import Snapshot
     from daq.results.result import Result
 

@@ -13,7 +13,7 @@ from textual_plot import HiResMode, LegendLocation, PlotWidget
 from textual_plot.axis_formatter import AxisFormatter, NumericAxisFormatter
 
 from tui.application.test_view.braille import cells, joined
-from tui.application.test_view.curves import level_limits
+from tui.application.test_view.curves import Curve, Line, level_limits
 from tui.application.test_view.units import SpectrumUnit
 
 if TYPE_CHECKING:
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from textual_plot.plot_widget import LinePlot, ScatterPlot
 
     from estimator.types import FloatArray
-    from tui.application.test_view.curves import Curve, Line
 
 DOTS_PER_ROW = 4  # of a Braille character
 ROUNDING = 1e-6  # of a dot

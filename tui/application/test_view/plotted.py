@@ -11,8 +11,8 @@ import numpy as np
 from daq.results.decision.limits import concerns, mask_psd
 from estimator.levels.bands import log_edges
 from tui.application.test_view.clocks import COLOURS
-from tui.application.test_view.curves import data_curve, mask_curve, noise_curve
-from tui.application.test_view.units import units_of
+from tui.application.test_view.curves import Curve, data_curve, mask_curve, noise_curve
+from tui.application.test_view.units import SpectrumUnit, units_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from daq.results.result import Result
     from tui.application.state import State
-    from tui.application.test_view.curves import Curve
-    from tui.application.test_view.units import SpectrumUnit
 
 THIRDS, TWELFTHS = 3, 12
 """Steps to an octave."""

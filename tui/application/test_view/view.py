@@ -10,7 +10,7 @@ from textual.binding import Binding, BindingType
 from textual.reactive import var
 
 from tui.application.dialogs import TextScreen
-from tui.application.state import TEST
+from tui.application.state import TEST, State
 from tui.application.test_view.board import Board
 from tui.application.test_view.details import details
 from tui.application.test_view.plotted import Choice, moved, panned, picking, stepped, zoomed
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from textual.events import MouseScrollDown, MouseScrollUp
 
     from daq.estimation.snapshot import Snapshot
-    from tui.application.state import State
 
 
 SNAPSHOT_ACTIONS = {

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from daq.archive.density import LOWEST_DB
+from daq.archive.density import LOWEST_DB, Density
 from daq.archive.facts import facts_of_archive
 from tui.output.archive.tables import day_text
 from tui.output.console import growing
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
     from daq.archive.answers import Answer
     from daq.archive.changes import Course
-    from daq.archive.density import Density
     from daq.archive.store import Store
 
     FloatArray = NDArray[np.float64]

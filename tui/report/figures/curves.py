@@ -18,7 +18,7 @@ from daq.results.decision.limits import concerns, mask_psd
 from daq.whole_file import write_whole
 from estimator.errors import InsufficientDataError
 from estimator.levels.bands import log_edges
-from estimator.self_noise.result import Flag
+from estimator.self_noise.result import Flag, SelfNoise
 from tui.report.figures import drawing
 from tui.report.figures.drawing import look, stack, stack_height
 from tui.report.parts import Plot
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from daq.results.band_summary import BandMeans
     from daq.results.result import Result
-    from estimator.self_noise.result import SelfNoise
     from estimator.types import FloatArray
 
     BoolArray = NDArray[np.bool_]

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from daq.protocols.block import EventKind
-from daq.results.signal import CLIPPED, GAP
+from daq.results.signal import CLIPPED, GAP, Mark, Signal, Spectrogram, Trace, Waveforms
 from tui.report.figures import drawing
 from tui.report.parts import Plot
 from tui.wording.signal import extent, moment, time_ticks, title
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from daq.estimation.snapshot import Snapshot
-    from daq.results.signal import Mark, Signal, Spectrogram, Trace, Waveforms
 
 COLUMNS, TIMES, BANDS, TICKS = 1200, 160, 60, 6
 TRACE_HEIGHT, SPECTRUM_HEIGHT = 0.36, 0.7

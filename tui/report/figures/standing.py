@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.ticker import FuncFormatter, NullLocator
 
-from daq.results.standing import pair_coherence, stances
+from daq.results.standing import PairCoherence, Stance, pair_coherence, stances
 from tui.output.standing import caption, remark
 from tui.report.figures import drawing
 from tui.report.figures.curves import logarithmic
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from daq.results.result import Result
-    from daq.results.standing import PairCoherence, Stance
 
 COLUMNS, SKETCH_HEIGHT, COHERENCE_HEIGHT = 6, 0.85, 1.0
 _MOST_PAIRS = 15

@@ -9,8 +9,8 @@ from xml.sax.saxutils import escape
 from daq.bench.units import decibels
 from daq.results.change_test import DECIBEL, NORMAL_95
 from tui.page.table import Table
-from tui.service.history.series import FALSE_ALARMS, SCATTER
-from tui.service.records.run_state import utc_text
+from tui.service.history.series import FALSE_ALARMS, SCATTER, Series
+from tui.service.records.run_state import BandNoise, utc_text
 from tui.wording.formatting import level_with_error
 
 if TYPE_CHECKING:
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from tui.service.history.ledger import SensorTest
-    from tui.service.history.series import Series
-    from tui.service.records.run_state import BandNoise
 
 _WIDTH, _HEIGHT = 8.0, 2.4
 """Inches, of one sensor."""

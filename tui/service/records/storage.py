@@ -9,21 +9,19 @@ from __future__ import annotations
 
 import logging
 import shutil
-from datetime import timedelta
+from datetime import datetime, timedelta
 from typing import TYPE_CHECKING
 
 from daq.errors import HuddleError, RecordingError
 from daq.recorder.retention import remove_run
 from daq.recording.storage.locking import is_being_written
-from tui.service.records.run_state import RunState
+from tui.service.records.run_state import Run, RunState
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from datetime import datetime
     from pathlib import Path
 
     from daq.bench.model import Bench
-    from tui.service.records.run_state import Run
     from tui.service.records.store import RunStore
 
 _LOGGER = logging.getLogger(__name__)
