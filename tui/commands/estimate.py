@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,11 +21,10 @@ from tui.commands.options import (
 from tui.output.exit_codes import ExitCode
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
     from rich.console import Console
 
-    from daq.estimation.estimation import Progress
     from daq.results.decision.verdict import TestVerdict
     from daq.results.noise_parameters import ChannelNoise
     from daq.results.result import Result
@@ -151,11 +149,11 @@ def _of_foreign_files(
     from daq.formats.importer import open_files
     from daq.results.result import Result
     from tui.commands.import_ import assigned, selected, show_chosen, show_taken
-    from tui.output.console import for_people
+    from tui.output.console import counted, for_people
     from tui.runs.estimate_settings import check_fit, chosen_for_files, spanned
 
     screen = for_people(json)
-    with TemporaryDirectory(prefix="huddle-") as folder, _counted_segments() as count:
+    with TemporaryDirectory(prefix="huddle-") as folder, counted("segments", waits=True) as count:
         try:
             recording, imported = open_files(
                 files,
@@ -194,6 +192,7 @@ def estimated(
     from daq.estimation.estimation import estimate
     from daq.recording.reader import Recording
     from daq.results.result import Result
+    from tui.output.console import counted
     from tui.runs.estimate_settings import settings_of
 
     if any(map(is_foreign, files)):
@@ -202,37 +201,13 @@ def estimated(
         )
     with (
         Recording.open(files[0]) as first,  # once, for its settings and for the estimate
-        _counted_segments() as count,
+        counted("segments", waits=True) as count,
     ):
         settings = settings_of(first, start=start, end=end, **wanted)
         snapshot = estimate([first, *files[1:]], settings, progress=count)
     outline = first.outline
     bench = first.bench if whole or (outline is not None and outline.has_limits) else None
     return Result(snapshot, settings, bench, tuple(files))
-
-
-@contextmanager
-def _counted_segments() -> Iterator[Progress | None]:
-    """Show how many segments of all are taken; None where that is not shown."""
-    from tui.output.console import progress, shows_progress
-
-    if not shows_progress():
-        yield None
-        return
-    from rich.progress import (
-        BarColumn,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-
-    with progress(
-        TextColumn("segments"),
-        BarColumn(),
-        TextColumn("{task.completed} of {task.total}"),
-        TimeRemainingColumn(),
-    ) as bar:
-        task = bar.add_task("")
-        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def show_result(

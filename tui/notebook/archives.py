@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Unpack, overload
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
-from daq.archive import stations
 from daq.archive.answers import FALSE_ALARM, Answer, answer
-from daq.archive.execution import begun, carried_out, failure_of, tasks_of
+from daq.archive.execution import carried_out
 from daq.archive.plan import STRETCHES
-from daq.archive.sources import are_waveforms, folder_for, recordings_in, sort
-from daq.archive.store import Store
-from daq.archive.waveforms import Contents, Reading, stations_in
+from daq.archive.sources import are_waveforms, folder_for
 from daq.errors import ArchiveError, WrongSettingError
 from daq.estimation.settings import Settings, check_fit
 from daq.formats.sources import Selection
@@ -24,11 +21,13 @@ from daq.recording.reader import Recording
 from tui.notebook.estimates import PathLike, response_sources
 from tui.notebook.options import EstimateOptions, called, changes_of, settings_of
 from tui.notebook.recording import nanoseconds
+from tui.runs.archives import Filling, reading_of
 
 if TYPE_CHECKING:
     from datetime import datetime
 
-    from daq.archive.task import Outcome, Task
+    from daq.archive.store import Store
+    from daq.archive.waveforms import Found, Reading
     from daq.formats.channel_runs import Overlap
 
 
@@ -72,41 +71,31 @@ class _Kept:
         return replace(found, problems=(*failures, *bad, *found.problems))
 
 
+class ArchiveOptions(EstimateOptions, total=False):
+    """Keyword arguments of `archive`, which explains each."""
+
+    store: PathLike | None
+    stretch: str | None
+    jobs: int
+    time_zone: str
+    false_alarm: float
+    response: object
+    channels: Sequence[str]
+    groups: Mapping[str, str] | None
+    start: str | datetime | None
+    end: str | datetime | None
+    file_overlap: Overlap
+
+
 @overload
 def archive(
-    *sources: PathLike,
-    store: PathLike | None = None,
-    stretch: str | None = None,
-    jobs: int = 1,
-    time_zone: str = "UTC",
-    false_alarm: float = FALSE_ALARM,
-    response: object = None,
-    channels: Sequence[str] = (),
-    groups: Mapping[str, str] | None = None,
-    start: str | datetime | None = None,
-    end: str | datetime | None = None,
-    file_overlap: Overlap = "refuse",
-    by_station: Literal[False] = False,
-    **options: Unpack[EstimateOptions],
+    *sources: PathLike, by_station: Literal[False] = False, **options: Unpack[ArchiveOptions]
 ) -> Answer: ...
 
 
 @overload
 def archive(
-    *sources: PathLike,
-    store: PathLike | None = None,
-    stretch: str | None = None,
-    jobs: int = 1,
-    time_zone: str = "UTC",
-    false_alarm: float = FALSE_ALARM,
-    response: object = None,
-    channels: Sequence[str] = (),
-    groups: Mapping[str, str] | None = None,
-    start: str | datetime | None = None,
-    end: str | datetime | None = None,
-    file_overlap: Overlap = "refuse",
-    by_station: Literal[True],
-    **options: Unpack[EstimateOptions],
+    *sources: PathLike, by_station: Literal[True], **options: Unpack[ArchiveOptions]
 ) -> StationAnswers: ...
 
 
@@ -193,14 +182,23 @@ def archive(
         ) from None
     given = [os.fspath(each) for each in sources]
     folder = folder_for(given) if store is None else Path(store)
-    filling = _Filling(folder, changes_of(options), options, stretch, jobs)
+    wanted = changes_of(options)
+    filling = Filling(
+        folder,
+        stretch,
+        partial(carried_out, jobs=jobs),
+        lambda plan: plan.changed(wanted, stretch),
+        refuse=partial(_nothing, folder),
+    )
     if are_waveforms(given):
         selection = Selection(
             tuple(channels), nanoseconds("start", start), nanoseconds("end", end), file_overlap
         )
-        stores, failures = filling.by_days(
-            given, selection, _reading(response, file_overlap), groups or {}, several=by_station
-        )
+        settings, reading = settings_of(Settings(), options), _reading(response, file_overlap)
+        found, known = filling.look(given, selection, settings, list((groups or {}).items()))
+        if not by_station:
+            _check_one(station.name for station in found.stations)
+        stores, failures = filling.by_days(found, known, settings, reading)
     else:
         of_files = {"response": response, "channels": channels, "groups": groups}
         of_files |= {"start": start, "end": end}
@@ -210,9 +208,11 @@ def archive(
                 f"{', '.join(wrong)}: for waveform files, such as sds://ROOT; the sources are"
                 " recordings"
             )
-        stores, failures = filling.by_recordings([Path(each) for each in given])
+        stores, failures = filling.by_recordings(
+            [Path(each) for each in given], partial(_settings_for, options=options)
+        )
     kept = {
-        name: _Kept(each, each.plan.changed(filling.wanted, stretch), zone, false_alarm)
+        name: _Kept(each, each.plan.changed(wanted, stretch), zone, false_alarm)
         for name, each in stores.items()
     }
     if by_station:
@@ -238,108 +238,26 @@ def _reading(response: object, overlap: Overlap) -> Reading:
                 f"response of type {type(each).__name__}; expected a path: processes that take"
                 " days read the file"
             )
-    return Reading(
-        tuple(str(each.resolve()) for each in some),
-        tuple((pattern, str(path.resolve())) for pattern, path in assigned),
-        overlap,
-    )
+    return reading_of(some, assigned, overlap)
 
 
-class _Filling:
-    """Adds what is new to the archive, or archives, in a folder."""
-
-    def __init__(
-        self,
-        folder: Path,
-        wanted: Mapping[str, object],
-        options: EstimateOptions,
-        stretch: str | None,
-        jobs: int,
-    ) -> None:
-        self._folder, self._options, self._stretch, self._jobs = folder, options, stretch, jobs
-        self.wanted = wanted
-
-    def by_recordings(self, given: Sequence[Path]) -> tuple[dict[str, Store], list[str]]:
-        """Take new recordings; returns the archive by its name, and what failed."""
-        paths, folder = recordings_in(given, leave_out=self._folder), self._folder
-        kept = Store.open(folder)
-        if kept is None and not paths:
-            inside = stations.archives_in(folder)
-            found = {each.name: store for each in inside if (store := Store.open(each))}
-            if found:
-                return found, []
-        kept = kept or begun(
-            folder,
-            paths,
-            self._stretch,
-            self._settings_for,
-            lambda plan: plan.changed(self.wanted, self._stretch),
+def _nothing(folder: Path, found: Found | None) -> ArchiveError:
+    """Return the error where there is nothing to take."""
+    text = "no miniSEED files found for these channels and times"
+    if found is None:
+        text = f"{folder}: no archive there; give recordings to begin one"
+    elif found.problems:
+        text = "\n".join(found.problems)
+    elif found.alone:
+        text = (
+            f"one sensor each: {' '.join(found.alone)}; expected two or more that stand"
+            " together: groups= joins those of several stations"
         )
-        kept.plan.changed(self.wanted, self._stretch)
-        failures: list[str] = []
-        if paths:
-            with kept.writing():
-                new = sort(paths, kept.entries()[0])
-                failures += new.failures
-                failures += filter(None, map(failure_of, self._run(tasks_of(kept, new.new))))
-        return {folder.resolve().name: kept}, failures
+    return ArchiveError(text)
 
-    def by_days(
-        self,
-        given: Sequence[str],
-        selection: Selection,
-        reading: Reading,
-        groups: Mapping[str, str],
-        *,
-        several: bool,
-    ) -> tuple[dict[str, Store], list[str]]:
-        """Take new days of waveform files; returns archives of stations, and what failed."""
-        settings = settings_of(Settings(), self._options)
-        known = Contents(self._folder)
-        found = stations_in(
-            given, selection, groups=list(groups.items()), known=known, segment=settings.segment
-        )
-        if not found.stations:
-            raise ArchiveError(
-                "\n".join(found.problems)
-                or (
-                    f"one sensor each: {' '.join(found.alone)}; expected two or more that stand"
-                    " together: groups= joins those of several stations"
-                    if found.alone
-                    else "no miniSEED files found for these channels and times"
-                )
-            )
-        if not several:
-            _check_one(station.name for station in found.stations)
-        stations.check_responses(found.stations, reading)
-        stores, failures = stations.begun(
-            self._folder,
-            found.stations,
-            settings,
-            self._stretch or "hour",
-            reading=reading,
-            run=self._run,
-            check=lambda plan: plan.changed(self.wanted, self._stretch),
-        )
-        failures = [*found.problems, *failures]
-        if not stores:
-            raise ArchiveError("\n".join(failures))
-        known.save()
-        with ExitStack() as stack:
-            for each in stores.values():
-                stack.enter_context(each.writing())
-            new = stations.work(found.stations, stores, reading)
-            failures += new.failures
-            for outcome in self._run(new.tasks(stores, reading)):
-                failures += [f"{outcome.source}: {problem}" for problem in outcome.problems]
-                failures += filter(None, [failure_of(outcome)])
-        return stores, failures
 
-    def _run(self, tasks: Iterable[Task]) -> Iterator[Outcome]:
-        return carried_out(tasks, jobs=self._jobs)
-
-    def _settings_for(self, path: Path) -> Settings:
-        with Recording.open(path) as recording:
-            settings = settings_of(Settings.of(recording.bench), self._options)
-            check_fit(settings, recording.sensors, called=called)
-            return settings
+def _settings_for(path: Path, options: EstimateOptions) -> Settings:
+    with Recording.open(path) as recording:
+        settings = settings_of(Settings.of(recording.bench), options)
+        check_fit(settings, recording.sensors, called=called)
+        return settings

@@ -118,6 +118,25 @@ def shows_progress() -> bool:
     return notices().is_terminal and not notices().quiet
 
 
+@contextmanager
+def counted(
+    what: str, of: str = "", *, waits: bool = False
+) -> Iterator[Callable[[int, int], None] | None]:
+    """Show how many of something are done, and the time left; yield what is told so, or None.
+
+    From the first that is done on; from the start, if one `waits` for it.
+    """
+    if not shows_progress():
+        yield None
+        return
+    from rich.progress import BarColumn, TimeRemainingColumn  # noqa: PLC0415
+
+    done = f"{{task.completed}} of {{task.total}} {of}".rstrip()
+    with progress(what, BarColumn(), done, TimeRemainingColumn()) as bar:
+        task = bar.add_task("", total=None, visible=waits)
+        yield lambda done, total: bar.update(task, completed=done, total=total, visible=True)
+
+
 def progress(*columns: str | ProgressColumn, per_second: float = 2) -> Progress:
     """Return a display of how far something is, where `shows_progress`.
 
