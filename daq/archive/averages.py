@@ -142,7 +142,7 @@ class Estimator:
                 self.dims,
                 self.channels,
                 dimensions=estimates.dimensions,
-                faulty={*average.clipped, *average.stood_still},
+                faulty={*average.counts.faulty, *average.stood_still},
                 axes=axes,
                 aligned=_aligned(average.residual),
             )
@@ -151,7 +151,7 @@ class Estimator:
                 edges,
                 bands=(band,),
                 dims=self.dims,
-                counts=CountLimits(average.clipped),
+                counts=average.counts,
                 stood_still=average.stood_still,
             ).added_to(diagnostics)
         snapshot = Snapshot(
@@ -204,7 +204,7 @@ class Average:
         self.elapsed = 0.0
         self.closed = True
         self.left_out: Counter[Reason] = Counter()
-        self.clipped: dict[int, float] = {}
+        self.counts = CountLimits()
         self.stood_still: dict[int, float] = {}
         self.shortened: dict[str, tuple[float, float]] = {}
 
@@ -237,8 +237,7 @@ class Average:
         self.elapsed += described.elapsed
         self.closed &= described.origin.closed
         self.left_out.update(described.left_out)
-        for column, share in described.clipped.items():
-            self.clipped[column] = max(share, self.clipped.get(column, 0.0))
+        self.counts = self.counts.joined(described.counts)
         for column, seconds in described.stood_still.items():
             self.stood_still[column] = seconds + self.stood_still.get(column, 0.0)
         for sensor, (late, early) in described.shortened.items():

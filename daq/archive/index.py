@@ -18,6 +18,7 @@ import numpy as np
 from daq.archive.rollup import month_of
 from daq.archive.spectra_file import Described, Origin
 from daq.recording.file_format import channel_attributes, channels_of, texts
+from estimator.checks.count_limits import CountLimits
 from estimator.spectra.segment_rejection import Reason
 
 if TYPE_CHECKING:
@@ -131,7 +132,7 @@ class Index:
                 origin=Origin(**found.pop("origin")),
                 channels=self._channels[found.pop("channels")],
                 left_out={Reason(k): v for k, v in found.pop("left_out").items()},
-                clipped={int(k): v for k, v in found.pop("clipped").items()},
+                counts=CountLimits.from_tables(found.pop("counts")),
                 stood_still={int(k): v for k, v in found.pop("stood_still").items()},
                 lacking={int(k): v for k, v in found.pop("lacking").items()},
                 shortened={k: (v[0], v[1]) for k, v in found.pop("shortened").items()},
@@ -155,6 +156,7 @@ class Index:
         self._texts[key] = channels
         document = {each.name: getattr(described, each.name) for each in fields(described)} | {
             "origin": asdict(described.origin),
+            "counts": asdict(described.counts),
             "channels": key,
             "start_utc_ns": entry.start_utc_ns,
             "n_segments": entry.n_segments,

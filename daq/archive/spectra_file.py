@@ -13,7 +13,7 @@ import contextlib
 import hashlib
 import itertools
 import json
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -25,6 +25,7 @@ from daq.recording.storage.packing import check_chunks
 from daq.recording.storage.refusals import dataset, member, number, text
 from daq.recording.storage.whole_hdf5 import WholeHdf5, little_endian
 from daq.whole_file import replaced
+from estimator.checks.count_limits import CountLimits
 from estimator.spectra.segment_rejection import Reason
 
 if TYPE_CHECKING:
@@ -99,7 +100,9 @@ class Described:
         What is left between clocks, in seconds rms, by sensor.
     not_understood : tuple of str
         Sensors whose clock is not understood.
-    clipped, stood_still : mapping of int to float
+    counts : CountLimits
+        What counts show of their limits; earlier versions kept `clipped` only.
+    stood_still : mapping of int to float
         As in `daq.estimation.snapshot.SnapshotDiagnostics`.
     lacking : mapping of int to int
         Segments that other channels have and a channel lacks, by its column: they are not kept.
@@ -118,7 +121,7 @@ class Described:
     left_out: Mapping[Reason, int] = field(default_factory=dict)
     residual: Mapping[str, float] = field(default_factory=dict)
     not_understood: tuple[str, ...] = ()
-    clipped: Mapping[int, float] = field(default_factory=dict)
+    counts: CountLimits = field(default_factory=CountLimits)
     stood_still: Mapping[int, float] = field(default_factory=dict)
     lacking: Mapping[int, int] = field(default_factory=dict)
     shortened: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -273,7 +276,7 @@ class SpectraWriter:
                 "left_out": json.dumps({str(k): v for k, v in described.left_out.items()}),
                 "residual": json.dumps(dict(described.residual)),
                 "not_understood": json.dumps(dict.fromkeys(described.not_understood, True)),
-                "clipped": json.dumps(dict(described.clipped)),
+                **{name: json.dumps(each) for name, each in asdict(described.counts).items()},
                 "stood_still": json.dumps(dict(described.stood_still)),
                 "simulated": int(described.simulated),
                 "lacking": json.dumps(dict(described.lacking)),
@@ -346,7 +349,9 @@ class SpectraFile:
             left_out={Reason(k): int(v) for k, v in _table(attributes, "left_out").items()},
             residual={k: float(v) for k, v in _table(attributes, "residual").items()},
             not_understood=tuple(_table(attributes, "not_understood", optional=True)),
-            clipped={int(k): float(v) for k, v in _table(attributes, "clipped").items()},
+            counts=CountLimits.from_tables(
+                {k.name: _table(attributes, k.name, optional=True) for k in fields(CountLimits)}
+            ),
             stood_still={int(k): float(v) for k, v in _table(attributes, "stood_still").items()},
             simulated=bool(attributes.get("simulated", 0)),
             lacking={

@@ -18,8 +18,8 @@ No question needs the full scale of a device; each has evidence that ordinary si
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -165,10 +165,44 @@ class CountLimits:
             {n: one for n, one in known.items() if one is not None and not one.are_complete},
         )
 
+    @classmethod
+    def from_tables(cls, tables: Mapping[str, Mapping[Any, Any]]) -> Self:
+        """Return the limits of which `dataclasses.asdict` made `tables`; keys may be texts."""
+        clipped, wrapped, repeated, codes = (
+            {int(column): one for column, one in tables[each.name].items()} for each in fields(cls)
+        )
+        return cls(
+            {n: float(share) for n, share in clipped.items()},
+            {n: Wraps(**one) for n, one in wrapped.items()},
+            {n: float(share) for n, share in repeated.items()},
+            {
+                n: Codes(**one | {"stuck_bits": tuple(one["stuck_bits"])})
+                for n, one in codes.items()
+            },
+        )
+
     @property
     def faulty(self) -> set[int]:
         """Columns whose noise is wrong."""
         return {*self.clipped, *self.wrapped, *self.repeated}
+
+    def of_columns(self, known: Mapping[int, int]) -> CountLimits:
+        """Return the limits of the columns `known`, each by its new number."""
+        return CountLimits(
+            {known[n]: one for n, one in self.clipped.items() if n in known},
+            {known[n]: one for n, one in self.wrapped.items() if n in known},
+            {known[n]: one for n, one in self.repeated.items() if n in known},
+            {known[n]: one for n, one in self.codes.items() if n in known},
+        )
+
+    def joined(self, other: CountLimits) -> CountLimits:
+        """Return the limits of both: the larger shares, and of wraps and codes those of `self`."""
+        clipped, repeated = (
+            {n: max(one.get(n, 0.0), two.get(n, 0.0)) for n in {**one, **two}}
+            for one, two in ((self.clipped, other.clipped), (self.repeated, other.repeated))
+        )
+        wrapped, codes = {**other.wrapped, **self.wrapped}, {**other.codes, **self.codes}
+        return CountLimits(clipped, wrapped, repeated, codes)
 
 
 def share_at_ends(counts: NDArray[Any], ordered: NDArray[Any] | None = None) -> float:

@@ -13,7 +13,7 @@ from daq.protocols.block import BlockFlag
 from estimator.checks.count_limits import CountLimits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -52,7 +52,7 @@ def limits_by_column(
     Of several recordings the largest share, and the first wraps and codes.
     """
     columns = {(sensor, channel.name): column for column, (sensor, channel) in enumerate(channels)}
-    whole = CountLimits({}, {}, {}, {})
+    whole = CountLimits()
     for recording in recordings:
         for record in recording.sensors:
             known = {
@@ -60,25 +60,8 @@ def limits_by_column(
                 for n, channel in enumerate(record.channels)
                 if (record.name, channel.name) in columns
             }
-            found = limits_of(record)
-            whole = CountLimits(
-                _largest(whole.clipped, found.clipped, known),
-                {known[n]: one for n, one in found.wrapped.items() if n in known}
-                | dict(whole.wrapped),
-                _largest(whole.repeated, found.repeated, known),
-                {known[n]: one for n, one in found.codes.items() if n in known} | dict(whole.codes),
-            )
+            whole = whole.joined(limits_of(record).of_columns(known))
     return whole
-
-
-def _largest(
-    before: Mapping[int, float], shares: Mapping[int, float], known: Mapping[int, int]
-) -> dict[int, float]:
-    found = dict(before)
-    for n, share in shares.items():
-        if n in known:
-            found[known[n]] = max(share, found.get(known[n], 0.0))
-    return found
 
 
 def in_clipped_blocks(

@@ -24,9 +24,11 @@ from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from datetime import datetime
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
     from daq.archive.task import Task
 
@@ -49,11 +51,13 @@ def record(
     unit: str = "m/s²",
     absent: Mapping[str, Sequence[tuple[int, int, int]]] = MappingProxyType({}),
     late: Mapping[str, int] = MappingProxyType({}),
+    device: Callable[[str, NDArray[np.int32]], NDArray[np.int32]] = lambda _, counts: counts,
 ) -> Path:
     """Write a recording: one motion, noise of its own in each sensor.
 
     `absent` has columns and their first and last rows without samples, by sensor; `late` the
     rows before a sensor begins.
+    `device` returns what a sensor makes of its counts.
     Where `free`, times come from arrivals only, so that clocks have to be estimated.
     """
     rng = np.random.default_rng(seed)
@@ -74,6 +78,7 @@ def record(
     with ArrayWriter(path, None, sensors=layouts, created=HostTime(begin_ns, begin_ns)) as writer:
         for name in names:
             counts = np.rint(motion + noise * rng.normal(size=motion.shape)).astype("<i4")
+            counts = device(name, counts)
             block_rows = 600 if free else 4096
             begin = late.get(name, 0)
             rows = [*range(begin, n, block_rows), n]

@@ -375,6 +375,31 @@ def test_recordings_whose_clocks_are_not_understood_are_left_out(
     np.testing.assert_array_equal(found.levels.mean, only.levels.mean)
 
 
+def _at_limits(name: str, counts: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Clip A.X, wrap A.Y at ten bits, and repeat every second row of B."""
+    if name == "A":
+        x, y = counts.T
+        return np.column_stack([x.clip(-600, 600), (y + 512) % 1024 - 512])
+    return counts[np.arange(len(counts)) // 2 * 2] if name == "B" else 3 * counts
+
+
+def test_what_counts_show_of_their_limits_is_kept(tmp_path: Path) -> None:
+    paths = [
+        record(tmp_path / "limits.h5", device=_at_limits),
+        record(tmp_path / "fine.h5", begin_ns=START_NS + 9 * HOUR_NS),
+    ]
+    store = store_for(tmp_path / "store", paths[0])
+    assert fill(store, paths) == []
+    counts = estimate(paths, SETTINGS).diagnostics.counts
+    assert (list(counts.clipped), list(counts.repeated)) == ([0], [2, 3])
+    assert {n: each.bits for n, each in counts.wrapped.items()} == {1: 10}
+    assert {n: each.step for n, each in counts.codes.items()} == {4: 3, 5: 3}
+    for _ in range(2):  # from the files, then from the index
+        pooled = answer(store, store.entries()[0], SETTINGS).pooled
+        assert pooled.diagnostics.counts == counts
+        assert pooled.diagnostics.faulty == {0, 1, 2, 3}
+
+
 @pytest.mark.parametrize("reject", [False, True])
 def test_segments_that_a_channel_lacks_are_named(tmp_path: Path, *, reject: bool) -> None:
     n, third = round(0.9 * 3600 * RATE), round(0.3 * 3600 * RATE)
