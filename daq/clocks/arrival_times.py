@@ -141,6 +141,7 @@ _FLOOR = 1e-7  # seconds; no delay is known better than the curve between nodes 
 _WELL_KNOWN = 0.02  # samples to which delays must be known to be of use
 _UTC_JUMP = 0.01  # samples
 _SET = 0.5  # samples by which a clock is set at least
+_TIME_NS = 10**18  # a counter beyond is a time in ns: no device counts samples or ticks so far
 _DRIFT = 1e-4  # by which a sampling clock may run off its rate
 _LEAST_SPAN = 60.0  # seconds of arrivals by which a rate is known
 _LEAP = 1e-3  # seconds; how well a step must agree with a leap second
@@ -192,6 +193,8 @@ class ArrivalTimes:
     _sleep: HostSleep = field(init=False)
     _leapt: float = 0.0
     _stated: list[_Stated] = field(default_factory=list)
+    _set_by: list[tuple[int, float]] = field(default_factory=list)  # of a device without UTC
+    _ahead: FloatArray = field(default_factory=lambda: np.zeros(1))  # of the time of its last block
     _latency: FloatArray = field(default_factory=lambda: np.empty(0))  # least of each epoch
     _line: tuple[float, list[float]] | None = None  # what `_lines` found, until more arrives
     _unmeasured: Clock | None = None  # what `solve` found, until more arrives
@@ -231,6 +234,7 @@ class ArrivalTimes:
             breaks = self._breaks_of_utc(first, length, late, flags=flags, latency=latency)
         else:
             breaks = self._sleep.breaks(index, late, (flags & int(_BREAKS)) != 0)
+            self._take_set(first, length, flags, blocks["device_counter"].astype(np.int64))
         breaks[0] |= begins
         epoch = len(self._epoch_starts) - 1 + np.cumsum(breaks)
         self._epoch_starts += [int(start) for start in first[breaks]]
@@ -268,9 +272,7 @@ class ArrivalTimes:
         begins = not self._epoch_starts
         late -= self._leapt
         step = np.diff(late, prepend=late[:1] if begins else self._late[-1:])
-        counted_on = first == np.append(self._end_sample, (first + length)[:-1])
-        was_set = counted_on & ((flags & int(_BREAKS)) == int(BlockFlag.CLOCK_RESTART))
-        was_set &= np.abs(step) > _SET / self.sampling_rate
+        counted_on, was_set = self._was_set(first, length, flags, step)
         leaps = np.where(counted_on & (np.abs(np.abs(step) - 1) < _LEAP), np.round(step), 0.0)
         leaps = np.where(was_set, step, leaps)
         self._take_stated(first, was_set, step, latency)
@@ -280,6 +282,24 @@ class ArrivalTimes:
         drift = _DRIFT * np.maximum(length, np.append(length[:1], length[:-1]))
         unsure = ~counted_on & ((flags & int(BlockFlag.MISSING_ESTIMATED)) != 0)
         return np.asarray(unsure | (np.abs(step) > (_UTC_JUMP + drift) / self.sampling_rate))
+
+    def _was_set(
+        self, first: IntArray, length: IntArray, flags: IntArray, step: FloatArray
+    ) -> tuple[BoolArray, BoolArray]:
+        """Return which blocks follow without a gap, and before which of them a clock was set."""
+        counted_on = first == np.append(self._end_sample, (first + length)[:-1])
+        was_set = counted_on & ((flags & int(_BREAKS)) == int(BlockFlag.CLOCK_RESTART))
+        return counted_on, was_set & (np.abs(step) > _SET / self.sampling_rate)
+
+    def _take_set(
+        self, first: IntArray, length: IntArray, flags: IntArray, counter: IntArray
+    ) -> None:
+        """Take how the clock was set of a device whose times are recorded, but are no UTC."""
+        ahead = (counter - self.origin_utc_ns) * _NANO - first / self.sampling_rate
+        step = np.diff(ahead, prepend=self._ahead if self._epoch_starts else ahead[:1])
+        was_set = self._was_set(first, length, flags, step)[1] & (counter > _TIME_NS)
+        self._set_by += zip(first[was_set].tolist(), step[was_set].tolist(), strict=True)
+        self._ahead = ahead[-1:]
 
     def _take_stated(
         self, first: IntArray, was_set: BoolArray, step: FloatArray, latency: FloatArray
@@ -296,7 +316,7 @@ class ArrivalTimes:
             last.latency = min(last.latency, float(latency[begin:end].min(initial=math.inf)))
 
     def settings(self, clock: Clock) -> tuple[ClockSetting, ...]:
-        """Return when, and by how much, the clock that states UTC was set.
+        """Return when, and by how much, the clock that states times was set.
 
         Seen by the driver while samples were counted, or between epochs by the motion, which gave
         `clock`.
@@ -304,8 +324,8 @@ class ArrivalTimes:
         found = [
             (after.first_sample, after.ahead - before.ahead)
             for before, after in itertools.pairwise(self._stated)
-        ]
-        if clock.state.refined:
+        ] + self._set_by
+        if clock.state.refined and self._device_utc:
             stated = self.solve(clock.state.sensor)
             for start in self.restarts.tolist():
                 edge = np.array([start - 1.0, start])

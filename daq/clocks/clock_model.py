@@ -214,7 +214,7 @@ class ClockState:
     slips : tuple of Uncounted
         Samples lost, or repeated, without being counted; the clock allows for them.
     settings : tuple of ClockSetting
-        Steps of the stated UTC; the clock does not follow them.
+        Steps of the stated times; the clock does not follow them.
     """
 
     sensor: str

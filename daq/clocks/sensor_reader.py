@@ -369,7 +369,7 @@ class SensorSource:
         clock = clock.without(self.slips)
         clock = replace(clock, state=replace(clock.state, slips=self._dated(clock)))
         if self.disproved is None or not clock.state.refined:
-            return clock
+            return self._with_settings(clock)
         return self._with_settings(corrected(self.disproved.solve(name), clock, moved=0.0))
 
     def _with_settings(self, clock: Clock) -> Clock:

@@ -99,7 +99,7 @@ class SampleIndexer:
             reason = self._reason or block.reason or "restart"
             self._reason = ""
             flags = block.flags | BlockFlag.CLOCK_RESTART
-            if estimated and missing:
+            if estimated:  # also where none is known to be missing
                 flags |= BlockFlag.MISSING_ESTIMATED
             return self._placed(replace(block, flags=flags), reason, estimated=estimated)
         if self._offset is None:

@@ -122,7 +122,7 @@ class StatedTimesUnchecked(Fact):
 
 @record
 class ClockSet(Fact):
-    """The clock by which a sensor states UTC was set; its count is the clock."""
+    """The clock by which a sensor states times was set; its samples count on."""
 
     name: ClassVar[str] = "clock-set"
     settings: tuple[ClockSetting, ...]

@@ -14,6 +14,8 @@ import pytest
 
 from daq.bench.channel import Channel
 from daq.devices.seedlink.decoder import SeedLinkDecoder, Selection
+from daq.devices.text.decoder import TextDecoder
+from daq.devices.text.format import RASPBERRY_SHAKE, TextFormat
 from daq.errors import CannotAlignError
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
@@ -22,14 +24,18 @@ from daq.recorder.block_writer import BlockWriter
 from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
 from daq.recording.writer import RecordingWriter
+from daq.results.facts.clocks import ClockSet, facts_of_clocks
 from daq.results.result import Result
 from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, create
 from tests.peers.digitizer import CODES, START, Digitizer, seedlink
+from tests.peers.text_logger import CHANNELS as TEXT_CHANNELS
+from tests.peers.text_logger import TextLogger
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from daq.protocols.block import Block, Event
+    from daq.estimation.snapshot import Snapshot
+    from daq.protocols.block import DeviceItem
 
 RATE, SECONDS, SNR = 100, 240.0, 1e3
 SETTINGS = Settings(segment=4.0, methods=("three-sensor",))
@@ -48,6 +54,55 @@ def arrival(seconds: float) -> HostTime:
     return HostTime(5_000_000_000_000 + round(seconds * 1e9), utc)
 
 
+def estimated(path: Path, items: list[DeviceItem]) -> Snapshot:
+    """Record what drivers yield, and estimate."""
+    layouts = [SensorLayout(name, CHANNELS, RATE, np.dtype(np.int32)) for name in "ABC"]
+    file = RecordingWriter.create(path, sensors=layouts, created=arrival(0))
+    writer = BlockWriter(file, dict.fromkeys("ABC", float(RATE)))
+    arrived = sorted(items, key=lambda item: item.received.monotonic_ns)
+    writer.write([*arrived])
+    writer.close(arrival(SECONDS + 1), "the end")
+    return estimate([path], SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("size", "packets"),
+    [
+        (-0.5, True),
+        (3600.0, False),
+        *(pytest.param(s, p, marks=pytest.mark.long) for s in (-20.0, 0.3) for p in (True, False)),
+    ],
+)
+def test_a_result_names_when_the_clock_of_a_text_logger_was_set(
+    tmp_path: Path, size: float, *, packets: bool
+) -> None:
+    """Rows and datacast, whose times are not their clock."""
+    items: list[DeviceItem] = []
+    for name, samples in zip("ABC", counts(3, round(SECONDS * RATE)), strict=True):
+        logger = TextLogger(SECONDS, steps=((100.0, size),) if name == "B" else (), seed=ord(name))
+        logger.samples = samples
+        if packets:
+            shake = replace(RASPBERRY_SHAKE, channel_names=TEXT_CHANNELS)
+            decoder, sent = TextDecoder(name, shake, sampling_rate=RATE), logger.packets()
+            receive = decoder.receive_datagram
+        else:
+            rows = TextFormat(columns=(1, 2, 3), time_column=0, whole=True)
+            decoder, sent = TextDecoder(name, rows, sampling_rate=RATE), logger.rows()
+            receive = decoder.receive
+        for data, seconds in sent:
+            items += receive(data, arrival(seconds))
+    snapshot = estimated(tmp_path / "r.h5", items)
+    (fact,) = [each for each in facts_of_clocks(snapshot) if isinstance(each, ClockSet)]
+    (setting,) = fact.settings
+    assert fact.sensors == ("B",)
+    assert setting.step == pytest.approx(size, abs=1e-3)
+    assert (setting.utc_ns - arrival(100.0).utc_ns) * 1e-9 == pytest.approx(0, abs=0.3)
+    true = 2 * (30_000**2 / SNR) / RATE
+    for mean in Result(snapshot, SETTINGS).means("three-sensor", (1.0, 40.0)):
+        assert mean.low[0] < 1.1 * true
+        assert mean.high[0] > true / 1.1
+
+
 @pytest.mark.parametrize(
     "steps",
     [
@@ -60,11 +115,7 @@ def arrival(seconds: float) -> HostTime:
 def test_noise_is_right_where_clocks_of_digitizers_are_set(
     tmp_path: Path, steps: dict[str, tuple[tuple[float, float], ...]]
 ) -> None:
-    path = tmp_path / "r.h5"
-    layouts = [SensorLayout(name, CHANNELS, RATE, np.dtype(np.int32)) for name in "ABC"]
-    file = RecordingWriter.create(path, sensors=layouts, created=arrival(0))
-    writer = BlockWriter(file, dict.fromkeys("ABC", float(RATE)))
-    items: list[Block | Event] = []
+    items: list[DeviceItem] = []
     for name, samples in zip("ABC", counts(3, round(SECONDS * RATE)), strict=True):
         digitizer = Digitizer(SECONDS, RATE, steps=steps.get(name, ()), seed=ord(name))
         digitizer.samples = samples
@@ -72,10 +123,7 @@ def test_noise_is_right_where_clocks_of_digitizers_are_set(
         decoder = SeedLinkDecoder({name: chosen}, {name: np.dtype(np.int32)}, hold=10.0)
         for sent in digitizer.records():
             items += decoder.receive(seedlink(sent, RATE, sent.number), arrival(sent.arrival))
-    arrived: list[Block | Event] = sorted(items, key=lambda item: item.received.monotonic_ns)
-    writer.write(arrived)
-    writer.close(arrival(SECONDS + 1), "the end")
-    snapshot = estimate([path], SETTINGS)
+    snapshot = estimated(tmp_path / "r.h5", items)
     means = Result(snapshot, SETTINGS).means("three-sensor", (1.0, 40.0))
     true = 2 * (30_000**2 / SNR) / RATE
     for mean in means:

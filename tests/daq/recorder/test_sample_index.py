@@ -68,6 +68,16 @@ def test_a_new_session_is_placed_by_host_time() -> None:
     assert follows.block.first_sample == 530
 
 
+def test_that_nothing_is_missing_before_a_new_session_is_an_estimate() -> None:
+    continuity = SampleIndexer(RATE)
+    continuity.place(block(0, 10, 0.1))
+    continuity.new_session("disconnected")
+    placed = continuity.place(block(0, 10, 0.2))
+    assert (placed.gap, placed.block and placed.block.first_sample) == (None, 10)
+    assert placed.block is not None
+    assert BlockFlag.MISSING_ESTIMATED in placed.block.flags
+
+
 def test_a_resumed_session_continues_the_index_of_the_last() -> None:
     continuity = SampleIndexer(RATE)
     continuity.place(block(0, 10, 0.1))
