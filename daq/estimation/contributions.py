@@ -41,6 +41,8 @@ MOST_SHARED = 0.99
 """Part of its noise that a channel shares at most."""
 MUCH_CHANGED = 0.1
 """Share of the noise that changes of responses may be, from which all of it may be."""
+MUCH_LEAKS = 0.5
+"""Share of the noise that leakage at the edges of segments may be, from which all of it may be."""
 MUCH_NONLINEAR = 0.05
 """Share of the noise from which squares and cubes of the motion delay a result, and from which
 terms of other forms may be all of the rest."""
@@ -63,7 +65,8 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
         below, above = (0.0 if each is None else each for each in (clocks, missing))
         found.append(contribution(Source.CLOCKS, shape, below=below, above=above))
     if diagnostics.edge_leakage is not None:
-        most = np.minimum(diagnostics.edge_leakage.most, psd)
+        most = diagnostics.edge_leakage.most
+        most = np.where(most > MUCH_LEAKS * psd, psd, most)
         found.append(contribution(Source.EDGES, shape, below=most))
     if snapshot.bridged is not None:
         leakage = np.nan_to_num(snapshot.bridged.leakage)

@@ -93,13 +93,16 @@ class ChannelResponses:
     coherence: FloatArray
 
     def slopes(self) -> ComplexArray:
-        """Return ``D' / D`` per Hz, by central differences, with the shape of `ratio`."""
+        """Return ``D' / D`` per Hz, by central differences, with the shape of `ratio`.
+
+        ``D'`` of the first known frequency is that of the next.
+        """
         f, ratio = self.frequency, self.ratio
         slopes = np.full_like(ratio, np.nan)
-        width = (f[2:] - f[:-2])[:, None, None]
+        slopes[1:-1] = (ratio[2:] - ratio[:-2]) / (f[2:] - f[:-2])[:, None, None]
+        slopes[:-1] = np.where(np.isnan(slopes[:-1]), slopes[1:], slopes[:-1])
         with np.errstate(invalid="ignore", divide="ignore"):
-            slopes[1:-1] = (ratio[2:] - ratio[:-2]) / width / ratio[1:-1]
-        return slopes
+            return np.asarray(slopes / ratio)
 
     def leakage(
         self, motion_psd: FloatArray, factor: float, *, n_effective: float
