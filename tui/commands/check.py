@@ -37,8 +37,10 @@ if TYPE_CHECKING:
 $ huddle check lab.toml
 Bench file lab.toml: no errors.
 ✓ ports         every sensor answers and sends samples
-✓ identity      the serial numbers are those of the bench file
-✗ sensitivities A reads 0.102 of B and C: correct its sensitivity
+? identity      not checked, because the bench file has no serial number of A,
+                B and C: huddle check --write adds it
+✗ sensitivities A.X reads 0.102 of B and C (g in place of m/s², or the
+                reverse): correct its sensitivity
 
 ✓ is right, ✗ must be corrected before a test, ? needs more to decide.""",
 )
