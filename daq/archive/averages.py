@@ -171,7 +171,7 @@ class Estimator:
             clocks=(),
             drift=np.empty((0, 1 + len(self.dims))),
             closed=average.closed,
-            left_out={reason: average.left_out[reason] for reason in Reason},
+            left_out={reason: average.left_out.get(reason, 0) for reason in Reason},
             diagnostics=diagnostics,
             across_axes=axes,
             rounding=ROUNDING if average.is_rounded else 0.0,

@@ -1,9 +1,10 @@
-"""Durations as people write them: ``10s``, ``90 min``, ``1.5h``, ``2d 12h``."""
+"""Durations as people write them: ``10s``, ``90 min``, ``1.5h``, ``2d 12h``; instants."""
 
 from __future__ import annotations
 
 import math
 import re
+from datetime import UTC, datetime, timedelta
 
 _SECONDS = {
     "ms": 1e-3,
@@ -71,3 +72,41 @@ def format_duration(seconds: float) -> str:
         if count:
             parts.append(f"{count}{unit}")
     return "".join(parts)
+
+
+def instant(text: str, created: datetime) -> datetime:
+    """Return a UTC time, or a time after the start of the recording, as an instant.
+
+    Raises
+    ------
+    ValueError
+        With what was expected.
+    """
+    try:
+        return created + timedelta(seconds=parse_duration(text, zero=True))
+    except ValueError:
+        pass
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        raise ValueError(
+            f"{text!r}: expected UTC as in 2026-11-21T03:00:00, or a time after the start as in 2h"
+        ) from None
+    return moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+
+
+def stretch(text: str, created: datetime) -> tuple[datetime, datetime]:
+    """Return start and end of a stretch of a recording, such as ``0s/60s``, as instants.
+
+    Raises
+    ------
+    ValueError
+        With what was expected.
+    """
+    begin, slash, end = text.partition("/")
+    if not slash:
+        raise ValueError(f"{text!r}: expected START/END, such as 0s/60s")
+    found = instant(begin, created), instant(end, created)
+    if found[0] >= found[1]:
+        raise ValueError(f"{text!r}: expected a start before the end, in the same form")
+    return found

@@ -169,6 +169,20 @@ class EstimateSettings:
             read=values.to_number,
         ),
     ] = 0.6
+    exclude: Annotated[
+        tuple[str, ...],
+        Option(
+            "Stretch of time of which no segment is used, such as a lorry that passed: two instants"
+            " in UTC, or two times after the start of the recording (0s/60s); may be repeated.",
+            check=values.stretches,
+            flags=("--exclude",),
+            metavar="START/END",
+            read=list,
+            show=list,
+            text=list,
+            repeated=True,
+        ),
+    ] = ()
     linearise: Annotated[
         bool,
         Option(

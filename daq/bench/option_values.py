@@ -8,6 +8,9 @@ A check takes a value of the bench file and returns the value of the setting. Wh
 import difflib
 import math
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+
+from daq.bench.durations import stretch
 
 METHODS = (
     *("auto", "two-channel", "three-channel", "three-sensor", "maximum-likelihood"),
@@ -215,6 +218,14 @@ def pairs(value: object) -> tuple[tuple[str, str], ...]:
     if len(found) < len(given) or any(len(set(each)) != 2 for each in found):
         raise ValueError('expected pairs of sensors, such as [["A", "B"]] or A:B')
     return tuple((each[0], each[1]) for each in found)
+
+
+def stretches(value: object) -> tuple[str, ...]:
+    """Return stretches of time, as they are given."""
+    given = value if isinstance(value, (list, tuple)) else [value]
+    for each in given:
+        stretch(str(each), datetime.fromtimestamp(0, UTC))
+    return tuple(map(str, given))
 
 
 def to_gains(texts: Sequence[str]) -> dict[str, float]:

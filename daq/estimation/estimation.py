@@ -51,6 +51,7 @@ from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError, Snapshot
 from daq.estimation.snapshot_builder import DIAGNOSIS_SHARE, SnapshotBuilder, keep_few, why_nothing
+from daq.recording.interface import created_at
 from estimator.checks.shared_noise import MAX_CHANNELS
 
 if TYPE_CHECKING:
@@ -173,7 +174,8 @@ class Estimation:
                 self._recordings.append(open_another(path, self._recordings))
             self._open_continuations()
             first = self._recordings[0]
-            self.settings = Settings.of(first.outline) if settings is None else settings
+            wanted = Settings.of(first.outline) if settings is None else settings
+            self.settings = wanted.at(created_at(first))
             self._sensors = live_sensors(first, self.settings) if live else None
             self._sensors = self._sensors or that_sent(self._recordings)
             self._passes = [self._pass(recording) for recording in self._recordings]

@@ -140,7 +140,7 @@ def check_same(passes: Sequence[Pass]) -> None:
 
 
 def check_span(passes: Sequence[Pass], settings: Settings) -> None:
-    """Refuse a start and an end between which no recording has a segment.
+    """Refuse a start and an end between which no recording has a segment; exclusion of nothing.
 
     Raises
     ------
@@ -158,6 +158,11 @@ def check_span(passes: Sequence[Pass], settings: Settings) -> None:
             f"{', '.join(wanted)}: not one segment of {settings.segment:g} s lies there: "
             + "; ".join(covered)
         )
+    for number, text in enumerate(settings.exclude):
+        spans = [(each.chosen()[number], each.aligned.n_available) for each in passes]
+        if covered and all(after <= 0 or first >= n for (first, after), n in spans):
+            begin, end = (_utc(datetime.fromisoformat(at).timestamp()) for at in text.split("/"))
+            raise WrongSettingError(f"exclude {begin}/{end}: nothing there: {'; '.join(covered)}")
 
 
 def _twice(path: Path, other: ReadableRecording) -> WrongSettingError:

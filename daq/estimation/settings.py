@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.bench.durations import parse_duration
+from daq.bench.durations import stretch
 from daq.bench.estimate_settings import EstimateSettings
 from daq.bench.option_fit import misfits
 from daq.errors import WrongSettingError
@@ -20,6 +19,7 @@ from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
+    from datetime import datetime
 
     from daq.bench.model import Bench, Sensor
     from daq.bench.outline import BenchOutline
@@ -56,6 +56,12 @@ class Settings(EstimateSettings):
     start: datetime | None = None
     end: datetime | None = None
     sampling_rate: float | None = None
+
+    def at(self, created: datetime) -> Settings:
+        """Return settings that exclude instants, of a recording that began at `created`."""
+        stretches = (stretch(each, created) for each in self.exclude)
+        instants = tuple(f"{begin.isoformat()}/{end.isoformat()}" for begin, end in stretches)
+        return replace(self, exclude=instants)
 
     def for_sensors(self, dims: tuple[int, ...]) -> Settings:
         """Return settings with a method in place of ``auto``, by the channels of each sensor.
@@ -184,24 +190,3 @@ def check_fit(
         raise ConflictingOptionError(
             f"{called(misfit.name)} {misfit.value}: {misfit.expected}", misfit.name
         )
-
-
-def instant(text: str, created: datetime) -> datetime:
-    """Return a UTC time, or a time after the start of the recording, as an instant.
-
-    Raises
-    ------
-    ValueError
-        With what was expected.
-    """
-    try:
-        return created + timedelta(seconds=parse_duration(text, zero=True))
-    except ValueError:
-        pass
-    try:
-        moment = datetime.fromisoformat(text)
-    except ValueError:
-        raise ValueError(
-            f"{text!r}: expected UTC as in 2026-11-21T03:00:00, or a time after the start as in 2h"
-        ) from None
-    return moment if moment.tzinfo else moment.replace(tzinfo=UTC)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
@@ -146,6 +147,11 @@ class _With:
 
     def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - as the object has it
         return getattr(self._of, name)
+
+
+def created_at(recording: ReadableRecording) -> datetime:
+    """Return the start of a recording, by the clock of the computer."""
+    return datetime.fromtimestamp(recording.created_at.utc_ns * 1e-9, UTC)
 
 
 def at_rates(recording: ReadableRecording, rates: Mapping[str, float]) -> ReadableRecording:

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
 
-GAP, CLIPPED = "gap", "clipped"
+GAP, CLIPPED, EXCLUDED = "gap", "clipped", "excluded"
 """Kinds of marks beside those of events."""
 LEAST_PARTS = 6
 """Parts of time in a span, from which a spectrogram is made of them."""

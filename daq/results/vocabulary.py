@@ -43,6 +43,7 @@ REASONS: Mapping[Reason, str] = {
     Reason.GAP: "where a sensor has a gap",
     Reason.CLIPPED: "where a sensor is at the end of its range",
     Reason.TRANSIENT: "with a transient",
+    Reason.CHOSEN: "by choice of the time (--exclude)",
 }
 """Why segments were excluded; the text follows their number."""
 

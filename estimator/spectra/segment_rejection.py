@@ -50,6 +50,7 @@ class Reason(enum.StrEnum):
     GAP = "gap"
     CLIPPED = "clipped"
     TRANSIENT = "transient"
+    CHOSEN = "chosen"
 
 
 @dataclass(frozen=True, slots=True)

@@ -194,6 +194,9 @@ def estimate(
     axis_tolerance : float or mapping of str to float
         Angle in degrees, rms, by which axes of sensors with one or two channels may be off
         (default 1), of all or by sensor. Motion across an axis widens the intervals.
+    exclude : sequence of str
+        Stretches of time of which no segment is used: two instants in UTC, or two times after the
+        start of the recording (``["0s/60s"]``).
     linearise : bool
         Whether what squares and cubes of the motion explain is subtracted from the noise.
     gain_steadiness : float

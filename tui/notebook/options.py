@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, TypeAlias, TypedDict
 
 import numpy as np
 
+from daq.bench.durations import instant
 from daq.bench.estimate_settings import OPTIONS, table_keys
 from daq.errors import WrongSettingError
-from daq.estimation.settings import Settings, instant, with_changes
+from daq.estimation.settings import Settings, with_changes
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -35,6 +36,7 @@ class EstimateOptions(TypedDict, total=False):
     equalise: str
     reject: bool
     bridge: float
+    exclude: Sequence[str]
     octaves: bool
     dimension: int | str
     gains: Mapping[str, float]

@@ -371,7 +371,7 @@ def _time_used(result: Result) -> str:
 
 def _option(option: Option, value: object) -> str:
     """Return the value of an option as in the bench file."""
-    if value is None or value == {}:
+    if value is None or value in ({}, ()):
         return "not given"
     if option.is_switch:
         return "yes" if value else "no"

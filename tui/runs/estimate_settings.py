@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from daq.bench.durations import instant
 from daq.bench.estimate_settings import OPTIONS, EstimateSettings
 from daq.estimation import settings as rules
 from daq.estimation.settings import ConflictingOptionError, Settings
@@ -125,6 +126,6 @@ def _flag(name: str) -> str:
 
 def _instant(text: str | None, created: datetime) -> datetime | None:
     try:
-        return None if text is None else rules.instant(text, created)
+        return None if text is None else instant(text, created)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None

@@ -6,7 +6,7 @@ import math
 from datetime import UTC, datetime, time
 from typing import TYPE_CHECKING
 
-from daq.results.signal import CLIPPED, GAP, Mark, Trace, Waveforms
+from daq.results.signal import CLIPPED, EXCLUDED, GAP, Mark, Trace, Waveforms
 from tui.wording.formatting import readings
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ STEPS = (
 )
 """Seconds between ticks of time; beyond them whole days."""
 _DAY = 86400.0
-SIGNS = {"mark": "▼", GAP: "░", CLIPPED: "▲"}
+SIGNS = {"mark": "▼", GAP: "░", CLIPPED: "▲", EXCLUDED: "╳"}
 """Signs of marks; of all other kinds `EVENT`."""
 EVENT = "◆"
 

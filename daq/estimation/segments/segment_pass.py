@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from daq.bench.durations import stretch
 from daq.clocks.aligned_recording import AlignedRecording
 from daq.clocks.grid import OwnSamples
 from daq.clocks.growing_rows import GrowingRows
@@ -19,7 +20,7 @@ from daq.estimation.segments.delay_measurement import DelayMeasurement
 from daq.estimation.segments.flatline import FlatlineDetector, stands_still
 from daq.estimation.segments.own_spectra import OwnSpectra, need_samples_of_grid
 from daq.estimation.segments.stated_times import agree, compare
-from daq.recording.interface import at_rates
+from daq.recording.interface import at_rates, created_at
 from estimator.spectra.channel_sets import ChannelSets
 from estimator.spectra.multiresolution import MultiResolution
 from estimator.spectra.parts import MOST, PartEnds, Parts, by_part, part_bins
@@ -208,6 +209,9 @@ class Pass:
         )
         self.n_channels = len(self.aligned.channels)
         self._settings = settings
+        created = created_at(recording)
+        stretches = [stretch(each, created) for each in settings.exclude]
+        self._excluded = [(_ns(begin), _ns(end)) for begin, end in stretches]
         self.filters: Equaliser | None = None
         self._every = 1  # of which segments delays are measured
         self._tolerance = _FINAL_TOLERANCE
@@ -406,11 +410,12 @@ class Pass:
     def averages(self, filters: Equaliser | None, begin: int, count: int) -> CrossSpectra:
         """Return spectra of `count` segments from grid sample `begin` on, filtered.
 
-        Gaps and clipped blocks are left out, and nothing else. It changes nothing of the pass.
+        Gaps, clipped blocks, excluded stretches are left out, and nothing else. It changes nothing
+        of the pass.
         """
         reach = 0 if filters is None else filters.reach
         part = self._read(self.aligned, filters, begin - reach, count)
-        usable = part.usable if part.clipped is None else part.usable & ~part.clipped
+        usable = part.usable if part.unwanted is None else part.usable & ~part.unwanted
         starts = np.arange(count) * self.welch.hop
         spectra = CrossSpectra(self.welch, self.n_channels, threads=1)
         spectra.add(part.samples, starts[whole_segments(usable, starts, self.welch.segment_length)])
@@ -433,15 +438,15 @@ class Pass:
             present = np.isfinite(samples)
             samples = np.where(present, samples, 0.0)
         self._silence(samples)
-        clipped = self._clipped(begin, len(samples))
+        unwanted = self._unwanted(begin, len(samples))
         raw, flat = samples[reach : reach + n_hops], usable[reach : reach + n_hops]
         if filters is not None:
             samples = filters.apply(samples)
             usable = surrounded(usable, reach)
             if present is not None:
                 present = np.column_stack([surrounded(column, reach) for column in present.T])
-            clipped = None if clipped is None else ~surrounded(~clipped, reach)
-        return _Samples(samples, usable, present, clipped, raw, flat)
+            unwanted = None if unwanted is None else ~surrounded(~unwanted, reach)
+        return _Samples(samples, usable, present, unwanted, raw, flat)
 
     def _survey(self) -> None:
         """Set free clocks from a few segments, before all are taken.
@@ -477,6 +482,7 @@ class Pass:
         """Set clocks from one segment in `every`; return the error of one delay, in s."""
         numbers = np.arange(self.n_complete)
         begins = numbers[_is_picked(numbers, every)] * self.welch.hop
+        begins = begins[~self._is_chosen(begins, self.welch.segment_length)]
         for first in range(0, len(begins), _READ_TOGETHER):
             some = begins[first : first + _READ_TOGETHER]
             whole, spectra = self._spectra_apart(some)
@@ -539,20 +545,22 @@ class Pass:
 
     def _take_samples(self, part: _Samples, first: int, count: int, *, together: bool) -> None:
         """Add segments from samples on the grid; `first` is the number of the first of them."""
-        samples, usable, clipped = part.samples, part.usable, part.clipped
+        samples, usable, unwanted = part.samples, part.usable, part.unwanted
         hop, length, reach = self.welch.hop, self.welch.segment_length, self.reach
         begin = first * hop
         self.stillness.add(part.raw, part.raw_usable)
         starts = np.arange(count) * hop
         whole = whole_segments(usable, starts, length)
-        clean = whole if clipped is None else whole_segments(usable & ~clipped, starts, length)
+        clean = whole if unwanted is None else whole_segments(usable & ~unwanted, starts, length)
         self.left_out[Reason.GAP] += count - int(whole.sum())
-        self.left_out[Reason.CLIPPED] += int((whole & ~clean).sum())
+        chosen = self._is_chosen(begin + starts, length + 2 * reach)
+        self.left_out[Reason.CHOSEN] += int((whole & chosen).sum())
+        self.left_out[Reason.CLIPPED] += int((whole & ~clean & ~chosen).sum())
         starts = starts[clean]
         if self.octaves is not None:
             present = usable if part.present is None else part.present
-            if clipped is not None:
-                present = (present.T & ~clipped).T
+            if unwanted is not None:
+                present = (present.T & ~unwanted).T
             new = self._fed - begin
             self.octaves.add(samples[new:], present[new:])
             self._fed = begin + len(samples)
@@ -563,10 +571,10 @@ class Pass:
         self._delays.measure(samples, starts, begin + reach + starts, together=together)
         touched = np.flatnonzero(~whole) * hop
         if self.octaves is None and part.present is not None and len(touched):
-            taken = self.sets.take(samples, part.present, clipped, touched)
+            taken = self.sets.take(samples, part.present, unwanted, touched)
             touched = np.setdiff1d(touched, taken)
         if self._bridge is not None and len(touched):
-            taken = self._bridge.take(samples, usable, clipped, touched)
+            taken = self._bridge.take(samples, usable, unwanted, touched)
             begins = begin + reach + taken
             self._delays.measure_with_gaps(
                 samples, usable, taken, begins, most=self._settings.bridge, together=together
@@ -577,11 +585,13 @@ class Pass:
         count, length, hop = len(part.spectra), self.welch.segment_length, self.welch.hop
         self.stillness.add(part.raw, np.ones(len(part.raw), dtype=np.bool_))
         starts = np.arange(count) * hop
-        clipped = self._clipped(first * hop, int(starts[-1]) + length)
+        unwanted = self._unwanted(first * hop, int(starts[-1]) + length)
         spectra = part.spectra
-        if clipped is not None:
-            clean = whole_segments(~clipped, starts, length)
-            self.left_out[Reason.CLIPPED] += count - int(clean.sum())
+        if unwanted is not None:
+            clean = whole_segments(~unwanted, starts, length)
+            chosen = self._is_chosen(first * hop + starts, length)
+            self.left_out[Reason.CHOSEN] += int(chosen.sum())
+            self.left_out[Reason.CLIPPED] += int((~clean & ~chosen).sum())
             spectra, starts = spectra[clean], starts[clean]
         begins = first * hop + starts
         self._take_whole(spectra, begins)
@@ -606,6 +616,31 @@ class Pass:
                 return np.ones(len(samples), dtype=np.bool_)
         return np.asarray(np.isfinite(samples).all(axis=1))
 
+    def chosen(self) -> list[tuple[int, int]]:
+        """Return the first grid sample of each excluded stretch, and the one after its last."""
+        per_ns, origin = self.welch.sampling_rate * 1e-9, self.aligned.start_utc_ns
+        return [
+            (math.ceil((begin - origin) * per_ns), math.ceil((end - origin) * per_ns))
+            for begin, end in self._excluded
+        ]
+
+    def _is_chosen(self, begins: NDArray[np.int64], length: int) -> BoolArray:
+        """Return which segments that begin at these grid samples touch an excluded stretch."""
+        found = np.zeros(len(begins), dtype=np.bool_)
+        for first, end in self.chosen():
+            found |= (begins < end) & (begins + length > first)
+        return found
+
+    def _unwanted(self, start: int, n_samples: int) -> NDArray[np.bool_] | None:
+        """Return which grid samples are in excluded stretches or clipped blocks; None if none."""
+        clipped = self._clipped(start, n_samples)
+        if not self._excluded:
+            return clipped
+        found = np.zeros(n_samples, dtype=np.bool_) if clipped is None else clipped
+        for first, end in self.chosen():
+            found[max(0, first - start) : max(0, end - start)] = True
+        return found if found.any() else None
+
     def _clipped(self, start: int, n_samples: int) -> NDArray[np.bool_] | None:
         """Return which grid samples lie in blocks that are clipped; None if none do."""
         if self._settings.reject is False:
@@ -620,7 +655,7 @@ class Pass:
         return in_clipped_blocks(self._sensors, times)
 
     def whole_segments(self, starts: NDArray[np.int64]) -> Iterator[FloatArray]:
-        """Yield the segments that begin at grid samples, but for those with gaps or clipped.
+        """Yield the segments that begin at grid samples; none with gaps, clipped or excluded.
 
         Neighbours are read together.
         """
@@ -632,8 +667,8 @@ class Pass:
                 continue
             first, last = int(some[0]), int(some[-1]) + length
             samples, valid = self.aligned.read(first, last)
-            clipped = self._clipped(first, len(samples))
-            usable = valid if clipped is None else valid & ~clipped
+            unwanted = self._unwanted(first, len(samples))
+            usable = valid if unwanted is None else valid & ~unwanted
             for begin in (some - first).tolist():
                 own = slice(begin, begin + length)
                 if len(samples[own]) == length and usable[own].all():
@@ -730,7 +765,7 @@ class _Samples:
     usable: NDArray[np.bool_]
     present: NDArray[np.bool_] | None
     """Which channel has each sample, shape (n_samples, n_channels); None where all have all."""
-    clipped: NDArray[np.bool_] | None
+    unwanted: NDArray[np.bool_] | None
     raw: FloatArray
     raw_usable: NDArray[np.bool_]
 
@@ -748,4 +783,8 @@ def still_for_a_while(passes: Sequence[Pass], settings: Settings) -> dict[int, f
 
 
 def _utc_ns(at: datetime | None) -> int | None:
-    return None if at is None else math.floor(at.timestamp()) * 10**9 + at.microsecond * 1000
+    return None if at is None else _ns(at)
+
+
+def _ns(at: datetime) -> int:
+    return math.floor(at.timestamp()) * 10**9 + at.microsecond * 1000

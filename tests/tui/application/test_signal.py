@@ -11,6 +11,7 @@ import pytest
 
 from daq.recording.reader import Recording
 from daq.results.signal import Signal
+from estimator.spectra.segment_rejection import Reason
 from tests.daq.clocks.recordings import Sensor, blocks, counts, create
 from tests.tui.application.screen_text import assert_looks_as_before, resized, screen_text
 from tests.tui.example_snapshot import ProgressCallback
@@ -130,6 +131,32 @@ async def test_the_mouse_zooms_drags_and_places_the_cursor(path: Path) -> None:
         moved = 10 / 62 * (before[1] - before[0])
         assert after == pytest.approx((before[0] + moved, before[1] + moved), abs=0.1)
         assert view.look.cursor == pytest.approx(START + 30, abs=1)  # that was no click
+
+
+async def test_a_stretch_is_excluded_and_taken_back(path: Path) -> None:
+    """The estimate follows: without the segments in the stretch, and with them again."""
+    app = HuddleApp(ProgressCallback(path))
+    async with app.run_test(size=SIZES["middle"]) as pilot:
+        view = await opened(pilot, app, path)
+        result = app.state.result
+        assert result is not None
+        whole = result.snapshot.n_segments
+        await pilot.press("t", *"01:00:30", "enter", "x", "t", *"01:00:20", "enter", "x")
+        assert view.look.excluded == ((START + 20, START + 30),)
+        await reached(pilot, lambda: _n_excluded(app) > 0)
+        assert view.look.excluded == ((START + 20, START + 30),)
+        assert "╳" in screen_text(app)
+        assert "excluded (x: take it back)" in screen_text(app)
+        await pilot.press("x")
+        await reached(pilot, lambda: app.state.has_result and _n_excluded(app) == 0)
+        assert app.state.result is not None
+        assert app.state.result.snapshot.n_segments == whole
+        assert not view.look.excluded
+
+
+def _n_excluded(app: HuddleApp) -> int:
+    result = app.state.result
+    return 0 if result is None else result.snapshot.left_out.get(Reason.CHOSEN, 0)
 
 
 async def test_without_a_recording_it_says_where_there_are_some(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from daq.bench.estimate_settings import OPTIONS, from_text
@@ -30,6 +30,7 @@ class SettingsForm(Form[Mapping[str, object]]):
             Field(field, OPTIONS[field].key or field, placeholder=_placeholder(field, settings))
             for field in FIELDS
         ]
+        self._settings = settings
         super().__init__(f"estimate {name} again", fields, does="estimates")
 
     def hint(self, name: str) -> str:
@@ -49,7 +50,13 @@ class SettingsForm(Form[Mapping[str, object]]):
     def submit(self) -> None:
         """Estimate with what was given."""
         given = {name: text for name in FIELDS if (text := self.value(name))}
-        self.dismiss({name: from_text(name, text) for name, text in given.items()})
+        kept = () if self._settings is None else self._settings.exclude
+        self.dismiss(excluding(kept) | {n: from_text(n, text) for n, text in given.items()})
+
+
+def excluding(stretches: Sequence[str]) -> dict[str, object]:
+    """Return the change of the settings that excludes these stretches."""
+    return {"exclude": tuple(stretches)} if stretches else {}
 
 
 def _placeholder(field: str, settings: Settings | None) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from rich.text import Text
 
+from daq.results.signal import EXCLUDED, Mark
 from tui.application.test_view.braille import cells
 from tui.wording.signal import extent, moment, most_first, sign, time_ticks, title, words
 
@@ -42,12 +43,26 @@ class Look:
         `RECORDED` or `NOISE` for a spectrogram of the channel; empty for waveforms of all.
     cursor : float or None
         Where values are read off.
+    excluded : sequence of (float, float)
+        Stretches that the estimate leaves out.
+    begun : float or None
+        Where a stretch to exclude begins, whose end is not chosen yet.
     """
 
     span: tuple[float, float] | None = None
     channel: int = 0
     spectrum: str = ""
     cursor: float | None = None
+    excluded: tuple[tuple[float, float], ...] = ()
+    begun: float | None = None
+
+    @property
+    def here(self) -> tuple[float, float] | None:
+        """The excluded stretch at the cursor."""
+        at = self.cursor
+        if at is None:
+            return None
+        return next((each for each in self.excluded if each[0] <= at <= each[1]), None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +91,7 @@ def picture(drawn: Drawn, look: Look, width: int, height: int) -> Text:
     )
     lines = [_title(drawn, look, width), *body]
     lines += [Text("", MUTED)] * (rows + 1 - len(lines))
-    lines += [_lane(waves, left, columns), _axis(waves, left, columns)]
+    lines += [_lane(waves, look, left, columns), _axis(waves, left, columns)]
     at = look.cursor
     if at is not None and waves.begin <= at <= waves.end:
         column = left + min(int((at - waves.begin) / _cell(waves, columns)), columns - 1)
@@ -164,10 +179,13 @@ def _spectrum(drawn: Drawn, left: int, columns: int, rows: int) -> list[Text]:
     return lines
 
 
-def _lane(waves: Waveforms, left: int, columns: int) -> Text:
+def _lane(waves: Waveforms, look: Look, left: int, columns: int) -> Text:
     """Return the signs of all marks; single moments are on top."""
     signs = [" "] * columns
-    for mark in sorted(waves.marks, key=lambda each: each.begin - each.end):
+    chosen = [Mark(begin, end, EXCLUDED) for begin, end in look.excluded]
+    if look.begun is not None:
+        chosen.append(Mark(look.begun, look.begun, EXCLUDED))
+    for mark in sorted((*chosen, *waves.marks), key=lambda each: each.begin - each.end):
         first = int((mark.begin - waves.begin) / _cell(waves, columns))
         last = int((mark.end - waves.begin) / _cell(waves, columns))
         for column in range(max(0, first), min(last, columns - 1) + 1):
@@ -197,6 +215,8 @@ def _read_off(waves: Waveforms, look: Look, width: int) -> Text:
     values = "no sample" if np.isnan(low) else f"{low:.4g} to {high:.4g} {trace.unit}"
     at = moment(look.cursor, fine=waves.end - waves.begin < 600)[11:]
     text = f"{at}  {trace.name} {values}".replace("-", "−")
+    if look.here is not None:
+        text += f"  {sign(Mark(*look.here, EXCLUDED))} excluded (x: take it back)"
     for mark in most_first(waves.near(look.cursor)):
         text += f"  {sign(mark)} {words(mark)}"
     return Text(text[:width])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, ClassVar
 
 from rich.text import Text
@@ -11,9 +12,13 @@ from textual.binding import Binding, BindingType
 from textual.message import Message
 from textual.widgets import Static
 
+from daq.bench.durations import stretch
 from daq.errors import HuddleError
+from daq.recording.interface import created_at
 from daq.results.signal import fitting, panned, zoomed
 from tui.application.dialogs import MarkScreen
+from tui.application.forms.estimate import FIELDS, excluding
+from tui.application.messages import OpeningRequested
 from tui.application.signal_view.picture import (
     BESIDE,
     NOISE,
@@ -36,7 +41,7 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from tui.application.signal_view.source import SignalSource
 
-ACTIONS = {"pan", "zoom", "channel", "spectrum", "mark", "go", "cursor", "whole"}
+ACTIONS = {"pan", "zoom", "channel", "spectrum", "mark", "go", "cursor", "whole", "exclude"}
 NOT_YET = "once the estimate is made"
 NONE = "not known: no three sensors, or too few averages"
 AROUND = 300.0
@@ -53,6 +58,8 @@ class SignalDrawn(Message):
     whole: tuple[float, float] = (0.0, 1.0)
     marks: tuple[float, ...] = ()
     """When they begin, ascending."""
+    created: datetime | None = None
+    """Start of the recording."""
     note: str = ""
 
 
@@ -77,6 +84,7 @@ class SignalView(View):
         Binding("g", "spectrum", "Spectrum"),
         Binding("t", "go", "Time"),
         Binding("n", "mark(1)", "Mark"),
+        Binding("x", "exclude", "Exclude"),
         Binding("N", "mark(-1)", "Mark before", show=False),
         Binding("full_stop", "cursor(0.02)", "Cursor right", show=False),
         Binding("comma", "cursor(-0.02)", "Cursor left", show=False),
@@ -89,6 +97,7 @@ class SignalView(View):
         ("Show the next mark, event or gap", "mark"),
         ("Show a spectrogram of a channel, or of its noise", "spectrum"),
         ("Show the whole recording", "whole"),
+        ("Exclude a stretch from the estimate, or take it back", "exclude"),
     )
     KEYS = (
         ("← →", "earlier and later; dragging with the mouse does the same"),
@@ -98,8 +107,12 @@ class SignalView(View):
         ("t", "go to a time, such as 03:12 (UTC)"),
         ("n N", "next and previous mark, event or gap"),
         (", .  < >", "cursor left and right, and far; a click places it"),
+        (
+            "x",
+            "exclude: x at the start, cursor to the end, x; in an excluded stretch: take it back",
+        ),
         ("esc", "the whole recording, without a cursor"),
-        ("▼ ◆ ░ ▲", "remark, event, gap, end of the range"),
+        ("▼ ◆ ░ ▲ ╳", "remark, event, gap, end of the range, excluded"),
     )
 
     def __init__(self, state: State, source: SignalSource) -> None:
@@ -111,6 +124,7 @@ class SignalView(View):
         self._whole = (0.0, 1.0)
         self._marks: tuple[float, ...] = ()
         self._key: object = None
+        self._created: datetime | None = None
         self._note = ""
         self._is_busy = self._is_old = False
         self._dragged: tuple[int, tuple[float, float]] | None = None
@@ -143,8 +157,17 @@ class SignalView(View):
         if self.state.path != self._path:
             self._path, self._look, self._drawn, self._key = self.state.path, Look(), None, None
             self._note = "reading …"
+        self._take_excluded()
         self._write()
         self._ask()
+
+    def _take_excluded(self) -> None:
+        """Show what the result that is known excludes."""
+        if self.state.result is None or self._created is None:
+            return
+        found = (stretch(each, self._created) for each in self.state.result.settings.exclude)
+        excluded = tuple((begin.timestamp(), end.timestamp()) for begin, end in found)
+        self._look = replace(self._look, excluded=excluded)
 
     def _write(self) -> None:
         text = Text(self._note or "No recording is open: 4 lists them.", MUTED)
@@ -166,7 +189,7 @@ class SignalView(View):
         if self._path is None or now is None:
             return
         snapshot = None if result is None or not result.snapshot.closed else result.snapshot
-        look = replace(self._look, cursor=None)
+        look = replace(self._look, cursor=None, excluded=(), begun=None)
         key = self._path, look, self._room, self._source.version, snapshot, now.closed
         if key == self._key:
             return
@@ -185,7 +208,7 @@ class SignalView(View):
                 if signal is None:
                     made.note = "reading …"
                 else:
-                    made.whole = signal.span
+                    made.whole, made.created = signal.span, created_at(signal.recording)
                     made.marks = tuple(mark.begin for mark in signal.marks)
                     span = made.whole if look.span is None else fitting(look.span, made.whole)
                     width, height = self._room
@@ -220,6 +243,8 @@ class SignalView(View):
             self._note = message.note
             if message.drawn is not None:
                 self._drawn, self._whole, self._marks = message.drawn, message.whole, message.marks
+                self._created = message.created
+                self._take_excluded()
             self._write()
             self.refresh_bindings()
         if self._is_old or message.path != self._path:
@@ -231,7 +256,8 @@ class SignalView(View):
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
         """Offer only what can be done now."""
         del parameters
-        return action not in ACTIONS or self._drawn is not None
+        known = self.state.has_result if action == "exclude" else True
+        return action not in ACTIONS or (known and self._drawn is not None)
 
     def _change(self, **changes: object) -> None:
         look = replace(self._look, **changes)  # type: ignore[arg-type]  # of several types
@@ -273,7 +299,33 @@ class SignalView(View):
 
     def action_whole(self) -> None:
         """Show the whole recording without a cursor."""
-        self._change(span=None, cursor=None)
+        self._change(span=None, cursor=None, begun=None)
+
+    def action_exclude(self) -> None:
+        """Begin a stretch at the cursor, exclude what lies between, or take a stretch back."""
+        path, result, look = self.state.path, self.state.result, self._look
+        if path is None or result is None:
+            return
+        if look.cursor is None:
+            self.action_cursor(0.0)
+            self.app.notify("Place the cursor where the stretch begins (, . or a click), then x")
+            return
+        if look.here is not None:
+            chosen = tuple(each for each in look.excluded if each != look.here)
+        elif look.begun is None:
+            self._change(begun=look.cursor)
+            self.app.notify("Move the cursor to the end of the stretch, then x; esc: not")
+            return
+        elif look.begun == look.cursor:
+            return
+        else:
+            ends = sorted((look.begun, look.cursor))
+            chosen = (*look.excluded, (ends[0], ends[1]))
+        settings = result.settings
+        changes = {name: getattr(settings, name) for name in FIELDS if name != "methods"}
+        self._change(excluded=chosen, begun=None)
+        changes |= excluding([_text(*each) for each in chosen])
+        self.post_message(OpeningRequested(path, changes, SIGNAL))
 
     def action_mark(self, step: int = 1) -> None:
         """Go to the next or previous mark."""
@@ -355,3 +407,9 @@ class SignalView(View):
         self.capture_mouse(capture=False)
         if not self._has_moved:
             self._change(cursor=self._time_at(event.screen_x))
+
+
+def _text(begin: float, end: float) -> str:
+    """Return a stretch between times of UTC in s, as the option takes it."""
+    ends = (datetime.fromtimestamp(at, UTC).isoformat() for at in (begin, end))
+    return "/".join(ends)

@@ -1,0 +1,94 @@
+"""`exclude`: no sample of an excluded stretch has an effect on the result."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from daq.bench.estimate_settings import from_text
+from daq.errors import WrongSettingError
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.results.facts.segments import SegmentsExcluded
+from daq.results.result import Result
+from estimator.spectra.segment_rejection import Reason
+from tests.daq.clocks.recordings import Sensor, write
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+RATE, SECONDS = 100, 120
+LORRY = slice(40 * RATE, 52 * RATE)
+EXCLUDED = "40s/52s"
+
+
+def recording(path: Path, disturbance: float, **of_sensor: Any) -> Path:  # noqa: ANN401 - fields of Sensor
+    """Write three sensors with common motion, all but alike: what B reads in `LORRY` differs."""
+    rng = np.random.default_rng(4)
+    motion = rng.normal(0, 300, RATE * SECONDS)
+    sensors = {}
+    for name in "ABC":
+        counts = motion + rng.normal(0, 30, len(motion))
+        if name == "B":
+            counts[LORRY] += disturbance * np.sin(np.arange(12 * RATE))
+        sensors[name] = Sensor(np.round(counts).astype(np.int32)[:, None], RATE, **of_sensor)
+    return write(path, sensors)
+
+
+@pytest.mark.parametrize(
+    ("options", "of_sensor"),
+    [
+        ({"clocks": "nominal"}, {}),
+        ({"clocks": "nominal"}, {"gaps": ((7000, 7040), (9000, 9010))}),
+        ({"clocks": "nominal", "octaves": True}, {}),
+        ({"clocks": "nominal", "reject": True}, {}),
+        ({"clocks": "nominal", "reject": False}, {}),
+        ({}, {}),
+        ({}, {"utc": True}),
+    ],
+)
+def test_no_sample_of_an_excluded_stretch_counts(
+    tmp_path: Path, options: dict[str, Any], of_sensor: dict[str, Any]
+) -> None:
+    settings = Settings(segment=4.0, exclude=(EXCLUDED,), **options)
+    quiet, loud = (
+        estimate([recording(tmp_path / f"{size}.h5", size, **of_sensor)], settings)
+        for size in (0, 90_000)
+    )
+    assert loud.n_segments == quiet.n_segments > 30
+    assert loud.left_out == quiet.left_out
+    n_chosen = loud.left_out[Reason.CHOSEN]  # of 4 s, each 2 s: from 38 s to 50 s, by any clock
+    assert n_chosen in {7, 8}
+    for method, found in quiet.results.items():
+        np.testing.assert_array_equal(loud.results[method].noise_psd, found.noise_psd)
+        np.testing.assert_array_equal(loud.results[method].high, found.high)
+    without = estimate([tmp_path / "90000.h5"], replace(settings, exclude=()))
+    assert (without.n_segments, without.left_out[Reason.CHOSEN]) != (quiet.n_segments, n_chosen)
+
+
+def test_instants_and_times_after_the_start_are_alike(tmp_path: Path) -> None:
+    path = recording(tmp_path / "r.h5", 0)
+    begin, end = "2016-07-14T01:00:40", "2016-07-14T01:00:52+00:00"
+    found = [
+        estimate([path], Settings(segment=4.0, exclude=(text,)))
+        for text in (EXCLUDED, f"{begin}/{end}")
+    ]
+    assert found[0].n_segments == found[1].n_segments
+    facts = Result(found[0], Settings(segment=4.0, exclude=(EXCLUDED,))).facts
+    (fact,) = (each for each in facts if isinstance(each, SegmentsExcluded))
+    assert fact.words.explanation == "8 segments excluded by choice of the time (--exclude)."
+
+
+def test_an_exclusion_of_nothing_is_refused(tmp_path: Path) -> None:
+    path = recording(tmp_path / "r.h5", 0)
+    with pytest.raises(WrongSettingError, match=r"exclude 2016-07-14T01:10:00/.*: nothing there: "):
+        estimate([path], Settings(segment=4.0, exclude=("10min/11min",)))
+
+
+@pytest.mark.parametrize("text", ["40s", "52s/40s", "40s/", "a/b", "40s/40s", "1/2/3"])
+def test_wrong_stretches_are_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        from_text("exclude", [text])
