@@ -621,10 +621,10 @@ class _Scores:
             score = 2 * found.covariance[:, :, i, j]
             score -= (found.noise[:, :, None, :] @ with_noise)[:, :, 0]
             known = 2 * (projector[:, i, j] ** 2 + projector[:, i, i] * projector[:, j, j]).real
-            known -= np.einsum("fpa,fpq,fqa->fa", with_noise, found.inverse, with_noise)
+            known -= np.einsum("fpa,fpa->fa", with_noise, found.inverse @ with_noise)
             root = np.sqrt(np.clip(known, 0.0, None))
             self.score[:, some] += score.sum(axis=1)
-            self._theory[some] += np.einsum("fa,fg,ga->a", root, correlation, root) / averages
+            self._theory[some] += (root * (correlation @ root)).sum(axis=0) / averages
             self._own[some] += known.sum(axis=0)
 
     def of_parts(self, some: BoolArray) -> _Scores:
