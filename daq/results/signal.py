@@ -27,7 +27,7 @@ from daq.recording.extremes import Extremes, extremes_of
 from estimator.errors import EstimatorError
 from estimator.levels.bands import log_edges
 from estimator.methods import self_noise
-from estimator.spectra.parts import grouped, joined_parts
+from estimator.spectra.parts import grouped
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 
 if TYPE_CHECKING:
@@ -484,7 +484,7 @@ def of_parts(snapshot: Snapshot, *, noise: bool) -> Spectrogram | None:
     if noise:
         least = AVERAGES * max(snapshot.dims)
         groups = grouped(averages, least)
-        divided = joined_parts(parts.csm(), averages, groups)
+        divided = parts.joined(slice(None), groups)
         if divided.averages[0] < least:
             return None
         found = []

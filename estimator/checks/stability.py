@@ -38,7 +38,7 @@ from estimator.likelihood.goodness_of_fit import critical_value
 from estimator.likelihood.score_test import usable
 from estimator.median import median
 from estimator.records import NOT_IN_JSON
-from estimator.spectra.parts import grouped, joined_parts
+from estimator.spectra.parts import grouped
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -336,7 +336,6 @@ def stability(
         bands.append(
             _band(
                 parts,
-                averages,
                 maximum,
                 some,
                 groups=groups,
@@ -413,7 +412,6 @@ class _Band:
 
 def _band(
     parts: Parts,
-    averages: FloatArray,
     maximum: Maximum,
     places: IntArray,
     *,
@@ -432,10 +430,10 @@ def _band(
     for some in np.array_split(places, -(-len(places) // at_once)):
         bins = parts.bins[some]
         lags = np.minimum(np.abs(bins[:, None] - bins), len(correlation) - 1)
-        csm, at, own = parts.csm(some), maximum.take(bins), correlation[lags]
-        if not np.isfinite(csm).all():
+        divided, at, own = parts.joined(some, groups), maximum.take(bins), correlation[lags]
+        if not np.isfinite(divided.csm).all():
             return None
-        found = regression(joined_parts(csm, averages, groups), at)
+        found = regression(divided, at)
         weight = found.averages / found.averages.sum()
         within += np.einsum("k,kfpp->p", weight, found.covariance)
         whole_band += np.einsum("fpp->p", found.projector).real
@@ -446,7 +444,7 @@ def _band(
         each.add(found, own)
         responses.append(each)
         if by_run:
-            of_run = regression(joined_parts(csm, averages, by_run), at)
+            of_run = regression(parts.joined(some, by_run), at)
             of_runs.append(noise_levels(of_run, own))
     whole = Levels.joined(levels)
     known = median(np.ravel(whole.degrees)) >= LEAST_DEGREES

@@ -27,7 +27,7 @@ import numpy as np
 
 from estimator.checks.steadiness import VALUES_AT_ONCE, ResponseScores, regression
 from estimator.median import median
-from estimator.spectra.parts import grouped, joined_parts
+from estimator.spectra.parts import grouped
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -100,7 +100,7 @@ def steadied(
     scores = ResponseScores(dims, len(groups))
     n_values = len(parts.each) * p**2
     for some in _pieces(places[good[parts.bins[places]]], n_values):
-        found = regression(joined_parts(parts.csm(some), n, groups), at.take(parts.bins[some]))
+        found = regression(parts.joined(some, groups), at.take(parts.bins[some]))
         scores.add(found, np.eye(len(some)))
     left, kept = _within(scores, dims, changed, np.array([n[some].sum() for some in groups]))
     out = [some for some, is_kept in zip(groups, kept, strict=True) if not is_kept]
@@ -110,7 +110,7 @@ def steadied(
     averages = np.array([n[some].sum() for some in groups])
     more = float((averages - q).sum()) + q
     for some in _pieces(places, n_values):
-        found = regression(joined_parts(parts.csm(some), n, groups), at.take(parts.bins[some]))
+        found = regression(parts.joined(some, groups), at.take(parts.bins[some]))
         U = found.directions
         motion = found.motion.sum(axis=0) / averages.sum()
         whole = U @ motion @ U.conj().swapaxes(1, 2)

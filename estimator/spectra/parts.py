@@ -155,7 +155,15 @@ class Parts:
         complex128, shape (n_parts, n_some, n_channels, n_channels)
             In unit**2/Hz; NaN where a response is zero.
         """
+        return self._unpacked(np.stack([part.packed(some) for part in self.each]), some)
+
+    def joined(self, some: slice | IntArray, groups: Sequence[IntArray]) -> Divided:
+        """Return the matrices of groups of parts, as `csm` does those of all parts."""
         packed = np.stack([part.packed(some) for part in self.each])
+        found = joined_parts(packed, self.averages, groups)
+        return replace(found, csm=self._unpacked(found.csm.real, some))
+
+    def _unpacked(self, packed: FloatArray, some: slice | IntArray) -> ComplexArray:
         turned, lower = packed.swapaxes(2, 3), np.tri(packed.shape[-1], dtype=np.bool_)
         found = np.empty(packed.shape, np.complex128)
         found.real = np.where(lower, packed, turned)
@@ -263,7 +271,9 @@ def grouped(averages: FloatArray, least: float) -> list[IntArray]:
     return [np.array(each) for each in groups]
 
 
-def joined_parts(csm: ComplexArray, averages: FloatArray, groups: Sequence[IntArray]) -> Divided:
+def joined_parts(
+    csm: ComplexArray | FloatArray, averages: FloatArray, groups: Sequence[IntArray]
+) -> Divided:
     """Return the averages of groups of parts."""
     sums = [averages[some].sum() for some in groups]
     means = [
