@@ -75,8 +75,26 @@ def coupling_beside(U: ComplexArray, sensor: IntArray) -> ComplexArray:
     return np.asarray(J)
 
 
-def inverse_beside(U: ComplexArray, sensor: IntArray) -> ComplexArray:
-    """Return the `inverse` of `coupling_beside`.
+def weights_beside(
+    root: ComplexArray, at: IntArray, U: ComplexArray, sensor: IntArray
+) -> ComplexArray:
+    """Return the weights of elements of the noise beside motion in every channel's noise.
+
+    These are ``L_ia conj(L_ib)``, multiplied by the `inverse` of `coupling_beside`.
+
+    Parameters
+    ----------
+    root : complex128, shape (n_blocks, p, p)
+        L, within each sensor alone.
+    at : int64, shape (n,)
+        Block of each of the directions.
+    U : complex128, shape (n, p, q)
+        Orthonormal columns.
+    sensor : int64, shape (p,)
+
+    Returns
+    -------
+    complex128, shape (n, p, n_pairs)
 
     Notes
     -----
@@ -84,33 +102,49 @@ def inverse_beside(U: ComplexArray, sensor: IntArray) -> ComplexArray:
     accurate unless one sensor has most of a direction.
     """
     if not are_many(sensor):
-        return inverse(coupling_beside(U, sensor))
+        return _solved(root, at, U, sensor)
     local, V, within = _beside(U, sensor)
-    n, n_pairs, rank = V.shape
+    n, n_sensors, size = local.shape[:3]
+    found = np.empty((n, len(sensor), n_sensors * size), np.complex128)
     heavy = np.linalg.eigvalsh(local)[:, :, 0].min(axis=1) < _SINGULAR
     if heavy.any():
-        found = np.empty((n, n_pairs, n_pairs), np.complex128)
-        found[heavy] = inverse(coupling_beside(U[heavy], sensor))
-        found[~heavy] = inverse_beside(U[~heavy], sensor)
+        found[heavy] = _solved(root, at[heavy], U[heavy], sensor)
+        found[~heavy] = weights_beside(root, at[~heavy], U[~heavy], sensor)
         return found
-    blocks = V.reshape(*local.shape[:3], rank)
-    size = np.einsum("nsii->nsi", local).real + (np.abs(blocks) ** 2).sum(axis=3)
-    own = np.linalg.inv(local + _RIDGE * size[..., None] * np.eye(local.shape[3]))
+    rank = V.shape[2]
+    blocks = V.reshape(n, n_sensors, size, rank)
+    diagonal = np.einsum("nsii->nsi", local).real + (np.abs(blocks) ** 2).sum(axis=3)
+    own = np.linalg.inv(local + _RIDGE * diagonal[..., None] * np.eye(size))
     LV = (own @ blocks).reshape(V.shape)
-    root = np.linalg.cholesky(np.eye(rank) + V.conj().swapaxes(1, 2) @ LV)
-    R = LV @ np.linalg.inv(root).conj().swapaxes(1, 2)
-    found = -R @ R.conj().swapaxes(1, 2)
-    found[:, *within] += own
-    return np.asarray(found)
+    part = np.linalg.cholesky(np.eye(rank) + V.conj().swapaxes(1, 2) @ LV)
+    R = LV @ np.linalg.inv(part).conj().swapaxes(1, 2)
+    channels = np.arange(len(sensor)).reshape(n_sensors, -1, 1)
+    L = root[:, channels, channels.swapaxes(1, 2)]
+    rows = (L[..., None] * L.conj()[..., None, :]).reshape(len(L), n_sensors, -1, size)[at]
+    shared = (rows @ R.reshape(blocks.shape)).reshape(n, len(sensor), rank)
+    np.matmul(-shared, R.conj().swapaxes(1, 2), out=found)
+    found[:, channels, within[1]] += rows @ own
+    return found
 
 
-def divided_beside(rows: ComplexArray, U: ComplexArray, sensor: IntArray) -> ComplexArray:
-    """Return ``rows @ inverse_beside``, in less time where sensors are few."""
-    if are_many(sensor):
-        return np.asarray(rows @ inverse_beside(U, sensor))
+def _solved(root: ComplexArray, at: IntArray, U: ComplexArray, sensor: IntArray) -> ComplexArray:
+    a, b = pairs(sensor)
     scaled, D = _scaled(coupling_beside(U, sensor))
-    found = np.linalg.solve(scaled.swapaxes(1, 2), (rows / D[:, None]).swapaxes(1, 2))
+    rows = (root[:, :, a] * root[:, :, b].conj())[at] / D[:, None]
+    found = np.linalg.solve(scaled.swapaxes(1, 2), rows.swapaxes(1, 2))
     return np.asarray(found.swapaxes(1, 2) / D[:, None])
+
+
+def mean_coupling(
+    U: ComplexArray, sensor: IntArray, share: FloatArray, first: IntArray
+) -> ComplexArray:
+    """Return the mean of `coupling_beside` in groups that begin at `first`, by their shares."""
+    local, V, within = _beside(U, sensor)
+    of = np.split(np.sqrt(share)[:, None, None] * V, first[1:])
+    wide = [each.swapaxes(0, 1).reshape(V.shape[1], len(each) * V.shape[2]) for each in of]
+    J = np.stack([each @ each.conj().T for each in wide])
+    J[:, *within] += np.add.reduceat(share[:, None, None, None] * local, first)
+    return np.asarray(J)
 
 
 def _beside(

@@ -36,12 +36,12 @@ from estimator.levels.interval import moved, worth
 from estimator.levels.noise_matrices import (
     are_many,
     axes_of,
-    coupling_beside,
-    divided_beside,
     inverse,
+    mean_coupling,
     pairs,
     times,
     traces,
+    weights_beside,
     white,
 )
 from estimator.median import median
@@ -248,9 +248,9 @@ def _pool(
 
     at = np.arange(len(begin))
     parts, mean = cut(at, sizes)
-    fit = _fitted(mean, parts, q, sensor, n_effective=n_effective, resolve=False)
-    _read(found, matrix, fit, sensor)
+    whole = fit = _fitted(mean, parts, q, sensor, n_effective=n_effective, resolve=False)
     level, whitener, best = fit.level.copy(), fit.whitener.copy(), fit.resolved.copy()
+    as_whole = np.ones(len(at), np.bool_)
     enough = int(np.searchsorted(averages[1:], max(FEW * q.max(), 1.5 * p))) + 1
     k = np.minimum(enough, sizes)
     largest = k * 2 ** np.log2(np.maximum(sizes // (k * LEAST_PARTS), 1)).astype(np.int64)
@@ -278,8 +278,10 @@ def _pool(
             here = more[better]
             level[here], whitener[here] = fit.level[better], fit.whitener[better]
             best[here] = fit.resolved[better]
+            as_whole[here] = False
         k[at] *= 2
         at = at[(best[at] < q[at]) & (k[at] <= largest[at])]
+    _read(found, matrix, whole, sensor, as_whole)
 
 
 def _parts(begin: IntArray, sizes: IntArray, k: IntArray, worth_of: FloatArray) -> _Parts:
@@ -365,9 +367,9 @@ def _fitted(
     n_sensors = sensor[-1] + 1
     hidden = SHOWN * np.sqrt(2 * _degrees(sensor, q)) / ((1 - 1 / n_sensors) * p * n_sensors)
     unseen = 1 + UNSEEN * hidden * (1 - q / np.maximum(wanted, 1)) * (wanted > 0)
-    root = np.linalg.inv(whitener)
+    root = np.asarray(np.linalg.inv(whitener), np.complex128)
     # noise of a bin is linear in the projected matrix
-    weight = divided_beside((root[:, :, a] * root[:, :, b].conj())[own], U, sensor)
+    weight = weights_beside(root, own, U, sensor)
     return _Fit(
         parts=parts,
         motion=U,
@@ -399,7 +401,7 @@ def _mean_coupling(
 ) -> ComplexArray:
     """Return the mean coupling of each block; of few sensors, without that of each sub-block."""
     if are_many(sensor):
-        return parts.mean(coupling_beside(U, sensor))
+        return mean_coupling(U, sensor, parts.share, parts.first)
     n, p = Q.shape[:2]
     a, b = pairs(sensor)
     of, share = (np.split(x, parts.first[1:]) for x in (Q.reshape(n, p * p), parts.share))
@@ -412,9 +414,11 @@ def _read(
     matrix: ComplexArray,
     fit: _Fit,
     sensor: IntArray,
-    wanted: BoolArray | None = None,
+    wanted: BoolArray,
 ) -> None:
-    """Write noise and cumulants of the bins of some blocks: of all, or of the wanted ones."""
+    """Write noise and cumulants of the bins of the wanted blocks."""
+    if not wanted.any():
+        return
     parts, U, weight = fit.parts, fit.motion, fit.weight
     Q = np.eye(U.shape[1]) - U @ U.conj().swapaxes(1, 2)
     a, b = pairs(sensor)
@@ -438,7 +442,7 @@ def _read(
     scaled = np.stack([traces[m] / fit.left[:, None] ** (m + 1) for m in range(3)])
     middle = np.add.reduceat(noise, parts.start) / parts.count[:, None]
     cumulants = moved(scaled[:, at], noise - middle[at])
-    use = np.ones(len(at), np.bool_) if wanted is None else wanted[parts.block][at]
+    use = wanted[parts.block][at]
     found.noise[parts.bins[use]] = noise[use]
     found.cumulants[:, parts.bins[use]] = cumulants[:, use]
 

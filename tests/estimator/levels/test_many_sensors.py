@@ -32,9 +32,18 @@ def test_information_is_inverted_sensor_by_sensor(q: int) -> None:
     U = motion(np.random.default_rng(q), q)
     Q = np.eye(len(TRIAXIAL)) - U @ U.conj().swapaxes(1, 2)
     J = noise_matrices.coupling(Q, *noise_matrices.pairs(TRIAXIAL))
-    expected = noise_matrices.inverse(J)
     np.testing.assert_allclose(noise_matrices.coupling_beside(U, TRIAXIAL), J, atol=1e-14)
-    found = noise_matrices.inverse_beside(U, TRIAXIAL)
+    share, first = np.array([0.5, 0.5, 1.0, 1.0]), np.array([0, 2, 3])
+    mean = noise_matrices.mean_coupling(U, TRIAXIAL, share, first)
+    np.testing.assert_allclose(mean, [(J[0] + J[1]) / 2, J[2], J[3]], atol=1e-14)
+    a, b = noise_matrices.pairs(TRIAXIAL)
+    root = np.where(
+        TRIAXIAL[:, None] == TRIAXIAL,
+        normal(np.random.default_rng(q), *U.shape[:2], len(TRIAXIAL)),
+        0,
+    )
+    expected = (root[:, :, a] * root[:, :, b].conj())[[1, 0, 0, 2]] @ noise_matrices.inverse(J)
+    found = noise_matrices.weights_beside(root, np.array([1, 0, 0, 2]), U, TRIAXIAL)
     error = np.abs(found - expected).max(axis=(1, 2)) / np.abs(expected).max(axis=(1, 2))
     assert error.max() < 1e-13
 
