@@ -210,9 +210,13 @@ def _response_change(advice: ResponseChanges, names: Names) -> str:
     else:
         whose = sensor if advice.channel is None else names.channels[advice.channel]
         direction = "rose" if advice.size > 0 else "fell"
-        what = f"The gain of {whose} {direction} by {percent(abs(advice.size))}"
+        by = "to about zero" if _is_lost(advice) else f"by {percent(abs(advice.size))}"
+        what = f"The gain of {whose} {direction} {by}"
     begin, end = (_clock_time(names, at) for at in (advice.begin, advice.end))
     return f"{what} at {begin}" if begin == end else f"{what} from {begin} to {end}"
+
+
+_LOST = -0.8  # of a gain: its scatter in parts with little motion reaches the rest
 
 
 def _clock_time(names: Names, seconds: float) -> str:
@@ -221,7 +225,14 @@ def _clock_time(names: Names, seconds: float) -> str:
     return time_of_day(names.start_utc_ns + round(seconds * 1e9))
 
 
+def _is_lost(advice: ResponseChanges) -> bool:
+    """Return whether a gain fell to so little that the sensor was moved, or its cable pulled."""
+    return not advice.is_turn and advice.size < _LOST
+
+
 def _remedy(advice: ResponseChanges) -> str:
+    if _is_lost(advice):
+        return "check its place and its cable"
     return "fix the sensor" if advice.is_turn else "let the sensor settle"
 
 

@@ -152,6 +152,20 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
         ("Sensor b turned by 0.05° from 100 s to 300 s", "Fix the sensor"),
     ),
     (
+        ResponseChanges(
+            rank=Rank.DELAYS,
+            sensors=(1,),
+            channel=None,
+            is_turn=False,
+            size=-1.3,
+            size_error=0.1,
+            begin=420.0,
+            end=420.0,
+            variance=0.2,
+        ),
+        ("The gain of b fell to about zero at 420 s", "Check its place and its cable"),
+    ),
+    (
         NoiseChanges(
             rank=Rank.TO_KNOW,
             sensors=(1,),
