@@ -209,7 +209,7 @@ class SignalView(View):
                     made.note = "reading …"
                 else:
                     made.whole, made.created = signal.span, created_at(signal.recording)
-                    made.marks = tuple(mark.begin for mark in signal.marks)
+                    made.marks = tuple(m.begin for m in signal.marks if m.end >= made.whole[0])
                     span = made.whole if look.span is None else fitting(look.span, made.whole)
                     width, height = self._room
                     waves = signal.view(*span, 2 * (width - name_width(signal.view(*span, 1))))
