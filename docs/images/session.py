@@ -27,6 +27,18 @@ PAGE = ROOT / "docs" / "session.md"
 SIZE = (120, 36)
 SPEED = 4.0
 PORT = re.compile(r"/\w+/huddle-\w+/huddle-\w+/tty")
+_KEY = re.compile(r"\x1b\[[A-D]|\x1b\[6~|.", re.DOTALL)
+_FRAME = re.compile("[|│━╌\u2800-\u28ff]+|/tmp/\\S*")
+NAMES = {"\t": "tab", "\r": "enter", "\x1b": "esc", "\x1b[B": "↓", "\x1b[6~": "page down"}
+QUESTIONS = """
+## Twenty questions
+
+Each with the keys that answer it, from the view before; seconds from the last key; the line that
+answers.
+
+| question | keys | s | answer |
+|---|---|---:|---|
+"""
 PATIENCE = 400.0
 """Seconds until a step must have come to the screen."""
 LIMIT = """
@@ -71,7 +83,7 @@ class Session:
 
     def __init__(self, terminal: Terminal, folder: Path) -> None:
         self._terminal, self._folder = terminal, str(folder)
-        self.page = PREFACE
+        self.page, self.answers, self.n_keys, self.walk = PREFACE, "", 0, 0
 
     def see(self, *texts: str, without: str = "") -> None:
         """Wait until some texts are on the screen, and another one is not."""
@@ -87,7 +99,19 @@ class Session:
         """Press keys one after the other, as a person does."""
         for key in keys:
             self._terminal.press(key)
+            self.n_keys += len(_KEY.findall(key))
             time.sleep(0.3)
+
+    def ask(self, question: str, *keys: str, answer: str) -> str:
+        """Press keys; keep the row of the answer, and the seconds that it took to come."""
+        self.press(*keys)
+        seconds = self._terminal.wait_for(answer, timeout=10)
+        row = next(row for row in self._terminal.rows if answer in row)
+        shown = " ".join(_FRAME.sub(" ", row.rpartition("▌")[2]).split())[:70]
+        pressed = " ".join(NAMES.get(key, key) for each in keys for key in _KEY.findall(each))
+        self.answers += f"| {question} | {pressed or '–'} | {seconds:.1f} | {shown} |\n"
+        print(self.answers.splitlines()[-1], flush=True)
+        return row
 
     def keep(self, title: str, text: str) -> None:
         """Keep the screen, once it has come to rest."""
@@ -123,8 +147,8 @@ def simulated(folder: Path) -> Iterator[Path]:
 def drive(session: Session) -> None:
     """Do the whole test."""
     session.see("p checks the sensors")
-    session.press("p")
-    session.see("nothing wrong is seen")
+    session.ask("Is anything wrong before the test?", "p", answer="nothing wrong is seen")
+    session.ask("Are all sensors sending?", answer="● live")
     session.keep(
         "Before the test",
         "`p` reads the sensors without recording. The last line says that all is ready.",
@@ -135,15 +159,22 @@ def drive(session: Session) -> None:
     session.press("\r")
     session.see("power spectral density", "c.o.v.", "● recording")
     session.keep("The test runs", "The first curves, and a verdict that is not decided yet.")
+    session.ask("How long must I still record?", answer="Record for")
+    session.ask("Are the clocks good enough?", answer="clocks A")
     session.see("disconnected")
+    session.ask("Which sensor is lost, and since when?", answer="B has been disconnected")
     session.keep("A cable is pulled", "The recorder goes on with the other two sensors.")
     session.see("● live", without="disconnected")
     session.see("Least margin")
     session.keep(
         "Decided", "The test has ended by itself. The Result view opens, with margin and interval."
     )
-    session.press("w")
-    session.see("Report written")
+    result_view(session)
+    signal_view(session)
+    session.press("3")
+    session.see("Least margin")
+    session.ask("Make the report.", "w", answer="Report written")
+    session.ask("Make a specimen of the certificate.", "i", "\r", answer="Specimen made")
     session.press("s")
     session.see("start a test")
     session.press("\t", "\t", "\x7f" * 8, "\r")
@@ -154,8 +185,37 @@ def drive(session: Session) -> None:
     )
     session.press("x", "y")
     session.see("recording  ", "channel    data", "w Report")
-    session.press("4")
-    session.see("⏎ Open")
+    session.ask("Which tests are there?", "4", answer="⏎ Open")
+    session.ask(
+        "How does this compare with the test before?", "\x1b[B", "c", answer="compared with"
+    )
+
+
+def result_view(session: Session) -> None:
+    """Ask what a result answers."""
+    session.walk = session.n_keys + 2
+    session.ask("Is it good, and what next?", answer="✓ PASS")
+    session.ask("Which limit is nearest?", answer="Least margin")
+    session.ask("How noisy is A.X, and how sure is that?", answer="A.X  ")
+    session.ask("Has A become noisier over its tests?", answer="A S")
+    session.ask("Whose samples are missing?", answer="B: 1 gap")
+    session.ask("Do the sensors share one motion?", answer="model test passes")
+    session.ask("Are all upright?", "a", answer="lean")
+    session.ask("How coherent are A and B?", "\x1b[6~", answer="Coherence of pairs")
+    session.press("\x1b")
+
+
+def signal_view(session: Session) -> None:
+    """Ask what a waveform answers."""
+    session.press("5")
+    session.see("C.Z", "UTC")
+    row = session.ask("What happened to B's cable, and when?", "n", "n", "n", answer="B gap")
+    at = row.split()[0][:5]
+    session.ask(f"What happened at {at}?", "t", at, "\r", answer=" to ")
+    session.ask("When was it loud?", "g", answer="recorded")
+    session.ask("When was the noise loud?", "g", answer="noise")
+    session.ask("Leave this out.", "g", "x", ">", "x", answer="excluded (x: take it back)")
+    session.ask("Take it back.", "x", answer=" A.X −")
 
 
 def main() -> None:
@@ -169,7 +229,8 @@ def main() -> None:
             session.press("\x1b", "2", "x", "y")  # no recorder stays behind a session that failed
             time.sleep(3)
             terminal.close()
-    PAGE.write_text(session.page, encoding="utf-8")
+    walk = f"\nFrom the first key to the specimen of the certificate: {session.walk} keys.\n"
+    PAGE.write_text(session.page + QUESTIONS + session.answers + walk, encoding="utf-8")
 
 
 if __name__ == "__main__":
