@@ -53,10 +53,16 @@ class FlatlineDetector:
         parts = parts.reshape(n_hops * self._n_parts, self._length, -1)
         hops = usable[: n_hops * self._hop].reshape(n_hops, self._hop)
         used = hops[:, : self._n_parts * self._length].reshape(len(parts), -1)
-        whole = np.asarray(used.all(axis=1))
+        whole: NDArray[np.bool_] = np.ones(len(parts), np.bool_)
+        if not usable.all():
+            whole[:] = used.all(axis=1)
         self._seen += int(whole.sum())
-        few = parts[:, :: max(1, self._length // 3)]  # of nearly all parts these tell enough
-        perhaps = (np.ptp(few, axis=1) <= _STILL * np.abs(few[:, 0])) & whole[:, None]
+        first = parts[:, 0]
+        perhaps = np.repeat(whole[:, None], first.shape[1], axis=1)
+        for place in range(self._length // 3, self._length, max(1, self._length // 3)):
+            perhaps &= np.abs(parts[:, place] - first) <= _STILL * np.abs(first)
+            if not perhaps.any():  # of nearly all parts the first tells enough
+                return
         for number in np.flatnonzero(perhaps.any(axis=1)):
             self._still += perhaps[number] & stands_still(parts[number])
 
