@@ -13,11 +13,12 @@ from daq.errors import WrongSettingError
 from daq.results.band_summary import correlation_of
 from daq.results.clock_effect import relative_time
 from daq.results.uncertainty_budget import Budget, Component, calibrated_budgets, known
+from estimator.checks.shared_motion import CanonicalCoherence
 from estimator.errors import InsufficientDataError
 from estimator.responses.calibration import calibrate_sensor, response_curve
 from estimator.responses.derived_quantities import Value
 from estimator.responses.edge_leakage import channel_responses, slope_factor
-from estimator.self_noise.coherency import other_channels, own_channels
+from estimator.self_noise.coherency import coherency, other_channels, own_channels
 from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:
@@ -203,6 +204,7 @@ class _Work:
         self._of_reference = math.hypot(self._of_reference, of_certificates)
         self._scale = scale
         self._csm: ComplexArray = snapshot.csm * scale[:, None] * scale[None, :]
+        self._coherence = CanonicalCoherence(coherency(self._csm, snapshot.dims).matrix)
         n = snapshot.n_effective
         self._averages = min([n, *(octave.n_effective for octave in snapshot.octaves)])
         self._bending = self._curvature()
@@ -217,6 +219,7 @@ class _Work:
             n_effective=self._averages,
             band=band,
             correlation=self._correlation,
+            coherence=self._coherence,
         )
 
     def curve(self, sensor: int) -> ResponseCurve:
@@ -229,6 +232,7 @@ class _Work:
             reference=self._reference,
             n_effective=self._averages,
             correlation=self._correlation,
+            coherence=self._coherence,
         )
 
     def octaves(self) -> list[tuple[float, float]]:

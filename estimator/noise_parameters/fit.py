@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.errors import EstimatorError, InsufficientDataError
+from estimator.median import median
 from estimator.records import NOT_IN_JSON
 
 if TYPE_CHECKING:
@@ -248,11 +249,9 @@ def _scatter(y: FloatArray, sd: FloatArray, model: FloatArray, groups: IntArray)
     for first, stop in pairwise(groups):
         here = slice(first, stop)
         known = np.isfinite(sd[here])
-        level = np.maximum(model[here], FLOOR * np.median(np.abs(y[here])))
+        level = np.maximum(model[here], FLOOR * median(np.abs(y[here])))
         level = np.maximum(level, np.finfo(np.float64).tiny)
-        relative = (
-            np.median((sd[here] / level)[known]) if known.any() else typical / np.median(level)
-        )
+        relative = median((sd[here] / level)[known]) if known.any() else typical / median(level)
         sigma[here] = np.maximum(relative, np.finfo(np.float64).eps) * level
     return sigma
 
@@ -276,7 +275,7 @@ def _converged(
     Deviations of more than `most` standard deviations have a reduced weight (Huber).
     """
     level = np.repeat(
-        [np.median(y[a:b]) for a, b in pairwise(groups)],
+        [median(y[a:b]) for a, b in pairwise(groups)],
         np.diff(groups),
     )
     sigma = _scatter(y, sd, level, groups)

@@ -26,6 +26,7 @@ from estimator.responses.derived_quantities import Value, with_errors
 from estimator.self_noise.coherency import other_channels, own_channels
 
 if TYPE_CHECKING:
+    from estimator.checks.shared_motion import CanonicalCoherence
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 _STEPS = 3  # alternating estimates of delays and matrix
@@ -136,8 +137,17 @@ def _pair(
     reference: int,
     n_effective: float,
     band: tuple[float, float],
+    coherence: CanonicalCoherence | None,
 ) -> _Pair:
-    start = relative_response(csm, frequency, dims=dims, first=reference, second=sensor, band=band)
+    start = relative_response(
+        csm,
+        frequency,
+        dims=dims,
+        first=reference,
+        second=sensor,
+        band=band,
+        coherence=coherence,
+    )
     inside = (frequency >= start.low) & (frequency <= start.high) & (frequency > 0)
     inside &= np.isfinite(csm).all(axis=(1, 2))
     own = [np.array(own_channels(dims, each)) for each in (sensor, reference)]
@@ -234,6 +244,7 @@ def calibrate_sensor(
     n_effective: float,
     band: tuple[float, float],
     correlation: FloatArray,
+    coherence: CanonicalCoherence | None = None,
 ) -> SensorCalibration:
     """Calibrate one sensor against another over a band.
 
@@ -254,6 +265,8 @@ def calibrate_sensor(
     correlation : float64, shape (n_lags,)
         Correlation of neighbouring frequencies, from
         `estimator.levels.bands.bin_correlation`.
+    coherence : CanonicalCoherence, optional
+        Of the same matrix, to avoid its computation for several sensors and bands.
 
     Raises
     ------
@@ -268,6 +281,7 @@ def calibrate_sensor(
         reference=reference,
         n_effective=n_effective,
         band=band,
+        coherence=coherence,
     )
     f, d = pair.frequency, pair.response.shape[1]
     inflation = 1 + 2 * float(np.sum(correlation[1 : len(f)]))
@@ -328,12 +342,13 @@ def response_curve(
     reference: int,
     n_effective: float,
     correlation: FloatArray,
+    coherence: CanonicalCoherence | None = None,
 ) -> ResponseCurve:
     """Return the relative response in narrow bands.
 
     Parameters
     ----------
-    csm, frequency, dims, sensor, reference, n_effective, correlation
+    csm, frequency, dims, sensor, reference, n_effective, correlation, coherence
         As for `calibrate_sensor`.
     edges : float64, shape (n_bands + 1,)
         Hz, ascending.
@@ -346,6 +361,7 @@ def response_curve(
         reference=reference,
         n_effective=n_effective,
         band=(float(edges[0]), float(edges[-1])),
+        coherence=coherence,
     )
     d, n_bands = pair.response.shape[1], len(edges) - 1
     matrix = np.full((n_bands, d, d), np.nan, dtype=np.complex128)
