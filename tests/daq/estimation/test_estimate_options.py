@@ -160,7 +160,7 @@ def test_clipped_blocks_are_left_out_unless_that_is_turned_off(tmp_path: Path) -
     found = estimate([tmp_path / "r.h5"], SETTINGS)
     assert not found.diagnostics.counts.clipped  # what says so itself is left out
     kept = [start for start in range(0, N_SAMPLES - 99, 50) if not 4900 < start < 5050]
-    assert found.left_out == {"gap": 0, "clipped": 2, "transient": 0}
+    assert found.left_out == {"gap": 0, "clipped": 2, "transient": 0, "chosen": 0}
     direct = spectra_of(sensors, kept).csm()
     np.testing.assert_allclose(found.csm[2:], direct[2:], rtol=1e-9, atol=1e-3)
     assert estimate([tmp_path / "r.h5"], replace(SETTINGS, reject=False)).n_dropped == 0
@@ -333,7 +333,8 @@ def test_samples_that_are_no_numbers_are_gaps(tmp_path: Path) -> None:
     sensors["a"].counts[3000, 1] = np.nan
     sensors["c"].counts[7030, 0] = -np.inf
     found = estimate([write(tmp_path / "r.h5", sensors)], SETTINGS)
-    assert found.left_out == {"gap": 4, "clipped": 0, "transient": 0}  # 2950, 3000; 6950, 7000
+    # 2950, 3000; 6950, 7000
+    assert found.left_out == {"gap": 4, "clipped": 0, "transient": 0, "chosen": 0}
     assert np.isfinite(found.results["three-sensor"].noise_psd[2:]).all()
 
 

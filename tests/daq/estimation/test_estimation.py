@@ -187,7 +187,7 @@ def test_a_disturbed_segment_is_left_out_where_that_is_asked_for(tmp_path: Path)
     quiet = estimate([path], replace(SETTINGS, reject=True))
     # Lattice segments at 3950 and 4000.
     assert everything.n_segments - quiet.n_segments == 2
-    assert quiet.left_out == {"gap": 0, "clipped": 0, "transient": 2}
+    assert quiet.left_out == {"gap": 0, "clipped": 0, "transient": 2, "chosen": 0}
     assert quiet.data_psd[2:6, 2].max() < 0.2 * everything.data_psd[2:6, 2].min()
 
 
