@@ -32,6 +32,7 @@ from daq.devices.port_rules import package, port_label
 from daq.devices.shared_port import Presence, answering
 from daq.errors import (
     BenchFileError,
+    DeviceError,
     FileFault,
     NoAnswerError,
     NotConnectedError,
@@ -58,7 +59,11 @@ NOTIFIER_CYCLE = 0.1
 NMT_OPERATIONAL, NMT_PRE_OPERATIONAL = 1, 128
 SILENT = 1.0
 """Seconds without a sample after which a device is started again, or without SYNC, the bus."""
+LOOKS = 4
+"""Waits for SYNC in this time: when this computer was stopped, the first one ends without it."""
 HEARTBEAT_MS = 500
+_Sign = tuple[int, int]
+"""A node that booted or sent a heartbeat, and its state."""
 
 
 class EpsonCanSettings(DriverSettings):
@@ -98,25 +103,25 @@ class EpsonCanSession(Session):
         self._present = {
             one.sensor: Presence(one.sensor, clock, trouble=one.trouble) for one in information
         }
-        self._heard_ns: dict[str, int] = {}
+        self._heard: dict[str, int] = {}  # SYNC messages up to the last sample of each sensor
 
     async def read(self) -> AsyncIterator[DeviceItem]:
         """Start SYNC and yield blocks, events, and the temperatures once a minute, until closed."""
         devices, present = self._devices, self._present
         await self._bus.start([d.node for n, d in devices.items() if not present[n].is_gone])
         reading_times = ReadingTimes()
-        now_ns = sync_ns = self._clock.now().monotonic_ns
-        self._heard_ns = dict.fromkeys(devices, now_ns)
+        self._heard = dict.fromkeys(devices, 0)
         while True:
-            messages, at = await self._bus.read(self._n_messages)
-            if any(cob_id == protocol.SYNC for cob_id, _ in messages):
-                sync_ns = at.monotonic_ns
-            for item in self._decoder.receive(messages, at):
+            messages, signs, at = await self._bus.read(self._n_messages)
+            n_syncs = self._bus.n_syncs
+            ending = self._ending(messages, signs)
+            for item in self._decoder.receive(messages, at, is_last=ending is not None):
                 if isinstance(item, Block):
-                    self._heard_ns[item.sensor] = at.monotonic_ns
+                    self._heard[item.sensor] = n_syncs
                 yield item
-            self._check_producer(at, sync_ns)
-            for event in await self._attend(at):
+            if ending is not None:
+                raise ending
+            for event in await self._attend(signs, n_syncs, at):
                 yield event
             if reading_times.is_due(at):
                 for sensor, device in devices.items():
@@ -124,21 +129,27 @@ class EpsonCanSession(Session):
                         for reading in await self._temperature(sensor, device.node, at):
                             yield reading
 
-    def _check_producer(self, at: HostTime, sync_ns: int) -> None:
-        """Raise NoAnswerError if nobody produces SYNC."""
-        producer = self._bus.producer
-        if (producer, protocol.BOOTED) in self._bus.signs:
-            raise NoAnswerError(f"{self._bus.label}: node {producer}, which sends SYNC, restarted")
-        if (at.monotonic_ns - sync_ns) * 1e-9 / self._clock.speed > SILENT:
-            raise NoAnswerError(f"{self._bus.label}: no SYNC from node {producer} in {SILENT:g} s")
+    def _ending(self, messages: list[protocol.Message], signs: set[_Sign]) -> DeviceError | None:
+        """Return why the session ends with these messages: nobody produces SYNC, or no bus."""
+        producer, failure = self._bus.producer, self._bus.failure
+        if failure is not None and not messages:
+            return NotConnectedError(f"{self._bus.label}: the bus closed ({failure})")
+        if (producer, protocol.BOOTED) in signs:
+            return NoAnswerError(f"{self._bus.label}: node {producer}, which sends SYNC, restarted")
+        if self._bus.n_quiet >= LOOKS:
+            return NoAnswerError(f"{self._bus.label}: no SYNC from node {producer} in {SILENT:g} s")
+        return None
 
-    async def _attend(self, at: HostTime) -> list[Event]:
-        """Start devices again that booted, or have become silent."""
-        signs, self._bus.signs = self._bus.signs, set()
+    async def _attend(self, signs: set[_Sign], n_syncs: int, at: HostTime) -> list[Event]:
+        """Start devices again that booted, or have become silent.
+
+        SYNC messages tell how long: after a stop of this computer, all messages are late alike.
+        """
         found: list[Event] = []
         for sensor, device in self._devices.items():
             presence = self._present[sensor]
-            silent = (at.monotonic_ns - self._heard_ns[sensor]) * 1e-9 / self._clock.speed
+            seconds = (n_syncs - self._heard[sensor]) / device.sensor.sampling_rate
+            silent = seconds / self._clock.speed
             has_booted = (device.node, protocol.BOOTED) in signs
             if presence.is_gone:
                 if any(node == device.node for node, _ in signs):
@@ -152,10 +163,14 @@ class EpsonCanSession(Session):
         return found
 
     async def _start(self, sensor: str, device: _Device) -> None:
+        boot = device.node, protocol.BOOTED
+        self._bus.signs.discard(boot)  # it is configured now
         await device.prepare(self._bus)
+        if boot in self._bus.signs:
+            raise NoAnswerError(f"{self._bus.label}: node {device.node} restarts")
         await self._bus.start_node(device.node)
         self._decoder.started(sensor)
-        self._heard_ns[sensor] = self._clock.now().monotonic_ns
+        self._heard[sensor] = self._bus.n_syncs
 
     async def _temperature(self, sensor: str, node: int, at: HostTime) -> list[Reading]:
         """Return the temperature of a device; none if it does not reply."""
@@ -178,8 +193,11 @@ class _Bus:
         self._wanted |= {base + node for base in protocol.TPDO_COB_IDS for node in nodes}
         self.producer = 0
         """Node that produces SYNC."""
-        self.signs: set[tuple[int, int]] = set()
-        """Nodes that booted or sent a heartbeat since the last look, each with its state."""
+        self.signs: set[_Sign] = set()
+        """Of devices since the last :meth:`read`."""
+        self.n_syncs = 0
+        self.n_quiet = 0
+        """Waits since the last SYNC that was read."""
         self._messages: list[protocol.Message] = []
         self._at: HostTime | None = None
         self._arrived = asyncio.Event()
@@ -223,24 +241,35 @@ class _Bus:
             if data[:1] == b"\0":
                 self._arrived.set()
             return
+        self.n_syncs += cob_id == protocol.SYNC
         self._messages.append((cob_id, data))
         self._at = at
         if len(self._messages) >= self._n_expected and cob_id != protocol.SYNC:
             self._arrived.set()
 
-    async def read(self, n_messages: int) -> tuple[list[protocol.Message], HostTime]:
-        """Return so many messages or more, or those until a device boots, or a second passed."""
+    @property
+    def failure(self) -> Exception | None:
+        """The error that ended the bus."""
+        return self._network.notifier.exception if self._network.notifier else None
+
+    async def read(self, n_messages: int) -> tuple[list[protocol.Message], set[_Sign], HostTime]:
+        """Return so many messages or more, or those until a device boots, or a wait ends.
+
+        And the signs of devices meanwhile.
+        """
         self._n_expected = n_messages
         if len(self._messages) < n_messages:
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(SILENT):
+            try:
+                async with asyncio.timeout(SILENT / LOOKS):
                     await self._arrived.wait()
+            except TimeoutError:
+                self.n_quiet += 1
         self._arrived.clear()
-        failure = self._network.notifier.exception if self._network.notifier else None
-        if failure is not None and not self._messages:
-            raise NotConnectedError(f"{self.label}: the bus closed ({failure})")
         messages, self._messages = self._messages, []
-        return messages, self._at if messages and self._at is not None else self._clock.now()
+        signs, self.signs = self.signs, set()
+        if any(cob_id == protocol.SYNC for cob_id, _ in messages):
+            self.n_quiet = 0
+        return messages, signs, self._at if messages and self._at else self._clock.now()
 
     async def ask(self, node: int, index: int, subindex: int = 0) -> bytes:
         """Read an object of a device."""
@@ -270,6 +299,7 @@ class _Bus:
             await self.set(node, protocol.SAMPLE_COUNTER, 0, 0, 2)
         self._messages.clear()
         self.signs.clear()
+        self.n_syncs = self.n_quiet = 0
         await asyncio.to_thread(self._network.nmt.send_command, NMT_OPERATIONAL)
         self.producer = nodes[0]
         produces = protocol.SYNC | protocol.PRODUCES_SYNC

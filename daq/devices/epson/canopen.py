@@ -113,8 +113,13 @@ class CanDecoder:
         if self._base is not None:
             self._started.add(name)
 
-    def receive(self, messages: Sequence[Message], at: HostTime) -> list[Block | Event]:
-        """Return the blocks that the messages complete, in the order in which they arrived."""
+    def receive(
+        self, messages: Sequence[Message], at: HostTime, *, is_last: bool = False
+    ) -> list[Block | Event]:
+        """Return the blocks that the messages complete, in the order in which they arrived.
+
+        `is_last`: no further messages will come.
+        """
         waiting = [*self._rest, *messages]
         if not waiting:
             return []
@@ -128,7 +133,7 @@ class CanDecoder:
                 name: self._samples(node, cob_ids, rows, syncs)
                 for name, node in self._nodes.items()
             }
-            if not all(map(len, samples.values())) and syncs[-1] < MAX_WAIT:
+            if not all(map(len, samples.values())) and syncs[-1] < MAX_WAIT and not is_last:
                 self._rest = waiting
                 return []
             if not any(map(len, samples.values())):
@@ -142,7 +147,7 @@ class CanDecoder:
             )
             self._base_sync = self._n_before + int(first["sync"][0])
         # What follows the last SYNC may lack messages that are still to come.
-        is_complete = all(
+        is_complete = is_last or all(
             len(self._samples(node, cob_ids[last_sync:], rows[last_sync:], syncs[last_sync:]))
             for node in self._nodes.values()
         )

@@ -24,6 +24,8 @@ class Node:
     def __init__(self, bus: Peer, number: int) -> None:
         self._bus, self.number = bus, number
         self.is_there = True
+        self.sent: list[int] = []
+        """Ticks of its samples."""
         self.reset()
 
     def reset(self) -> None:
@@ -133,6 +135,7 @@ class Peer:
 
     def _sample(self, node: Node) -> None:
         number = node.number
+        node.sent.append(self.tick)
         self.send(0x180 + number, struct.pack("<ii", self.tick, number))
         self.send(0x280 + number, struct.pack("<iH", -self.tick, node.counter % 65536))
         node.counter += 1

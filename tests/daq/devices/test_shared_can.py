@@ -121,6 +121,28 @@ async def test_a_node_that_is_missing_at_first_joins_at_its_place() -> None:
     assert len(rows_of(found, "B")[0]) > 50
 
 
+async def test_a_node_that_boots_while_it_is_configured_is_configured_again() -> None:
+    with bus() as (peer, sensors):
+        node = peer.nodes[2]
+        node.leave()
+        ask = node.ask
+
+        def booting(request: bytes) -> bytes:
+            node.ask = ask  # type: ignore[method-assign]
+            reply = ask(request)
+            node.come()
+            return reply
+
+        node.ask = booting  # type: ignore[method-assign]
+        peer.schedule = {250: [lambda: setattr(node, "is_there", True)]}
+        _, found, _ = await session(sensors, 550)
+    check_rows(found, complete={"A", "C"})
+    index, ticks = rows_of(found, "B")
+    assert ticks == list(range(ticks[0], ticks[-1] + 1))
+    assert ticks == node.sent[: len(ticks)]
+    assert index == list(range(index[0], index[-1] + 1))
+
+
 @pytest.mark.parametrize(
     "order",
     [
@@ -140,8 +162,10 @@ async def test_the_bus_goes_on_without_its_producer_and_a_dead_node(order: list[
             peer.schedule[250] = [producer.come]
         _, before, why = await session(sensors, 10**6)
         assert "node 1" in why
+        sent = [peer.nodes[NODES[name]].sent[-1] for name in "AB"]
         information, after, why = await session(sensors, peer.tick + 400)
     assert not why
+    assert sent == [rows_of(before, name)[1][-1] for name in "AB"]  # up to the last SYNC
     gone = {"A"} if "producer dies" in order else set()
     gone |= {"C"} if "C is dead" in order else set()
     alive = {"A", "B", "C"} - gone
