@@ -218,6 +218,8 @@ class SeedLinkDecoder:
         self._name = next(iter(selections)) if len(selections) == 1 else ""
         self._n_jumps: Counter[str] = Counter()  # of the numbers of a station's packets
         self._n_jumps_at: dict[str, int] = {}  # at the latest record of a stream
+        self.waiting: list[Block | Event] = []
+        """Items that no session has yielded yet: a connection may be lost while it is opened."""
         self.last: dict[str, tuple[int, int]] = {}
         """Last packet of each station, by ``NET_STA``: its number, UTC of its first sample in
         ns."""

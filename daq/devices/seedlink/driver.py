@@ -152,7 +152,6 @@ class SeedLinkSession(Session):
         link: _Link,
         *,
         information: tuple[DeviceInformation, ...],
-        buffered: list[Block | Event],
         resumed: bool,
     ) -> None:
         self.information = information
@@ -160,18 +159,16 @@ class SeedLinkSession(Session):
         self.resumed = resumed
         self.patience = link.settings.patience
         self._link = link
-        self._buffered = buffered
 
     async def read(self) -> AsyncIterator[Block | Event]:
         """Yield blocks and events."""
-        buffered, self._buffered = self._buffered, []
-        for item in buffered:
-            yield item
+        while self.decoder.waiting:
+            yield self.decoder.waiting.pop(0)
         link = self._link
-        refused = {
-            name: Presence(name, link.clock, trouble=why) for name, why in link.refused.items()
-        }
+        refused: dict[str, Presence] = {}
         while True:
+            for name in link.refused.keys() - refused.keys():  # each connection may refuse others
+                refused[name] = Presence(name, link.clock, trouble=link.refused[name])
             received, at = await link.read(refused.values())
             for item in self.decoder.receive(received, at):
                 yield item
@@ -345,12 +342,11 @@ async def _opened(
     link = _Link(planned, sensors, clock, decoder)
     async with contextlib.aclosing(link):
         await link.open()
-        buffered = link.taken()
-        await _listen(link, buffered)
+        decoder.waiting += link.taken()
+        await _listen(link)
         yield SeedLinkSession(
             link,
             information=_information(planned, sensors, link),
-            buffered=buffered,
             resumed=before is not None,
         )
 
@@ -471,13 +467,13 @@ class _Server:
         return text
 
 
-async def _listen(link: _Link, buffered: list[Block | Event]) -> None:
+async def _listen(link: _Link) -> None:
     """Listen until the streams of every sensor are decided, for at most the patience."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(link.settings.patience / link.clock.speed):
             while not set(link.decoder.silent) <= {*link.refused, *link.decoder.refused}:
                 received, at = await link.server.stream.read()
-                buffered += link.decoder.receive(received, at)
+                link.decoder.waiting += link.decoder.receive(received, at)
 
 
 def _information(

@@ -33,18 +33,22 @@ def record(name: str, station: int, turn: int, *, size: int = 256, rate: int = R
 
 
 class Server:
-    """Keeps all records that it made; ``make`` makes one more of each station.
+    """Keeps all records that it made; ``make`` makes one more of each station that is not away.
 
-    ``refuses`` are stations that get ERROR, ``rates`` those whose records state another rate;
-    ``hang_up`` closes all connections.
+    ``made`` has the turns of the records of each station, ``refuses`` stations that get ERROR,
+    ``rates`` those whose records state another rate; ``hang_up`` closes all connections.
     """
 
     def __init__(self, stations: list[str], *, size: int = 256, padded: bool = False) -> None:
         self.stations = stations
+        self.made: dict[str, list[int]] = {name: [] for name in stations}
         self.refuses: set[str] = set()
+        self.away: set[str] = set()
         self.rates: dict[str, int] = {}
         self.n_turns = 0
         self.n_connections = 0
+        self.sending = asyncio.Event()
+        """Set when a connection gets records."""
         self._size, self._padded = size, padded
         self._streams: dict[asyncio.StreamWriter, dict[str, int]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
@@ -66,20 +70,22 @@ class Server:
 
     def make(self) -> None:
         """Make one record of each station, and send what is requested."""
+        for name in set(self.stations) - self.away:
+            self.made[name].append(self.n_turns)
         self.n_turns += 1
         for writer, following in self._streams.items():
             self._send(writer, following)
 
     def _send(self, writer: asyncio.StreamWriter, following: dict[str, int]) -> None:
-        for name, turn in following.items():
-            for number in range(turn, self.n_turns):
+        for name, sent in following.items():
+            for number, turn in enumerate(self.made[name][sent:], sent):
                 rate = self.rates.get(name, RATE)
                 station = self.stations.index(name)
-                payload = record(name, station, number, size=self._size, rate=rate)
+                payload = record(name, station, turn, size=self._size, rate=rate)
                 if self._padded:
                     payload = payload.ljust(512, b"\0")
                 writer.write(b"SL%06X" % number + payload)
-            following[name] = max(turn, self.n_turns)
+            following[name] = max(sent, len(self.made[name]))
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
@@ -96,6 +102,7 @@ class Server:
                     continue
                 if command == "END":
                     self._streams[writer] = chosen
+                    self.sending.set()
                     self._send(writer, chosen)
                     continue
                 if command == "STATION":
@@ -104,7 +111,7 @@ class Server:
                     writer.write(b"ERROR\r\n")
                     continue
                 if command == "DATA":
-                    chosen[name] = int(rest[0], 16) if rest else self.n_turns
+                    chosen[name] = int(rest[0], 16) if rest else len(self.made[name])
                 writer.write(b"OK\r\n")
         except (asyncio.CancelledError, ConnectionError):
             pass

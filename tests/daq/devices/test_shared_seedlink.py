@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from contextlib import AbstractAsyncContextManager
 
     from daq.devices.interface import Session
+    from daq.host_clock import HostClock
     from daq.protocols.block import DeviceItem
 
 DRIVER = driver_type("seedlink")
@@ -133,15 +134,68 @@ async def test_a_refused_station_costs_the_others_nothing_and_comes_back(
         await stack.aclose()
 
 
+async def test_a_station_that_a_later_connection_refuses_is_requested_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(shared_port, "FIRST_RETRY", 0.1)
+    async with Server(NAMES) as server:
+        server.refuses = {"BBB"}
+        opening = asyncio.create_task(_opened(server))
+        while not opening.done():
+            server.make()
+            await asyncio.wait([opening], timeout=0.05)
+        _, stack, reader, task = opening.result()
+        server.refuses = {"CCC"}
+        await reader.until(server, BBB=200)
+        server.refuses = set()
+        await reader.until(server, AAA=200, BBB=200, CCC=200)
+        for name in NAMES:
+            reader.check(name)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        await stack.aclose()
+
+
+async def test_records_that_come_while_a_connection_is_opened_and_lost_are_recorded() -> None:
+    async with Server(NAMES) as server:
+        server.away = {"AAA"}  # awaited for the patience of 1 s
+        clock = SystemClock(5.0)
+        opening = asyncio.create_task(_opened(server, clock=clock))
+        while not opening.done():
+            server.make()
+            await asyncio.wait([opening], timeout=0.05)
+        session, stack, reader, task = opening.result()
+        await reader.until(server, BBB=200, CCC=200)
+        server.hang_up()
+        await asyncio.gather(task, return_exceptions=True)
+        await stack.aclose()
+        server.sending.clear()
+        failing = asyncio.create_task(_opened(server, session, clock=clock))
+        async with asyncio.timeout(limit(30)):
+            await server.sending.wait()
+        for _ in range(5):
+            server.make()
+        await asyncio.sleep(0.3)
+        server.hang_up()
+        with pytest.raises(NotConnectedError):
+            await failing
+        _, stack, again, task = await _opened(server, session, clock=clock)
+        again.items, again.rows = reader.items, reader.rows
+        await again.until(server, BBB=200, CCC=200)
+        for name in ("BBB", "CCC"):
+            again.check(name)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        await stack.aclose()
+
+
 async def _opened(
-    server: Server, before: Session | None = None
+    server: Server, before: Session | None = None, *, clock: HostClock | None = None
 ) -> tuple[Session, contextlib.AsyncExitStack, Reader, asyncio.Task[None]]:
     stack = contextlib.AsyncExitStack()
-    bench = sensors(server.port)
+    bench, clock = sensors(server.port), clock or SystemClock()
     opened: AbstractAsyncContextManager[Session] = (
-        DRIVER.open(bench, SystemClock())
-        if before is None
-        else DRIVER.resume(bench, SystemClock(), before)
+        DRIVER.open(bench, clock) if before is None else DRIVER.resume(bench, clock, before)
     )
     session = await stack.enter_async_context(opened)
     reader = Reader()
