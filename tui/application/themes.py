@@ -7,6 +7,7 @@ symbol and a word, and each curve a mark.
 
 from __future__ import annotations
 
+import select
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final, TypeVar
 
@@ -123,8 +124,11 @@ class HarmlessLines(LineFilter):
         return segments
 
 
+_TERMINAL_CHECK = 1.0  # seconds between looks at whether there is still a terminal
+
+
 class ThemedApp(App[Outcome]):
-    """An application in these themes, whose lines are harmless to a terminal."""
+    """An application in these themes, whose lines are harmless to a terminal; ends with it."""
 
     _filters_for: tuple[str, Sequence[LineFilter]] = "", ()
     _line_filters: Sequence[LineFilter] = ()
@@ -136,6 +140,18 @@ class ThemedApp(App[Outcome]):
         self.theme = USUAL
         for name in self.available_themes.keys() - THEMES.keys():
             self.unregister_theme(name)
+
+    def on_mount(self) -> None:
+        """Look after the terminal; Textual calls this beside that of each subclass."""
+        if not self.is_headless and hasattr(select, "poll"):
+            self.set_interval(_TERMINAL_CHECK, self._end_without_terminal)
+
+    def _end_without_terminal(self) -> None:
+        """End where the terminal has gone without a signal: Textual would read its end for ever."""
+        terminal = select.poll()
+        terminal.register(0, 0)
+        if any(events & select.POLLHUP for _, events in terminal.poll(0)):
+            self.exit()
 
     def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
         """Yield the commands of Textual that the palette has."""
