@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 FILE = "index.sqlite"
 ROLLUP = "rollup-"
-"""Names of files of years begin with this (`daq.archive.years`)."""
+"""Names of files of years begin with this (`daq.archive.answers`)."""
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS recordings
     (name TEXT PRIMARY KEY, n_bytes INTEGER, modified_ns INTEGER, document TEXT);

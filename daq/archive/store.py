@@ -8,7 +8,7 @@
         2026/RUN.h5         spectra and summaries of one recording (`daq.archive.spectra_file`),
                             in the year in which it begins; without a year in older archives
         2026/2026-11-01.h5  of a day, where waveform files are taken by station and day
-        2026/rollup-KEY.h5  months and year (`daq.archive.years`)
+        2026/rollup-KEY.h5  months and year (`daq.archive.answers`)
 
 A file is replaced whole. One command at a time adds recordings; others may read. The index and the
 roll-ups can be deleted: they are made again.

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from daq.archive.plan import Plan
-    from daq.formats.channel_runs import Overlap
+    from daq.formats.assembly import Overlap
     from daq.formats.importer import ImportResult
     from daq.formats.memory import RecordingInMemory
     from daq.formats.response import Responses

@@ -6,7 +6,7 @@ import bisect
 import math
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from daq.clocks.clock_model import (
     OffsetSource,
 )
 from daq.clocks.device_utc import UtcRate, corrected
-from daq.clocks.growing_rows import GrowingRows
 from daq.clocks.quantiles import median
 from daq.clocks.slips import Slips
 from daq.errors import CannotAlignError
@@ -37,6 +36,46 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
     BoolArray = NDArray[np.bool_]
     IntArray = NDArray[np.int64]
+
+
+_Number = TypeVar("_Number", bound=np.generic)
+
+
+class GrowingRows(Generic[_Number]):
+    """One array that is doubled when it is full: an array for each row takes ten times as much.
+
+    Parameters
+    ----------
+    dtype : type
+    columns : int
+        Numbers in a row.
+    """
+
+    def __init__(self, dtype: type[_Number], *columns: int) -> None:
+        self._rows: NDArray[_Number] = np.empty((16, *columns), dtype)
+        self._n = 0
+
+    def __len__(self) -> int:
+        return self._n
+
+    def add(self, rows: NDArray[Any]) -> None:
+        """Append rows, shape (n, columns)."""
+        end = self._n + len(rows)
+        if end > len(self._rows):
+            room = np.empty((max(end, 2 * self._n), *self._rows.shape[1:]), self._rows.dtype)
+            room[: self._n] = self.values
+            self._rows = room
+        self._rows[self._n : end] = rows
+        self._n = end
+
+    def clear(self) -> None:
+        """Drop all rows."""
+        self._rows, self._n = self._rows[:16].copy(), 0
+
+    @property
+    def values(self) -> NDArray[_Number]:
+        """All rows, shape (n, columns): later ones do not change them."""
+        return self._rows[: self._n]
 
 
 def from_instants(

@@ -34,7 +34,7 @@ from daq.errors import DeviceError, NoAnswerError, NotConnectedError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, Event, EventKind
 from daq.protocols.errors import RemoteProtocolError
-from daq.recorder.block_checks import BlockValidator
+from daq.recorder.connection import BlockValidator
 from daq.transport.address import host_and_port
 
 if TYPE_CHECKING:

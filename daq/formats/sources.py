@@ -15,21 +15,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 from daq.errors import ImportFormatError
-from daq.formats.assembly import assembled
-from daq.formats.channel_runs import SAME_RATE
+from daq.formats.assembly import SAME_RATE, assembled
 from daq.formats.foreign_sensor import FIRST_DATE_NS
-from daq.formats.readers.delimited.reader import read_delimited
+from daq.formats.readers.delimited import read_delimited
 from daq.formats.readers.miniseed import is_miniseed, miniseed_parts
 from daq.formats.readers.npz import read_mat, read_npz
-from daq.formats.readers.tdms import tdms_parts
-from daq.formats.readers.vibration import read_uff, read_wav
+from daq.formats.readers.vibration import read_uff, read_wav, tdms_parts
 from daq.formats.readers.waveforms import waveform_parts
 from daq.formats.traces import FilePart, PartCache, pieces_of, traces_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
-    from daq.formats.channel_runs import Overlap
+    from daq.formats.assembly import Overlap
     from daq.formats.foreign_sensor import Calibration, ForeignSensor
     from daq.formats.traces import Part, Piece, Trace
 

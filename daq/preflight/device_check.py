@@ -17,10 +17,9 @@ from daq.devices.registry import driver_type
 from daq.devices.text.format import MessageFinder
 from daq.devices.text.guess import guess_settings
 from daq.errors import DeviceError, NoAnswerError, NotConnectedError, WrongDeviceError
-from daq.preflight.arrivals import arrivals
 from daq.preflight.findings import CheckRow, Outcome
 from daq.preflight.preflight import check_list
-from daq.preflight.preview import LENGTH, SensorPreview
+from daq.preflight.preview import LENGTH, SensorPreview, arrivals
 from daq.protocols.block import Block, BlockFlag, Event
 from daq.protocols.errors import RemoteProtocolError
 from daq.recorder.device_identity import check_identity, with_owner

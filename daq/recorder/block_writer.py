@@ -1,6 +1,12 @@
 """Writes the items of all connections into the recording: blocks, gaps and events.
 
 It has no clock and no event loop; the recorder calls it from its writing thread.
+
+Devices that repeat their readings for long are found while a run goes on. Rows are kept for some
+seconds at intervals, and judged as in a check list
+(``estimator.checks.count_limits.share_of_repeats``, which who runs the recorder gives: the recorder
+knows no estimator). Readings that repeat three times in a row
+are repeated for good: a quiet channel is not named by chance.
 """
 
 from __future__ import annotations
@@ -11,25 +17,71 @@ import re
 from collections import defaultdict, deque
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
 
 from daq.protocols.block import Block, Event, EventKind, Quantity, Reading, ReadingTimes
 from daq.protocols.pace import Pace
 from daq.recorder.connection import SensorLate, SensorLost
 from daq.recorder.late_blocks import REASON as LATE_FOR_GOOD
 from daq.recorder.late_blocks import LateBlocks
-from daq.recorder.repeated_rows import RepeatedRows
 from daq.recorder.sample_index import Gap, SampleIndexer
 from daq.recording.sensor_state import SensorState
 from daq.recording.writer import SensorCounts
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from typing import Any
+
+    from numpy.typing import NDArray
 
     from daq.protocols.block import HostTime
     from daq.recorder.connection import Connected, Item
-    from daq.recorder.repeated_rows import ShareOfRepeats
     from daq.recording.writer import Committed, RecordingWriter
+
+
+ShareOfRepeats: TypeAlias = "Callable[[NDArray[Any]], float]"
+
+ROWS = 1000
+"""Rows that are judged together."""
+INTERVAL = 20.0
+"""Seconds of the sensor's time from one judgment to the next."""
+_TIMES = 3
+
+
+class RepeatedRows:
+    """Judges the rows of one sensor now and then.
+
+    Parameters
+    ----------
+    sampling_rate : float
+        In Hz.
+    share_of_repeats : callable
+        Returns the share of rows, shape (n_samples, n_channels), that repeat the row before.
+    """
+
+    def __init__(self, sampling_rate: float, share_of_repeats: ShareOfRepeats) -> None:
+        self._rate = sampling_rate
+        self._share_of_repeats = share_of_repeats
+        self._kept: list[NDArray[Any]] = []
+        self._n_kept = self._n_waited = self._n_times = 0
+
+    def refresh_rate(self, counts: NDArray[Any]) -> float | None:
+        """Take rows; return the rate in Hz of new readings, once, when they repeat for long."""
+        if self._n_waited > 0:
+            self._n_waited -= len(counts)
+            return None
+        self._kept.append(counts)
+        self._n_kept += len(counts)
+        if self._n_kept < ROWS:
+            return None
+        share = self._share_of_repeats(np.concatenate(self._kept))
+        self._kept.clear()
+        self._n_kept, self._n_waited = 0, round(INTERVAL * self._rate)
+        self._n_times = self._n_times + 1 if share else 0
+        return (1 - share) * self._rate if self._n_times == _TIMES else None
+
 
 _LOGGER = logging.getLogger(__name__)
 _ROUTINE = {
@@ -185,7 +237,7 @@ class BlockWriter:
     speed : float
         Of the host's clock against real time.
     share_of_repeats : callable, optional
-        See :class:`daq.recorder.repeated_rows.RepeatedRows`; default: repeats are not looked for.
+        See :class:`daq.recorder.block_writer.RepeatedRows`; default: repeats are not looked for.
     """
 
     def __init__(

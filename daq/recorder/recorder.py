@@ -18,11 +18,12 @@ import logging
 import math
 import shutil
 import signal
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from daq.bench.durations import format_duration
 from daq.devices.bench_file import is_simulated
@@ -39,7 +40,6 @@ from daq.recording import control
 from daq.recording.control import Command
 from daq.recording.file_format import SIMULATED, SensorLayout
 from daq.recording.storage.names import CONTINUES, continuation_names
-from daq.recording.storage.writing_thread import WritingThread
 from daq.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
@@ -48,9 +48,32 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench, Sensor
     from daq.devices.interface import AnyDriver
     from daq.host_clock import HostClock
+    from daq.recorder.block_writer import ShareOfRepeats
     from daq.recorder.connection import Item
-    from daq.recorder.repeated_rows import ShareOfRepeats
     from daq.recording.writer import Committed
+
+
+class WritingThread:
+    """The only thread that accesses the file."""
+
+    def __init__(self) -> None:
+        self._executor = ThreadPoolExecutor(1, thread_name_prefix="recording")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._executor.shutdown()
+
+    async def run(self, function: Callable[[], _Result]) -> _Result:
+        """Run a function in the thread; wait for its end even if this task is cancelled."""
+        future = asyncio.get_running_loop().run_in_executor(self._executor, function)
+        try:
+            return await asyncio.shield(future)
+        except asyncio.CancelledError:
+            await asyncio.wait([future])
+            raise
+
 
 _LOGGER = logging.getLogger(__name__)
 QUEUE_LENGTH = 4096

@@ -1,25 +1,347 @@
-"""One sensor of an open recording: its committed samples, blocks and gaps."""
+"""One sensor of an open recording: its committed samples, blocks and gaps.
+
+A long recording has millions of blocks. Rows stay in the file and are read on demand. Only the
+newest rows and the clipped stretches are
+kept in memory, since they are needed repeatedly.
+
+Many small chunks of a dataset are read together, also from several threads. HDF5 takes longer to
+fetch a small chunk than to read it. So where a file is closed, the raw chunks
+are located once, and read from the file as they are, many at a time. Checksums are of blocks, so
+whoever reads them finds out what is damaged.
+"""
 
 from __future__ import annotations
 
+import bisect
 import contextlib
+import os
+import threading
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from daq.errors import NotARecordingError, RecordingError
+from daq.protocols.block import BlockFlag
 from daq.recording import file_format
-from daq.recording.chunks.block_table import BlockTable
 from daq.recording.chunks.checksums import intact_blocks
-from daq.recording.chunks.chunk_reader import ChunkedRows
 from daq.recording.storage.opening import refresh
+from daq.recording.storage.packing import PIPELINE, RAW, InflationError, check_chunks, unpacked
 from daq.recording.storage.refusals import check_length, dataset, number, text
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     import h5py
     from numpy.typing import NDArray
 
     from daq.bench.channel import Channel
+
+    IntArray = NDArray[np.int64]
+
+
+_ROWS_PER_READ = 1 << 14  # 900 kB
+_ROWS_PER_MARK = 1 << 8
+_NEWEST_ROWS = 1 << 10  # 57 kB; who follows a recording asks for them again and again
+
+
+class BlockTable:
+    """Committed blocks, dtype :data:`daq.recording.file_format.BLOCK_DTYPE`, indexed like an array.
+
+    A slice reads only its rows; the name of a field reads only that field.
+    """
+
+    def __init__(self, dataset: h5py.Dataset) -> None:
+        self._dataset = dataset
+        self._n_rows = 0
+        self._clipped: list[IntArray] = []
+        self._marks: list[int] = []
+        self._newest = np.empty(0, dataset.dtype)
+        self._covering: tuple[int, int, NDArray[np.void]] = (0, 0, self._newest)
+        self.n_samples = 0
+        """Number of rows of samples in these blocks."""
+
+    def __len__(self) -> int:
+        return self._n_rows
+
+    def __getitem__(self, which: Any) -> NDArray[Any]:  # noqa: ANN401 - any index of an array
+        if isinstance(which, str):
+            return self._read(0, self._n_rows, which)
+        if isinstance(which, slice) and which.step is None:
+            first, last, _ = which.indices(self._n_rows)
+            return self._read(first, max(first, last))
+        return np.asarray(self._read(0, self._n_rows)[which])
+
+    def __iter__(self) -> Iterator[NDArray[np.void]]:
+        for first in range(0, self._n_rows, _ROWS_PER_READ):
+            yield from self[first : first + _ROWS_PER_READ]
+
+    @property
+    def clipped(self) -> IntArray:
+        """First sample, and the one after the last, of each clipped stretch; shape (n, 2)."""
+        if len(self._clipped) > 1:
+            self._clipped = [np.concatenate(self._clipped)]
+        return self._clipped[0] if self._clipped else np.empty((0, 2), np.int64)
+
+    def extend(self, n_rows: int, n_samples: int, *, closed: bool = False) -> None:
+        """Add blocks up to row ``n_rows``, without those that end beyond ``n_samples``.
+
+        A crash may leave one of the two numbers older than the other. Blocks and samples are cut to
+        end together. A closed recording was completed, so it has exactly these numbers.
+
+        Raises
+        ------
+        RecordingError
+            If the blocks are not contiguous, or those of a closed recording have another number of
+            samples.
+        """
+        if n_rows > self._n_rows:
+            refresh(self._dataset)
+        for first in range(self._n_rows, n_rows, _ROWS_PER_READ):
+            blocks = self._read(first, min(first + _ROWS_PER_READ, n_rows))
+            ends = blocks["first_row"] + blocks["n_samples"]
+            if closed:
+                self._check_contiguous(blocks)  # `ends` of damaged blocks are not in order
+            n_whole = int(np.searchsorted(ends, n_samples, side="right"))
+            self._check_contiguous(blocks[:n_whole])
+            if n_whole:
+                self._mark(blocks[:n_whole])
+                self._n_rows, self.n_samples = first + n_whole, int(ends[n_whole - 1])
+                self._note_clipped(blocks[:n_whole])
+                self._keep_newest(blocks[:n_whole])
+            if n_whole < len(blocks):
+                break
+        if closed and self.n_samples != n_samples:
+            raise RecordingError(
+                f"{self._where}: damaged: its blocks have {self.n_samples} samples; expected"
+                f" {n_samples}"
+            )
+
+    def covering(self, first_row: int, last_row: int) -> NDArray[np.void]:
+        """Return the blocks with rows ``first_row`` to ``last_row`` (not included) of samples."""
+        marks = self._marks
+        begin = (bisect.bisect_right(marks, first_row) - 1) * _ROWS_PER_MARK
+        end = bisect.bisect_left(marks, last_row) * _ROWS_PER_MARK
+        first, last, _ = slice(max(0, begin), end).indices(self._n_rows)
+        known_first, known_last, blocks = self._covering
+        if not known_first <= first <= last <= known_last:
+            known_first, blocks = first, self._read(first, max(first, last))
+            self._covering = first, first + len(blocks), blocks
+        blocks = blocks[first - known_first : last - known_first]
+        ends = blocks["first_row"] + blocks["n_samples"]
+        return np.asarray(blocks[(ends > first_row) & (blocks["first_row"] < last_row)])
+
+    def _check_contiguous(self, blocks: NDArray[np.void]) -> None:
+        """Check that each block begins at the row where the previous one ends.
+
+        If not, ``n_samples`` becomes the number of samples whose blocks are certain.
+
+        Raises
+        ------
+        RecordingError
+            With the first wrong row of the table.
+        """
+        ends = blocks["first_row"] + blocks["n_samples"]
+        expected = np.append(self.n_samples, ends[:-1]) if len(blocks) else ends
+        wrong = np.flatnonzero((blocks["first_row"] != expected) | (blocks["n_samples"] <= 0))
+        if len(wrong):
+            at = int(wrong[0])
+            # Either this row is wrong, or the number of samples of the row before.
+            self.n_samples = int(expected[max(at - 1, 0)])
+            raise RecordingError(
+                f"{self._where}: damaged: row {self._n_rows + at} has its samples at row"
+                f" {blocks['first_row'][at]}; expected {expected[at]}"
+            )
+
+    def _mark(self, blocks: NDArray[np.void]) -> None:
+        """Store the first row of samples of every ``_ROWS_PER_READ``-th block."""
+        first = -self._n_rows % _ROWS_PER_MARK
+        self._marks += blocks["first_row"][first::_ROWS_PER_MARK].tolist()
+
+    def _keep_newest(self, blocks: NDArray[np.void]) -> None:
+        self._newest = np.concatenate([self._newest, blocks])[-_NEWEST_ROWS:].copy()
+
+    def _note_clipped(self, blocks: NDArray[np.void]) -> None:
+        blocks = blocks[(blocks["flags"] & int(BlockFlag.CLIPPED)) != 0]
+        if len(blocks):
+            first, end = blocks["first_sample"], blocks["first_sample"] + blocks["n_samples"]
+            apart = first[1:] != end[:-1]
+            begins, ends = first[np.append(True, apart)], end[np.append(apart, True)]
+            self._clipped.append(np.column_stack([begins, ends]))
+
+    def _read(self, first: int, last: int, field: str | None = None) -> NDArray[Any]:
+        begin = self._n_rows - len(self._newest)
+        if begin <= first < last <= self._n_rows:
+            newest = self._newest[first - begin : last - begin]
+            return newest if field is None else np.asarray(newest[field])
+        dataset = self._dataset if field is None else self._dataset.fields(field)
+        try:
+            rows = np.asarray(dataset[first:last])
+        except (OSError, RuntimeError) as error:
+            raise RecordingError(
+                f"{self._where}: damaged between rows {first} and {last}: {error}"
+            ) from error
+        if len(rows) < last - first:
+            raise RecordingError(
+                f"{self._where} has {first + len(rows)} rows where {last} were committed"
+            )
+        return rows
+
+    @property
+    def _where(self) -> str:
+        return f"{self._dataset.file.filename}: {self._dataset.name}"
+
+
+_KEPT_BYTES = 1 << 20  # of the last read: short recordings are read several times
+_LOCATED_FROM = 1 / 16  # share of the chunks that is fetched before all are located
+
+
+class RawChunks:
+    """Reads chunks that went through no filter from the file itself.
+
+    Parameters
+    ----------
+    dataset : h5py.Dataset
+        Of a closed file, in chunks along its first axis only.
+    """
+
+    def __init__(self, dataset: h5py.Dataset) -> None:
+        self._file, self._length = dataset.file.id, dataset.chunks[0]
+        row_bytes = dataset.dtype.itemsize * int(np.prod(dataset.chunks[1:]))
+        self._n_bytes = self._length * row_bytes
+        self._at = np.full(-(-len(dataset) // self._length), -1, np.int64)
+        """Byte of the file at which each chunk begins; -1 for one that is not raw."""
+        file = dataset.file
+        if file.driver == "sec2" and not file.userblock_size and hasattr(os, "preadv"):
+            dataset.id.chunk_iter(self._note)
+
+    def _note(self, chunk: Any) -> None:  # noqa: ANN401 - h5py names no type
+        if chunk.filter_mask == RAW and chunk.size == self._n_bytes:
+            self._at[chunk.chunk_offset[0] // self._length] = chunk.byte_offset
+
+    def read(self, first: int, rows: NDArray[Any]) -> bool:
+        """Put the contents of chunks, from chunk `first` on, into rows; return False if not all.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be read.
+        """
+        plain = rows.view(np.uint8).reshape(-1).data
+        at = self._at[first : first + len(plain) // self._n_bytes]
+        if len(at) * self._n_bytes < len(plain) or (at < 0).any():
+            return False
+        cuts = np.flatnonzero(np.diff(at) != self._n_bytes) + 1
+        for begin, end in zip([0, *cuts.tolist()], [*cuts.tolist(), len(at)], strict=True):
+            part = plain[begin * self._n_bytes : end * self._n_bytes]
+            if os.preadv(self._file.get_vfd_handle(), [part], int(at[begin])) < len(part):
+                return False
+        return True
+
+
+class ChunkedRows:
+    """Reads rows of a chunked dataset.
+
+    Parameters
+    ----------
+    dataset : h5py.Dataset
+        Chunked along its first axis only.
+    """
+
+    def __init__(self, dataset: h5py.Dataset) -> None:
+        self._dataset = dataset
+        self._length, *columns = dataset.chunks
+        self._dtype: np.dtype[Any] = dataset.dtype
+        self._corner = (0,) * len(columns)
+        created = dataset.id.get_create_plist()
+        filters = tuple(created.get_filter(n)[0] for n in range(created.get_nfilters()))
+        self._kept: tuple[int, NDArray[Any]] = (0, np.empty((0, *columns), self._dtype))
+        self._lock = threading.Lock()
+        self._direct = filters == PIPELINE and tuple(columns) == dataset.shape[1:]
+        self._checked: set[int] = set()
+        """First rows of the chunks that inflate to no more than their size."""
+        self._n_fetched = 0
+        self._raw: RawChunks | None = None
+        self.is_closed = False
+        """Whether the file is closed: its chunks stay where they are."""
+
+    def read(self, first_row: int, last_row: int, n_rows: int) -> NDArray[Any]:
+        """Return rows, ``last_row`` not included.
+
+        Whoever reads forwards has each chunk decompressed once: rows of the last read, and of the
+        chunk in which it ended, are kept. Threads that read neighbouring rows wait for each other.
+
+        Parameters
+        ----------
+        first_row, last_row : int
+        n_rows : int
+            Rows of the dataset that do not change any more.
+
+        Raises
+        ------
+        OSError, RuntimeError
+            If the file is damaged at these rows.
+        """
+        if self._direct:
+            with self._lock:
+                begin, kept = self._kept
+                if begin <= first_row and last_row <= begin + len(kept):
+                    return kept[first_row - begin : last_row - begin]
+                whole = (begin + len(kept)) // self._length * self._length - begin
+                known, low = kept[:0], first_row // self._length * self._length
+                if 0 <= first_row - begin < whole:
+                    known, low = kept[first_row - begin : whole], first_row
+                # For parts of a chunk HDF5 is used, which caches the chunk.
+                if len(known) or last_row - first_row >= self._length:
+                    rows = self._decompressed(known, low, last_row, n_rows)
+                    if rows is not None:
+                        return rows[first_row - low : last_row - low]
+        self._check_chunks(first_row, last_row)
+        return np.asarray(self._dataset[first_row:last_row])
+
+    def _check_chunks(self, first_row: int, last_row: int) -> None:
+        """Refuse chunks that HDF5 would inflate beyond their size; each is looked at once."""
+        for row in range(first_row // self._length * self._length, last_row, self._length):
+            if row not in self._checked:
+                check_chunks(self._dataset, row, row + self._length)
+                self._checked.add(row)
+
+    def _decompressed(
+        self, known: NDArray[Any], low: int, last_row: int, n_rows: int
+    ) -> NDArray[Any] | None:
+        """Return rows from ``low`` on, the first of which are known; None if HDF5 must read them.
+
+        The rows after the known ones begin a chunk.
+        """
+        start = low + len(known)
+        n_chunks = -(-(last_row - start) // self._length)
+        rows = np.empty((len(known) + n_chunks * self._length, *known.shape[1:]), self._dtype)
+        rows[: len(known)] = known
+        try:
+            if not self._filled(rows[len(known) :], start):
+                return None
+        except InflationError:
+            raise
+        except (OSError, RuntimeError):
+            return None
+        rows = rows[: n_rows - low]
+        rows.flags.writeable = False
+        # The next read begins in a chunk that is not in these rows, or in the rows that are kept.
+        excess = rows.nbytes - _KEPT_BYTES
+        dropped = -(-excess // (rows.nbytes // len(rows))) if excess > 0 else 0
+        self._kept = low + dropped, rows[dropped:].copy() if dropped else rows
+        return rows
+
+    def _filled(self, rows: NDArray[Any], start: int) -> bool:
+        """Put whole chunks, from row ``start`` of the dataset on, into rows; return if all are."""
+        self._n_fetched += len(rows) // self._length
+        many = self._n_fetched * self._length >= _LOCATED_FROM * len(self._dataset)
+        if self._raw is None and self.is_closed and many:
+            self._raw = RawChunks(self._dataset)
+        if self._raw is not None and self._raw.read(start // self._length, rows):
+            return True
+        fetch, end = self._dataset.id.read_direct_chunk, start + len(rows)
+        stored = [fetch((row, *self._corner)) for row in range(start, end, self._length)]
+        return unpacked(stored, rows)
 
 
 class CommittedRows:

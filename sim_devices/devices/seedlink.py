@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.devices.seedlink.decoder import WaveRecord, encode_log, encode_record
 from daq.devices.seedlink.packets import (
     LINE_END,
     WRAP,
@@ -24,7 +25,6 @@ from daq.devices.seedlink.packets import (
     Version,
     encode_packet,
 )
-from daq.devices.seedlink.records import WaveRecord, encode_log, encode_record
 from sim_devices.devices.interface import NEVER, Endpoint, Line, Samples, whole
 
 if TYPE_CHECKING:

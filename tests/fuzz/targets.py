@@ -27,8 +27,7 @@ from daq.devices.modbus import rtu
 from daq.devices.modbus.fifo_protocol import FifoDecoder
 from daq.devices.modbus.registers_protocol import RegisterDecoder, RegisterMap
 from daq.devices.seedlink import packets as seedlink
-from daq.devices.seedlink.decoder import SeedLinkDecoder, Selection
-from daq.devices.seedlink.records import WaveRecord, encode_record
+from daq.devices.seedlink.decoder import SeedLinkDecoder, Selection, WaveRecord, encode_record
 from daq.devices.text.decoder import TextDecoder
 from daq.devices.text.format import RASPBERRY_SHAKE, TextFormat
 from daq.protocols.block import Block, Event, HostTime

@@ -23,11 +23,11 @@ import pytest
 from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.devices.registry import driver_type
-from daq.devices.seedlink.records import WaveRecord, encode_record
+from daq.devices.seedlink.decoder import WaveRecord, encode_record
 from daq.errors import WrongDeviceError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block
-from sim_devices.server.ports import self_signed
+from sim_devices.server.serve import self_signed
 from tests.acceptance.ringserver import Feeder
 from tests.devices import serving
 from tests.sim_devices.simulated_bench import device, spec

@@ -13,8 +13,7 @@ import pytest
 
 from sim_devices.devices.interface import NEVER, Endpoint, Line
 from sim_devices.faults import LineFaults, parse
-from sim_devices.server.ports import PseudoTerminal, TcpPort
-from sim_devices.server.serve import Served, WorldClock
+from sim_devices.server.serve import PseudoTerminal, Served, TcpPort, WorldClock
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -48,13 +47,13 @@ async def test_the_address_is_removed_before_the_terminal(monkeypatch: pytest.Mo
         close(descriptor)
 
     with monkeypatch.context() as patched:
-        patched.setattr("sim_devices.server.ports.os.close", watched)
+        patched.setattr("sim_devices.server.serve.os.close", watched)
         line.hang_up()
     assert there == [False]  # the terminal's own end, and nothing before it
     line.restore()
     assert os.path.lexists(line.address)  # noqa: ASYNC240 - at once, by intent
     with monkeypatch.context() as patched:
-        patched.setattr("sim_devices.server.ports.os.close", watched)
+        patched.setattr("sim_devices.server.serve.os.close", watched)
         await line.close()
     assert not any(there)
 

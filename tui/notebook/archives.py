@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from daq.archive.store import Store
     from daq.archive.waveforms import Found, Reading
-    from daq.formats.channel_runs import Overlap
+    from daq.formats.assembly import Overlap
 
 
 class StationAnswers(Mapping[str, "Answer"]):

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from daq.bench.channel import Channel
     from daq.bench.model import Bench
-    from daq.formats.channel_runs import Overlap
+    from daq.formats.assembly import Overlap
     from daq.formats.memory import RecordingInMemory
     from estimator.types import FloatArray, IntArray
     from tui.notebook.result import Result

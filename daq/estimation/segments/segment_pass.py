@@ -14,7 +14,7 @@ import numpy as np
 from daq.bench.durations import stretch
 from daq.clocks.aligned_recording import AlignedRecording
 from daq.clocks.grid import OwnSamples
-from daq.clocks.growing_rows import GrowingRows
+from daq.clocks.sensor_reader import GrowingRows
 from daq.estimation.segments.clipping import in_clipped_blocks
 from daq.estimation.segments.delay_measurement import DelayMeasurement
 from daq.estimation.segments.flatline import FlatlineDetector, stands_still

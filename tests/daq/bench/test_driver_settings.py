@@ -9,7 +9,7 @@ import pytest
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from daq.bench.driver_settings import settings_of
-from daq.bench.field_faults import field_faults
+from daq.bench.loading import field_faults
 from daq.devices.registry import driver_names, driver_type
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from daq.clocks.growing_rows import GrowingRows
+from daq.clocks.sensor_reader import GrowingRows
 
 
 def test_rows_stay_in_order_and_earlier_looks_do_not_change() -> None:

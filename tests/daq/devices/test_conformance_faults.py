@@ -180,7 +180,7 @@ def test_each_sample_has_its_index(
     """One test, for all modes are recorded once."""
     for module in ("protocols.sample_counter", "devices.labjack.stream"):
         monkeypatch.setattr(f"daq.{module}.SLACK", 2 * HELD_UP * SPEED)
-    monkeypatch.setattr("daq.devices.labjack.device.SLACK", 2 * HELD_UP * SPEED)
+    monkeypatch.setattr("daq.devices.labjack.driver.SLACK", 2 * HELD_UP * SPEED)
     monkeypatch.setattr("daq.recorder.connection.MAX_RETRY_DELAY", MAX_RETRY_DELAY / SPEED)
     path = tmp_path / "all.h5"
     with serving_all(speed=SPEED, faults=script()) as served:

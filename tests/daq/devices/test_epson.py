@@ -12,8 +12,7 @@ from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.devices.epson import commands
 from daq.devices.epson.commands import CommandDecoder, Read, Write
-from daq.devices.epson.device import Configuration, Device, EpsonSettings
-from daq.devices.epson.driver import EpsonSession
+from daq.devices.epson.driver import Configuration, Device, EpsonSession, EpsonSettings
 from daq.devices.interface import DeviceInformation
 from daq.errors import NoAnswerError
 from daq.protocols.block import Block, HostTime

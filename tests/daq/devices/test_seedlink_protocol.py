@@ -12,9 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daq.devices.seedlink import packets
-from daq.devices.seedlink.decoder import SeedLinkDecoder, Selection
+from daq.devices.seedlink.decoder import (
+    SeedLinkDecoder,
+    Selection,
+    WaveRecord,
+    decode_record,
+    encode_record,
+)
 from daq.devices.seedlink.packets import Packet, PacketFinder, Version, encode_packet
-from daq.devices.seedlink.records import WaveRecord, decode_record, encode_record
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
 from daq.protocols.errors import RemoteProtocolError
 

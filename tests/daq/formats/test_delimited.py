@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from daq.errors import ImportFormatError
-from daq.formats.readers.delimited.grid import grid_of
-from daq.formats.readers.delimited.reader import read_delimited
-from daq.formats.readers.delimited.times import nanoseconds
+from daq.formats.readers.delimited import grid_of, nanoseconds, read_delimited
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -11,7 +11,7 @@ import pytest
 from scipy.io import savemat
 
 from daq.errors import ImportFormatError
-from daq.formats.readers.delimited.reader import read_delimited
+from daq.formats.readers.delimited import read_delimited
 from daq.formats.readers.npz import read_mat, read_npz
 from daq.formats.sources import Selection, open_sources
 

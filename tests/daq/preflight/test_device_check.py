@@ -13,7 +13,6 @@ from daq.bench.loading import parse
 from daq.bench.model import Bench
 from daq.devices.registry import driver_names
 from daq.errors import NotConnectedError
-from daq.preflight.arrivals import arrivals
 from daq.preflight.device_check import (
     MODBUS_BAUD_RATES,
     MODBUS_DEVICES,
@@ -21,6 +20,7 @@ from daq.preflight.device_check import (
     examine,
     search_description,
 )
+from daq.preflight.preview import arrivals
 from daq.protocols.block import Block, HostTime
 from tests.devices import host_clock, serving
 from tests.sim_devices.simulated_bench import device, sensors, spec

@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from daq.bench.model import DataSheet
 from daq.devices.interface import DeviceInformation
-from daq.preflight.arrivals import arrivals
 from daq.preflight.findings import Check, CheckRow, Finding, Outcome, Problem
 from daq.preflight.preflight import check_list, is_complete
-from daq.preflight.preview import SensorPreview
+from daq.preflight.preview import SensorPreview, arrivals
 from daq.protocols.block import Block, HostTime
 from estimator.checks.sensitivities import Cause
 from tests.tui.example_snapshot import demo_bench

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from daq.protocols.block import Event, HostTime, Reading
-from daq.recorder.block_checks import BlockValidator, FaultyDriverError
+from daq.recorder.connection import BlockValidator, FaultyDriverError
 from tests.scripted_driver import PlayedDriver, bench, block
 
 NOW = HostTime(10**9, 10**18)

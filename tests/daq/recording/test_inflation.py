@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from daq.errors import NotARecordingError
-from daq.recording.chunks.chunk_reader import ChunkedRows
+from daq.recording.sensor_record import ChunkedRows
 from daq.recording.storage.journal import journal_path, read_journal
 from daq.recording.storage.packing import PIPELINE, InflationError
 from daq.recording.storage.refusals import check_all, dataset, hdf5_function, member

@@ -13,13 +13,12 @@ import pytest
 from daq.bench.channel import Channel
 from daq.errors import RecordingError
 from daq.protocols.block import Block, HostTime
-from daq.recording.creation import make_datasets
 from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
 from daq.recording.repair import repair, verify
 from daq.recording.storage.journal import journal_path
 from daq.recording.storage.superblock import Superblock, lookup3
-from daq.recording.writer import RecordingWriter
+from daq.recording.writer import RecordingWriter, make_datasets
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -11,9 +11,9 @@ import pytest
 
 from daq.bench.channel import Channel
 from daq.protocols.block import Block, HostTime
-from daq.recording.chunks.chunk_reader import ChunkedRows
 from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
+from daq.recording.sensor_record import ChunkedRows
 from daq.recording.storage import packing
 from daq.recording.writer import RecordingWriter
 

@@ -61,7 +61,7 @@ def test_hooks_and_metrics_are_not_recorded(
 def test_a_recording_with_hooks_warns(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("daq.recording.creation.recorded_text", lambda bench: bench.text)
+    monkeypatch.setattr("daq.recording.writer.recorded_text", lambda bench: bench.text)
     bench = parse(BENCH.format(hooks='[hooks]\non_failed = ["x"]'), tmp_path / "lab.toml")
     layout = SensorLayout("a", bench.sensors[0].channels, 100.0, np.dtype("i4"))
     path = tmp_path / "r.h5"

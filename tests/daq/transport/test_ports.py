@@ -17,8 +17,7 @@ import pytest
 from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.devices.epson import commands
-from daq.devices.epson.device import Configuration, Device, EpsonSettings
-from daq.devices.epson.driver import EpsonSession
+from daq.devices.epson.driver import Configuration, Device, EpsonSession, EpsonSettings
 from daq.devices.interface import DeviceInformation
 from daq.devices.registry import driver_type
 from daq.errors import NotConnectedError

@@ -12,9 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daq.devices.guralp import brp, gcf
-from daq.devices.guralp.decoders import SerialDecoder
+from daq.devices.guralp.decoders import SerialDecoder, Streams
 from daq.devices.guralp.gcf import SampleBlock, StatusBlock
-from daq.devices.guralp.streams import Streams
 from daq.protocols.block import Block, BlockFlag, Event, Reading
 from tests.daq.devices.guralp.sample_blocks import (
     AT,

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daq.devices.text import format as text_format
-from daq.devices.text import packet_order
-from daq.devices.text.decoder import TextDecoder
+from daq.devices.text.decoder import MAX_WAITING, TextDecoder
 from daq.devices.text.format import (
     LILY,
     TextFormat,
@@ -181,4 +180,4 @@ def test_memory_stays_bounded() -> None:
     shake = TextDecoder("A", SHAKE, sampling_rate=100.0)
     for packet in range(500):
         shake.receive_datagram(datacast("ENZ", packet), at(0))
-    assert len(shake._packets._waiting) <= packet_order.MAX_WAITING  # noqa: SLF001 -- the claim
+    assert len(shake._packets._waiting) <= MAX_WAITING  # noqa: SLF001 -- the claim

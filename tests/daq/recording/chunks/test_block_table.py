@@ -10,8 +10,8 @@ import pytest
 
 from daq.errors import RecordingError
 from daq.protocols.block import BlockFlag
-from daq.recording.chunks.block_table import BlockTable
 from daq.recording.file_format import BLOCK_DTYPE, BLOCKS_PER_CHUNK
+from daq.recording.sensor_record import BlockTable
 from tests.traced_memory import peak_of
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ import h5py
 import numpy as np
 import pytest
 
-from daq.recording.chunks import chunk_reader
-from daq.recording.chunks.chunk_reader import ChunkedRows, RawChunks
+from daq.recording import sensor_record
+from daq.recording.sensor_record import ChunkedRows, RawChunks
 from daq.recording.storage import packing
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ def test_overlapping_reads_inflate_each_chunk_once(
     rows = ramp("<i4", 3)
     write(tmp_path / "f.h5", rows)
     inflated = count_of_inflated(monkeypatch)
-    monkeypatch.setattr(chunk_reader, "_KEPT_BYTES", kept_bytes)
+    monkeypatch.setattr(sensor_record, "_KEPT_BYTES", kept_bytes)
     with h5py.File(tmp_path / "f.h5", "r") as file:
         reader = ChunkedRows(file["rows"])
         for first in range(0, N_ROWS - overlap, length - overlap):
@@ -206,7 +206,7 @@ def test_raw_chunks_of_a_closed_file_are_read_from_the_file(
         n_read.append(len(stored))
         return packing.unpacked(stored, into)
 
-    monkeypatch.setattr(chunk_reader, "unpacked", unpacked)
+    monkeypatch.setattr(sensor_record, "unpacked", unpacked)
     with h5py.File(tmp_path / "f.h5", "r") as file:
         reader = ChunkedRows(file["rows"])
         np.testing.assert_array_equal(reader.read(0, 20, N_ROWS), rows[:20])

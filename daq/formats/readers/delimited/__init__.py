@@ -1,1 +1,0 @@
-"""CSV and other delimited text, as loggers and spreadsheets write it."""
