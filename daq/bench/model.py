@@ -40,6 +40,7 @@ from daq.bench.tables.unattended import (
     Web,
 )
 from daq.bench.units import DensityUnit
+from daq.errors import ABSENT, BenchFileError, FileFault
 
 Day: TypeAlias = dt.date
 
@@ -247,6 +248,10 @@ class Sensor(Table):
     def clock_name(self, *, shares_clock: bool) -> str:
         """Return the name of the clock that samples this sensor."""
         return self.clock or (self.port if shares_clock else self.name)
+
+    def fault(self, key: str, expected: str, value: object = ABSENT) -> BenchFileError:
+        """Return the error of a value of its table, such as ``settings.filter``."""
+        return BenchFileError(FileFault(key, expected, value, self.name))
 
     @property
     def n_main_channels(self) -> int:

@@ -22,7 +22,7 @@ from pydantic import Field, PositiveFloat, Strict
 from daq.devices.blocking import BlockingSource, Samples
 from daq.devices.interface import DeviceInformation, Driver, DriverSettings, PresentPort
 from daq.devices.port_rules import inputs_of, package, port_label
-from daq.errors import BenchFileError, FileFault, NotConnectedError
+from daq.errors import NotConnectedError
 from daq.protocols.block import BlockFlag
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ class NiDriver(Driver[NiSettings]):
                     "expected ni:// and the name of a device or chassis in NI MAX, such as"
                     " ni://cDAQ1"
                 )
-                raise BenchFileError(FileFault("port", expected, sensor.port, sensor.name))
+                raise sensor.fault("port", expected, sensor.port)
             names = settings[sensor.name].inputs
             names = names or tuple(f"ai{len(used) + k}" for k in range(len(sensor.channels)))
             return [f"{device}{'' if '/' in name else '/'}{name}" for name in names]

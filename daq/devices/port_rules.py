@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeVar
+from urllib.parse import urlsplit
 
-from daq.errors import BenchFileError, FileFault, NotConnectedError, toml_value
+from daq.errors import NotConnectedError, toml_value
 from daq.python_process import install_command
-from daq.transport.address import check_serial, host_and_port
+from daq.transport.address import USUAL_NUMBERS, check_serial, host_and_port
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
@@ -32,7 +33,7 @@ def only(sensors: Sequence[Sensor], why: str) -> Sensor:
     if len(sensors) > 1:
         names = ", ".join(repr(other.name) for other in sensors)
         expected = f"is the port of {names}; {why}"
-        raise BenchFileError(FileFault("port", expected, sensor.port, sensor.name))
+        raise sensor.fault("port", expected, sensor.port)
     require_address(sensor)
     return sensor
 
@@ -73,8 +74,7 @@ def inputs_of(
                 expected = f"{label.format(one)} is already {what} of sensor {used[one]!r}"
             used[one] = sensor.name
         if expected:
-            fault = FileFault(f"settings.{key}", expected, list(inputs), sensor.name)
-            raise BenchFileError(fault)
+            raise sensor.fault(f"settings.{key}", expected, list(inputs))
         found[sensor.name] = inputs
     return found
 
@@ -114,7 +114,38 @@ def require_alike(
                 problem = (
                     f"expected {wanted}, as of {first.name!r}, the first on port {sensor.port}"
                 )
-                raise BenchFileError(FileFault(f"settings.{key}", problem, value, sensor.name))
+                raise sensor.fault(f"settings.{key}", problem, value)
+
+
+def host_of(
+    sensor: Sensor, scheme: str, usual: int | None = None, *, bare: bool = False
+) -> tuple[str, int]:
+    """Return host and number of a port ``scheme://host``, the usual number if it states none.
+
+    Parameters
+    ----------
+    sensor : Sensor
+    scheme : str
+    usual : int, optional
+        Default: that of the scheme.
+    bare : bool
+        Whether the scheme may be absent, or another.
+
+    Raises
+    ------
+    BenchFileError
+        The port has another form.
+    """
+    is_bare = bare and "://" not in sensor.port
+    try:
+        parts = urlsplit(f"{scheme}://{sensor.port}" if is_bare else sensor.port)
+        host, number = parts.hostname or "", parts.port or usual or USUAL_NUMBERS[scheme][0]
+    except ValueError:
+        host = ""
+    if not host or not (bare or parts.scheme == scheme):
+        expected = f"expected {scheme}://host, or {scheme}://host:port"
+        raise sensor.fault("port", expected, sensor.port)
+    return f"[{host}]" if ":" in host else host, number
 
 
 def require_address(sensor: Sensor) -> None:
@@ -130,10 +161,10 @@ def require_address(sensor: Sensor) -> None:
             host_and_port(sensor.port)
         except ValueError as error:
             expected = f"expected {sensor.port.partition('://')[0]}://host:port"
-            raise BenchFileError(FileFault("port", expected, sensor.port, sensor.name)) from error
+            raise sensor.fault("port", expected, sensor.port) from error
     else:
         try:
             check_serial(sensor.port)
         except ValueError as error:
             expected = "expected a device such as /dev/ttyUSB0, or socket://host:port"
-            raise BenchFileError(FileFault("port", expected, sensor.port, sensor.name)) from error
+            raise sensor.fault("port", expected, sensor.port) from error

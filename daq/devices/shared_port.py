@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from daq.devices.interface import DeviceInformation
 from daq.errors import DeviceError, NoAnswerError, NotConnectedError, WrongDeviceError
 from daq.protocols.block import Event, EventKind
+from daq.protocols.errors import shortened
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -111,5 +112,4 @@ class Presence:
         return [self._event(EventKind.CONNECTED, text)]
 
     def _event(self, kind: EventKind, text: str) -> Event:
-        short = text.encode()[:200].decode(errors="ignore")
-        return Event(self.sensor, kind, short, self._clock.now())
+        return Event(self.sensor, kind, shortened(text), self._clock.now())

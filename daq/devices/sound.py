@@ -23,7 +23,7 @@ from pydantic import Field
 from daq.devices.blocking import BlockingSource, Samples
 from daq.devices.interface import DeviceInformation, Driver, DriverSettings, PresentPort
 from daq.devices.port_rules import inputs_of, package, port_label
-from daq.errors import BenchFileError, FileFault, NotConnectedError, WrongDeviceError
+from daq.errors import NotConnectedError, WrongDeviceError
 from daq.protocols.block import BlockFlag
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ class SoundDriver(Driver[SoundSettings]):
                 expected = (
                     "expected audio:// and a part of the card's name; audio:// is the default"
                 )
-                raise BenchFileError(FileFault("port", expected, sensor.port, sensor.name))
+                raise sensor.fault("port", expected, sensor.port)
             first = max(used, default=0) + 1
             following = range(first, first + len(sensor.channels))
             return settings[sensor.name].inputs or following

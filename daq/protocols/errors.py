@@ -30,3 +30,8 @@ class DeviceSettingError(ValueError):
 def several(count: int, one: str, rest: str = "") -> str:
     """Return a count with its noun, such as "1 frame lost" or "2 frames lost"."""
     return f"{count} {one}{'s' * (count != 1)}{' ' * bool(rest)}{rest}"
+
+
+def shortened(text: str, n_bytes: int = 200) -> str:
+    """Return a text of at most so many bytes, as that of an event."""
+    return text.encode()[:n_bytes].decode(errors="ignore")

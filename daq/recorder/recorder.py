@@ -213,37 +213,30 @@ async def record(
     return await recorder.run(duration, drivers, anyway=anyway)
 
 
+@dataclass(eq=False)
 class _Recorder:
-    def __init__(
-        self,
-        bench: Bench,
-        path: Path,
-        clock: HostClock,
-        stop: asyncio.Event,
-        acknowledged: Callable[[RecorderStatus], None] | None,
-        *,
-        attributes: Mapping[str, str],
-        share_of_repeats: ShareOfRepeats | None,
-    ) -> None:
-        self._bench = bench
-        self._share_of_repeats = share_of_repeats
-        self._attributes = attributes
-        self._path = self._file = path
-        self._clock = clock
-        self._stop = stop
-        self._acknowledged = acknowledged
+    bench: Bench
+    path: Path
+    clock: HostClock
+    stop: asyncio.Event
+    acknowledged: Callable[[RecorderStatus], None] | None
+    attributes: Mapping[str, str]
+    share_of_repeats: ShareOfRepeats | None
+
+    def __post_init__(self) -> None:
+        self._path = self._file = self.path
         self._queue: asyncio.Queue[Item] = asyncio.Queue(QUEUE_LENGTH)
         self._uncounted: dict[str, list[Uncounted]] = {}  # by sensor; recorded already
-        self._started = self._file_started = clock.now()
+        self._started = self._file_started = self.clock.now()
         self._end_reason = "stopped"
-        self._status = RecorderStatus(str(path), 0.0, {})
+        self._status = RecorderStatus(str(self.path), 0.0, {})
 
     async def run(
         self, duration: float | None, drivers: Callable[[str], AnyDriver], *, anyway: bool
     ) -> RecorderStatus:
         connections = [
-            Connection(drivers(sensors[0].driver), sensors, self._clock, anyway=anyway)
-            for sensors in self._bench.ports().values()
+            Connection(drivers(sensors[0].driver), sensors, self.clock, anyway=anyway)
+            for sensors in self.bench.ports().values()
         ]
         start = asyncio.Event()
         async with control.serve(self._answer, self._path.parent) as address:
@@ -282,20 +275,20 @@ class _Recorder:
             tasks.remove(task)
             text = f"the driver on {task.get_name()} does not end; it was abandoned"
             with contextlib.suppress(asyncio.QueueFull):
-                self._queue.put_nowait(Event("", EventKind.STATUS, text, self._clock.now()))
+                self._queue.put_nowait(Event("", EventKind.STATUS, text, self.clock.now()))
 
     async def _all_connected(self, connections: list[Connection]) -> bool:
         """Wait for all first sessions; return False if the run was stopped before."""
-        stopped = asyncio.ensure_future(self._stop.wait())
+        stopped = asyncio.ensure_future(self.stop.wait())
         waiting = asyncio.gather(*(c.connected for c in connections), return_exceptions=True)
         try:
             await asyncio.wait((waiting, stopped), return_when=asyncio.FIRST_COMPLETED)
-            if self._stop.is_set():
+            if self.stop.is_set():
                 return False
             failures = [
                 DeviceError(f"port {connection.port}: {result}")
                 if isinstance(result, RemoteProtocolError)
-                else with_owner(result, self._bench.sensors)
+                else with_owner(result, self.bench.sensors)
                 for connection, result in zip(connections, waiting.result(), strict=True)
                 if isinstance(result, Exception)
             ]
@@ -333,14 +326,14 @@ class _Recorder:
                 states = connection.driver.states_temperature
                 if layout.temperature is None and not states:
                     thermometers |= _thermometer(sensor)
-        ordered = [layouts[sensor.name] for sensor in self._bench.sensors]
-        self._started = self._file_started = self._clock.now()
+        ordered = [layouts[sensor.name] for sensor in self.bench.sensors]
+        self._started = self._file_started = self.clock.now()
         self._new_file = partial(
-            RecordingWriter.create, bench=self._bench, sensors=ordered, control=address
+            RecordingWriter.create, bench=self.bench, sensors=ordered, control=address
         )
         attributes: dict[str, str | float] = {} if duration is None else {"duration": duration}
-        attributes |= self._attributes
-        if is_simulated(self._bench):
+        attributes |= self.attributes
+        if is_simulated(self.bench):
             attributes[SIMULATED] = 1
         writer = self._new_file(self._path, created=self._started, attributes=attributes)
         writer.event(Event("", EventKind.STARTED, f"{len(ordered)} sensors", self._started))
@@ -349,8 +342,8 @@ class _Recorder:
         rates = {layout.name: layout.sampling_rate for layout in ordered}
         rows = BlockWriter(
             *(writer, rates, thermometers),
-            speed=self._clock.speed,
-            share_of_repeats=self._share_of_repeats,
+            speed=self.clock.speed,
+            share_of_repeats=self.share_of_repeats,
         )
         rows.write(
             Reading(layout.name, Quantity.TEMPERATURE, layout.temperature, self._started)
@@ -369,12 +362,12 @@ class _Recorder:
         """Write and commit the items of the connections until the run ends."""
         loop = asyncio.get_running_loop()
         last_commit, n_committed = -math.inf, 0
-        watch, host_times = ClockWatch(self._clock), ReadingTimes()
-        while not self._stop.is_set():
+        watch, host_times = ClockWatch(self.clock), ReadingTimes()
+        while not self.stop.is_set():
             batch = await self._batch()
             if (report := watch.look()) is not None:
                 batch.append(report)
-            now = self._clock.now()
+            now = self.clock.now()
             if host_times.is_due(now) and (celsius := host_temperature()) is not None:
                 batch.append(Reading("", Quantity.TEMPERATURE, celsius, now))
             await self._done(
@@ -399,7 +392,7 @@ class _Recorder:
         """Return the items of a short interval, so that one call of the thread writes many."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(_BATCH_INTERVAL):
-                await self._stop.wait()
+                await self.stop.wait()
         return self._queued()
 
     def _queued(self) -> list[Item]:
@@ -411,7 +404,7 @@ class _Recorder:
     async def _finish(self, writer: BlockWriter, thread: WritingThread) -> None:
         write = partial(writer.write, self._queued())
         await self._done(writer, thread, write, partial(writer.write, ()))
-        close = partial(writer.close, self._clock.now(), self._end_reason)
+        close = partial(writer.close, self.clock.now(), self._end_reason)
         self._acknowledge(writer, await self._done(writer, thread, close))
 
     async def _done(
@@ -436,7 +429,7 @@ class _Recorder:
         DiskError
             The given error, if no other file can be created, or if this one did not last.
         """
-        now, before = self._clock.now(), self._file
+        now, before = self.clock.now(), self._file
         lasted = (now.monotonic_ns - self._file_started.monotonic_ns) / 1e9
         if before != self._path and lasted < MIN_CONTINUATION:
             raise DiskError(f"{error}; {self._safe()}") from error
@@ -457,7 +450,7 @@ class _Recorder:
 
     def _safe(self) -> str:
         """Return how much of each sensor is safe on the disk."""
-        rates = {sensor.name: sensor.sampling_rate for sensor in self._bench.sensors}
+        rates = {sensor.name: sensor.sampling_rate for sensor in self.bench.sensors}
         seconds = [one.samples / rates[name] for name, one in self._status.sensors.items()]
         return f"{min(seconds, default=0.0):.0f} s of every sensor are safe"
 
@@ -480,8 +473,8 @@ class _Recorder:
 
     def _publish(self, status: RecorderStatus) -> None:
         self._status = status
-        if self._acknowledged is not None:
-            self._acknowledged(status)
+        if self.acknowledged is not None:
+            self.acknowledged(status)
 
     def _with_current_states(self, writer: BlockWriter) -> dict[str, SensorProgress]:
         """Return the last acknowledged counts with the current states."""
@@ -489,7 +482,7 @@ class _Recorder:
         return {n: replace(one, state=states[n]) for n, one in self._status.sensors.items()}
 
     def _elapsed(self) -> float:
-        return (self._clock.now().monotonic_ns - self._started.monotonic_ns) / 1e9
+        return (self.clock.now().monotonic_ns - self._started.monotonic_ns) / 1e9
 
     def _is_complete(self, writer: BlockWriter, duration: float) -> bool:
         return writer.recorded_seconds() >= duration or self._elapsed() >= duration + _LAST_BLOCKS
@@ -498,14 +491,14 @@ class _Recorder:
         """Execute a command of the control channel."""
         if command is Command.STOP:
             self._end_reason = "stopped by command"
-            self._stop.set()
+            self.stop.set()
         elif command is Command.MARK:
-            await self._queue.put(Event("", EventKind.MARK, text, self._clock.now()))
+            await self._queue.put(Event("", EventKind.MARK, text, self.clock.now()))
         elif command is Command.UNCOUNTED:
             try:
                 utc_ns, within, n_samples, sensor = text.split(" ", 3)
                 found = Uncounted(int(utc_ns), float(within), int(n_samples))
-                event = Event(sensor, EventKind.UNCOUNTED, found.in_words, self._clock.now())
+                event = Event(sensor, EventKind.UNCOUNTED, found.in_words, self.clock.now())
             except (ValueError, OverflowError, OSError):
                 return {"error": f"uncounted: expected a time, two numbers and a sensor: {text!r}"}
             if sensor not in self._status.sensors:

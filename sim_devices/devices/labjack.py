@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -145,29 +145,23 @@ class Stream:
         return Packet(taken, 2 * self.n_waiting, status, information)
 
 
+@dataclass(eq=False)
 class Columns:
     """Values of the addresses of a scan list."""
 
-    def __init__(
-        self,
-        addresses: Sequence[int],
-        inputs: Mapping[int, int],
-        rate: float,
-        *,
-        core_began: int = 0,
-        system_began: float = 0.0,
-    ) -> None:
-        self.n = len(addresses)
-        self._addresses = addresses
-        self._inputs = inputs  # address of an analog input: column of the samples
-        self._ticks = round(reg.CORE_HZ / rate)
-        self._rate = rate
-        self._core_began = core_began
-        self._system_began = system_began
+    addresses: Sequence[int]
+    inputs: Mapping[int, int]  # address of an analog input: column of the samples
+    rate: float
+    core_began: int = 0
+    system_began: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.n = len(self.addresses)
+        self._ticks = round(reg.CORE_HZ / self.rate)
 
     def timer(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return CORE_TIMER at each scan."""
-        return (index * self._ticks - self._core_began) % (1 << 32)
+        return (index * self._ticks - self.core_began) % (1 << 32)
 
     def scans(self, samples: Samples, first: int, n: int) -> NDArray[np.uint16]:
         """Return ``n`` scans, shape (n, n_columns)."""
@@ -175,17 +169,17 @@ class Columns:
         index = np.arange(first, first + n)
         rows = np.zeros((n, self.n), np.int64)
         wide = np.zeros(n, np.int64)  # the last 32-bit value, for its upper half
-        for column, address in enumerate(self._addresses):
+        for column, address in enumerate(self.addresses):
             if address == reg.STREAM_DATA_CAPTURE_16:
                 rows[:, column] = wide >> 16
                 continue
             if address == reg.CORE_TIMER:
                 wide = self.timer(index)
             elif address == reg.SYSTEM_TIMER_20HZ:
-                seconds = index / self._rate - self._system_began
+                seconds = index / self.rate - self.system_began
                 wide = (seconds * reg.SYSTEM_HZ).astype(np.int64) % (1 << 32)
-            elif address in self._inputs:
-                wide = counts[:, self._inputs[address]]
+            elif address in self.inputs:
+                wide = counts[:, self.inputs[address]]
             else:
                 wide = np.full(n, CENTER if address < 512 else column)
             rows[:, column] = wide & 0xFFFF

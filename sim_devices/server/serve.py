@@ -518,54 +518,48 @@ Replies are not delayed.
 """
 
 
+@dataclass(eq=False)
 class Served:
     """One endpoint on its line: calls the endpoint for received bytes and at due times.
 
     Units are sent at absolute instants of world time, so that delays do not accumulate.
     """
 
-    def __init__(
-        self,
-        line: Line,
-        clock: WorldClock,
-        faults: LineFaults,
-        tell: Callable[[float, Fault], None],
-        tell_sent: Callable[[float, bytes], None] | None = None,
-        *,
-        number: int = 0,
-    ) -> None:
-        self.line = line
-        self._faults = faults
-        self._tell_fault = tell
-        self._tell_sent = tell_sent
+    line: Line
+    clock: WorldClock
+    faults: LineFaults
+    tell: Callable[[float, Fault], None]
+    tell_sent: Callable[[float, bytes], None] | None = None
+    number: int = 0
+
+    def __post_init__(self) -> None:
         self._unsent: deque[tuple[float, bytes]] = deque()
         """Time and bytes of units accepted by the port, of which some wait in this process."""
-        self._endpoint: Endpoint = line.endpoint
-        self._clock = clock
+        self._endpoint: Endpoint = self.line.endpoint
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._last = -math.inf
         self._down = self._muted = False
         self._pending_hang_up: asyncio.TimerHandle | None = None
         self.port: DevicePort = make_port(
-            line.kind, self, scheme=line.scheme, number=number, tls=line.tls
+            self.line.kind, self, scheme=self.line.scheme, number=self.number, tls=self.line.tls
         )
 
     def connected(self) -> None:
         """Handle a reader that opened the line."""
-        self._send(self._endpoint.connected(self._clock.now()))
+        self._send(self._endpoint.connected(self.clock.now()))
         self._schedule()
 
     def received(self, received: bytes) -> None:
         """Handle received bytes."""
         self._last = -math.inf
-        self._send(self._endpoint.receive(received, self._clock.now()))
+        self._send(self._endpoint.receive(received, self.clock.now()))
         self._schedule()
 
     def disconnected(self) -> None:
         """Handle the last reader that closed the line."""
         self._unsent.clear()
-        self._endpoint.disconnected(self._clock.now())
+        self._endpoint.disconnected(self.clock.now())
         self._schedule()
 
     async def close(self) -> None:
@@ -578,46 +572,46 @@ class Served:
 
     def _send(self, units: Sequence[bytes]) -> None:
         if units:
-            self._put(self._faults.send(units, self._clock.now()))
+            self._put(self.faults.send(units, self.clock.now()))
 
     def _put(self, units: Sequence[bytes]) -> None:
         if self._muted:
             return
         sent = self.port.send(units)
-        if self._tell_sent is not None:
-            self._unsent += [(self._clock.now(), unit) for unit in sent]
+        if self.tell_sent is not None:
+            self._unsent += [(self.clock.now(), unit) for unit in sent]
             self._tell()
 
     def _tell(self) -> None:
         """Log the units that have left this process whole: a reader can read them."""
         n_waiting = self.port.n_unsent()
         n_logged = sum(len(unit) for _, unit in self._unsent) - n_waiting
-        while self._tell_sent is not None and self._unsent:
+        while self.tell_sent is not None and self._unsent:
             at, unit = self._unsent[0]
             if len(unit) > n_logged:
                 return
             n_logged -= len(unit)
             self._unsent.popleft()
-            self._tell_sent(at, unit)
+            self.tell_sent(at, unit)
 
     def _hang_up(self) -> None:
         self._pending_hang_up = None
         self._muted = False
-        if self._tell_sent is not None:
+        if self.tell_sent is not None:
             self._tell()
         self._unsent.clear()
         self.port.hang_up()
 
     def _strike(self) -> None:
         """Start and end the faults that are due."""
-        now = self._clock.now()
-        if self._down and now >= self._faults.down_until:
+        now = self.clock.now()
+        if self._down and now >= self.faults.down_until:
             self._down = False
             if self._pending_hang_up is not None:  # unplugged for less than the delay
                 self._pending_hang_up.cancel()
                 self._hang_up()
             self.port.restore()
-        faults, units = self._faults.act(now)
+        faults, units = self.faults.act(now)
         self._put(units)
         for fault in faults:
             if fault.kind == "disconnect" and not self._down:
@@ -625,26 +619,26 @@ class Served:
                 self._pending_hang_up = self._loop.call_later(HANG_UP_DELAY, self._hang_up)
             else:
                 self._endpoint.fault(fault.kind, now, fault.duration)
-        for at, fault in self._faults.struck:
-            self._tell_fault(at, fault)
-        self._faults.struck.clear()
+        for at, fault in self.faults.struck:
+            self.tell(at, fault)
+        self.faults.struck.clear()
 
     def _schedule(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        when = min(self._endpoint.next_due(), self._faults.next_due())
+        when = min(self._endpoint.next_due(), self.faults.next_due())
         if self._down:
-            when = min(when, self._faults.down_until)
+            when = min(when, self.faults.down_until)
         if when < NEVER:
-            at = max(self._clock.monotonic(when), self._last + MIN_INTERVAL)
+            at = max(self.clock.monotonic(when), self._last + MIN_INTERVAL)
             self._timer = self._loop.call_at(at, self._tick)
 
     def _tick(self) -> None:
         self._timer = None
         self._last = self._loop.time()
         self._strike()
-        self._send(self._endpoint.due(self._clock.now()))
+        self._send(self._endpoint.due(self.clock.now()))
         self._schedule()
 
 

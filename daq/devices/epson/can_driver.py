@@ -81,41 +81,37 @@ class EpsonCanSettings(DriverSettings):
     """In g; samples beyond are flagged as clipped."""
 
 
+@dataclass(eq=False)
 class EpsonCanSession(Session):
     """The devices of one bus, configured and quiet."""
 
     hint = "expected SYNC and TPDO messages; check power, termination and bitrate"
 
-    def __init__(
-        self,
-        bus: _Bus,
-        devices: Mapping[str, _Device],
-        decoder: protocol.CanDecoder,
-        information: tuple[DeviceInformation, ...],
-        clock: HostClock,
-        *,
-        n_messages: int,
-    ) -> None:
-        self.information = information
-        self._bus, self._devices, self._decoder = bus, devices, decoder
-        self._clock = clock
-        self._n_messages = n_messages
+    bus: _Bus
+    devices: Mapping[str, _Device]
+    decoder: protocol.CanDecoder
+    information: tuple[DeviceInformation, ...]
+    clock: HostClock
+    n_messages: int
+
+    def __post_init__(self) -> None:
         self._present = {
-            one.sensor: Presence(one.sensor, clock, trouble=one.trouble) for one in information
+            one.sensor: Presence(one.sensor, self.clock, trouble=one.trouble)
+            for one in self.information
         }
         self._heard: dict[str, int] = {}  # SYNC messages up to the last sample of each sensor
 
     async def read(self) -> AsyncIterator[DeviceItem]:
         """Start SYNC and yield blocks, events, and the temperatures once a minute, until closed."""
-        devices, present = self._devices, self._present
-        await self._bus.start([d.node for n, d in devices.items() if not present[n].is_gone])
+        devices, present = self.devices, self._present
+        await self.bus.start([d.node for n, d in devices.items() if not present[n].is_gone])
         reading_times = ReadingTimes()
         self._heard = dict.fromkeys(devices, 0)
         while True:
-            messages, signs, at = await self._bus.read(self._n_messages)
-            n_syncs = self._bus.n_syncs
+            messages, signs, at = await self.bus.read(self.n_messages)
+            n_syncs = self.bus.n_syncs
             ending = self._ending(messages, signs)
-            for item in self._decoder.receive(messages, at, is_last=ending is not None):
+            for item in self.decoder.receive(messages, at, is_last=ending is not None):
                 if isinstance(item, Block):
                     self._heard[item.sensor] = n_syncs
                 yield item
@@ -131,13 +127,13 @@ class EpsonCanSession(Session):
 
     def _ending(self, messages: list[protocol.Message], signs: set[_Sign]) -> DeviceError | None:
         """Return why the session ends with these messages: nobody produces SYNC, or no bus."""
-        producer, failure = self._bus.producer, self._bus.failure
+        producer, failure = self.bus.producer, self.bus.failure
         if failure is not None and not messages:
-            return NotConnectedError(f"{self._bus.label}: the bus closed ({failure})")
+            return NotConnectedError(f"{self.bus.label}: the bus closed ({failure})")
         if (producer, protocol.BOOTED) in signs:
-            return NoAnswerError(f"{self._bus.label}: node {producer}, which sends SYNC, restarted")
-        if self._bus.n_quiet >= LOOKS:
-            return NoAnswerError(f"{self._bus.label}: no SYNC from node {producer} in {SILENT:g} s")
+            return NoAnswerError(f"{self.bus.label}: node {producer}, which sends SYNC, restarted")
+        if self.bus.n_quiet >= LOOKS:
+            return NoAnswerError(f"{self.bus.label}: no SYNC from node {producer} in {SILENT:g} s")
         return None
 
     async def _attend(self, signs: set[_Sign], n_syncs: int, at: HostTime) -> list[Event]:
@@ -146,10 +142,10 @@ class EpsonCanSession(Session):
         SYNC messages tell how long: after a stop of this computer, all messages are late alike.
         """
         found: list[Event] = []
-        for sensor, device in self._devices.items():
+        for sensor, device in self.devices.items():
             presence = self._present[sensor]
             seconds = (n_syncs - self._heard[sensor]) / device.sensor.sampling_rate
-            silent = seconds / self._clock.speed
+            silent = seconds / self.clock.speed
             has_booted = (device.node, protocol.BOOTED) in signs
             if presence.is_gone:
                 if any(node == device.node for node, _ in signs):
@@ -164,18 +160,18 @@ class EpsonCanSession(Session):
 
     async def _start(self, sensor: str, device: _Device) -> None:
         boot = device.node, protocol.BOOTED
-        self._bus.signs.discard(boot)  # it is configured now
-        await device.prepare(self._bus)
-        if boot in self._bus.signs:
-            raise NoAnswerError(f"{self._bus.label}: node {device.node} restarts")
-        await self._bus.start_node(device.node)
-        self._decoder.started(sensor)
-        self._heard[sensor] = self._bus.n_syncs
+        self.bus.signs.discard(boot)  # it is configured now
+        await device.prepare(self.bus)
+        if boot in self.bus.signs:
+            raise NoAnswerError(f"{self.bus.label}: node {device.node} restarts")
+        await self.bus.start_node(device.node)
+        self.decoder.started(sensor)
+        self._heard[sensor] = self.bus.n_syncs
 
     async def _temperature(self, sensor: str, node: int, at: HostTime) -> list[Reading]:
         """Return the temperature of a device; none if it does not reply."""
         try:
-            octets = await self._bus.ask(node, *protocol.TEMPERATURE)
+            octets = await self.bus.ask(node, *protocol.TEMPERATURE)
         except (NoAnswerError, WrongDeviceError):
             return []
         count = int.from_bytes(octets, "little", signed=True)

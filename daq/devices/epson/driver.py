@@ -137,9 +137,7 @@ class Configuration:
         if rate not in commands.RATES or rate != sensor.sampling_rate:
             rates = ", ".join(map(str, commands.RATES))
             expected = f"expected one of the device's rates: {rates} Hz"
-            raise BenchFileError(
-                FileFault("sampling_rate", expected, sensor.sampling_rate, sensor.name)
-            )
+            raise sensor.fault("sampling_rate", expected, sensor.sampling_rate)
         axes: Iterator[Field] = iter(("x", "y", "z"))
         fields = settings.fields or tuple(
             "temperature" if channel.auxiliary else next(axes, "temperature")
@@ -150,7 +148,7 @@ class Configuration:
                 "expected a different one of x, y, z, temperature for each of the sensor's"
                 f" {len(sensor.channels)} channels"
             )
-            raise BenchFileError(FileFault("settings.fields", expected, list(fields), sensor.name))
+            raise sensor.fault("settings.fields", expected, list(fields))
         flags = ("flag",) if settings.flags else ()
         burst = BurstFormat.of(*flags, *fields, "count", "checksum")
         # A streaming device answers no requests: its temperature comes with the samples, or not.
@@ -162,9 +160,7 @@ class Configuration:
                 f"expected at least {needed} for {rate} Hz of {burst.size} bytes (or fewer fields,"
                 " or a lower rate)"
             )
-            raise BenchFileError(
-                FileFault("settings.baud_rate", expected, settings.baud_rate, sensor.name)
-            )
+            raise sensor.fault("settings.baud_rate", expected, settings.baud_rate)
         if lacking := _lacking(settings, model):
             raise BenchFileError(replace(lacking, sensor=sensor.name))
         is_a370 = "A370" in model
@@ -434,44 +430,37 @@ LISTEN = 0.5
 """Time in s to listen for a lost device, and again after the first bytes."""
 
 
+@dataclass(eq=False)
 class EpsonSession(Session):
     """An accelerometer, configured and idle until :meth:`read`, or still streaming.
 
-    Parameters
+    Attributes
     ----------
     heard : (bytes, HostTime) or None
         For a stream that continues: the bytes already received, and their arrival.
     """
 
-    def __init__(
-        self,
-        device: Device,
-        configuration: Configuration,
-        information: DeviceInformation,
-        decoder: BurstDecoder,
-        clock: HostClock,
-        *,
-        heard: tuple[bytes, HostTime] | None = None,
-    ) -> None:
-        self.information = (information,)
-        self.patience = configuration.settings.patience
-        self.resumed = heard is not None
-        self.decoder = decoder
-        self._device = device
-        self._clock = clock
-        self._stream = device.stream
-        self._configuration = configuration
-        self._heard = heard
+    device: Device
+    configuration: Configuration
+    information: tuple[DeviceInformation, ...]
+    decoder: BurstDecoder
+    clock: HostClock
+    heard: tuple[bytes, HostTime] | None = None
+
+    def __post_init__(self) -> None:
+        self.patience = self.configuration.settings.patience
+        self.resumed = self.heard is not None
+        self._stream = self.device.stream
 
     async def read(self) -> AsyncIterator[DeviceItem]:
         """Start sampling and yield blocks, events, and the temperature once a minute."""
-        configuration = self._configuration
-        if self._heard is None:
+        configuration = self.configuration
+        if self.heard is None:
             self._stream.discard()
-            await self._device.write(commands.MODE_CTRL, commands.SAMPLING, high=True)
+            await self.device.write(commands.MODE_CTRL, commands.SAMPLING, high=True)
         else:
             self.decoder.resume()
-            for item in self.decoder.receive(*self._heard):
+            for item in self.decoder.receive(*self.heard):
                 yield item
         at: HostTime | None = None
         # A device waiting for a trigger also replies, so a reply does not prove a restart.
@@ -495,7 +484,7 @@ class EpsonSession(Session):
     @property
     def hint(self) -> str:
         """Expected number of frames, and the trigger to check."""
-        configuration = self._configuration
+        configuration = self.configuration
         return f"expected {configuration.sampling_rate} frames a second{configuration.hint}"
 
     async def _rest(self, last: HostTime | None) -> tuple[bytes, HostTime]:
@@ -504,14 +493,14 @@ class EpsonSession(Session):
         The arrival is computed from the last read and the sampling rate, because it serves to
         estimate the silence of a restarted device.
         """
-        received, now = b"", self._clock.now()
+        received, now = b"", self.clock.now()
         self._stream.expect(1)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(WAITING):
                 received, now = await self._stream.read()
         if last is None:
             return received, now
-        burst, rate = self._configuration.burst, self._configuration.sampling_rate
+        burst, rate = self.configuration.burst, self.configuration.sampling_rate
         passed_ns = round(len(received) / burst.size / rate * 1e9)
         return received, HostTime(last.monotonic_ns + passed_ns, last.utc_ns + passed_ns)
 
@@ -525,7 +514,7 @@ class EpsonSession(Session):
             only delayed does not reply.
         """
         while True:
-            await self._device.ask(commands.ID)
+            await self.device.ask(commands.ID)
             try:
                 async with asyncio.timeout(ASK_AFTER):
                     received, at = await self._stream.read()
@@ -533,7 +522,7 @@ class EpsonSession(Session):
                 continue
             break
         answer = commands.find_reply(received, commands.ID.address)
-        if answer == commands.DEVICE_ID and len(received) < self._configuration.burst.size:
+        if answer == commands.DEVICE_ID and len(received) < self.configuration.burst.size:
             raise NoAnswerError(f"{self._stream.label}: the device was restarted")
         return received, at
 
@@ -607,14 +596,8 @@ class EpsonDriver(Driver[EpsonSettings]):
                     heard = await _listen(stream, before.decoder)  # it may stream nevertheless
                 if heard is not None and before.decoder.continues(*heard):
                     async with _left_quiet(device, stream):
-                        yield EpsonSession(
-                            device,
-                            configuration,
-                            before.information[0],
-                            before.decoder,
-                            clock,
-                            heard=heard,
-                        )
+                        known = before.information, before.decoder
+                        yield EpsonSession(device, configuration, *known, clock, heard)
                     return
             async with _set_up(sensor, configuration.settings, stream, clock) as session:
                 yield session
@@ -643,7 +626,7 @@ async def _set_up(
         actual = float(configuration.sampling_rate)
         information = replace(information, sampling_rate=actual)
         decoder = configuration.decoder(sensor.name)
-        yield EpsonSession(device, configuration, information, decoder, clock)
+        yield EpsonSession(device, configuration, (information,), decoder, clock)
 
 
 @contextlib.asynccontextmanager

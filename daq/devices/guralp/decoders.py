@@ -33,7 +33,7 @@ from daq.devices.guralp.brp import (
 from daq.devices.guralp.gcf import SampleBlock, StatusBlock, decode_block, serial_number
 from daq.devices.guralp.scream import ACKNOWLEDGED, NO_SERVER, Packet, PacketFinder, decode_packet
 from daq.protocols.block import Block, DeviceItem, Event, EventKind, HostTime, Quantity, Reading
-from daq.protocols.errors import RemoteProtocolError, several
+from daq.protocols.errors import RemoteProtocolError, several, shortened
 from daq.protocols.joined_streams import MAX_PENDING, JoinedStreams
 
 if TYPE_CHECKING:
@@ -172,18 +172,13 @@ class Streams:
                     if (found := pattern.search(text))
                 ]
                 for name in sorted(owners):
-                    yield Event(name, EventKind.STATUS, cut(text), at)
+                    yield Event(name, EventKind.STATUS, shortened(text), at)
                     for quantity, value in stated if name else ():
                         yield Reading(name, quantity, value, at)
 
 
 def _joined(sensor: str, stream_ids: tuple[str, ...]) -> JoinedStreams:
     return JoinedStreams(sensor, stream_ids, full_scale=FULL_SCALE_COUNTS)
-
-
-def cut(text: str) -> str:
-    """Return a text, shortened to the maximum length of an event."""
-    return text.encode()[:200].decode(errors="ignore")
 
 
 def only(names: Iterable[str]) -> str:
@@ -245,14 +240,14 @@ class SerialDecoder:
         try:
             block = decode_block(data)
         except RemoteProtocolError as error:
-            yield Event(self._name, EventKind.CHECKSUM, cut(str(error)), at)
+            yield Event(self._name, EventKind.CHECKSUM, shortened(str(error)), at)
             return
         yield from self.streams.receive(block, at, awaiting=self._receiver.awaiting)
 
 
 def _skipped_text(n_bytes: int, start: bytes) -> str:
     if sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in start) > 0.9 * len(start):
-        return cut("terminal: " + " ".join(start.decode("ascii", "replace").split()))
+        return shortened("terminal: " + " ".join(start.decode("ascii", "replace").split()))
     if start[:1] == b"G" and len(start) >= 4 and int.from_bytes(start[2:4], "big") > MAX_SIZE:
         size = int.from_bytes(start[2:4], "big")
         return f"skipped {n_bytes} bytes: a block of {size} bytes; expected at most {MAX_SIZE}"
@@ -308,7 +303,7 @@ class ScreamDecoder:
         try:
             return list(self._packet(decode_packet(data), at))
         except RemoteProtocolError as error:
-            return [Event(self._name, EventKind.RESYNCHRONISED, cut(str(error)), at)]
+            return [Event(self._name, EventKind.RESYNCHRONISED, shortened(str(error)), at)]
 
     def not_available(self, sequence: int) -> None:
         """Stop waiting for a packet that the server no longer has."""

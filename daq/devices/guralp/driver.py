@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import AfterValidator, Field, PositiveFloat
@@ -35,10 +35,7 @@ from daq.devices.guralp.gcf import BLOCK_SIZE, component, serial_number
 from daq.devices.interface import DeviceInformation, Driver, DriverSettings, Session
 from daq.devices.port_rules import inputs_of, port_label, require_address
 from daq.errors import (
-    ABSENT,
-    BenchFileError,
     DeviceError,
-    FileFault,
     NoAnswerError,
     NotConnectedError,
     WrongDeviceError,
@@ -255,26 +252,20 @@ async def _stop_asking(asking: asyncio.Task[None], stream: DatagramStream) -> No
 COMPONENTS = "ZNEX1234"
 
 
+@dataclass(eq=False)
 class GuralpSession(Session):
     """A session in which every stream has been received once."""
 
     hint = "check the digitizer's terminal, cable and power"
 
-    def __init__(
-        self,
-        link: Link,
-        *,
-        patience: float,
-        information: tuple[DeviceInformation, ...],
-        buffered: list[DeviceItem],
-        identify: Callable[[str], DeviceInformation],
-    ) -> None:
-        self.information = information
-        self.patience = patience
-        self._link = link
-        self._buffered = buffered
-        self._identify = identify
-        self._absent = {one.sensor for one in information if one.trouble}
+    link: Link
+    information: tuple[DeviceInformation, ...]
+    buffered: list[DeviceItem]
+    identify: Callable[[str], DeviceInformation]
+    patience: float
+
+    def __post_init__(self) -> None:
+        self._absent = {one.sensor for one in self.information if one.trouble}
         self._refused: set[str] = set()
 
     async def read(self) -> AsyncIterator[DeviceItem]:
@@ -289,17 +280,17 @@ class GuralpSession(Session):
                 yield item
 
     async def _received(self) -> AsyncGenerator[DeviceItem]:
-        buffered, self._buffered = self._buffered, []
+        buffered, self.buffered = self.buffered, []
         for item in buffered:
             yield item
         try:
             while True:
-                for item in await self._link.receive():
+                for item in await self.link.receive():
                     yield item
-                for item in await self._link.respond():
+                for item in await self.link.respond():
                     yield item
         except DeviceError:  # blocks behind a hole need not wait for lost ones any longer
-            for item in self._link.streams.release():
+            for item in self.link.streams.release():
                 yield item
             raise
 
@@ -307,7 +298,7 @@ class GuralpSession(Session):
         """Identify a sensor whose streams were missing at the start; exclude a wrong device."""
         self._absent.discard(first.sensor)
         try:
-            self._identify(first.sensor)
+            self.identify(first.sensor)
         except WrongDeviceError as error:
             self._refused.add(first.sensor)
             return Event(first.sensor, EventKind.REFUSED, str(error)[:200], first.received)
@@ -372,7 +363,7 @@ def _stream_ids(
             expected = (
                 f"expected a stream ID for each of the sensor's {len(sensor.channels)} channels"
             )
-            raise BenchFileError(FileFault("settings.streams", expected, ABSENT, sensor.name))
+            raise sensor.fault("settings.streams", expected)
         return streams
 
     return inputs_of(sensors, given, key="streams", what="a stream")

@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -24,12 +25,11 @@ from daq.devices.interface import (
     DriverSettings,
     Session,
 )
-from daq.devices.port_rules import only, port_label
-from daq.errors import BenchFileError, FileFault, NoAnswerError, WrongDeviceError
+from daq.devices.port_rules import host_of, only, port_label
+from daq.errors import NoAnswerError, WrongDeviceError
 from daq.protocols.block import Block, BlockFlag, Event, EventKind, Quantity, Reading, ReadingTimes
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.pace import Pace
-from daq.transport.address import USUAL_NUMBERS, host_and_port
 from daq.transport.ports import open_port
 
 if TYPE_CHECKING:
@@ -43,8 +43,6 @@ if TYPE_CHECKING:
     from daq.transport.byte_stream import ByteStream
 
 _Reply = TypeVar("_Reply")
-SCHEME = "iio://"
-(PORT,) = USUAL_NUMBERS["iio"]
 REPLY_TIMEOUT = 5.0
 BLOCK_SECONDS = 0.1
 """Seconds of samples in one buffer."""
@@ -122,44 +120,39 @@ class _Iiod:
         self._buffer += received
 
 
+@dataclass(eq=False)
 class IioSession(Session):
     """One device, ready to fill buffers."""
 
     hint = "expected buffers from IIOD; check the trigger of the device"
 
-    def __init__(
-        self,
-        iiod: _Iiod,
-        sensor: Sensor,
-        device: protocol.Device,
-        inputs: Sequence[str],
-        *,
-        information: DeviceInformation,
-        patience: float,
-    ) -> None:
-        self.information = (information,)
-        self.patience = patience
-        self._iiod, self._sensor, self._device = iiod, sensor, device
-        self._inputs = tuple(inputs)
-        names = [one.channel for one in device.elements]
+    iiod: _Iiod
+    sensor: Sensor
+    device: protocol.Device
+    inputs: tuple[str, ...]
+    information: tuple[DeviceInformation, ...]
+    patience: float
+
+    def __post_init__(self) -> None:
+        names = [one.channel for one in self.device.elements]
         self._has_times = protocol.TIMESTAMP in names
-        wanted = [*inputs, protocol.TIMESTAMP] if self._has_times else list(inputs)
-        self._mask = protocol.mask_of(device.elements, wanted)
-        enabled = [one for one in device.elements if one.channel in wanted]
+        wanted = [*self.inputs, protocol.TIMESTAMP] if self._has_times else list(self.inputs)
+        self._mask = protocol.mask_of(self.device.elements, wanted)
+        enabled = [one for one in self.device.elements if one.channel in wanted]
         self._layout = protocol.ScanLayout(enabled)
-        self._period_ns = 1e9 / (information.sampling_rate or sensor.sampling_rate)
+        self._period_ns = 1e9 / (self.information[0].sampling_rate or self.sensor.sampling_rate)
         self._next = 0
         self._latest_ns: int | None = None
         self._pace = Pace(1e9 / self._period_ns)
         limits = {one.channel: one for one in enabled}
         self._full_scales = np.array(
-            [2 ** (limits[name].bits - limits[name].is_signed) - 1 for name in inputs]
+            [2 ** (limits[name].bits - limits[name].is_signed) - 1 for name in self.inputs]
         )
 
     async def read(self) -> AsyncIterator[DeviceItem]:
         """Fill buffers and yield their samples, and the temperature once a minute, until closed."""
-        iiod, device = self._iiod, self._device.id
-        n_scans = max(1, round(BLOCK_SECONDS * self._sensor.sampling_rate))
+        iiod, device = self.iiod, self.device.id
+        n_scans = max(1, round(BLOCK_SECONDS * self.sensor.sampling_rate))
         code = await iiod.ask(f"OPEN {device} {n_scans} {self._mask}")
         if code < 0:
             raise WrongDeviceError(
@@ -182,38 +175,38 @@ class IioSession(Session):
 
     async def _temperature(self) -> list[Reading]:
         """Return the temperature; none if the device has none, or its scans have it already."""
-        names = [] if protocol.TEMPERATURE in self._inputs else self._device.of_temperature
+        names = [] if protocol.TEMPERATURE in self.inputs else self.device.of_temperature
         values = {}
         for name in {"input", "raw", "offset", "scale"}.intersection(names):
-            place = f"{self._device.id} INPUT {protocol.TEMPERATURE} {name}"
+            place = f"{self.device.id} INPUT {protocol.TEMPERATURE} {name}"
             with contextlib.suppress(WrongDeviceError, ValueError):
-                values[name] = float(await self._iiod.text(f"READ {place}"))
-        celsius, at = protocol.celsius(values), self._iiod.at
+                values[name] = float(await self.iiod.text(f"READ {place}"))
+        celsius, at = protocol.celsius(values), self.iiod.at
         if celsius is None or at is None or not math.isfinite(celsius):
             return []
-        return [Reading(self._sensor.name, Quantity.TEMPERATURE, celsius, at)]
+        return [Reading(self.sensor.name, Quantity.TEMPERATURE, celsius, at)]
 
     async def _buffer(self, size: int) -> bytes:
         """Return the bytes that answer READBUF."""
         scans, is_first = b"", True
         while len(scans) < size:
-            n_bytes = await self._iiod.integer()
+            n_bytes = await self.iiod.integer()
             if n_bytes < 0 or n_bytes > size - len(scans):
                 raise NoAnswerError(
-                    f"{self._iiod.stream.label}: the device ended its buffer (error {n_bytes})"
+                    f"{self.iiod.stream.label}: the device ended its buffer (error {n_bytes})"
                 )
             if not n_bytes:
                 break
             if is_first:
-                mask = await self._iiod.exactly(len(self._mask) + 1)
+                mask = await self.iiod.exactly(len(self._mask) + 1)
                 if mask.strip().decode("ascii", "replace") != self._mask:
                     raise RemoteProtocolError(f"mask {mask!r}; expected {self._mask}")
                 is_first = False
-            scans += await self._iiod.exactly(n_bytes)
+            scans += await self.iiod.exactly(n_bytes)
         return scans
 
     def _blocks(self, scans: bytes, at: HostTime) -> list[Block | Event]:
-        columns = [self._layout.decode(scans, name) for name in self._inputs]
+        columns = [self._layout.decode(scans, name) for name in self.inputs]
         counts = np.stack(columns, axis=1)
         times = self._layout.decode(scans, protocol.TIMESTAMP) if self._has_times else None
         found: list[Block | Event] = []
@@ -222,7 +215,7 @@ class IioSession(Session):
             cuts, missing, flags, was_set = self._gaps(times, at)
             if was_set:
                 text = "the clock of the board was set"
-                found.append(Event(self._sensor.name, EventKind.RESET, text, at))
+                found.append(Event(self.sensor.name, EventKind.RESET, text, at))
         for rows, n_missing in zip(np.split(np.arange(len(counts)), cuts), missing, strict=True):
             if not len(rows):
                 continue
@@ -236,7 +229,7 @@ class IioSession(Session):
             reason = f"{n_missing} scans lost in the board" if n_missing else ""
             counter = int(times[rows[0]]) if times is not None else None
             values = part.astype(np.int32)
-            found.append(Block(self._sensor.name, first, values, at, counter, own, reason))
+            found.append(Block(self.sensor.name, first, values, at, counter, own, reason))
             self._next = first + len(rows)
         self._pace.take(self._next - 1, at)
         return found
@@ -293,7 +286,7 @@ class IioDriver(Driver[IioSettings]):
         sensor = sensors[0]
         if len(sensors) > 1:
             sensor = only(sensors, "each IIO device needs a port of its own, as iio://host/2")
-        return sensor, _address(sensor), self.typed(sensors)[sensor.name]
+        return sensor, ":".join(map(str, host_of(sensor, "iio"))), self.typed(sensors)[sensor.name]
 
     @contextlib.asynccontextmanager
     async def open(self, sensors: Sequence[Sensor], clock: HostClock) -> AsyncIterator[IioSession]:
@@ -319,7 +312,7 @@ class IioDriver(Driver[IioSettings]):
                     sensor,
                     device,
                     inputs,
-                    information=information,
+                    information=(information,),
                     patience=settings.patience,
                 )
             finally:
@@ -377,19 +370,6 @@ def _inputs(
             f" {len(sensor.channels)} of them, got {', '.join(inputs)}"
         )
     return inputs
-
-
-def _address(sensor: Sensor) -> str:
-    rest = sensor.port.removeprefix(SCHEME).partition("/")[0]
-    expected = "expected iio://host, or iio://host:port"
-    fault = FileFault("port", expected, sensor.port, sensor.name)
-    if not sensor.port.startswith(SCHEME) or not rest:
-        raise BenchFileError(fault)
-    try:
-        host, number = host_and_port(f"socket://{rest if ':' in rest else f'{rest}:{PORT}'}")
-    except ValueError as error:
-        raise BenchFileError(fault) from error
-    return f"{host}:{number}"
 
 
 DRIVER = IioDriver()

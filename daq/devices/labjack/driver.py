@@ -25,7 +25,6 @@ import math
 import struct
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Literal
-from urllib.parse import urlsplit
 
 import numpy as np
 from pydantic import (
@@ -55,7 +54,6 @@ from daq.errors import BenchFileError, DeviceError, FileFault, NoAnswerError, Wr
 from daq.protocols.block import Quantity, Reading, ReadingTimes
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.sample_counter import CLOCK_TOLERANCE, SLACK
-from daq.transport.address import USUAL_NUMBERS, host_and_port
 from daq.transport.ports import open_port
 
 if TYPE_CHECKING:
@@ -151,7 +149,6 @@ def lacking(settings: LabJackSettings, numbers: tuple[int, ...], product: str) -
 REPLY_TIMEOUT = 2.0
 PACKETS_PER_SECOND = 10
 PRODUCTS = {7.0: "T7", 8.0: "T8"}
-(MODBUS_PORT,) = USUAL_NUMBERS["modbus-tcp"]
 BUFFERS = {"T7": 32768, "T8": 262144}
 
 
@@ -229,19 +226,6 @@ def exact(rate: float) -> float:
     return reg.CORE_HZ / max(1, round(reg.CORE_HZ / rate))
 
 
-def address_of(sensor: Sensor) -> tuple[str, int]:
-    """Return host and port number of a device."""
-    url = sensor.port if "://" in sensor.port else f"modbus-tcp://{sensor.port}"
-    try:
-        if urlsplit(url).port is None:
-            url = f"{url}:{MODBUS_PORT}"
-        host, number = host_and_port(url)
-    except ValueError as error:
-        expected = "expected modbus-tcp://host, or modbus-tcp://host:port"
-        raise BenchFileError(FileFault("port", expected, sensor.port, sensor.name)) from error
-    return f"[{host}]" if ":" in host else host, number
-
-
 def inputs_of(
     sensors: Sequence[Sensor], settings: dict[str, LabJackSettings]
 ) -> dict[str, tuple[int, ...]]:
@@ -269,9 +253,7 @@ def inputs_of(
         for number in set(negative) & taken.keys():
             expected = f"AIN{number} is already an input of sensor {taken[number]!r}"
         if expected:
-            raise BenchFileError(
-                FileFault("settings.negative_inputs", expected, list(negative), sensor.name)
-            )
+            raise sensor.fault("settings.negative_inputs", expected, list(negative))
     return inputs
 
 
@@ -489,38 +471,25 @@ MAX_RESTARTS = 3
 """Maximum number of restarts of a stream that ends with its first packet."""
 
 
+@dataclass(eq=False)
 class LabJackSession(Session):
     """A digitizer with a configured scan list."""
 
-    def __init__(
-        self,
-        registers: Registers,
-        settings: LabJackSettings,
-        decoder: StreamDecoder,
-        *,
-        information: tuple[DeviceInformation, ...],
-        clock: HostClock,
-        stream_address: str,
-        packet_seconds: float,
-        patience: float,
-        uptime: Uptime | None,
-        resumed: bool,
-    ) -> None:
-        self.information = information
-        self.decoder = decoder
-        self.uptime = uptime
-        self.resumed = resumed
-        self._registers = registers
-        self._settings = settings
-        self._clock = clock
-        self._stream_address = stream_address
-        self.patience = patience
-        self._ask_after = ASK_AFTER + 2 * packet_seconds
+    registers: Registers
+    settings: LabJackSettings
+    decoder: StreamDecoder
+    information: tuple[DeviceInformation, ...]
+    clock: HostClock
+    stream_address: str
+    packet_seconds: float
+    uptime: Uptime | None
+    patience: float
+    resumed: bool
 
     @property
     def hint(self) -> str:
         """Where samples are expected."""
-        return f"expected samples from {self._stream_address}"
+        return f"expected samples from {self.stream_address}"
 
     @property
     def recovers(self) -> bool:
@@ -536,7 +505,7 @@ class LabJackSession(Session):
         The device's temperature is read once a minute, between two packets.
         """
         reading_times = ReadingTimes()
-        if self._settings.mode == "command-response":
+        if self.settings.mode == "command-response":
             received = self._by_command()
         else:
             received = self._spontaneous()
@@ -554,29 +523,29 @@ class LabJackSession(Session):
                 fruitless += 1
                 if fruitless > MAX_RESTARTS:
                     why = labjack.FATAL[self.decoder.fatal]
-                    raise DeviceError(f"{self._registers.label}: the stream keeps ending: {why}")
-                await self._registers.stop_stream()
+                    raise DeviceError(f"{self.registers.label}: the stream keeps ending: {why}")
+                await self.registers.stop_stream()
                 self.decoder.restart()
                 await self._start()
 
     async def _temperature(self) -> list[Reading]:
         """Return the temperature of the device for all its sensors; none if it does not reply."""
         with contextlib.suppress(NoAnswerError, RemoteProtocolError):
-            celsius, at = await read_temperature(self._registers)
+            celsius, at = await read_temperature(self.registers)
             names = [one.sensor for one in self.information] if math.isfinite(celsius) else []
             return [Reading(name, Quantity.TEMPERATURE, celsius, at) for name in names]
         return []
 
     async def _start(self) -> None:
-        await self._registers.do("starting the stream", long(reg.STREAM_ENABLE, 1))
+        await self.registers.do("starting the stream", long(reg.STREAM_ENABLE, 1))
 
     async def _spontaneous(self) -> AsyncGenerator[list[Block | Event]]:
-        label = self._registers.label
-        async with open_port(self._stream_address, self._clock, label=label) as stream:
+        label = self.registers.label
+        async with open_port(self.stream_address, self.clock, label=label) as stream:
             await self._start()
             while True:
                 try:
-                    async with asyncio.timeout(self._ask_after):
+                    async with asyncio.timeout(ASK_AFTER + 2 * self.packet_seconds):
                         received, at = await stream.read()
                 except TimeoutError:
                     await self._check_streaming()
@@ -591,11 +560,11 @@ class LabJackSession(Session):
         """
         with contextlib.suppress(RemoteProtocolError):
             try:
-                values, _ = await self._registers.exchange(Read(reg.STREAM_ENABLE, 2))
+                values, _ = await self.registers.exchange(Read(reg.STREAM_ENABLE, 2))
             except NoAnswerError:
                 return
             if not int.from_bytes(values, "big"):
-                raise NoAnswerError(f"{self._registers.label}: the device no longer streams")
+                raise NoAnswerError(f"{self.registers.label}: the device no longer streams")
 
     async def _by_command(self) -> AsyncGenerator[list[Block | Event]]:
         await self._start()
@@ -603,11 +572,11 @@ class LabJackSession(Session):
         while True:
             try:
                 # No time limit: the samples in a late reply are not sent again.
-                values, at = await self._registers.exchange(read, reply_within=None)
+                values, at = await self.registers.exchange(read, reply_within=None)
             except RemoteProtocolError as error:
-                reason = await self._registers.reason()
+                reason = await self.registers.reason()
                 raise DeviceError(
-                    f"{self._registers.label}: reading the stream: {error}{reason}"
+                    f"{self.registers.label}: reading the stream: {error}{reason}"
                 ) from error
             packet = decode_response(values)
             yield self.decoder.receive_response(packet, at)
@@ -636,7 +605,9 @@ class LabJackDriver(Driver[LabJackSettings]):
             if fault:
                 raise BenchFileError(replace(fault, sensor=sensor.name))
         stream = plan(settings[first.name], inputs, first.sampling_rate)
-        return _Planned(settings, inputs, stream, address_of(first))
+        return _Planned(
+            settings, inputs, stream, port_rules.host_of(first, "modbus-tcp", bare=True)
+        )
 
     def open(
         self, sensors: Sequence[Sensor], clock: HostClock

@@ -57,16 +57,6 @@ QUIET = 0.06
 delays bytes."""
 _UNIT = 6
 """Position of the unit in a frame over TCP."""
-EXCEPTIONS = {
-    1: "illegal function",
-    2: "illegal data address",
-    3: "illegal data value",
-    4: "device failure",
-    5: "acknowledged, not done yet",
-    6: "device busy",
-    10: "no path through the gateway",
-    11: "no reply behind the gateway",
-}
 
 
 class RefusedError(DeviceError):
@@ -402,7 +392,7 @@ class ModbusBus:
                 f"{self.label}: no answer in {self._patience:.2g} s to {request}{detail}"
             ) from error
         if answer.exception is not None:
-            why = EXCEPTIONS.get(answer.exception, "unknown")
+            why = rtu.EXCEPTIONS.get(answer.exception, "unknown")
             raise RefusedError(
                 f"{self.label}: Modbus exception {answer.exception} ({why}) to {request}",
                 answer.exception,

@@ -15,6 +15,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
@@ -31,7 +32,7 @@ from daq.devices.modbus import rtu
 from daq.devices.modbus.fifo_protocol import MAX_WORDS, RATE_REGISTER, READ_OVERHEAD, FifoDecoder
 from daq.devices.modbus.rtu import ReplyFinder
 from daq.devices.port_rules import only, port_label
-from daq.errors import BenchFileError, DeviceError, FileFault, NoAnswerError, WrongDeviceError
+from daq.errors import DeviceError, NoAnswerError, WrongDeviceError
 from daq.transport.ports import open_port
 
 if TYPE_CHECKING:
@@ -71,27 +72,18 @@ class FifoSettings(DriverSettings, strict=True):
     of the FIFO (``capacity``), at least 10 s."""
 
 
+@dataclass(eq=False)
 class FifoSession(Session):
     """A device that samples into its FIFO."""
 
     hint = "the device does not answer; check cable and power"
 
-    def __init__(
-        self,
-        stream: ByteStream,
-        settings: FifoSettings,
-        decoder: FifoDecoder,
-        *,
-        information: DeviceInformation,
-        clock: HostClock,
-        patience: float,
-    ) -> None:
-        self.information = (information,)
-        self.patience = patience
-        self._stream = stream
-        self._settings = settings
-        self._decoder = decoder
-        self._clock = clock
+    stream: ByteStream
+    settings: FifoSettings
+    decoder: FifoDecoder
+    information: tuple[DeviceInformation, ...]
+    clock: HostClock
+    patience: float
 
     async def read(self) -> AsyncIterator[Block | Event]:
         """Read the FIFO and yield its blocks."""
@@ -100,7 +92,7 @@ class FifoSession(Session):
                 async for item in received:
                     yield item
             except DeviceError:
-                for item in self._decoder.flush():
+                for item in self.decoder.flush():
                     yield item
                 raise
 
@@ -112,39 +104,39 @@ class FifoSession(Session):
             items, answered = await self._once()
             for item in items:
                 yield item
-            if not answered or items or self._decoder.level:
+            if not answered or items or self.decoder.level:
                 fed = loop.time()
             elif loop.time() - fed > STALLED:
                 raise NoAnswerError(
-                    f"{self._stream.label}: the FIFO has been empty for {STALLED:g} s"
+                    f"{self.stream.label}: the FIFO has been empty for {STALLED:g} s"
                 )
-            level = self._decoder.level or math.inf  # unknown before the first reply
-            if self._decoder.started or level < least or least == math.inf:
+            level = self.decoder.level or math.inf  # unknown before the first reply
+            if self.decoder.started or level < least or least == math.inf:
                 least, lessened = level, loop.time()
             elif loop.time() - lessened > MAX_FILLING_TIME:
                 raise NoAnswerError(
-                    f"{self._stream.label}: the FIFO is never empty, {self._decoder.level} words"
+                    f"{self.stream.label}: the FIFO is never empty, {self.decoder.level} words"
                     " left: the link is too slow for the sampling rate; set a higher"
                     " settings.baud_rate on both ends, or a lower rate"
                 )
-            if self._decoder.level < MAX_WORDS:
-                await asyncio.sleep(self._settings.poll_interval)
+            if self.decoder.level < MAX_WORDS:
+                await asyncio.sleep(self.settings.poll_interval)
 
     async def _once(self) -> tuple[list[Block | Event], bool]:
         """Read once; return blocks and events, and whether a reply arrived."""
-        decoder, stream = self._decoder, self._stream
+        decoder, stream = self.decoder, self.stream
         stream.discard()  # a late reply to an earlier read
         await stream.write(decoder.request())
         items: list[Block | Event] = []
         try:
-            async with asyncio.timeout(self._settings.timeout):
+            async with asyncio.timeout(self.settings.timeout):
                 while decoder.waiting and not decoder.is_damaged:
                     received, at = await stream.read()
                     items += decoder.receive(received, at)
         except TimeoutError:
             pass
         if decoder.waiting:
-            return [*items, *decoder.timed_out(self._clock.now())], False
+            return [*items, *decoder.timed_out(self.clock.now())], False
         return items, True
 
 
@@ -194,7 +186,7 @@ class FifoDriver(Driver[FifoSettings]):
                 stream,
                 settings,
                 decoder,
-                information=information,
+                information=(information,),
                 clock=clock,
                 patience=settings.patience or max(DEFAULT_PATIENCE, kept),
             )
@@ -208,21 +200,19 @@ def _check_rate(sensor: Sensor, settings: FifoSettings) -> None:
             f"expected whole Hz up to {HIGHEST_RATE}, as the device's register holds (or"
             " settings.set_rate = false)"
         )
-        raise BenchFileError(FileFault("sampling_rate", expected, rate, sensor.name))
+        raise sensor.fault("sampling_rate", expected, rate)
     n_channels = len(sensor.channels)
     samples_a_read = MAX_WORDS // n_channels
     if not samples_a_read:
         expected = f"expected at most {MAX_WORDS}, the words of one read"
-        raise BenchFileError(FileFault("channels", expected, f"{n_channels} channels", sensor.name))
+        raise sensor.fault("channels", expected, f"{n_channels} channels")
     bytes_a_sample = 2 * n_channels + READ_OVERHEAD / samples_a_read
     needed = math.ceil(rate * bytes_a_sample * (10 if settings.parity == "N" else 11))
     if needed > settings.baud_rate:
         expected = (
             f"expected at least {needed} for {rate:g} Hz of {n_channels} channels (or a lower rate)"
         )
-        raise BenchFileError(
-            FileFault("settings.baud_rate", expected, settings.baud_rate, sensor.name)
-        )
+        raise sensor.fault("settings.baud_rate", expected, settings.baud_rate)
 
 
 async def _set_up(stream: ByteStream, sensor: Sensor, settings: FifoSettings) -> None:

@@ -24,6 +24,7 @@ sampling starts are stale and discarded.
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -46,13 +47,14 @@ BLOCK_SAMPLES = 1024
 Header = Literal["size", "left"]
 
 
+@dataclass(eq=False)
 class FifoDecoder:
     """Client of a FIFO: requests out, replies in, blocks out.
 
     Send :meth:`request`, pass the received bytes to :meth:`receive` until ``waiting`` is false, or
     call :meth:`timed_out`; pause while ``level`` is low.
 
-    Parameters
+    Attributes
     ----------
     sensor : str
         Name of the sensor.
@@ -68,22 +70,15 @@ class FifoDecoder:
         Capacity of the FIFO in words, if known.
     """
 
-    def __init__(
-        self,
-        sensor: str,
-        sampling_rate: float,
-        *,
-        n_channels: int = 3,
-        header: Header = "size",
-        unit: int = 1,
-        capacity: int | None = None,
-    ) -> None:
-        self._sensor = sensor
-        self._rate = sampling_rate
-        self._n_channels = n_channels
-        self._header = header
-        self._unit = unit
-        self._capacity = capacity
+    sensor: str
+    sampling_rate: float
+    n_channels: int = 3
+    header: Header = "size"
+    unit: int = 1
+    capacity: int | None = None
+
+    def __post_init__(self) -> None:
+        self._rate = self.sampling_rate
         self._finder = ReplyFinder()
         self._n_requested = 0  # words requested
         self._doubtful = 0  # words that an unanswered read may have removed
@@ -117,11 +112,11 @@ class FifoDecoder:
 
     def request(self) -> bytes:
         """Return the next request: for the level and the samples known to be in the FIFO."""
-        most = MAX_WORDS // self._n_channels * self._n_channels
-        self._n_requested = min(self.level // self._n_channels * self._n_channels, most)
+        most = MAX_WORDS // self.n_channels * self.n_channels
+        self._n_requested = min(self.level // self.n_channels * self.n_channels, most)
         if self._doubtful:  # the level alone decides whether these words were removed
             self._n_requested = 0
-        request = rtu.read_request(self._unit, FIFO_REGISTER, 1 + self._n_requested)
+        request = rtu.read_request(self.unit, FIFO_REGISTER, 1 + self._n_requested)
         self._finder.expect(request)
         return request
 
@@ -133,7 +128,7 @@ class FifoDecoder:
         self._n_unanswered += 1
         text = f"no reply to a read: {other or 'nothing received'} ({self._n_unanswered} so far)"
         kind = EventKind.RESYNCHRONISED if other else EventKind.STATUS
-        return [*self.flush(), Event(self._sensor, kind, text, at)]
+        return [*self.flush(), Event(self.sensor, kind, text, at)]
 
     def flush(self) -> list[Block | Event]:
         """Return the collected samples; they arrived with the last reply."""
@@ -149,20 +144,20 @@ class FifoDecoder:
             self.level = 0
             self._n_refused += 1
             text = f"the device refused a read: {why} ({self._n_refused} so far)"
-            return [Event(self._sensor, EventKind.REFUSED, text, at)]
+            return [Event(self.sensor, EventKind.REFUSED, text, at)]
         registers = reply.registers
-        level = int(registers[0]) + (self._n_requested if self._header == "left" else 0)
+        level = int(registers[0]) + (self._n_requested if self.header == "left" else 0)
         found = self._resolve_doubt(level, at)
-        if self._capacity is not None and level >= self._capacity and self._started:
+        if self.capacity is not None and level >= self.capacity and self._started:
             if not self._full:
                 text = f"{level} words in the FIFO: it is full and samples were dropped"
-                found.append(Event(self._sensor, EventKind.OVERFLOW, text, at))
+                found.append(Event(self.sensor, EventKind.OVERFLOW, text, at))
             index, since = self._caught_up
             index += round((at.monotonic_ns - since) * 1e-9 * self._rate)
             self._full.append((level, index))
         words = registers[1:].view(np.int16)
         if level < self._n_requested and not words[level:].any():  # zeros behind the words
-            words = words[: level // self._n_channels * self._n_channels]
+            words = words[: level // self.n_channels * self.n_channels]
             found += self._emptied(level, at)
         self.level = max(0, level - self._n_requested)
         self._last = at
@@ -174,11 +169,11 @@ class FifoDecoder:
         if not self._started:
             return []
         text = f"{level} words in the FIFO, expected {self._n_requested}: the device was restarted"
-        found = [*self._hand_over(at), Event(self._sensor, EventKind.RESET, text, at)]
+        found = [*self._hand_over(at), Event(self.sensor, EventKind.RESET, text, at)]
         index, since = self._caught_up
         index += round((at.monotonic_ns - since) * 1e-9 * self._rate)
         self._full.clear()
-        self._skip_to(max(self._next, index - level // self._n_channels), "FIFO emptied")
+        self._skip_to(max(self._next, index - level // self.n_channels), "FIFO emptied")
         self._flags |= BlockFlag.CLOCK_RESTART
         return found
 
@@ -186,7 +181,7 @@ class FifoDecoder:
         caught_up = self.level < MAX_WORDS
         if not self._started:  # these words are stale
             self._started = caught_up
-            self._caught_up = (self.level // self._n_channels, at.monotonic_ns)
+            self._caught_up = (self.level // self.n_channels, at.monotonic_ns)
             return []
         found: list[Block | Event] = []
         while self._full and len(words):
@@ -201,12 +196,12 @@ class FifoDecoder:
         if caught_up or self._n_rows >= BLOCK_SAMPLES:
             found += self._hand_over(at)
         if caught_up:
-            self._caught_up = (self._next + self.level // self._n_channels, at.monotonic_ns)
+            self._caught_up = (self._next + self.level // self.n_channels, at.monotonic_ns)
         return found
 
     def _gather(self, words: NDArray[np.int16]) -> None:
         if len(words):
-            self._rows.append(words.reshape(-1, self._n_channels))
+            self._rows.append(words.reshape(-1, self.n_channels))
             self._n_rows += len(self._rows[-1])
 
     def _hand_over(self, at: HostTime) -> list[Block | Event]:
@@ -220,7 +215,7 @@ class FifoDecoder:
         reason, self._reason = self._reason, ""
         if counts.max() == np.iinfo(np.int16).max or counts.min() == np.iinfo(np.int16).min:
             flags |= BlockFlag.CLIPPED
-        return Block(self._sensor, first, counts, at, flags=flags, reason=reason)
+        return Block(self.sensor, first, counts, at, flags=flags, reason=reason)
 
     def _resolve_doubt(self, level: int, at: HostTime) -> list[Block | Event]:
         """Decide by the level whether unanswered reads removed samples."""
@@ -229,9 +224,9 @@ class FifoDecoder:
             return []
         found = self._hand_over(self._last)
         self._flags |= BlockFlag.MISSING_ESTIMATED  # also for 0 missing: host time is uncertain
-        made = (at.monotonic_ns - self._last.monotonic_ns) * 1e-9 * self._rate * self._n_channels
+        made = (at.monotonic_ns - self._last.monotonic_ns) * 1e-9 * self._rate * self.n_channels
         if self.level + made - level > doubtful / 2:
-            self._skip_to(self._next + doubtful // self._n_channels, "lost reply")
+            self._skip_to(self._next + doubtful // self.n_channels, "lost reply")
         return found
 
     def _skip_to(self, index: int, reason: str) -> None:

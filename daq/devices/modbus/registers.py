@@ -32,14 +32,12 @@ from daq.devices.port_rules import port_label, require_address
 from daq.devices.shared_port import Presence, answering
 from daq.errors import (
     ABSENT,
-    BenchFileError,
     DeviceError,
-    FileFault,
     NoAnswerError,
     WrongDeviceError,
 )
 from daq.protocols.block import Block, Event, EventKind
-from daq.protocols.errors import DeviceSettingError, RemoteProtocolError
+from daq.protocols.errors import DeviceSettingError, RemoteProtocolError, shortened
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
@@ -112,8 +110,7 @@ class _Polled:
         except DeviceSettingError as error:
             value = sensor.settings.get(error.key, ABSENT)
             key = f"settings.{error.key}" if error.key else "settings"
-            fault = FileFault(key, error.expected, value, sensor.name)
-            raise BenchFileError(fault) from error
+            raise sensor.fault(key, error.expected, value) from error
         preset = protocol.PRESETS.get(settings.preset or "", {})
         return cls(sensor, settings, registers, given.get("device_id", preset.get("device_id", 1)))
 
@@ -249,7 +246,7 @@ class _Poller:
     def _event(self, kind: EventKind, text: str) -> list[Block | Event]:
         now = self._clock.now()
         self._n_wrong[kind] += 1
-        counted = f"{text.encode()[:180].decode(errors='ignore')} ({self._n_wrong[kind]} so far)"
+        counted = f"{shortened(text, 180)} ({self._n_wrong[kind]} so far)"
         return [*self._decoder.flush(), Event(self.sensor, kind, counted, now)]
 
     def _schedule(self) -> None:
@@ -263,34 +260,28 @@ class _Poller:
         self._due_ns += (late + 1) * self._period_ns
 
 
+@dataclass(eq=False)
 class RegisterSession(Session):
     """A bus with devices that reply, idle until :meth:`read`."""
 
-    def __init__(
-        self,
-        bus: ModbusBus,
-        clock: HostClock,
-        polled: Sequence[_Polled],
-        information: tuple[DeviceInformation, ...],
-    ) -> None:
-        self.information = information
-        self._bus = bus
-        self._clock = clock
-        self._polled = polled
+    bus: ModbusBus
+    clock: HostClock
+    polled: Sequence[_Polled]
+    information: tuple[DeviceInformation, ...]
 
     async def read(self) -> AsyncIterator[Block | Event]:
         """Poll all sensors of the bus, each at its rate."""
         pollers = [
-            _Poller(one, self._clock, trouble=about.trouble)
-            for one, about in zip(self._polled, self.information, strict=True)
+            _Poller(one, self.clock, trouble=about.trouble)
+            for one, about in zip(self.polled, self.information, strict=True)
         ]
         while True:
             poller = min(pollers, key=lambda one: one.due_ns)
-            wait = (poller.due_ns - self._clock.now().monotonic_ns) * 1e-9 / self._clock.speed
+            wait = (poller.due_ns - self.clock.now().monotonic_ns) * 1e-9 / self.clock.speed
             if wait > 0:
                 await asyncio.sleep(wait)
             try:
-                found = await poller.poll(self._bus)
+                found = await poller.poll(self.bus)
             except DeviceError:
                 for item in (item for one in pollers for item in one.flush()):
                     yield item
@@ -300,7 +291,7 @@ class RegisterSession(Session):
             if all(one.presence.is_gone for one in pollers):
                 names = ", ".join(repr(one.sensor) for one in pollers)
                 raise NoAnswerError(
-                    f"{self._bus.label}: {names} did not answer several polls in a row"
+                    f"{self.bus.label}: {names} did not answer several polls in a row"
                 )
 
 

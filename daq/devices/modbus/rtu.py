@@ -31,10 +31,13 @@ _EXCEPTION_SIZE = 5
 
 EXCEPTIONS = {
     1: "illegal function",
-    2: "illegal address",
-    3: "illegal value",
+    2: "illegal data address",
+    3: "illegal data value",
     4: "device failure",
+    5: "acknowledged, not done yet",
     6: "device busy",
+    10: "no path through the gateway",
+    11: "no reply behind the gateway",
 }
 
 

@@ -22,25 +22,22 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
-from urllib.parse import urlsplit
 
 import numpy as np
 from pydantic import Field, PositiveFloat, Strict
 
 from daq.devices.interface import DeviceInformation, Driver, DriverSettings, Session
-from daq.devices.port_rules import port_label
+from daq.devices.port_rules import host_of, port_label
 from daq.devices.seedlink import packets
 from daq.devices.seedlink.decoder import SeedLinkDecoder, Selection
 from daq.devices.shared_port import Presence
 from daq.errors import (
-    BenchFileError,
     DeviceError,
-    FileFault,
     NoAnswerError,
     NotConnectedError,
     WrongDeviceError,
 )
-from daq.transport.address import USUAL_NUMBERS, host_and_port
+from daq.transport.address import USUAL_NUMBERS
 from daq.transport.ports import open_port
 
 if TYPE_CHECKING:
@@ -110,8 +107,7 @@ class SeedLinkSettings(DriverSettings, strict=True):
         elif self.tls is None and not self.is_encrypted(number):
             expected = "others on the network can read them; expected tls = true (or false: send)"
         if expected:
-            fault = FileFault("settings.credentials", expected, self.credentials, sensor.name)
-            raise BenchFileError(fault)
+            raise sensor.fault("settings.credentials", expected, self.credentials)
 
     def read_credentials(self, sensor: Sensor) -> list[str]:
         """Return user and password, or a token; raise BenchFileError if the file has neither."""
@@ -122,8 +118,7 @@ class SeedLinkSettings(DriverSettings, strict=True):
         except (OSError, UnicodeDecodeError) as error:
             words, expected = [], f"cannot be read: {error}"
         if len(words) not in {1, 2}:
-            fault = FileFault("settings.credentials", expected, str(path), sensor.name)
-            raise BenchFileError(fault)
+            raise sensor.fault("settings.credentials", expected, str(path))
         return words
 
     def selection(self, sensor: Sensor) -> Selection:
@@ -136,35 +131,31 @@ class SeedLinkSettings(DriverSettings, strict=True):
                 f"expected the code of each of the sensor's {n_channels} channels, or one pattern"
                 ' such as "HN?" for all of them'
             )
-            raise BenchFileError(FileFault("settings.channels", expected, list(codes), sensor.name))
+            raise sensor.fault("settings.channels", expected, list(codes))
         patterns = tuple((self.location, code) for code in codes)
         rate = sensor.sampling_rate
         return Selection(self.network, self.station, patterns, n_channels, rate)
 
 
+@dataclass(eq=False)
 class SeedLinkSession(Session):
     """A server that sends; all streams of at least one sensor have been received."""
 
     hint = "the server sends no records; check its digitizer"
 
-    def __init__(
-        self,
-        link: _Link,
-        *,
-        information: tuple[DeviceInformation, ...],
-        resumed: bool,
-    ) -> None:
-        self.information = information
-        self.decoder = link.decoder
-        self.resumed = resumed
-        self.patience = link.settings.patience
-        self._link = link
+    link: _Link
+    information: tuple[DeviceInformation, ...]
+    resumed: bool
+
+    def __post_init__(self) -> None:
+        self.decoder = self.link.decoder
+        self.patience = self.link.settings.patience
 
     async def read(self) -> AsyncIterator[Block | Event]:
         """Yield blocks and events."""
         while self.decoder.waiting:
             yield self.decoder.waiting.pop(0)
-        link = self._link
+        link = self.link
         refused: dict[str, Presence] = {}
         while True:
             for name in link.refused.keys() - refused.keys():  # each connection may refuse others
@@ -181,25 +172,22 @@ class SeedLinkSession(Session):
             refused = {name: one for name, one in refused.items() if one.is_gone}
 
 
+@dataclass(eq=False)
 class _Link:
     """The connection to a server, which is replaced when the server has a refused station."""
 
-    def __init__(
-        self,
-        planned: _Planned,
-        sensors: Sequence[Sensor],
-        clock: HostClock,
-        decoder: SeedLinkDecoder,
-    ) -> None:
-        self.clock = clock
-        self.decoder = decoder
-        self.label = port_label(sensors)
-        self.settings = planned.settings[sensors[0].name]
+    planned: _Planned
+    sensors: Sequence[Sensor]
+    clock: HostClock
+    decoder: SeedLinkDecoder
+
+    def __post_init__(self) -> None:
+        self.label = port_label(self.sensors)
+        self.settings = self.planned.settings[self.sensors[0].name]
         self.refused: dict[str, str] = {}
         """Why the server refused the station of a sensor."""
         self.server: _Server
-        self._first = sensors[0]
-        self._planned = planned
+        self._first = self.sensors[0]
         self._found: list[Block | Event] = []
         self._stack = contextlib.AsyncExitStack()
 
@@ -250,7 +238,7 @@ class _Link:
     ) -> tuple[contextlib.AsyncExitStack, _Server, dict[str, str]]:
         """Connect; raise WrongDeviceError if the server refuses ``wanted``, or all stations."""
         settings, label = self.settings, self.label
-        host, number = self._planned.address
+        host, number = self.planned.address
         tls = None
         if settings.is_encrypted(number):
             try:
@@ -266,9 +254,7 @@ class _Link:
             await server.greet(settings.protocol)
             if settings.credentials is not None:
                 await server.authenticate(settings.read_credentials(self._first))
-            refused = await server.choose(
-                self._planned.selections, self.decoder.last, wanted=wanted
-            )
+            refused = await server.choose(self.planned.selections, self.decoder.last, wanted=wanted)
             return stack.pop_all(), server, refused
 
 
@@ -288,7 +274,7 @@ class SeedLinkDriver(Driver[SeedLinkSettings]):
         """Return the plan of the server; raise BenchFileError if it is impossible."""
         first, settings = sensors[0], self.typed(sensors)
         common = settings[first.name]
-        host, number = _address(first, TLS_PORT if common.tls else PORT)
+        host, number = host_of(first, SCHEME, TLS_PORT if common.tls else PORT)
         common.check_credentials(first, number)
         selections = {one.name: settings[one.name].selection(one) for one in sensors}
         return _Planned(settings, selections, (host, number))
@@ -314,20 +300,6 @@ class _Planned:
     settings: dict[str, SeedLinkSettings]
     selections: dict[str, Selection]
     address: tuple[str, int]
-
-
-def _address(sensor: Sensor, default: int) -> tuple[str, int]:
-    """Return host and number of a sensor's port, ``default`` if it has no number."""
-    expected = "expected seedlink://host, or seedlink://host:port"
-    fault = FileFault("port", expected, sensor.port, sensor.name)
-    port = sensor.port.rstrip("/")
-    if not port.startswith(f"{SCHEME}://"):
-        raise BenchFileError(fault)
-    try:
-        host, number = host_and_port(port if urlsplit(port).port else f"{port}:{default}")
-    except ValueError as error:
-        raise BenchFileError(fault) from error
-    return f"[{host}]" if ":" in host else host, number
 
 
 @contextlib.asynccontextmanager

@@ -63,7 +63,7 @@ from daq.protocols.block import (
     Reading,
     ReadingTimes,
 )
-from daq.protocols.errors import RemoteProtocolError
+from daq.protocols.errors import RemoteProtocolError, shortened
 from daq.protocols.sample_counter import SampleCounter
 from daq.protocols.sample_times import LATE_NS, Place, SampleTimes
 
@@ -177,7 +177,6 @@ class Packets:
         return Group(one.time_ns, counts, self._last, one.resolution_ns)
 
 
-_ANNOUNCED = 200
 _FIRST_ROWS = 5
 
 
@@ -261,7 +260,7 @@ class TextDecoder:
                 f"{MAX_MESSAGE} bytes without the terminator {self._format.terminator!r}: dropped"
                 f" ({self._n_given_up} so far); check settings.terminator"
             )
-            yield Event(self._sensor, EventKind.RESYNCHRONISED, _cut(text), at)
+            yield Event(self._sensor, EventKind.RESYNCHRONISED, shortened(text), at)
 
     def _messages(self, messages: list[bytes], at: HostTime) -> list[DeviceItem]:
         found: list[DeviceItem] = []
@@ -284,8 +283,8 @@ class TextDecoder:
                 self._n_unreadable += 1
                 if not self._has_read and len(self.first_rows) < _FIRST_ROWS:
                     self.first_rows.append(message)
-                text = f"{_cut(str(error), 160)} ({self._n_unreadable} unreadable so far)"
-                found.append(Event(self._sensor, EventKind.CHECKSUM, _cut(text), at))
+                text = f"{shortened(str(error), 160)} ({self._n_unreadable} unreadable so far)"
+                found.append(Event(self._sensor, EventKind.CHECKSUM, shortened(text), at))
                 self._unreadable()
         found += self._rows(rows, at)
         if rows and self._stated_keys and self._reading_times.is_due(at):
@@ -415,7 +414,7 @@ class TextDecoder:
         for group in self._packets.ready(self._times):
             yield from self._timed([group])
         for text in self._packets.dropped(at):
-            yield Event(self._sensor, EventKind.OVERFLOW, _cut(text), at)
+            yield Event(self._sensor, EventKind.OVERFLOW, shortened(text), at)
 
     # --- positions by time -------------------------------------------------------------------
 
@@ -517,7 +516,3 @@ def _numbers(fields: list[str], format_: TextFormat) -> NDArray[Any]:
     if (whole != values).any():
         raise ValueError(fields)
     return whole.astype(np.int32)
-
-
-def _cut(text: str, n_bytes: int = _ANNOUNCED) -> str:
-    return text.encode()[:n_bytes].decode(errors="ignore")

@@ -11,7 +11,7 @@ end. LILY tiltmeters need ``*9900XYC2`` and ``*9900XYC-OFF``.
 from __future__ import annotations
 
 import contextlib
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from ipaddress import ip_address
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -33,7 +33,7 @@ from daq.devices.text.format import (
     is_readable,
 )
 from daq.devices.text.guess import guess_settings
-from daq.errors import BenchFileError, DeviceError, FileFault, toml_value
+from daq.errors import DeviceError, toml_value
 from daq.protocols.block import Block, DeviceItem, Event, EventKind
 from daq.transport.ports import open_port
 from daq.transport.udp import open_datagrams
@@ -149,15 +149,13 @@ class TextSettings(DriverSettings, strict=True):
         if len(places) != n_channels:
             what = "columns" if format_.layout == "row" else "channel_names"
             expected = f"expected one for each of the sensor's {n_channels} channels"
-            raise BenchFileError(FileFault(f"settings.{what}", expected, list(places), sensor.name))
+            raise sensor.fault(f"settings.{what}", expected, list(places))
         if format_.terminator in format_.delimiter:
             expected = (
                 f"is in settings.delimiter = {toml_value(format_.delimiter)}; expected one that"
                 " ends a message, not a field"
             )
-            raise BenchFileError(
-                FileFault("settings.terminator", expected, format_.terminator, sensor.name)
-            )
+            raise sensor.fault("settings.terminator", expected, format_.terminator)
         _check_format(format_, sensor)
         return format_
 
@@ -166,19 +164,19 @@ def _check_format(format_: TextFormat, sensor: Sensor) -> None:
     """Raise BenchFileError for settings that contradict each other."""
     if format_.device_time and format_.layout != "channel" and format_.time_column is None:
         expected = "expected settings.time_column with it"
-        raise BenchFileError(FileFault("settings.device_time", expected, True, sensor.name))
+        raise sensor.fault("settings.device_time", expected, True)
     if format_.device_time and format_.time_format in SINCE_START:
         expected = f"a time in {format_.time_format} is no UTC: leave it out"
-        raise BenchFileError(FileFault("settings.device_time", expected, True, sensor.name))
+        raise sensor.fault("settings.device_time", expected, True)
     if format_.decimal_comma and "," in format_.delimiter and format_.layout == "row":
         expected = "expected another settings.delimiter than a comma with it"
-        raise BenchFileError(FileFault("settings.decimal_comma", expected, True, sensor.name))
+        raise sensor.fault("settings.decimal_comma", expected, True)
     for key in ("time_column", "counter_column"):
         value = getattr(format_, key)
         if value is not None and isinstance(value, int) != (format_.layout == "row"):
             what = "the number" if format_.layout == "row" else "the name"
             expected = f'expected {what} of a field, for layout "{format_.layout}"'
-            raise BenchFileError(FileFault(f"settings.{key}", expected, value, sensor.name))
+            raise sensor.fault(f"settings.{key}", expected, value)
 
 
 class _Source:
@@ -219,32 +217,27 @@ class _DatagramSource(_Source):
         return found
 
 
+@dataclass(eq=False)
 class TextSession(Session):
     """An open port; the device sends by itself or after the start command."""
 
-    def __init__(
-        self,
-        source: _Source,
-        settings: TextSettings,
-        *,
-        information: DeviceInformation,
-        decoder: TextDecoder,
-    ) -> None:
-        self.information = (information,)
-        self.patience = settings.patience
-        self._source = source
-        self._settings = settings
-        self._decoder = decoder
+    source: _Source
+    settings: TextSettings
+    information: tuple[DeviceInformation, ...]
+    decoder: TextDecoder
+
+    def __post_init__(self) -> None:
+        self.patience = self.settings.patience
         self._advice = (
             "check that the device sends to this computer and port, and that no firewall blocks it"
-            if isinstance(source, _DatagramSource)
+            if isinstance(self.source, _DatagramSource)
             else "check cable, power, settings.baud_rate and settings.start"
         )
 
     @property
     def hint(self) -> str:
         """Advice if no block arrives: on the format, if rows arrive but none is readable."""
-        rows = self._decoder.first_rows
+        rows = self.decoder.first_rows
         if not rows:
             return self._advice
         shown = ", ".join(repr(row[:60].decode("ascii", "replace")) for row in rows[:2])
@@ -256,11 +249,11 @@ class TextSession(Session):
 
     async def read(self) -> AsyncIterator[DeviceItem]:
         """Start the device and yield blocks and events."""
-        self._source.discard()
-        if self._settings.start:
-            await self._source.send(self._settings.start.encode())
+        self.source.discard()
+        if self.settings.start:
+            await self.source.send(self.settings.start.encode())
         while True:
-            for item in await self._source.receive():
+            for item in await self.source.receive():
                 yield item
 
 
@@ -296,7 +289,7 @@ class TextDriver(Driver[TextSettings]):
         )
         async with _opened(sensor, clock, settings, decoder, label=port_label(sensors)) as source:
             try:
-                yield TextSession(source, settings, information=information, decoder=decoder)
+                yield TextSession(source, settings, (information,), decoder)
             finally:
                 if settings.stop:
                     with contextlib.suppress(DeviceError):
@@ -307,11 +300,11 @@ def _check_port(sensor: Sensor, settings: TextSettings) -> None:
     """Raise BenchFileError for settings that do not apply to the port."""
     if settings.from_ is not None and not sensor.port.startswith("udp://"):
         expected = f"is for ports udp://…, not {sensor.port}: leave it out"
-        raise BenchFileError(FileFault("settings.from", expected, settings.from_, sensor.name))
+        raise sensor.fault("settings.from", expected, settings.from_)
     for key in ("start", "stop"):
         if sensor.port.startswith("udp://") and (value := getattr(settings, key)):
             expected = f"nothing can be sent to {sensor.port}: leave it out"
-            raise BenchFileError(FileFault(f"settings.{key}", expected, value, sensor.name))
+            raise sensor.fault(f"settings.{key}", expected, value)
 
 
 @contextlib.asynccontextmanager

@@ -11,7 +11,7 @@ from pydantic import PositiveInt
 
 from daq.devices.interface import DeviceInformation, Driver, DriverSettings, Session
 from daq.devices.port_rules import only, port_label
-from daq.errors import BenchFileError, DeviceError, FileFault, NoAnswerError, WrongDeviceError
+from daq.errors import DeviceError, NoAnswerError, WrongDeviceError
 from daq.transport.ports import open_port
 from huddle_ax3.protocol import FRAME, RATES, Decoder
 
@@ -77,14 +77,10 @@ class AX3Driver(Driver[AX3Settings]):
         sensor = only(sensors, "an AX3 needs a port of its own")
         if sensor.sampling_rate not in RATES:
             expected = f"expected one of {', '.join(map(str, RATES))} Hz"
-            raise BenchFileError(
-                FileFault("sampling_rate", expected, sensor.sampling_rate, sensor.name)
-            )
+            raise sensor.fault("sampling_rate", expected, sensor.sampling_rate)
         if len(sensor.channels) != 3:
             expected = "expected 3: x, y and z"
-            raise BenchFileError(
-                FileFault("channels", expected, f"{len(sensor.channels)} channels", sensor.name)
-            )
+            raise sensor.fault("channels", expected, f"{len(sensor.channels)} channels")
         return sensor, self.typed(sensors)[sensor.name]
 
     @contextlib.asynccontextmanager

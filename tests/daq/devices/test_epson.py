@@ -162,7 +162,7 @@ async def test_frames_before_a_restart_have_their_arrival_time(
     stream = cast("ByteStream", Restarted(frames, configuration.burst.size, n_lost))
     decoder = configuration.decoder("A")
     device = Device(SENSOR, stream)
-    session = EpsonSession(device, configuration, DeviceInformation("A"), decoder, host_clock())
+    session = EpsonSession(device, configuration, (DeviceInformation("A"),), decoder, host_clock())
     blocks: list[Block] = []
 
     async def read() -> None:

@@ -181,7 +181,7 @@ async def test_a_lost_reply_is_not_reported_as_a_slow_link(monkeypatch: pytest.M
         stream,
         settings,
         decoder,
-        information=DeviceInformation("A"),
+        information=(DeviceInformation("A"),),
         clock=host_clock(),
         patience=10.0,
     )
@@ -216,7 +216,7 @@ async def test_an_overflow_is_reported_and_its_gap_estimated(
     ("changes", "error", "said"),
     [
         ({"settings": {"unit": 9}}, NoAnswerError, "of unit 9: nothing received; check cable"),
-        ({"sampling_rate": 20_001.0}, WrongDeviceError, "refused setting .*: illegal value"),
+        ({"sampling_rate": 20_001.0}, WrongDeviceError, "refused setting .*: illegal data value"),
         ({"sampling_rate": 0.5}, BenchFileError, "expected whole Hz"),
     ],
 )

@@ -328,7 +328,7 @@ def test_refusals_are_reported() -> None:
     assert isinstance(event, Event)
     assert (event.kind, event.text) == (
         "refused",
-        "the device refused a read: illegal address (1 so far)",
+        "the device refused a read: illegal data address (1 so far)",
     )
 
 

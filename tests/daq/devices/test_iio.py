@@ -101,8 +101,8 @@ def decoded(
         cast("Any", None),  # nothing is read
         one,
         Device("iio:device0", "x", ELEMENTS, ()),
-        ["accel_x"],
-        information=DeviceInformation("A", sampling_rate=RATE),
+        ("accel_x",),
+        information=(DeviceInformation("A", sampling_rate=RATE),),
         patience=1.0,
     )
     layout, rng = ScanLayout(ELEMENTS), np.random.default_rng(1)

@@ -228,7 +228,7 @@ async def test_reads_of_an_epson_return_to_the_ends_of_frames() -> None:
         decoder = configuration.decoder("A")
         device = Device(sensor, stream)
         session = EpsonSession(
-            device, configuration, DeviceInformation("A"), decoder, SystemClock()
+            device, configuration, (DeviceInformation("A"),), decoder, SystemClock()
         )
         items = session.read()
 
