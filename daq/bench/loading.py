@@ -260,15 +260,11 @@ def _port_faults(
     for sensor in sensors:
         other = first.setdefault(sensor.port, sensor)
         if other.driver != sensor.driver:
-            yield FileFault(
-                "driver",
-                (
-                    f'expected "{other.driver}", which sensor {other.name!r} uses on the same port'
-                    f" {sensor.port}"
-                ),
-                sensor.driver,
-                sensor.name,
+            expected = (
+                f'expected "{other.driver}", which sensor {other.name!r} uses on the same port'
+                f" {sensor.port}"
             )
+            yield FileFault("driver", expected, sensor.driver, sensor.name)
     clocks: dict[str, Sensor] = {}
     for sensor in sensors:
         if sensor.driver not in drivers:
@@ -277,12 +273,10 @@ def _port_faults(
             sensor.clock_name(shares_clock=drivers[sensor.driver].shares_clock), sensor
         )
         if other.sampling_rate != sensor.sampling_rate:
-            yield FileFault(
-                "sampling_rate",
-                f"expected {other.sampling_rate:g} Hz, as sensor {other.name!r} on the same clock",
-                sensor.sampling_rate,
-                sensor.name,
+            expected = (
+                f"expected {other.sampling_rate:g} Hz, as sensor {other.name!r} on the same clock"
             )
+            yield FileFault("sampling_rate", expected, sensor.sampling_rate, sensor.name)
 
 
 def _device_faults(
@@ -307,21 +301,16 @@ def _set_faults(
 ) -> Iterator[FileFault]:
     needed = max(LEAST_SENSORS.get(method, 3) for method in estimate.methods)
     if n_named < needed:
-        yield FileFault(
-            "sensors",
-            f"expected at least {needed} for method {', '.join(estimate.methods)}",
-            f"{n_named} sensor{'' if n_named == 1 else 's'}",
-        )
+        expected = f"expected at least {needed} for method {', '.join(estimate.methods)}"
+        yield FileFault("sensors", expected, f"{n_named} sensor{'' if n_named == 1 else 's'}")
     counts = Counter(sensor.n_main_channels for sensor in sensors)
     if len(counts) > 1:
         usual = counts.most_common(1)[0][0]
         for sensor in sensors:
             if sensor.n_main_channels != usual:
+                expected = f"expected {usual} that are not auxiliary, as in the other sensors"
                 yield FileFault(
-                    "channels",
-                    f"expected {usual} that are not auxiliary, as in the other sensors",
-                    f"{sensor.n_main_channels} channels",
-                    sensor.name,
+                    "channels", expected, f"{sensor.n_main_channels} channels", sensor.name
                 )
 
 
@@ -341,15 +330,11 @@ def _unit_faults(sensors: Sequence[Sensor], estimate: EstimateSettings) -> Itera
     example = channels[quantities.index(usual)][2]
     for (sensor, name, unit), quantity in zip(channels, quantities, strict=True):
         if quantity != usual:
-            yield FileFault(
-                f'channels["{name}"].unit',
-                (
-                    f"expected a unit of the quantity of most channels, such as {example};"
-                    " if the sensor measures another motion, set the unit of [estimate]"
-                ),
-                unit,
-                sensor,
+            expected = (
+                f"expected a unit of the quantity of most channels, such as {example};"
+                " if the sensor measures another motion, set the unit of [estimate]"
             )
+            yield FileFault(f'channels["{name}"].unit', expected, unit, sensor)
 
 
 def _method_faults(estimate: EstimateSettings) -> Iterator[FileFault]:
@@ -376,15 +361,11 @@ def _option_faults(estimate: EstimateSettings, sensors: Sequence[Sensor]) -> Ite
 def _rate_faults(sensors: Sequence[Sensor], rate: float) -> Iterator[FileFault]:
     for sensor in sensors:
         if sensor.sampling_rate < rate:
-            yield FileFault(
-                "sampling_rate",
-                (
-                    f"expected at least {rate:g} Hz, the rate of the bench: a slower sensor cannot"
-                    " be resampled to it; lower the sampling_rate of the bench"
-                ),
-                sensor.sampling_rate,
-                sensor.name,
+            expected = (
+                f"expected at least {rate:g} Hz, the rate of the bench: a slower sensor cannot"
+                " be resampled to it; lower the sampling_rate of the bench"
             )
+            yield FileFault("sampling_rate", expected, sensor.sampling_rate, sensor.name)
 
 
 def _estimate_faults(
@@ -396,26 +377,20 @@ def _estimate_faults(
     if estimate.band is not None:
         low, high = estimate.band
         if not (1 / estimate.segment <= low < high <= rate / 2):
-            yield FileFault(
-                "estimate.band",
-                (
-                    f"expected [low, high] in Hz from {1 / estimate.segment:.4g} (one over the"
-                    f" segment) to {rate / 2:.4g} (half the sampling rate)"
-                ),
-                list(estimate.band),
+            expected = (
+                f"expected [low, high] in Hz from {1 / estimate.segment:.4g} (one over the"
+                f" segment) to {rate / 2:.4g} (half the sampling rate)"
             )
+            yield FileFault("estimate.band", expected, list(estimate.band))
     if recording is None or recording.duration is None or not sensors:
         return
     n_segments, shortest = shortest_duration(estimate, sensors)
     if recording.duration < shortest:
-        yield FileFault(
-            "recording.duration",
-            (
-                f"expected at least {format_duration(shortest)}: an estimate needs {n_segments}"
-                f" segments of {format_duration(estimate.segment)}"
-            ),
-            format_duration(recording.duration),
+        expected = (
+            f"expected at least {format_duration(shortest)}: an estimate needs {n_segments}"
+            f" segments of {format_duration(estimate.segment)}"
         )
+        yield FileFault("recording.duration", expected, format_duration(recording.duration))
 
 
 def _limit_faults(table: Mapping[str, Any], sensors: Sequence[Sensor]) -> Iterator[FileFault]:

@@ -25,7 +25,7 @@ from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.host_clock import SystemClock
 from daq.protocols import block
 from daq.protocols.block import Block, BlockFlag, HostTime, Quantity, Reading
-from sim_devices.devices.epson import BUS_CELSIUS, SimulatedBus
+from tests.daq.devices.simulated_can_bus import BUS_CELSIUS, SimulatedBus
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
