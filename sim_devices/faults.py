@@ -64,7 +64,7 @@ import itertools
 import math
 import zlib
 from collections import deque
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeAlias
 
 import numpy as np
 from pydantic import (
@@ -84,7 +84,6 @@ from sim_devices.errors import ScenarioError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
-    from typing import Self
 
     from numpy.typing import NDArray
     from pydantic_core import ErrorDetails

@@ -17,7 +17,7 @@ import json
 import logging
 from collections import Counter
 from dataclasses import dataclass, fields, replace
-from datetime import UTC
+from datetime import UTC, tzinfo
 from functools import reduce
 from operator import add
 from typing import TYPE_CHECKING, Any
@@ -26,9 +26,9 @@ import h5py
 import numpy as np
 
 from daq.archive.averages import Average, Estimator, converted
-from daq.archive.changes import courses
+from daq.archive.changes import Course, courses
 from daq.archive.density import MIN_BINS, Density
-from daq.archive.index import ROLLUP
+from daq.archive.index import ROLLUP, Entry
 from daq.archive.plan import settings_document
 from daq.archive.rollup import (
     Grid,
@@ -40,7 +40,14 @@ from daq.archive.rollup import (
     series_of,
     summaries,
 )
-from daq.archive.spectra_file import SUMMARY_VERSION, SpectraFile, packed, unpacked
+from daq.archive.spectra_file import (
+    SUMMARY_VERSION,
+    Described,
+    SpectraFile,
+    Summary,
+    packed,
+    unpacked,
+)
 from daq.errors import ArchiveError, HuddleError
 from daq.estimation.blas_threads import one_blas_thread
 from daq.recording.storage.refusals import check_all
@@ -51,14 +58,10 @@ from daq.whole_file import hidden, put_in_place, remove
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
-    from datetime import tzinfo
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from daq.archive.changes import Course
-    from daq.archive.index import Entry
-    from daq.archive.spectra_file import Described, Summary
     from daq.archive.store import Store
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot

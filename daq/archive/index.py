@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from daq.archive.rollup import month_of
-from daq.archive.spectra_file import Described, Origin
+from daq.archive.spectra_file import Described, Origin, SpectraFile
 from daq.recording.file_format import channel_attributes, channels_of, texts
 from estimator.checks.count_limits import CountLimits
 from estimator.spectra.segment_rejection import Reason
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from daq.archive.spectra_file import SpectraFile
     from daq.bench.channel import Channel
 
 FILE = "index.sqlite"

@@ -13,14 +13,14 @@ neighbouring bins.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, tzinfo
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from daq.archive.averages import Average, Estimator
-from daq.archive.density import counted
-from daq.archive.spectra_file import DAY_NS, Summary
+from daq.archive.density import Density, counted
+from daq.archive.spectra_file import DAY_NS, Described, Summary
 from daq.results.band_summary import Levels, Spectrum, band_within, correlation_of
 from estimator.errors import BandError
 from estimator.levels.bands import BandLevels, band_edges
@@ -29,14 +29,11 @@ from estimator.levels.interval import like_psd
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
-    from datetime import tzinfo
 
     import h5py
     from numpy.typing import NDArray
 
-    from daq.archive.density import Density
     from daq.archive.plan import Plan
-    from daq.archive.spectra_file import Described
     from daq.estimation.settings import Settings
 
     FloatArray = NDArray[np.float64]

@@ -22,16 +22,14 @@ from daq.archive.execution import failure_of
 from daq.archive.plan import Plan, settings_document
 from daq.archive.spectra_file import DAY_NS
 from daq.archive.store import PLAN_FILE, Store
-from daq.archive.task import Task, software_version
-from daq.archive.waveforms import States, responses_on, without_channels
+from daq.archive.task import Outcome, Task, software_version
+from daq.archive.waveforms import Day, Reading, States, Station, responses_on, without_channels
 from daq.errors import ImportFormatError, WrongArchiveError, WrongSettingError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from daq.archive.task import Outcome
-    from daq.archive.waveforms import Day, Reading, Station
     from daq.estimation.settings import Settings
 
     Run = Callable[[Iterable[Task]], Iterator[Outcome]]

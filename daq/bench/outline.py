@@ -12,13 +12,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from daq.bench.estimate_settings import OPTIONS, EstimateSettings, table_keys
-from daq.bench.sensitivity import known_sensitivities
+from daq.bench.sensitivity import Sensitivities, known_sensitivities
 from daq.bench.tables.toml_text import checked_table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-    from daq.bench.sensitivity import Sensitivities
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ from daq.clocks.grid import SNAP, Grid, OwnSamples, grid_rate, joint_start, late
 from daq.clocks.quantiles import median
 from daq.clocks.resampling import USABLE
 from daq.clocks.sensor_reader import SensorSource, main_columns
-from daq.clocks.slips import Slip, arrive_otherwise, lost_by_delays, steps
+from daq.clocks.slips import Slip, Step, arrive_otherwise, lost_by_delays, steps
 from daq.errors import CannotAlignError
 
 if TYPE_CHECKING:
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.channel import Channel
-    from daq.clocks.slips import Step
     from daq.recording.interface import ReadableRecording
 
     FloatArray = NDArray[np.float64]

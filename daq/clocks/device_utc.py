@@ -13,14 +13,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.clocks.clock_model import Clock, ClockSource, ClockState, Epoch
+from daq.clocks.clock_model import Clock, ClockSource, ClockState, Epoch, MeasuredDelays
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from numpy.typing import NDArray
-
-    from daq.clocks.clock_model import MeasuredDelays
 
     FloatArray = NDArray[np.float64]
 

@@ -24,14 +24,12 @@ from daq.clocks.quantiles import median
 from daq.clocks.slips import Slips
 from daq.errors import CannotAlignError
 from daq.protocols.block import BlockFlag, Uncounted
-from daq.recording.interface import absences
+from daq.recording.interface import ReadableSensor, absences
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from numpy.typing import NDArray
-
-    from daq.recording.interface import ReadableSensor
 
     FloatArray = NDArray[np.float64]
     BoolArray = NDArray[np.bool_]

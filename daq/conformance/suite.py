@@ -31,8 +31,8 @@ import pytest
 from pydantic import BaseModel
 
 from daq.errors import DeviceError, NoAnswerError, NotConnectedError
-from daq.host_clock import SystemClock
-from daq.protocols.block import Block, BlockFlag, Event, EventKind
+from daq.host_clock import HostClock, SystemClock
+from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, EventKind, HostTime
 from daq.protocols.errors import RemoteProtocolError
 from daq.recorder.connection import BlockValidator
 from daq.transport.address import host_and_port
@@ -45,8 +45,6 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Sensor
     from daq.devices.interface import AnyDriver
-    from daq.host_clock import HostClock
-    from daq.protocols.block import DeviceItem, HostTime
 
 LIMIT = 60.0
 """Seconds that any test may take."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from daq.bench import loading
@@ -11,7 +11,6 @@ from daq.devices.registry import driver_names, driver_type
 from daq.transport.ports import is_simulated as is_simulated_port
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
     from daq.bench.model import Bench

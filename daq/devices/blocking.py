@@ -24,10 +24,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daq.devices.interface import Session
+from daq.devices.interface import DeviceInformation, Session
 from daq.devices.port_rules import port_label
 from daq.errors import DeviceError, NotConnectedError
-from daq.protocols.block import Block, BlockFlag
+from daq.protocols.block import Block, BlockFlag, HostTime
 from daq.protocols.sample_counter import SLACK
 
 if TYPE_CHECKING:
@@ -36,9 +36,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.model import Sensor
-    from daq.devices.interface import DeviceInformation
     from daq.host_clock import HostClock
-    from daq.protocols.block import HostTime
 
 _LOGGER = logging.getLogger(__name__)
 QUEUE = 256

@@ -16,13 +16,9 @@ from __future__ import annotations
 
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
-from typing import TYPE_CHECKING
 
-from daq.devices.interface import AnyDriver, Driver, Listing
+from daq.devices.interface import AnyDriver, Driver, Listing, PresentPort
 from daq.errors import DriverError, NotConnectedError
-
-if TYPE_CHECKING:
-    from daq.devices.interface import PresentPort
 
 GROUP = "huddle.drivers"
 

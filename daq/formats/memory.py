@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daq.errors import RecordingError
-from daq.protocols.block import BlockFlag, HostTime
+from daq.protocols.block import BlockFlag, Event, HostTime, Reading
 from daq.recording.array_writer import BLOCK_ROWS
 from daq.recording.file_format import BLOCK_DTYPE, GAP_DTYPE
 
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     from daq.bench.channel import Channel
     from daq.formats.foreign_sensor import ForeignSensor, Stretch
-    from daq.protocols.block import Event, Reading
 
 
 class BlocksInMemory:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daq.bench.response import AnalogPolesZeros, Fir, Gain, Iir, Measured, Response
+from daq.bench.response import AnalogPolesZeros, Fir, Gain, Iir, Measured, Response, Stage
 from daq.clocks.arrival_times import ArrivalTimes
 from daq.errors import RecordingError
 from daq.formats.foreign_sensor import NS_PER_S
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.channel import Channel
-    from daq.bench.response import Stage
     from daq.recording.reader import Recording
     from daq.recording.sensor_record import SensorRecord
 

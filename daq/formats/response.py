@@ -14,13 +14,13 @@ import hashlib
 import math
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -32,15 +32,11 @@ from daq.bench.response import (
     Iir,
     Measured,
     Response,
+    Stage,
 )
 from daq.bench.units import canonical, is_motion
 from daq.errors import ImportFormatError
 from daq.formats.readers.waveforms import load_obspy
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-    from daq.bench.response import Stage
 
 _SAME_UNIT = {
     "count": "counts",

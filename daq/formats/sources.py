@@ -15,21 +15,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 from daq.errors import ImportFormatError
-from daq.formats.assembly import SAME_RATE, assembled
-from daq.formats.foreign_sensor import FIRST_DATE_NS
+from daq.formats.assembly import SAME_RATE, Overlap, assembled
+from daq.formats.foreign_sensor import FIRST_DATE_NS, Calibration, ForeignSensor
 from daq.formats.readers.delimited import read_delimited
 from daq.formats.readers.miniseed import is_miniseed, miniseed_parts
 from daq.formats.readers.npz import read_mat, read_npz
 from daq.formats.readers.vibration import read_uff, read_wav, tdms_parts
 from daq.formats.readers.waveforms import waveform_parts
-from daq.formats.traces import FilePart, PartCache, pieces_of, traces_of
+from daq.formats.traces import FilePart, Part, PartCache, Piece, Trace, pieces_of, traces_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
-
-    from daq.formats.assembly import Overlap
-    from daq.formats.foreign_sensor import Calibration, ForeignSensor
-    from daq.formats.traces import Part, Piece, Trace
 
     Progress: TypeAlias = Callable[[str], None]
     from collections.abc import Callable

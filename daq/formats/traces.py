@@ -20,15 +20,13 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 import numpy as np
 
 from daq.errors import ImportFormatError
-from daq.formats.foreign_sensor import NS_PER_S
+from daq.formats.foreign_sensor import NS_PER_S, Calibration, ForeignSensor
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
-
-    from daq.formats.foreign_sensor import Calibration, ForeignSensor
 
     Samples: TypeAlias = NDArray[Any]
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.bench.units import conversion, is_motion
-from estimator.checks.relative_response import relative_response
+from estimator.checks.relative_response import RelativeResponse, relative_response
 from estimator.errors import EstimatorError
 
 if TYPE_CHECKING:
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Sensor
     from daq.preflight.preview import SensorPreview
-    from estimator.checks.relative_response import RelativeResponse
     from estimator.types import ComplexArray, FloatArray
 
 SEGMENT = 1.0

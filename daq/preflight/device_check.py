@@ -20,7 +20,7 @@ from daq.errors import DeviceError, NoAnswerError, NotConnectedError, WrongDevic
 from daq.preflight.findings import CheckRow, Outcome
 from daq.preflight.preflight import check_list
 from daq.preflight.preview import LENGTH, SensorPreview, arrivals
-from daq.protocols.block import Block, BlockFlag, Event
+from daq.protocols.block import Block, BlockFlag, DeviceItem, Event
 from daq.protocols.errors import RemoteProtocolError
 from daq.recorder.device_identity import check_identity, with_owner
 from daq.transport.address import USUAL_NUMBERS
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench, Sensor
     from daq.devices.interface import DeviceInformation
     from daq.host_clock import HostClock
-    from daq.protocols.block import DeviceItem
 
 MIN_SAMPLES = 4
 TEXT_BAUD_RATES = (115200, 9600, 57600, 38400, 19200, 230400)

@@ -16,7 +16,7 @@ import numpy as np
 
 from daq.devices.registry import driver_type
 from daq.errors import DeviceError, WrongDeviceError
-from daq.protocols.block import Block, BlockFlag
+from daq.protocols.block import Block, BlockFlag, DeviceItem
 from daq.protocols.errors import RemoteProtocolError
 from daq.recorder.device_identity import check_identity, with_owner
 from estimator.checks.count_limits import CountLimits
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench, Sensor
     from daq.devices.interface import DeviceInformation
     from daq.host_clock import HostClock
-    from daq.protocols.block import DeviceItem
 
 
 MIN_BLOCKS, MAX_RATE_ERROR = 3, 0.01

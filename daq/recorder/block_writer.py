@@ -17,28 +17,23 @@ import re
 from collections import defaultdict, deque
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from daq.protocols.block import Block, Event, EventKind, Quantity, Reading, ReadingTimes
+from daq.protocols.block import Block, Event, EventKind, HostTime, Quantity, Reading, ReadingTimes
 from daq.protocols.pace import Pace
-from daq.recorder.connection import SensorLate, SensorLost
+from daq.recorder.connection import Connected, Item, SensorLate, SensorLost
 from daq.recorder.late_blocks import REASON as LATE_FOR_GOOD
 from daq.recorder.late_blocks import LateBlocks
 from daq.recorder.sample_index import Gap, SampleIndexer
 from daq.recording.sensor_state import SensorState
-from daq.recording.writer import SensorCounts
+from daq.recording.writer import Committed, RecordingWriter, SensorCounts
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
-    from typing import Any
 
     from numpy.typing import NDArray
-
-    from daq.protocols.block import HostTime
-    from daq.recorder.connection import Connected, Item
-    from daq.recording.writer import Committed, RecordingWriter
 
 
 ShareOfRepeats: TypeAlias = "Callable[[NDArray[Any]], float]"

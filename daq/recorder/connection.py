@@ -22,11 +22,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daq.errors import DeviceError, NoAnswerError, NotConnectedError, WrongDeviceError
-from daq.protocols.block import Block, DeviceItem, Event, EventKind, Reading
+from daq.protocols.block import Block, DeviceItem, Event, EventKind, HostTime, Reading
 from daq.recorder.device_identity import check_identity
-from daq.recorder.stall_detector import StallDetector
+from daq.recorder.stall_detector import OverdueState, StallDetector
 from daq.recording.sensor_state import STATE_AFTER, SensorState
-from daq.transport.serial_ports import serial_ports
+from daq.transport.serial_ports import SerialPort, serial_ports
 from daq.transport.wire_log import session_ends
 
 if TYPE_CHECKING:
@@ -36,9 +36,6 @@ if TYPE_CHECKING:
     from daq.bench.model import Sensor
     from daq.devices.interface import AnyDriver, DeviceInformation, Session
     from daq.host_clock import HostClock
-    from daq.protocols.block import HostTime
-    from daq.recorder.stall_detector import OverdueState
-    from daq.transport.serial_ports import SerialPort
 
 
 _MIN_INT64, _MAX_INT64 = -(1 << 63), (1 << 63) - 1

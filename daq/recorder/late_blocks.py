@@ -18,13 +18,9 @@ A rate that is a little off makes no sudden step. An early block makes none eith
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
-from daq.protocols.block import BlockFlag
+from daq.protocols.block import Block, BlockFlag
 from daq.protocols.pace import Pace
-
-if TYPE_CHECKING:
-    from daq.protocols.block import Block
 
 REASON = "late for good"
 """Reason of gaps that are found here."""

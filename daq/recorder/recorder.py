@@ -29,28 +29,24 @@ from daq.bench.durations import format_duration
 from daq.devices.bench_file import is_simulated
 from daq.devices.registry import driver_type
 from daq.errors import DeviceError, DiskError, RecordingError
-from daq.host_clock import SystemClock
+from daq.host_clock import HostClock, SystemClock
 from daq.protocols.block import Event, EventKind, Quantity, Reading, ReadingTimes, Uncounted
 from daq.protocols.errors import RemoteProtocolError
-from daq.recorder.block_writer import BlockWriter, SensorProgress
+from daq.recorder.block_writer import BlockWriter, SensorProgress, ShareOfRepeats
 from daq.recorder.clock_trust import ClockWatch
-from daq.recorder.connection import CLOSE_TIMEOUT, Connection
+from daq.recorder.connection import CLOSE_TIMEOUT, Connection, Item
 from daq.recorder.device_identity import with_owner
 from daq.recording import control
 from daq.recording.control import Command
 from daq.recording.file_format import SIMULATED, SensorLayout
 from daq.recording.storage.names import CONTINUES, continuation_names
-from daq.recording.writer import RecordingWriter
+from daq.recording.writer import Committed, RecordingWriter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from daq.bench.model import Bench, Sensor
     from daq.devices.interface import AnyDriver
-    from daq.host_clock import HostClock
-    from daq.recorder.block_writer import ShareOfRepeats
-    from daq.recorder.connection import Item
-    from daq.recording.writer import Committed
 
 
 class WritingThread:

@@ -22,12 +22,8 @@ Samples that were recorded before (in late or repeated blocks) are not recorded 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
-from daq.protocols.block import Block, BlockFlag
-
-if TYPE_CHECKING:
-    from daq.protocols.block import HostTime
+from daq.protocols.block import Block, BlockFlag, HostTime
 
 _NS = 1e9
 _MAX_DISAGREEMENT = 3600.0

@@ -6,7 +6,16 @@ from typing import TYPE_CHECKING, Self, TypeAlias
 
 import numpy as np
 
-from daq.protocols.block import Block, BlockFlag, Event, HostTime, Reading
+from daq.protocols.block import (
+    Block,
+    BlockFlag,
+    CountsArray,
+    Event,
+    EventKind,
+    HostTime,
+    Quantity,
+    Reading,
+)
 from daq.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
@@ -17,7 +26,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.model import Bench
-    from daq.protocols.block import CountsArray, EventKind, Quantity
     from daq.recording.file_format import SensorLayout
 
     Times: TypeAlias = Sequence[int] | NDArray[np.int64]

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daq.recording.interface import absences
+from daq.recording.interface import ReadableRecording, ReadableSensor, absences
 from daq.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
-
-    from daq.recording.interface import ReadableRecording, ReadableSensor
 
     IntArray = NDArray[np.int64]
 

@@ -10,15 +10,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.bench.end_condition import NEVER
-from daq.protocols.block import BlockFlag
+from daq.bench.end_condition import NEVER, EndCondition
+from daq.protocols.block import BlockFlag, Event
 from daq.recording.sensor_state import STATE_AFTER, SensorState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from daq.bench.end_condition import EndCondition
-    from daq.protocols.block import Event
     from daq.recording.reader import Recording
     from daq.recording.sensor_record import SensorRecord
 

@@ -28,7 +28,7 @@ import numpy as np
 
 from daq.errors import HuddleError, RecordingError
 from daq.host_clock import SystemClock
-from daq.protocols.block import EventKind
+from daq.protocols.block import EventKind, HostTime
 from daq.recording import file_format
 from daq.recording.chunks.manifest import (
     RESULTS,
@@ -55,7 +55,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daq.protocols.block import HostTime
     from daq.recording.sensor_record import SensorRecord
 
 _ROWS_PER_READ = 1 << 17

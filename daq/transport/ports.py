@@ -34,14 +34,13 @@ import serial
 from daq.errors import NotConnectedError
 from daq.transport import wire_log
 from daq.transport.address import check_serial, host_and_port, is_same_port, is_virtual
-from daq.transport.byte_stream import ByteStream, why
+from daq.transport.byte_stream import ByteStream, Transport, why
 
 if TYPE_CHECKING:
     import ssl
     from collections.abc import AsyncIterator
 
     from daq.host_clock import HostClock
-    from daq.transport.byte_stream import Transport
 
 
 if sys.platform != "win32":

@@ -16,14 +16,12 @@ import numpy as np
 
 from daq.devices.modbus import rtu
 from daq.devices.modbus.fifo_protocol import FIFO_REGISTER, MAX_WORDS, RATE_REGISTER
-from daq.devices.modbus.rtu import RequestFinder
-from sim_devices.devices.interface import NEVER, Endpoint, Line, Samples, whole
+from daq.devices.modbus.rtu import Request, RequestFinder
+from sim_devices.devices.interface import NEVER, DeviceSpec, Endpoint, Line, Samples, Source, whole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from daq.devices.modbus.rtu import Request
-    from sim_devices.devices.interface import DeviceSpec, Source
 
 TURNAROUND = 0.001
 CAPACITY = 24_576

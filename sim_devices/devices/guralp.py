@@ -22,16 +22,14 @@ import numpy as np
 
 from daq.devices.guralp import gcf, scream
 from daq.devices.guralp.brp import Transmitter
-from daq.devices.guralp.gcf import SampleBlock, StatusBlock, SystemId
+from daq.devices.guralp.gcf import SampleBlock, StatusBlock, SystemId, Width
 from daq.devices.guralp.scream import Packet
-from sim_devices.devices.interface import NEVER, Endpoint, Line, Samples, whole
+from sim_devices.devices.interface import NEVER, DeviceSpec, Endpoint, Line, Samples, Source, whole
 from sim_devices.errors import ScenarioError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from daq.devices.guralp.gcf import Width
-    from sim_devices.devices.interface import DeviceSpec, Source
 
 FULL_SCALE = (1 << 23) - 1
 MAX_SAMPLES = 248

@@ -15,12 +15,11 @@ from daq.devices.iio.protocol import (
     ScanLayout,
     mask_of,
 )
-from sim_devices.devices.interface import NEVER, Endpoint, Line, Samples, whole
+from sim_devices.devices.interface import NEVER, DeviceSpec, Endpoint, Line, Samples, Source, whole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from sim_devices.devices.interface import DeviceSpec, Source
 
 FORMAT, TIME_FORMAT = "be:s32/32>>0", "le:s64/64>>0"
 VERSION = "0.25.v0.25  "

@@ -36,14 +36,13 @@ from daq.devices.labjack.stream import (
     SCAN_OVERLAP,
 )
 from daq.protocols.errors import RemoteProtocolError
-from sim_devices.devices.interface import NEVER, Endpoint, Line, Samples, whole
+from sim_devices.devices.interface import NEVER, DeviceSpec, Endpoint, Line, Samples, Source, whole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from sim_devices.devices.interface import DeviceSpec, Source
 
 CENTER = 33523
 

@@ -14,7 +14,7 @@ import numpy as np
 from pymodbus.constants import ExcCodes
 from pymodbus.exceptions import ModbusIOException
 from pymodbus.framer import FramerRTU, FramerSocket
-from pymodbus.pdu import DecodePDU, ExceptionResponse
+from pymodbus.pdu import DecodePDU, ExceptionResponse, ModbusPDU
 
 from daq.devices.modbus.registers_protocol import (
     PRESETS,
@@ -22,15 +22,13 @@ from daq.devices.modbus.registers_protocol import (
     WITMOTION_UNLOCK,
     RegisterMap,
 )
-from sim_devices.devices.interface import Endpoint, Line
+from sim_devices.devices.interface import DeviceSpec, Endpoint, Line, Source
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Mapping, Sequence
 
     from pymodbus.datastore import ModbusServerContext
-    from pymodbus.pdu import ModbusPDU
 
-    from sim_devices.devices.interface import DeviceSpec, Source
 
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 

@@ -25,12 +25,11 @@ from daq.devices.seedlink.packets import (
     Version,
     encode_packet,
 )
-from sim_devices.devices.interface import NEVER, Endpoint, Line, Samples, whole
+from sim_devices.devices.interface import NEVER, DeviceSpec, Endpoint, Line, Samples, Source, whole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from sim_devices.devices.interface import DeviceSpec, Source
 
 RECORD_SAMPLES = 100
 KEEP = 600.0

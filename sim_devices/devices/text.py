@@ -19,12 +19,11 @@ from daq.devices.text.format import (
     encode_row,
     encode_time,
 )
-from sim_devices.devices.interface import NEVER, Endpoint, Line, Samples, whole
+from sim_devices.devices.interface import NEVER, DeviceSpec, Endpoint, Line, Samples, Source, whole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from sim_devices.devices.interface import DeviceSpec, Source
 
 PACKET_SAMPLES = 25
 LILY_TAIL = ("194.25", "", "", "N9655")

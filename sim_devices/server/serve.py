@@ -64,7 +64,15 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from sim_devices.devices.interface import NEVER, ChannelSpec, DeviceSpec, Endpoint, Line, Source
+from sim_devices.devices.interface import (
+    NEVER,
+    ChannelSpec,
+    DeviceSpec,
+    Endpoint,
+    Kind,
+    Line,
+    Source,
+)
 from sim_devices.errors import ServeError
 from sim_devices.faults import Fault, LineFaults, SampleFaults, parse
 from sim_devices.world.scenario import Scenario
@@ -72,7 +80,6 @@ from sim_devices.world.scenario import Scenario
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from sim_devices.devices.interface import Kind
     from sim_devices.server.paced_clock import PacedClock
 
 

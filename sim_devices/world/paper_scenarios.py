@@ -12,13 +12,12 @@ import numpy as np
 
 from sim_devices.errors import ScenarioError
 from sim_devices.world.scenario import Scenario
-from sim_devices.world.spectrum import Mixed, Resonance, Sum, Tabulated, White
+from sim_devices.world.spectrum import Mixed, Resonance, Spectrum, Sum, Tabulated, White
 from sim_devices.world.tables import ChangingLevel, CommonMotion, PlaneWaves, SensorModel
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from sim_devices.world.spectrum import Spectrum
 
 STANDARD_GRAVITY = 9.80665
 NOISE = 1e-15 * STANDARD_GRAVITY**2

@@ -46,7 +46,7 @@ A field of plane waves instead of one common motion; distant sensors are not coh
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, NonNegativeInt, ValidationError, model_validator
@@ -56,7 +56,6 @@ from sim_devices.world.tables import MAX_BLOCK, USABLE, MotionModel, SensorModel
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from typing import Self
 
     from sim_devices.arrays import FloatArray
     from sim_devices.world.spectrum import Spectrum

@@ -10,14 +10,12 @@ Each shape is a frozen table, written in a bench file as::
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Literal, Self, TypeAlias
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFloat, model_validator
 
 if TYPE_CHECKING:
-    from typing import Self
-
     from sim_devices.arrays import FloatArray
 
 

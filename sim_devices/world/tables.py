@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Final, Literal, Self, TypeAlias
 
 import numpy as np
 from pydantic import (
@@ -19,8 +19,6 @@ from pydantic import (
 from sim_devices.world.spectrum import Spectrum, White
 
 if TYPE_CHECKING:
-    from typing import Self
-
     from sim_devices.arrays import FloatArray
 
 USABLE = 0.9

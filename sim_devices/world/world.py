@@ -22,14 +22,20 @@ from numpy import fft
 from numpy.lib.stride_tricks import sliding_window_view
 
 from sim_devices.world import plane_waves
-from sim_devices.world.tables import MAX_BLOCK, USABLE, PlaneWaves
+from sim_devices.world.tables import (
+    MAX_BLOCK,
+    USABLE,
+    ChangingLevel,
+    PlaneWaves,
+    Response,
+    SensorClock,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from sim_devices.arrays import ComplexArray, FloatArray
     from sim_devices.world.scenario import Scenario
-    from sim_devices.world.tables import ChangingLevel, Response, SensorClock
 
 _Kept = TypeVar("_Kept")
 

@@ -20,18 +20,27 @@ from daq.devices.epson.commands import (
     BURST_HEADER,
     DELIMITER,
     FLAG_ERROR,
+    BurstFormat,
     are_sums_right,
     temperature,
 )
-from daq.protocols.block import Block, BlockFlag, Event, EventKind, Quantity, Reading, ReadingTimes
+from daq.protocols.block import (
+    Block,
+    BlockFlag,
+    DeviceItem,
+    Event,
+    EventKind,
+    HostTime,
+    Quantity,
+    Reading,
+    ReadingTimes,
+)
 from daq.protocols.errors import several
 from daq.protocols.sample_counter import Run, SampleCounter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from daq.devices.epson.commands import BurstFormat
-    from daq.protocols.block import DeviceItem, HostTime
 
 OctetArray: TypeAlias = NDArray[np.uint8]
 BoolArray: TypeAlias = NDArray[np.bool_]

@@ -38,14 +38,22 @@ from daq.errors import (
     NotConnectedError,
     WrongDeviceError,
 )
-from daq.protocols.block import Block, Event, EventKind, Quantity, Reading, ReadingTimes
+from daq.protocols.block import (
+    Block,
+    DeviceItem,
+    Event,
+    EventKind,
+    HostTime,
+    Quantity,
+    Reading,
+    ReadingTimes,
+)
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping, Sequence
 
     from daq.bench.model import Sensor
     from daq.host_clock import HostClock
-    from daq.protocols.block import DeviceItem, HostTime
 
 SCHEME = "can://"
 BLOCK_SECONDS = 0.1

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daq.protocols.block import Block, BlockFlag, Event, EventKind
+from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
 from daq.protocols.sample_counter import SampleCounter
 
 if TYPE_CHECKING:
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daq.protocols.block import HostTime
 
 SYNC_COB_ID, SYNC_PERIOD = 0x1005, 0x1006
 """Objects: COB-ID of SYNC, with the bit of its producer; period in µs."""

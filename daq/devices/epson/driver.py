@@ -45,14 +45,13 @@ from daq.errors import (
     NotConnectedError,
     WrongDeviceError,
 )
-from daq.protocols.block import HostTime
+from daq.protocols.block import DeviceItem, HostTime
 from daq.transport.ports import open_port
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator, Sequence
 
     from daq.host_clock import HostClock
-    from daq.protocols.block import DeviceItem
     from daq.transport.byte_stream import ByteStream
 
 

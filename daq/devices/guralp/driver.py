@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import AfterValidator, Field, PositiveFloat
 
 from daq.devices.guralp import scream
-from daq.devices.guralp.decoders import FULL_SCALE_COUNTS, ScreamDecoder, SerialDecoder
+from daq.devices.guralp.decoders import FULL_SCALE_COUNTS, ScreamDecoder, SerialDecoder, Streams
 from daq.devices.guralp.gcf import BLOCK_SIZE, component, serial_number
 from daq.devices.interface import DeviceInformation, Driver, DriverSettings, Session
 from daq.devices.port_rules import inputs_of, port_label, require_address
@@ -40,10 +40,10 @@ from daq.errors import (
     NotConnectedError,
     WrongDeviceError,
 )
-from daq.protocols.block import Block, DeviceItem, Event, EventKind
+from daq.protocols.block import Block, DeviceItem, Event, EventKind, HostTime
 from daq.transport.address import host_and_port
 from daq.transport.ports import open_port
-from daq.transport.udp import open_datagrams
+from daq.transport.udp import DatagramStream, open_datagrams
 
 if TYPE_CHECKING:
     from collections.abc import (
@@ -56,11 +56,8 @@ if TYPE_CHECKING:
     )
 
     from daq.bench.model import Sensor
-    from daq.devices.guralp.decoders import Streams
     from daq.host_clock import HostClock
-    from daq.protocols.block import HostTime
     from daq.transport.byte_stream import ByteStream
-    from daq.transport.udp import DatagramStream
 
 
 StreamId = Annotated[

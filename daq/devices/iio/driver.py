@@ -27,7 +27,17 @@ from daq.devices.interface import (
 )
 from daq.devices.port_rules import host_of, only, port_label
 from daq.errors import NoAnswerError, WrongDeviceError
-from daq.protocols.block import Block, BlockFlag, Event, EventKind, Quantity, Reading, ReadingTimes
+from daq.protocols.block import (
+    Block,
+    BlockFlag,
+    DeviceItem,
+    Event,
+    EventKind,
+    HostTime,
+    Quantity,
+    Reading,
+    ReadingTimes,
+)
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.pace import Pace
 from daq.transport.ports import open_port
@@ -39,7 +49,6 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Sensor
     from daq.host_clock import HostClock
-    from daq.protocols.block import DeviceItem, HostTime
     from daq.transport.byte_stream import ByteStream
 
 _Reply = TypeVar("_Reply")

@@ -47,11 +47,11 @@ from daq.devices.interface import (
 from daq.devices.labjack import registers as reg
 from daq.devices.labjack import stream as labjack
 from daq.devices.labjack.packets import MAX_CR_SAMPLES, MAX_SAMPLES, decode_response
-from daq.devices.labjack.registers import Adu, AduFinder, Calibration, Read, Write
+from daq.devices.labjack.registers import Adu, AduFinder, Calibration, Command, Read, Write
 from daq.devices.labjack.stream import StreamDecoder
 from daq.devices.port_rules import port_label
 from daq.errors import BenchFileError, DeviceError, FileFault, NoAnswerError, WrongDeviceError
-from daq.protocols.block import Quantity, Reading, ReadingTimes
+from daq.protocols.block import Block, DeviceItem, Event, HostTime, Quantity, Reading, ReadingTimes
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.sample_counter import CLOCK_TOLERANCE, SLACK
 from daq.transport.ports import open_port
@@ -61,9 +61,7 @@ if TYPE_CHECKING:
     from contextlib import AbstractAsyncContextManager
 
     from daq.bench.model import Sensor
-    from daq.devices.labjack.registers import Command
     from daq.host_clock import HostClock
-    from daq.protocols.block import Block, DeviceItem, Event, HostTime
     from daq.transport.byte_stream import ByteStream
 
 

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
-from daq.protocols.block import Block, BlockFlag, CountsArray, Event, EventKind
+from daq.protocols.block import Block, BlockFlag, CountsArray, Event, EventKind, HostTime
 from daq.protocols.errors import DeviceSettingError, RemoteProtocolError, several
 
 if TYPE_CHECKING:
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daq.protocols.block import HostTime
 
 DataType: TypeAlias = Literal[
     "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from daq.devices.seedlink.packets import RECORD_SIZE, WRAP, PacketFinder
+from daq.devices.seedlink.packets import RECORD_SIZE, WRAP, Packet, PacketFinder, Version
 from daq.protocols.block import Block, Event, EventKind, HostTime
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.joined_streams import JoinedStreams
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from numpy.typing import NDArray
-
-    from daq.devices.seedlink.packets import Packet, Version
 
     SampleArray: TypeAlias = NDArray[np.int32] | NDArray[np.float32] | NDArray[np.float64]
 

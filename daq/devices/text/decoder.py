@@ -56,6 +56,7 @@ from daq.devices.text.format import (
 from daq.protocols.block import (
     Block,
     BlockFlag,
+    DeviceItem,
     Event,
     EventKind,
     HostTime,
@@ -71,8 +72,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
-
-    from daq.protocols.block import DeviceItem
 
 
 PATIENCE = 2

@@ -36,7 +36,7 @@ from daq.devices.text.guess import guess_settings
 from daq.errors import DeviceError, toml_value
 from daq.protocols.block import Block, DeviceItem, Event, EventKind
 from daq.transport.ports import open_port
-from daq.transport.udp import open_datagrams
+from daq.transport.udp import DatagramStream, open_datagrams
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from daq.bench.model import Sensor
     from daq.host_clock import HostClock
     from daq.transport.byte_stream import ByteStream
-    from daq.transport.udp import DatagramStream
 
 
 class TextSettings(DriverSettings, strict=True):

@@ -16,7 +16,7 @@ import math
 import struct
 import zipfile
 import zlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
@@ -26,7 +26,6 @@ from daq.recording.storage.refusals import check_names, dataset
 
 if TYPE_CHECKING:
     from pathlib import Path
-    from typing import Any, BinaryIO
 
     from numpy.typing import NDArray
 
