@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from daq.archive.plan import Plan
     from daq.archive.task import Outcome
     from daq.estimation.settings import Settings
-    from daq.formats.channel_runs import Overlap
+    from daq.formats.assembly import Overlap
     from daq.formats.sources import Selection
 
 
