@@ -478,14 +478,7 @@ def _in_order(epochs: Iterable[_Epoch]) -> list[_Epoch]:
     ordered = sorted(epochs, key=lambda epoch: epoch.start_ns)
     nexts = [epoch.start_ns for epoch in ordered[1:]] + [_END_OF_TIME_NS]
     return [
-        _Epoch(
-            e.path,
-            e.sensor,
-            e.channel,
-            e.start_ns,
-            min(following, e.end_ns) if e.end_ns > _FAR_NS else e.end_ns,
-            e.raw,
-        )
+        replace(e, end_ns=min(following, e.end_ns) if e.end_ns > _FAR_NS else e.end_ns)
         for e, following in zip(ordered, nexts, strict=True)
     ]
 

@@ -215,9 +215,8 @@ class SerialDecoder:
                 case Frame(_, block):
                     found += self._frame(block, at)
                 case Damaged(sequence):
-                    found.append(
-                        Event(self._name, EventKind.CHECKSUM, f"block {sequence} was damaged", at)
-                    )
+                    text = f"block {sequence} was damaged"
+                    found.append(Event(self._name, EventKind.CHECKSUM, text, at))
                     self.streams.lost("damaged block")
                 case Lost(sequence, n_frames):
                     text = f"lost {several(n_frames, 'block')} from number {sequence} on"
@@ -286,11 +285,8 @@ class ScreamDecoder:
             if isinstance(item, Packet):
                 found += self._packet(item, at)
             else:
-                found.append(
-                    Event(
-                        self._name, EventKind.RESYNCHRONISED, f"skipped {several(item, 'byte')}", at
-                    )
-                )
+                text = f"skipped {several(item, 'byte')}"
+                found.append(Event(self._name, EventKind.RESYNCHRONISED, text, at))
         return found
 
     def receive_datagram(self, data: bytes, at: HostTime) -> list[DeviceItem]:

@@ -149,11 +149,8 @@ class StreamDecoder:
             if isinstance(item, Packet):
                 found += self._packet(item, rows, at)
             else:
-                found.append(
-                    Event(
-                        self._name, EventKind.RESYNCHRONISED, f"skipped {several(item, 'byte')}", at
-                    )
-                )
+                text = f"skipped {several(item, 'byte')}"
+                found.append(Event(self._name, EventKind.RESYNCHRONISED, text, at))
         return found + self._blocks(rows, at)
 
     def receive_response(self, packet: Packet, at: HostTime) -> list[Block | Event]:
@@ -175,15 +172,13 @@ class StreamDecoder:
             return found
         if lost:
             found += self._blocks(rows, at)
-            found.append(
-                Event(self._name, EventKind.RESYNCHRONISED, several(lost, "packet", "lost"), at)
-            )
+            text = several(lost, "packet", "lost")
+            found.append(Event(self._name, EventKind.RESYNCHRONISED, text, at))
             self._skip_samples(lost * self._packet_size)
         self._packet_size = max(len(packet.samples), self._packet_size)
         if packet.status == AUTO_RECOVER_ACTIVE and not self.recovers:
-            found.append(
-                Event(self._name, EventKind.OVERFLOW, "the device's buffer overflowed (2940)", at)
-            )
+            text = "the device's buffer overflowed (2940)"
+            found.append(Event(self._name, EventKind.OVERFLOW, text, at))
         self.recovers = packet.status == AUTO_RECOVER_ACTIVE
         scans = self._scans(packet.samples)
         if packet.status != AUTO_RECOVER_END:  # such a packet may begin with a scan of 0xFFFF
