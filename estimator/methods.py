@@ -9,6 +9,7 @@ import numpy as np
 
 from estimator.errors import EstimatorError, UnknownMethodError
 from estimator.levels.interval import unpredicted
+from estimator.levels.noise_matrices import together
 from estimator.levels.pooled import pooled_noise
 from estimator.likelihood.maximum_likelihood import maximum_likelihood
 from estimator.self_noise.coherency import coherency
@@ -55,6 +56,7 @@ def self_noise(
     real: BoolArray | None = None,
     blocks: IntArray | None = None,
     correlation: FloatArray | None = None,
+    groups: IntArray | None = None,
     known: SelfNoise | None = None,
     **options: Any,  # noqa: ANN401 - each method's own
 ) -> SelfNoise:
@@ -83,6 +85,8 @@ def self_noise(
     correlation : float64, shape (n_lags,), optional
         Of the power of neighbouring frequencies (`estimator.levels.bands.bin_correlation`);
         default: independent.
+    groups : int64, shape (n_freqs, n_sensors), optional
+        Group of every sensor: sensors of one group may share noise. Default: none do.
     known : SelfNoise, optional
         What the method gives without `blocks`, if that is estimated already.
     **options
@@ -115,16 +119,20 @@ def self_noise(
             scale = np.where(is_real, np.array([[2.0], [4.0], [8.0]]), 1.0)[:, :, None]
             found = SelfNoise.of(method, found.noise_psd, scale * found.cumulants, found.flags)
     if blocks is not None and method in {"three-sensor", "maximum-likelihood"}:
-        found = _with_neighbours(
-            found,
-            csm,
-            np.where(is_real, -1, blocks),
-            _dimensions(options.get("n_factors"), dims, len(csm)),
-            dims=dims,
-            n_effective=n_effective,
-            correct=correct,
-            correlation=np.ones(1) if correlation is None else correlation,
-        )
+        every = np.arange(len(dims))[None] if groups is None else groups
+        for group in np.unique(every, axis=0):
+            here = (every == group).all(axis=1) & ~is_real
+            found = _with_neighbours(
+                found,
+                csm,
+                np.where(here, blocks, -1),
+                _dimensions(options.get("n_factors"), dims, len(csm)),
+                dims=dims,
+                group=group,
+                n_effective=n_effective,
+                correct=correct,
+                correlation=np.ones(1) if correlation is None else correlation,
+            )
     return found
 
 
@@ -169,6 +177,7 @@ def _with_neighbours(
     n_dims: IntArray,
     *,
     dims: tuple[int, ...],
+    group: IntArray,
     n_effective: float,
     correct: bool,
     correlation: FloatArray,
@@ -176,7 +185,8 @@ def _with_neighbours(
     """Return a result with the levels of the engine, `estimator.levels.pooled`.
 
     All do, unless motion has more dimensions than sensors have channels and the sensors are too
-    few to divide the noise well among channels. `blocks` is negative at bins without neighbours.
+    few to divide the noise well among channels. `blocks` is negative at bins without neighbours;
+    sensors of one `group` may share noise.
     """
     missing = Flag.DEAD_CHANNEL | Flag.DUPLICATE | Flag.NO_COUNTERPART
     given = coherency(csm, dims)
@@ -197,9 +207,11 @@ def _with_neighbours(
         return found
     steps = [np.diff(each[rows], prepend=-1) != 0 for each in (blocks, n_dims)]
     number = np.cumsum(steps[0] | steps[1]) - 1
+    order, live = together(live, group[left > 0])
+    columns = columns[order]
     psd = given.psd[rows[:, None], columns]
     matrix = given.matrix
-    if len(rows) < len(found.flags) or len(columns) < len(sensor):
+    if len(rows) < len(found.flags) or not np.array_equal(columns, np.arange(len(sensor))):
         matrix = matrix[rows[:, None, None], columns[:, None], columns]
     del given  # as large as all averages
     rest, _ = unpredicted(

@@ -93,6 +93,7 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
         above = taken if source is Source.SHARED_NOISE else 0.0
         if share.any() or np.any(above):
             found.append(contribution(source, shape, above=above, share=share[:, None]))
+    found += _of_two(snapshot, method, psd)
     found += _by_motion_that_changes(snapshot, method, psd)
     found += _changes(snapshot, psd)
     found += _contradicted(snapshot, method, tuple(found))
@@ -337,6 +338,10 @@ def shared_parts(snapshot: Snapshot) -> FloatArray:
         for pair, amount in zip(advice.channels, advice.coherencies, strict=True):
             rows = np.ix_(here, np.array(pair))
             parts[rows] = np.maximum(parts[rows], min(abs(amount), MOST_SHARED))
+    for choice in snapshot.diagnostics.dimensions:
+        if choice.pairs:
+            here = (frequency >= choice.low) & (frequency <= choice.high)
+            parts[here] = np.maximum(parts[here], 1 - np.array(choice.least))
     return parts
 
 
@@ -351,6 +356,18 @@ def _taken_for_motion(snapshot: Snapshot, method: str) -> FloatArray:
             further |= (frequency >= choice.low) & (frequency <= choice.high)
     parts = shared_parts(snapshot)
     return np.where(further[:, None], parts / (1 - parts), 0.0)
+
+
+def _of_two(snapshot: Snapshot, method: str, psd: FloatArray) -> Iterator[Contribution]:
+    """Yield what noise that two sensors share may be instead: a motion that no other feels."""
+    below, above = np.zeros((2, *psd.shape))
+    for choice in snapshot.diagnostics.dimensions if method == "maximum-likelihood" else ():
+        if choice.pairs:
+            inside = (snapshot.frequency >= choice.low) & (snapshot.frequency <= choice.high)
+            below[inside] = (1 - np.array(choice.least)) * psd[inside]
+            above[inside] = (np.array(choice.most) - 1) * psd[inside]
+    if below.any():
+        yield contribution(Source.SHARED_NOISE, psd.shape, below=below, above=above)
 
 
 def _misfits(snapshot: Snapshot, explained: BoolArray) -> dict[Source, FloatArray]:

@@ -397,11 +397,14 @@ def _is_explained(advice: Advice, faulty: Collection[int]) -> bool:
 
 
 def _is_fitted(advice: Advice, dimensions: Dimensions | None) -> bool:
-    """Whether the dimensions chosen by the motion explain what the usual ones do not."""
-    if dimensions is None or not isinstance(advice, ModelMisfit) or advice.band is None:
+    """Whether dimensions chosen by the motion, or sensors that share noise, explain a misfit."""
+    is_known = isinstance(advice, ModelMisfit | SharedNoise)
+    if dimensions is None or not is_known or advice.band is None:
         return False
     low, high = advice.band
     concerned = [each for each in dimensions.chosen if each.low <= high and each.high >= low]
+    if isinstance(advice, SharedNoise) and not any(each.pairs for each in concerned):
+        return False
     return bool(concerned) and all(each.accepted for each in concerned)
 
 

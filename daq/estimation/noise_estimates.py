@@ -14,7 +14,7 @@ from estimator.checks.counts import shared_rounding
 from estimator.errors import InsufficientDataError
 from estimator.levels.bands import bin_correlation
 from estimator.levels.pooled import blocks_of
-from estimator.likelihood.dimension import BandDimension, choose_dimension
+from estimator.likelihood.dimension import BandDimension, choose_dimension, noise_groups
 from estimator.likelihood.goodness_of_fit import neighbour_correlation
 from estimator.median import median
 from estimator.methods import METHODS, self_noise
@@ -531,7 +531,13 @@ def noise_estimates(
                     dimensions = dimensions or chosen_dimensions(
                         bands, settings, dims, positions, maxima
                     )
-                    options = [{"n_factors": q} for q in dimensions.n_factors]
+                    options = [
+                        {
+                            "n_factors": q,
+                            "groups": noise_groups(dimensions.chosen, band.frequencies, len(dims)),
+                        }
+                        for q, band in zip(dimensions.n_factors, bands, strict=True)
+                    ]
                 if method == "maximum-likelihood":
                     options = [option | {"maxima": maxima} for option in options]
                 engine = chosen or method == "maximum-likelihood"
@@ -690,8 +696,8 @@ def chosen_dimensions(
     ]
     n_factors = tuple(n_factors for n_factors, _ in found)
     chosen = tuple(choice for _, choices in found for choice in choices)
-    if len(bands) > 1:
-        return Dimensions(n_factors, chosen)
+    if len(bands) > 1 or any(choice.pairs for choice in chosen):
+        return Dimensions(n_factors, chosen)  # gradients are fitted beside independent noise
     from estimator.likelihood.gradients import with_gradients  # noqa: PLC0415 - of many sensors
 
     gradients, chosen = with_gradients(

@@ -275,8 +275,38 @@ def white(matrix: ComplexArray, whitener: ComplexArray) -> ComplexArray:
     return np.asarray(whitener @ matrix @ whitener.conj().swapaxes(1, 2))
 
 
-def discrepancy(csm: ComplexArray, n_factors: int, sensor: IntArray) -> FloatArray:
-    """Return the discrepancy of the model at its maximum likelihood, shape (n_freqs,).
+def together(dims: tuple[int, ...], group: IntArray) -> tuple[IntArray, tuple[int, ...]]:
+    """Return channels in the order of their groups, and the numbers of channels of the groups.
+
+    Parameters
+    ----------
+    dims : tuple of int
+        Channels of each sensor.
+    group : int64, shape (n_sensors,)
+        Sensors of one group may share noise: they have one matrix.
+    """
+    of_channel = np.unique(np.repeat(group, dims), return_inverse=True)[1]
+    return np.argsort(of_channel, kind="stable"), tuple(np.bincount(of_channel).tolist())
+
+
+def apart(noise: ComplexArray, own: IntArray, other: IntArray) -> FloatArray:
+    """Return the share of the noise of channels that others do not share, shape (n, n_own).
+
+    Of noise ``N_ii`` and ``N_ij`` that is as large in both sensors, in units of each one's noise:
+    ``N_ii**(1/2) (1 - (C C*)**(1/2)) N_ii**(1/2)``, ``C = N_ii**(-1/2) N_ij N_jj**(-1/2)``.
+    """
+    first, second = (noise[:, at[:, None], at] for at in (own, other))
+    w, u = np.linalg.eigh(first)
+    root = (u * np.sqrt(np.maximum(w, 0.0))[:, None, :]) @ u.conj().swapaxes(1, 2)
+    towards = np.linalg.solve(root, noise[:, own[:, None], other])
+    w, u = np.linalg.eigh(towards @ np.linalg.solve(second, towards.conj().swapaxes(1, 2)))
+    left = 1 - np.sqrt(np.clip(w, 0.0, 1.0))
+    rest = np.einsum("nik,nk,nik->ni", root @ u, left, (root @ u).conj()).real
+    return np.asarray(rest / np.einsum("nii->ni", first).real)
+
+
+def fitted(csm: ComplexArray, n_factors: int, sensor: IntArray) -> tuple[FloatArray, ComplexArray]:
+    """Return the discrepancy of the model at its maximum likelihood, and the noise there.
 
     Parameters
     ----------
@@ -285,12 +315,14 @@ def discrepancy(csm: ComplexArray, n_factors: int, sensor: IntArray) -> FloatArr
     n_factors : int
         Dimensions of the motion, q; ``(p - q)**2`` must exceed the number of `pairs`.
     sensor : int64, shape (n_channels,)
+        Or group of sensors: non-decreasing.
 
     Returns
     -------
-    float64
+    discrepancy : float64, shape (n_freqs,)
         ``sum(w - ln w - 1)`` over the p - q smallest eigenvalues w of the whitened matrix
-        (`estimator.likelihood.goodness_of_fit.statistic` makes a test of it).
+        (`estimator.likelihood.goodness_of_fit.likelihood_ratio` makes a test of it).
+    noise : complex128, shape (n_freqs, n_channels, n_channels)
     """
     p = csm.shape[1]
     a, b = pairs(sensor)
@@ -327,7 +359,13 @@ def discrepancy(csm: ComplexArray, n_factors: int, sensor: IntArray) -> FloatArr
         going = going[gained > SETTLED]
         if not len(going):
             break
-    return value
+    root = np.linalg.inv(whitener)
+    return value, np.asarray(root @ root.conj().swapaxes(1, 2))
+
+
+def discrepancy(csm: ComplexArray, n_factors: int, sensor: IntArray) -> FloatArray:
+    """Return the discrepancy of `fitted` alone."""
+    return fitted(csm, n_factors, sensor)[0]
 
 
 def _point(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.errors import InsufficientDataError, InvalidMatrixError
-from estimator.levels.noise_matrices import discrepancy, pairs
+from estimator.levels.noise_matrices import fitted, together
 from estimator.levels.pooled import blocks_of
 from estimator.likelihood.factor_analysis import Maxima, max_factors
 from estimator.likelihood.goodness_of_fit import (
@@ -27,6 +27,7 @@ from estimator.likelihood.goodness_of_fit import (
 )
 from estimator.likelihood.maximum_likelihood import standard_error
 from estimator.likelihood.prior import expected_noise, kinds, maximise_expecting
+from estimator.likelihood.shared_by_two import SHARING, SharedByTwo, local_shares
 from estimator.median import median
 from estimator.self_noise.coherency import (
     check_averages,
@@ -38,7 +39,7 @@ from estimator.self_noise.coherency import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable
 
     from estimator.records import Hertz
     from estimator.self_noise.coherency import Presence
@@ -111,6 +112,13 @@ class BandDimension:
     gradients : bool
         Whether the further dimensions are the motion's gradients, see
         `estimator.likelihood.gradients`.
+    pairs : tuple of (int, int)
+        Sensors, from 0, that share noise, or a motion that no other feels: it is left in the noise.
+    alternatives : tuple of (int, int)
+        Pairs of sensors one of which may share noise instead.
+    least, most : tuple of float
+        Noise of each channel over its estimate, if all that two sensors share is motion, and by the
+        alternatives; empty without `pairs`.
     """
 
     low: Hertz
@@ -124,6 +132,10 @@ class BandDimension:
     usual_cov: float
     n_sensors: int = field(default=MIN_DETERMINED_SENSORS, metadata={"key": "sensors"})
     gradients: bool = field(default=False, metadata={"key": "are_gradients"})
+    pairs: tuple[tuple[int, int], ...] = ()
+    alternatives: tuple[tuple[int, int], ...] = ()
+    least: tuple[float, ...] = ()
+    most: tuple[float, ...] = ()
 
     @property
     def is_undetermined(self) -> bool:
@@ -155,6 +167,21 @@ class BandDimension:
     def is_biased(self) -> bool:
         """Whether no dimension explains the band, at a level of one in a hundred."""
         return not self.accepted and self.test.p_value < MISFIT_LEVEL
+
+
+def noise_groups(
+    choices: Iterable[BandDimension], frequency: FloatArray, n_sensors: int
+) -> IntArray:
+    """Return the group of every sensor at every frequency, shape (n_freqs, n_sensors).
+
+    Sensors of one group may share noise.
+    """
+    group = np.broadcast_to(np.arange(n_sensors), (len(frequency), n_sensors)).copy()
+    for choice in choices:
+        inside = (frequency >= choice.low) & (frequency <= choice.high)
+        for one, other in choice.pairs:
+            group[inside, other] = one
+    return group
 
 
 def bands(frequency: FloatArray) -> IntArray:
@@ -261,14 +288,14 @@ def choose_dimension(
         kind=kind,
         n_effective=n_effective,
         maxima=maxima or Maxima(),
+        dims=there.dims,
+        stride=stride,
     )
     r = HANN_HALF if neighbours is None else neighbours
     open_bands = list(stride)
     level /= len(open_bands)
-    sensor = np.repeat(np.arange(len(dims)), dims)[list(there.channels)]
     tried: dict[int, list[BandTest]] = {b: [] for b in open_bands}
-    cov: dict[int, float] = {}
-    usual_cov: dict[int, float] = {}
+    cov: dict[tuple[int, int], float] = {}
     for q in range(most + 1):
         hopeless = {} if q in {usual, most} else search.hopeless(q, open_bands, stride, r)
         for b, test in hopeless.items():
@@ -280,17 +307,29 @@ def choose_dimension(
         for b in some:
             distant = r[stride[b] - 1 :: stride[b]]
             tried[b].append(pool(fit.test, fit.number == b, neighbours=distant))
-            cov[b] = fit.median_cov(b)
+            cov[b, q] = fit.median_cov(b)
         open_bands = [b for b in open_bands if not tried[b][-1].p_value > level]
         if q == usual:
-            usual_cov = {b: fit.median_cov(b) for b in tried}
+            cov |= {(b, q): fit.median_cov(b) for b in tried}
             search.expect(fit, open_bands)
-            for b, test in search.with_sensor_noise(q, open_bands, sensor, stride, r):
-                if test.p_value > level:
-                    tried[b][-1] = test
-                    open_bands = [other for other in open_bands if other != b]
+            for b in list(open_bands) if usual > 1 else ():
+                found = search.sensor_test(q, b, np.arange(len(there.sensors)), r)
+                if found is not None and found[0].p_value > level:
+                    tried[b][-1] = found[0]
+                    open_bands.remove(b)
         if not open_bands and q >= usual:
             break
+    sharers = SharedByTwo(
+        lambda q, b, group: search.sensor_test(q, b, group, r),
+        search.local,
+        dims=there.dims,
+        usual=usual,
+        level=level,
+    )
+    shared = sharers.found(tried, open_bands) if len(there.sensors) >= SHARING else {}
+    for b, sharing in shared.items():
+        tried[b][sharing.n_factors :] = [sharing.test]
+    open_bands = [b for b in open_bands if b not in shared]
     choices = tuple(
         BandDimension(
             low=float(frequency[number == b][0]),
@@ -302,8 +341,9 @@ def choose_dimension(
             n_sensors=len(there.sensors),
             test=tests[-1],
             tried=tuple(tests),
-            cov=cov[b],
-            usual_cov=usual_cov.get(b, float("nan")),
+            cov=cov.get((b, len(tests) - 1), float("nan")),
+            usual_cov=cov.get((b, usual), float("nan")),
+            **({} if b not in shared else shared[b].of_all(there, sum(dims))),
         )
         for b, tests in tried.items()
     )
@@ -357,8 +397,11 @@ class _Search:
         kind: IntArray,
         n_effective: float,
         maxima: Maxima,
+        dims: tuple[int, ...],
+        stride: dict[int, int],
     ) -> None:
-        self._maxima = maxima
+        self._maxima, self._dims, self._stride = maxima, dims, stride
+        self.local: dict[int, FloatArray] = {}
         self._matrix = matrix
         self._psd = psd
         self._number = number
@@ -380,6 +423,10 @@ class _Search:
                 kind=self._kind,
                 n_effective=self._n_effective,
             )
+        if q <= self._usual + 1:
+            for b in some:
+                here = maximum.eigenvectors[self._number[rows] == b]
+                self.local[b] = local_shares(here, self._dims)
         error = standard_error(maximum, n_effective=self._n_effective)
         return _Fit(
             number=self._number[rows],
@@ -400,40 +447,37 @@ class _Search:
                 found[b] = test
         return found
 
-    def with_sensor_noise(
-        self,
-        q: int,
-        some: list[int],
-        sensor: IntArray,
-        stride: dict[int, int],
-        neighbours: FloatArray,
-    ) -> Iterator[tuple[int, BandTest]]:
-        """Test q factors beside noise that the channels of a sensor may share, in these bands.
+    def sensor_test(
+        self, q: int, band: int, group: IntArray, neighbours: FloatArray
+    ) -> tuple[BandTest, ComplexArray] | None:
+        """Test q factors beside a matrix of noise for each group of sensors, in a band.
 
-        Nothing where that is no other model, or leaves nothing to test.
+        With the noise, shape (n_rows, n_channels, n_channels); None where nothing is left to test.
         """
-        sensor = np.unique(sensor, return_inverse=True)[1]
-        p, unknown = len(sensor), len(pairs(sensor)[0])
-        if unknown == p or (p - q) ** 2 <= unknown:
-            return
-        for band in some:
-            rows = np.flatnonzero(self._number == band)
-            every = -(-len(rows) // SENSOR_BINS)
-            rows = rows[every // 2 :: every]
-            rows = rows[np.isfinite(self._matrix[rows]).all(axis=(1, 2))]
-            rows = rows[np.linalg.eigvalsh(self._matrix[rows])[:, 0] > _REGULAR]
-            test = likelihood_ratio(
-                discrepancy(self._matrix[rows], q, sensor),
-                np.full(len(rows), float(unknown)),
-                n_channels=p,
-                n_factors=q,
-                n_effective=self._n_effective,
-            )
-            step = every * stride[band]
-            yield (
-                band,
-                pool(test, np.ones(len(rows), np.bool_), neighbours=neighbours[step - 1 :: step]),
-            )
+        order, dims = together(self._dims, group)
+        p, unknown = len(order), sum(d * d for d in dims)
+        if (p - q) ** 2 <= unknown:
+            return None
+        rows = np.flatnonzero(self._number == band)
+        every = -(-len(rows) // SENSOR_BINS)
+        rows = rows[every // 2 :: every]
+        rows = rows[np.isfinite(self._matrix[rows]).all(axis=(1, 2))]
+        rows = rows[np.linalg.eigvalsh(self._matrix[rows])[:, 0] > _REGULAR]
+        matrix = self._matrix[rows[:, None, None], order[:, None], order]
+        discrepancy, noise = fitted(matrix, q, np.repeat(np.arange(len(dims)), dims))
+        test = likelihood_ratio(
+            discrepancy,
+            np.full(len(rows), float(unknown)),
+            n_channels=p,
+            n_factors=q,
+            n_effective=self._n_effective,
+        )
+        step = every * self._stride[band]
+        back = np.argsort(order)
+        return (
+            pool(test, np.ones(len(rows), np.bool_), neighbours=neighbours[step - 1 :: step]),
+            noise[:, back[:, None], back],
+        )
 
     def expect(self, fit: _Fit, open_bands: list[int]) -> None:
         """Set the expected noise of the open bands from the noise of the explained bands."""

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, ClassVar
 
+import numpy as np
+
 from daq.results.facts.fact import Fact
 from estimator.checks.advice import Rank, Untested, model
 from estimator.checks.advice_on_model import ModelMisfit, TooFewDimensions
 from estimator.checks.advice_on_signals import NoSharedMotion, TooFewSensors
-from estimator.records import record
-from estimator.wording import Words, span
+from estimator.records import Share, record
+from estimator.wording import Words, listed, percent, span
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -167,6 +169,55 @@ class DimensionsUndetermined(Fact):
         )
 
 
+@record
+class SharedByTwo(Fact):
+    """Two of `sensors` share noise in `bands` (Hz), or a motion that no third sensor feels.
+
+    Attributes
+    ----------
+    bands : tuple of (float, float)
+    alternatives : tuple of (str, str)
+        Pairs of sensors that may be the ones instead.
+    part : float
+        Largest part of the noise of a channel that is shared.
+    """
+
+    name: ClassVar[str] = "shared-by-two"
+    bands: tuple[tuple[Hertz, Hertz], ...]
+    alternatives: tuple[tuple[str, str], ...]
+    part: Share
+
+    def _words(self) -> Words:
+        pairs = [" and ".join(pair) for pair in (self.sensors, *self.alternatives)]
+        who, at = listed(pairs, "or"), _bands(self.bands)
+        return Words(
+            f"{who} share {percent(self.part)} of their noise at {at} Hz, or a motion that only "
+            "they feel",
+            f"At {at} Hz {who} share up to {percent(self.part)} of their noise. No third sensor "
+            "feels it, so that it may be noise or motion. The estimate includes it; the intervals "
+            "reach down to the noise without it.",
+            "Check what these sensors have in common: digitizer, power supply, ground, cable, "
+            "mount.",
+        )
+
+
+def _shared_by_two(snapshot: Snapshot) -> Iterator[SharedByTwo]:
+    """Yield the pairs of sensors that share noise, by the bands in which they do."""
+    choices, names = snapshot.diagnostics.dimensions, snapshot.sensor_names
+    sensor = np.repeat(np.arange(len(snapshot.dims)), snapshot.dims)
+    for pair in dict.fromkeys(pair for choice in choices for pair in choice.pairs):
+        here = [choice for choice in choices if pair in choice.pairs]
+        instead = dict.fromkeys(other for choice in here for other in choice.alternatives)
+        least = np.min([np.array(choice.least)[np.isin(sensor, pair)] for choice in here])
+        yield SharedByTwo(
+            rank=Rank.DELAYS,
+            sensors=tuple(names[n] for n in pair),
+            bands=tuple((choice.low, choice.high) for choice in here),
+            alternatives=tuple((names[i], names[j]) for i, j in instead),
+            part=1 - float(least),
+        )
+
+
 def _gradients(choices: Sequence[BandDimension]) -> list[str]:
     """Return the bands that gradients of the motion explain, and their cost in precision."""
     if not choices:
@@ -226,11 +277,13 @@ def facts_of_model(snapshot: Snapshot) -> Iterator[Fact]:
         found is not None
         and not failing
         and not more
+        and not any(each.pairs for each in choices)
         and all(clock.is_understood for clock in snapshot.clocks)
     ):
         yield ModelPasses(rank=Rank.TO_KNOW, n_factors=found.n_factors, dims=snapshot.dims)
     if not choices:
         return
+    yield from _shared_by_two(snapshot)
     biased = [(each.low, each.high) for each in choices if each.is_biased]
     unknown = [each for each in choices if each.is_undetermined and not each.is_biased]
     unusual = tuple(each for each in choices if each.accepted and each.n_factors != each.usual)

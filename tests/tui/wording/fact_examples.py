@@ -61,6 +61,7 @@ from daq.results.facts.model import (
     FewSensors,
     ModelPasses,
     ModelUntested,
+    SharedByTwo,
 )
 from daq.results.facts.precision import IntervalsWidened, PairCompared, TargetMissed
 from daq.results.facts.recordings import (
@@ -223,6 +224,13 @@ EXAMPLES: tuple[Fact, ...] = (
     DimensionsChosen(rank=Rank.TO_KNOW, choices=(), usual=3, elsewhere=True),
     DimensionsUnexplained(rank=Rank.INVALIDATES, bands=((1.0, 2.0), (2.0, 4.0))),
     DimensionsUndetermined(rank=Rank.INVALIDATES, bands=((1.0, 2.0),), usual=3, n_sensors=5),
+    SharedByTwo(
+        rank=Rank.DELAYS,
+        sensors=("A", "B"),
+        bands=((1.0, 2.0), (2.0, 4.0)),
+        alternatives=(("C", "D"),),
+        part=0.94,
+    ),
     SharedNoiseNotSearched(rank=Rank.TO_KNOW, n_channels=120, most=96),
     SteadinessNotTested(rank=Rank.TO_KNOW, causes=("archives",)),
     LikeChannelsAssumed(rank=Rank.TO_KNOW, method="two-channel"),

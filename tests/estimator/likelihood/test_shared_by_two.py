@@ -1,0 +1,65 @@
+"""Noise that two sensors share is left to them: named, and no dimension of the motion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.formats.arrays import recording_of_arrays
+from daq.results.facts.model import SharedByTwo
+from daq.results.result import Result
+
+RATE, SECONDS = 100.0, 120.0
+UNIT = 2 / RATE
+"""PSD of noise of variance 1."""
+AMPLITUDES = np.array([[4.0, 2.0, 0.0], [0.0, 4.0, 2.0]])
+"""Of a source in the channels of the first two sensors, over their own noise."""
+
+
+def recorded(
+    n_sensors: int, d: int, ratio: float, rng: np.random.Generator, *, shared: bool = True
+) -> dict[str, np.ndarray]:
+    """Return samples of sensors in any direction, of which the first two may share noise."""
+    n = round(SECONDS * RATE)
+    motion = np.sqrt(ratio) * rng.standard_normal((n, d)) * np.sqrt([1.0, 1.4, 0.7])[:d]
+    source = rng.standard_normal(n) * shared
+    samples = {}
+    for number in range(n_sensors):
+        turned = np.linalg.qr(rng.standard_normal((d, d)))[0] if d > 1 else np.eye(1)
+        own = rng.standard_normal((n, d))
+        if number < 2:
+            own += np.outer(source, AMPLITUDES[0 if d == 1 else number][:d])
+        samples["ABCDEFGH"[number]] = motion @ turned.T + own
+    return samples
+
+
+@pytest.mark.parametrize(("n_sensors", "d", "ratio"), [(8, 3, 0.1), (4, 3, 10.0), (6, 1, 0.1)])
+def test_noise_of_two_sensors_is_left_in_both_and_in_their_intervals(
+    n_sensors: int, d: int, ratio: float
+) -> None:
+    """Before, it was taken for motion: 1.4 [-1.8, 2.9] dB for 12.3, and nothing was reported."""
+    rng = np.random.default_rng([46, n_sensors, d])
+    settings = Settings(segment=2.0)
+    recording = recording_of_arrays(recorded(n_sensors, d, ratio, rng), RATE)
+    result = Result(estimate([recording], settings), settings)
+    (named,) = [each for each in result.facts if isinstance(each, SharedByTwo)]
+    assert named.sensors == ("A", "B")
+    assert named.part > 0.8
+    truth = UNIT * (1 + np.square(AMPLITUDES[:, :d] if d > 1 else AMPLITUDES[[0, 0], :1])).ravel()
+    for noise, true in zip(result.means(result.method, (10.0, 30.0)), truth, strict=False):
+        assert noise.mean[0] == pytest.approx(true, rel=0.12)
+        assert noise.low[0] <= true <= noise.high[0] * 1.05
+        if true > 4 * UNIT:
+            assert noise.low[0] < 0.5 * true  # it may be a motion that only they feel
+
+
+@pytest.mark.parametrize(("n_sensors", "d"), [(4, 3), (6, 1), (8, 3)])
+def test_motion_of_all_sensors_is_no_noise_of_two(n_sensors: int, d: int) -> None:
+    settings = Settings(segment=2.0)
+    for ratio in (0.1, 10.0):
+        rng = np.random.default_rng([47, n_sensors, d])
+        samples = recorded(n_sensors, d, ratio, rng, shared=False)
+        result = Result(estimate([recording_of_arrays(samples, RATE)], settings), settings)
+        assert not any(choice.pairs for choice in result.snapshot.diagnostics.dimensions)
