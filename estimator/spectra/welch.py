@@ -24,6 +24,8 @@ from estimator.spectra.parts import Part
 from estimator.spectra.windows import effective_averages, get_window
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     from estimator.spectra.parts import PartEnds
@@ -246,13 +248,37 @@ class CrossSpectra:
 
         Return the spectra of the segments at the kept frequencies, if there are any.
         """
+        single: list[ComplexArray] = []
+        for spectra in self._transformed(samples, starts, work):
+            if self._single is not None:
+                single.append(spectra[:, self._single.bins])
+            total.add(spectra)
+        return single
+
+    def transforms(self, samples: FloatArray, starts: IntArray) -> ComplexArray:
+        """Return the spectra of segments as `add_spectra` takes them; threads may call it.
+
+        Parameters are those of `add`.
+        """
+        found = np.empty((len(starts), *self._shape), np.complex128)
+        for _ in self._transformed(samples, starts, _Work(), found):
+            pass
+        return found
+
+    def _transformed(
+        self,
+        samples: FloatArray,
+        starts: IntArray,
+        work: _Work,
+        found: ComplexArray | None = None,
+    ) -> Iterator[ComplexArray]:
+        """Yield the spectra of some segments at a time: parts of `found`, or the same memory."""
         length, n_channels = self.settings.segment_length, self.n_channels
-        block = min(self._block, len(starts))
+        block = max(1, min(self._block, len(starts)))
         by_channel = samples.strides[0] == samples.itemsize  # channel after channel in memory
         taper = self._window[:, None] if by_channel else self._taper
-        frames, spectra = work.of(block, length, n_channels, by_channel=by_channel)
+        frames, at_work = work.of(block, length, n_channels, by_channel=by_channel)
         trend = np.empty((block, len(self._fit), n_channels))
-        single: list[ComplexArray] = []
         for first in range(0, len(starts), block):
             rows = starts[first : first + block]
             n = len(rows)
@@ -260,12 +286,10 @@ class CrossSpectra:
             np.matmul(self._fit, segments, out=trend[:n])
             if self._tapers:
                 segments = np.multiply(segments, taper, out=frames[:n])
-            np.fft.rfft(segments, axis=1, out=spectra[:n])
-            spectra[:n, self._trend_bins] -= self._trend_spectra @ trend[:n]
-            if self._single is not None:
-                single.append(spectra[:n, self._single.bins])
-            total.add(spectra[:n])
-        return single
+            spectra = at_work[:n] if found is None else found[first : first + n]
+            np.fft.rfft(segments, axis=1, out=spectra)
+            spectra[:, self._trend_bins] -= self._trend_spectra @ trend[:n]
+            yield spectra
 
     @property
     def n_effective(self) -> float:

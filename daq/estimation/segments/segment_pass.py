@@ -6,7 +6,7 @@ import itertools
 import math
 from collections import Counter, deque
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -81,7 +81,7 @@ def read_ahead(read: Callable[[_Piece], _Read], pieces: Sequence[_Piece]) -> Ite
 
 
 MOST_VALUES = 1 << 19
-"""Samples times channels that are kept at most: 4 MB."""
+"""Samples times channels that are kept, or transformed ahead, at most: 4 MB."""
 
 
 class NewestSamples:
@@ -373,7 +373,12 @@ class Pass:
                 found = self._own_spectra((first + np.arange(count)) * hop)
                 if found is not None:
                     return found
-            return self._read(source, self.filters, first * hop, count)
+            part = self._read(source, self.filters, first * hop, count)
+            is_small = count * self.welch.segment_length * self.n_channels <= MOST_VALUES
+            if live or not is_small or self.octaves is not None or self._undisturbed is not None:
+                return part
+            # in this thread: the one that adds them is waited for
+            return replace(part, spectra=self._all.transforms(part.samples, np.arange(count) * hop))
 
         for (first, count), part in zip(pieces, read_ahead(read, pieces), strict=True):
             if isinstance(part, OwnSpectra):
@@ -539,7 +544,7 @@ class Pass:
 
     def _take_whole(self, spectra: ComplexArray, begins: NDArray[np.int64]) -> None:
         """Add segments by their spectra; they begin at grid samples `begins`."""
-        for some in by_part(self._all, begins // self.welch.hop):
+        for some in by_part(self._all, (begins - self.reach) // self.welch.hop):
             self._all.add_spectra(spectra[some])
         self._kept_at.add(begins)
 
@@ -564,6 +569,9 @@ class Pass:
             new = self._fed - begin
             self.octaves.add(samples[new:], present[new:])
             self._fed = begin + len(samples)
+        elif part.spectra is not None:
+            spectra = part.spectra if clean.all() else part.spectra[clean]
+            self._take_whole(spectra, begin + reach + starts)
         else:
             self._take(samples, starts, begin + reach)
         self._n_taken += len(starts)
@@ -768,6 +776,8 @@ class _Samples:
     unwanted: NDArray[np.bool_] | None
     raw: FloatArray
     raw_usable: NDArray[np.bool_]
+    spectra: ComplexArray | None = None
+    """Of all segments, also those that are left out."""
 
 
 def still_for_a_while(passes: Sequence[Pass], settings: Settings) -> dict[int, float]:
