@@ -13,7 +13,7 @@ from estimator.checks.advice import Rank
 from estimator.checks.advice_on_model import ModelMisfit, TooFewDimensions
 from estimator.checks.advice_on_noise import SharedNoise
 from estimator.checks.counts import MARGIN
-from estimator.checks.steadied import bounds
+from estimator.checks.steadied import MARGIN as WITHIN
 from estimator.levels.contributions import (
     Contribution,
     Source,
@@ -162,18 +162,15 @@ def _changes(snapshot: Snapshot, psd: FloatArray) -> list[Contribution]:
     """Return what responses that change leave of the motion in the noise."""
     found = snapshot.diagnostics.diagnosis
     steady = None if found is None else found.stability
-    if steady is None or not steady.added.any():
+    if steady is None:
         return []
-    motion = np.maximum(np.nan_to_num(snapshot.data_psd) - psd, 0.0)
-    if within := [each for each in steady.steadied if each is not None]:
-        below = np.max([each.below for each in within], axis=0) * motion
-        above = np.max([each.above for each in within], axis=0) * motion
-        return [contribution(Source.CHANGES, psd.shape, below=np.minimum(below, psd), above=above)]
-    most = np.maximum.reduceat(steady.added, np.cumsum([0, *snapshot.dims[:-1]]))
-    n_changed = int(np.count_nonzero(most))
-    less, more = (np.repeat(e, snapshot.dims) * motion for e in bounds(most, n_changed))
-    less = np.where(less > MUCH_CHANGED * psd, psd, less)
-    return [contribution(Source.CHANGES, psd.shape, below=less, above=more)]
+    share = steady.changed_at(snapshot.frequency)
+    if not share.any():
+        return []
+    if not any(steady.steadied):  # averages are those of all segments
+        share = np.where(share > MUCH_CHANGED, 1.0, WITHIN * share)
+    below, above = (psd * np.clip(part, 0.0, 1.0) for part in (share, -share))
+    return [contribution(Source.CHANGES, psd.shape, below=below, above=above)]
 
 
 def _nonlinear(snapshot: Snapshot, psd: FloatArray) -> Iterator[Contribution]:

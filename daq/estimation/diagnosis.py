@@ -120,10 +120,12 @@ class Findings:
         most = np.maximum.reduceat(steady.added, np.cumsum([0, *dims[:-1]]))
         changes = tuple(each for each in steady.changes if most[each.sensor] > explained)
         left = {each.sensor for each in changes}
+        own = np.repeat([number in left for number in range(len(dims))], dims)
         steady = replace(
             steady,
             changes=changes,
-            added=np.where(np.repeat([n in left for n in range(len(dims))], dims), steady.added, 0),
+            added=np.where(own, steady.added, 0.0),
+            explained=np.where(own, steady.explained, 0.0),
             steadied=steady.steadied if changes else (),
         )
         advice = (
@@ -133,10 +135,10 @@ class Findings:
         )
         return replace(self, diagnosis=replace(whole, advice=tuple(advice), stability=steady))
 
-    def of_all_segments(self) -> Findings:
+    def of_all_segments(self, *, unless: bool = False) -> Findings:
         """Return findings of which the averages within parts are not used."""
         whole, steady = self.diagnosis, self.stability
-        if whole is None or steady is None:
+        if unless or whole is None or steady is None:
             return self
         return replace(self, diagnosis=replace(whole, stability=replace(steady, steadied=())))
 

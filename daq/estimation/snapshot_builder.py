@@ -309,9 +309,11 @@ class SnapshotBuilder:
         if final or (self._diagnoses.is_due and not left):
             with self._diagnoses:
                 bands_of_all = bands if raw else ()
-                self._findings = self._diagnose(
-                    recordings, passes, raw, bands_of_all, estimates, maxima=maxima
-                ).linear_first(nonlinear, psd, dims)
+                self._findings = (
+                    self._diagnose(recordings, passes, raw, bands_of_all, estimates, maxima=maxima)
+                    .linear_first(nonlinear, psd, dims)
+                    .of_all_segments(unless=final and bool(raw) and not sets)
+                )
             self._occasional_cost += self._diagnoses.cost
         if final and raw and not sets:
             bands, estimates = self._within_parts(

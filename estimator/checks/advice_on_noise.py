@@ -156,7 +156,9 @@ class NoiseChanges(Advice):
 
 @record
 class ResponseChanges(Advice):
-    """The gain or the direction of a sensor changes during the recording.
+    """The gain or the direction of a sensor changes during the recording, or its response.
+
+    With a band, the response changes at these frequencies alone, in any way.
 
     Attributes
     ----------
@@ -165,7 +167,8 @@ class ResponseChanges(Advice):
     is_turn : bool
         Whether the sensor turns; its gains otherwise.
     size : float
-        Change of the gain, as a fraction of the gain before; of a turn in radians.
+        Change of the gain, as a fraction of the gain before; of a turn in radians. With a band, the
+        standard deviation of the response, as a fraction.
     size_error : float
         Standard error of the size.
     begin, end : float
@@ -205,7 +208,9 @@ class ResponseChanges(Advice):
 def _response_change(advice: ResponseChanges, names: Names) -> str:
     """Return what changed, by how much and when."""
     (sensor,) = (names.sensors[number] for number in advice.sensors)
-    if advice.is_turn:
+    if advice.band is not None:
+        what = f"The response of {sensor} varied by {percent(advice.size)} at {advice.where}"
+    elif advice.is_turn:
         what = f"Sensor {sensor} turned by {math.degrees(abs(advice.size)):.2g}°"
     else:
         whose = sensor if advice.channel is None else names.channels[advice.channel]

@@ -98,6 +98,7 @@ def changes(
         yield ResponseChanges(
             rank=Rank.DELAYS,
             sensors=(change.sensor,),
+            band=change.band,
             channel=change.channel,
             is_turn=change.is_turn,
             size=change.size,
@@ -318,6 +319,7 @@ def diagnose(
                 tested,
                 frequency,
                 insides,
+                psd=part.psd,
                 dims=there.dims,
                 n_effective=n_effective,
                 neighbours=between,

@@ -65,17 +65,24 @@ SIGNIFICANCE = 3.0
 """Standard errors by which scatter must exceed its expectation to be significant."""
 LONG_TAILS = 100.0
 """By which alarms of several ranges of frequencies are rarer: parts have few averages in each."""
+SURE = 5.0
+"""Standard errors that a change of some frequencies has at least, to be dated."""
 DOUBT = 4.0
 """By which a doubtful noise may be wrong as the scale of a test."""
 SECOND_ORDER = 4.0
 """Times the variance of a response between parts, a change is at most, squared. Scores are linear
 in changes: the share of its statistic that may look like changes of other sensors."""
+LEAST_OF = 0.1
+"""Noise that changes of a sensor explain, over the most of any sensor, from which it is named."""
+ALIKE = 0.25
+"""What a gain or a turn adds, over what the median of the bands that show a change have, from which
+it is a gain or a turn: the response changes otherwise, at some frequencies."""
 STRONG = 100.0
 """Motion over noise from which changes of responses are suspected without a noise that is known."""
 LEAST_SHARE = 0.01
-"""Share of a channel beside the motion, from which what is left of it within parts counts."""
-WITHIN_PARTS = 0.75
-"""Share of a channel's noise within parts, below which its responses, or others', may change."""
+"""Share of a channel beside the motion, from which what its regression explains counts."""
+ADDED = 0.05
+"""Share of the noise that changes of responses add, from which a band shows them."""
 LEAST_DEGREES = 8.0
 """Degrees of freedom of the noise of a part from which a band is tested."""
 
@@ -177,6 +184,9 @@ class Stability:
         Responses that change, by sensor, the clearest first.
     added : float64, shape (n_channels,)
         What these changes add to the noise, as a fraction of the PSD of the motion.
+    explained, within : float64, shape (n_bands, n_channels)
+        Share of the noise that changes of any form between parts explain, where that is clear; and
+        that may be left within parts by `steadied`. Negative where noise is too low.
     n_segments : int
         Number of examined segments.
     disturbed : int64, shape (n_disturbed,)
@@ -197,6 +207,8 @@ class Stability:
     inflations: FloatArray
     changes: tuple[ResponseChange, ...]
     added: FloatArray
+    explained: FloatArray
+    within: FloatArray
     n_segments: int
     disturbed: IntArray
     excess: float
@@ -228,7 +240,7 @@ class Stability:
             if each.sensor in clearest or each.statistic <= most:
                 continue
             is_added = True
-            if seen[each.sensor] > 1 or len(found) == 1:
+            if seen[each.sensor] > 1 or len(found) == 1 or each.band is not None:
                 clearest[each.sensor] = each
                 second_order += each.statistic * each.size**2
         runs = [each.runs for each in found if each.runs is not None]
@@ -241,6 +253,8 @@ class Stability:
             inflations=np.concatenate([each.inflations for each in found]),
             changes=tuple(clearest.values()),
             added=np.max([each.added for each in found], axis=0) * is_added,
+            explained=np.concatenate([each.explained for each in found]),
+            within=np.concatenate([each.within for each in found]),
             steadied=tuple(
                 None if each is None or not each.steadied else each.steadied[0] for each in ranges
             )
@@ -250,20 +264,35 @@ class Stability:
 
     def inflation_at(self, frequency: FloatArray) -> FloatArray:
         """Return the inflation at frequencies, shape (n_freqs,); 1 outside of the bands."""
+        return 1 + self._at(frequency, self.inflations[:, None] - 1)[:, 0]
+
+    def changed_at(self, frequency: FloatArray) -> FloatArray:
+        """Return the share of the noise that changes of responses may be, (n_freqs, n_channels).
+
+        Negative where noise may be too low.
+        """
+        return self._at(frequency, self.within if any(self.steadied) else self.explained)
+
+    def _at(self, frequency: FloatArray, values: FloatArray) -> FloatArray:
+        """Return values of bands at frequencies; 0 outside of the bands."""
         place = np.maximum(np.searchsorted(self.low, frequency, side="right") - 1, 0)
         inside = (frequency >= self.low[place]) & (frequency <= self.high[place])
-        return np.where(inside, self.inflations[place], 1.0)
+        return np.where(inside[:, None], values[place], 0.0)
 
     def among(self, channels: Sequence[int], sensors: Sequence[int], n_channels: int) -> Stability:
         """Return the same with channels and sensors numbered among all, dead ones included."""
         added = np.zeros(n_channels)
         added[list(channels)] = self.added
+        explained, within = np.zeros((2, len(self.low), n_channels))
+        explained[:, list(channels)], within[:, list(channels)] = self.explained, self.within
         return replace(
             self,
             parts=self.parts.among(channels, n_channels),
             runs=None if self.runs is None else self.runs.among(channels, n_channels),
             channel=channels[self.channel],
             added=added,
+            explained=explained,
+            within=within,
             steadied=self.steadied if len(channels) == n_channels else (),
             changes=tuple(
                 replace(
@@ -283,6 +312,7 @@ def stability(
     frequency: FloatArray,
     insides: Sequence[BoolArray],
     *,
+    psd: FloatArray,
     dims: tuple[int, ...],
     n_effective: float,
     neighbours: FloatArray,
@@ -295,11 +325,13 @@ def stability(
         Single segments, among which disturbed ones are looked for.
     parts : Parts
     maximum : Maximum
-        Maximum of the likelihood for the averages of all segments, at all frequencies.
+        Maximum of the likelihood for the averages, at all frequencies.
     frequency : float64, shape (n_freqs,)
         Hz.
     insides : sequence of bool, shape (n_freqs,)
         Frequencies of each band.
+    psd : float64, shape (n_freqs, n_channels)
+        Of the averages.
     dims : tuple of int
         Channels of each sensor.
     n_effective : float
@@ -337,6 +369,7 @@ def stability(
             _band(
                 parts,
                 maximum,
+                psd,
                 some,
                 groups=groups,
                 by_run=by_run if several else [],
@@ -347,25 +380,45 @@ def stability(
     found = [band for band in bands if band is not None]
     if doubtful:
         bands = [None if band is None else replace(band, levels=None) for band in bands]
-    suspect = any(band.share.min() < WITHIN_PARTS for band in found)
+    alarm = FALSE_ALARM / (n_channels * max(len(found), 1))
+    explained = np.stack(
+        [np.zeros(n_channels) if b is None else b.explained.where_clear(alarm) for b in bands]
+    )
+    suspect = bool(explained.any())
     levels = [None if band is None else band.levels for band in bands]
     changes, added = _changed(bands, dims, begin, end, doubtful=doubtful and suspect)
+    low = np.array([frequency[inside][0] for inside in insides])
+    high = np.array([frequency[inside][-1] for inside in insides])
+    if suspect and not doubtful:
+        noise = [
+            median(maximum.psi[inside & good]) if (inside & good).any() else np.zeros(n_channels)
+            for inside in insides
+        ]
+        changes, added = _also_by_band(
+            (changes, added),
+            bands,
+            explained,
+            noise,
+            edges=(low, high),
+            dims=dims,
+            time=(begin, end),
+        )
     without = None
     if changes or suspect:
-        sensors = [each.sensor for each in changes]
-        without = steadied(parts, maximum, dims=dims, good=good, changed=sensors)
+        without = steadied(parts, maximum, psd, good=good, insides=insides)
+    if without is not None:
         kept = np.array([not np.isin(some, without.left_out).any() for some in groups])
         if kept.sum() >= MIN_PARTS:
             bands = [None if band is None else band.of_parts(kept) for band in bands]
             levels = [None if band is None else band.levels for band in bands]
-    elif all(each is None for each in levels):
+    elif not (changes or suspect) and all(each is None for each in levels):
         return None
     out, excess = np.zeros(0, np.bool_), np.zeros((1, n_channels))
     if course is not None and len(course.spectra) >= MIN_SEGMENTS * MIN_PARTS:
         out, excess = _disturbed_segments(course, maximum, good)
     return Stability(
-        low=np.array([frequency[inside][0] for inside in insides]),
-        high=np.array([frequency[inside][-1] for inside in insides]),
+        low=low,
+        high=high,
         parts=Scatter.of(levels, n_channels),
         runs=(
             Scatter.of([None if band is None else band.of_runs for band in bands], n_channels)
@@ -375,6 +428,8 @@ def stability(
         inflations=np.array([1.0 if band is None else band.inflation for band in bands]),
         changes=changes,
         added=added,
+        explained=explained,
+        within=np.zeros_like(explained) if without is None else without.within,
         n_segments=parts.n_segments,
         disturbed=np.flatnonzero(out),
         excess=float(excess.max()),
@@ -385,17 +440,32 @@ def stability(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Band:
-    """What the parts show of one band.
+    """What the parts show of one band; `levels` are None where they are too uncertain."""
 
-    `levels` are None where they are too uncertain. `share`, shape (n_channels,), is that of the
-    residuals of all segments which is left within parts.
-    """
-
-    share: FloatArray
+    explained: _Explained
     levels: Levels | None
     of_runs: Levels | None
     scores: _Scores
     responses: ResponseScores
+
+    def change(
+        self, sensor: int, begin: FloatArray, end: FloatArray, *, size: float
+    ) -> ResponseChange:
+        """Return a change of this band alone, of any form: of `size` rms."""
+        found = response_change(self.responses, sensor, begin, end, 0)
+        if abs(found.size) < SURE * found.error:
+            found = replace(found, begin=float(begin[0]), end=float(end[-1]))
+        explained = self.explained
+        statistic, degrees = explained.clearest
+        return replace(
+            found,
+            channel=None,
+            is_turn=False,
+            size=size,
+            error=size * math.sqrt(degrees / 2) / (statistic - degrees),
+            statistic=statistic,
+            degrees=degrees,
+        )
 
     @property
     def inflation(self) -> float:
@@ -413,6 +483,7 @@ class _Band:
 def _band(
     parts: Parts,
     maximum: Maximum,
+    psd: FloatArray,
     places: IntArray,
     *,
     groups: Sequence[IntArray],
@@ -426,17 +497,20 @@ def _band(
     at_once = max(1, VALUES_AT_ONCE // (len(parts.each) * sum(dims) ** 2))
     levels, of_runs, responses = [], [], []
     scores = _Scores(len(groups), sum(dims))
-    within, whole_band = np.zeros((2, sum(dims)))
+    explained, spread = np.zeros((3, sum(dims))), 0.0
+    squares = np.zeros((sum(dims), sum(dims)))
     for some in np.array_split(places, -(-len(places) // at_once)):
         bins = parts.bins[some]
         lags = np.minimum(np.abs(bins[:, None] - bins), len(correlation) - 1)
         divided, at, own = parts.joined(some, groups), maximum.take(bins), correlation[lags]
         if not np.isfinite(divided.csm).all():
             return None
-        found = regression(divided, at)
-        weight = found.averages / found.averages.sum()
-        within += np.einsum("k,kfpp->p", weight, found.covariance)
-        whole_band += np.einsum("fpp->p", found.projector).real
+        found = regression(divided, at, psd[bins])
+        scatter = found.scatter
+        beside = np.einsum("fpp->fp", found.projector).real
+        explained += [e.sum(axis=0) for e in (found.explained, scatter, beside)]
+        squares += (np.abs(found.projector) ** 2).sum(axis=0)
+        spread += own.sum()
         piece = noise_levels(found, own)
         levels.append(piece)
         scores.add(found, own)
@@ -444,18 +518,111 @@ def _band(
         each.add(found, own)
         responses.append(each)
         if by_run:
-            of_run = regression(parts.joined(some, by_run), at)
+            of_run = regression(parts.joined(some, by_run), at, psd[bins])
             of_runs.append(noise_levels(of_run, own))
     whole = Levels.joined(levels)
     known = median(np.ravel(whole.degrees)) >= LEAST_DEGREES
-    beside = whole_band > LEAST_SHARE * len(places)
+    left = parts.averages.sum() / len(groups) - maximum.n_factors
+    degrees = 2 * len(places) ** 2 / spread * len(groups) * maximum.n_factors
     return _Band(
-        np.where(beside, within / np.where(beside, whole_band, 1.0), 1.0),
+        _Explained(
+            power=explained[0] / len(places),
+            scatter=explained[1] / len(places),
+            beside=explained[2] / len(places),
+            added=fisher.covariance(squares[None])[0] @ (explained[0] - explained[1]),
+            degrees=degrees,
+            left=left / maximum.n_factors,
+        ),
         whole if known else None,
         Levels.joined(of_runs) if of_runs and known else None,
         scores,
         functools.reduce(operator.add, responses),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Explained:
+    """What changes of responses of any form explain of a band, between parts.
+
+    Attributes
+    ----------
+    power, scatter : float64, shape (n_channels,)
+        What regressions explain beside the motion, and what they explain by scatter.
+    beside : float64, shape (n_channels,)
+        Share of the noise of a channel beside the motion.
+    added : float64, shape (n_channels,)
+        What the difference adds to the noise, as a share.
+    degrees : float
+        Of freedom of the power.
+    left : float
+        Degrees of freedom that scatter is measured by, over those.
+    """
+
+    power: FloatArray
+    scatter: FloatArray
+    beside: FloatArray
+    added: FloatArray
+    degrees: float
+    left: float
+
+    @property
+    def clearest(self) -> tuple[float, float]:
+        """The largest statistic of any channel, as chi-squared, and its degrees of freedom.
+
+        A channel counts whose noise is seen beside the motion, and grows by `ADDED` at least.
+        """
+        degrees = self.degrees * self.left / (1 + self.left)
+        much = self.power - self.scatter > ADDED * self.scatter * (1 + self.left)
+        much &= self.beside > LEAST_SHARE
+        return degrees * float((self.power / self.scatter)[much].max(initial=1.0)), degrees
+
+    def where_clear(self, alarm: float) -> FloatArray:
+        """Return what is added to the noise, shape (n_channels,); zero where that is by chance."""
+        statistic, degrees = self.clearest
+        is_clear = statistic > critical_value(degrees, alarm)
+        return np.nan_to_num(self.added) if is_clear else np.zeros_like(self.added)
+
+
+def _also_by_band(
+    known: tuple[tuple[ResponseChange, ...], FloatArray],
+    bands: Sequence[_Band | None],
+    explained: FloatArray,
+    noise: Sequence[FloatArray],
+    *,
+    edges: tuple[FloatArray, FloatArray],
+    dims: tuple[int, ...],
+    time: tuple[FloatArray, FloatArray],
+) -> tuple[tuple[ResponseChange, ...], FloatArray]:
+    """Return the known changes that explain noise of the bands, and others of some bands.
+
+    With what they add as a fraction of the motion's PSD: both as from `_changed`. `noise` of a band
+    is a share of the PSD of its channels, `edges` are the frequencies of bands in Hz, `time` is
+    that of parts in s.
+    """
+    changes, added = known
+    first = np.cumsum([0, *dims])
+    share = np.clip(noise, 0.0, 0.5)
+    of_motion = np.maximum(explained, 0.0) * share / (1 - share)
+    most = np.maximum.reduceat(of_motion, first[:-1], axis=1)
+    seen = most.max(axis=0) > LEAST_OF * most.max()
+    usual = median(most[explained.any(axis=1)])
+    alike = np.maximum.reduceat(added, first[:-1]) > ALIKE * usual
+    found = [each for each in changes if seen[each.sensor] and alike[each.sensor]]
+    named = {each.sensor for each in found}
+    added = added * np.repeat([number in named for number in range(len(dims))], dims)
+    worst = np.where(explained.any(axis=1), most.argmax(axis=1), -1)
+    for sensor in sorted({*worst.tolist()} - {-1, *named}):
+        own = np.flatnonzero(worst == sensor)
+        at = int(own[most[own, sensor].argmax()])
+        band = bands[at]
+        if not seen[sensor] or band is None:
+            continue
+        channels = slice(first[sensor], first[sensor + 1])
+        added[channels] = of_motion[at, channels]
+        size = math.sqrt(added[channels].max())
+        span = float(edges[0][own[0]]), float(edges[1][own[-1]])
+        found.append(replace(band.change(sensor, *time, size=size), band=span))
+    return tuple(found), added
 
 
 def _changed(

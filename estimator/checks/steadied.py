@@ -14,8 +14,11 @@ estimates *within* parts, by being given this matrix.
 
 Within a part responses change, too. A course of slope s, between the means of the part's
 neighbours, leaves ``s**2 / 12`` of the motion. One that wanders leaves a sixth of its second
-difference c, squared, on average: ``c**2 / 3`` holds with few parts, too. Parts in which this
-is far more than in others, as about a step, are left out.
+difference c, squared, on average: ``c**2 / 3`` holds with few parts, too. Parts in which this is
+far more than in others, as about a step, are left out. Where the response of a part has another
+slope over frequency than the mean, more leaks at the edges of its segments (`edge_leakage`): a
+third of the squared difference between neighbouring frequencies. All of it is measured at every
+frequency, by the coefficients of the regression less what their scatter adds.
 """
 
 from __future__ import annotations
@@ -25,13 +28,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.checks.steadiness import VALUES_AT_ONCE, ResponseScores, regression
+from estimator.checks.steadiness import VALUES_AT_ONCE, regression
+from estimator.likelihood import fisher
 from estimator.median import median
 from estimator.spectra.parts import grouped
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
+    from estimator.checks.steadiness import Regression
     from estimator.likelihood.factor_analysis import Maximum
     from estimator.spectra.parts import Parts
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
@@ -40,6 +45,10 @@ LEAST = 4
 """Averages of a part, per dimension of the motion: a quarter of them is spent."""
 APART = 4.0
 """A part whose responses change so many times as much as those of the median is left out."""
+LEAST_MOTION = 10.0
+"""Motion over noise, in some band of each part."""
+LEAST_KEPT = 0.4
+"""Share of the motion, of all parts together, in those that are not left out."""
 MOST_LEFT_OUT = 0.4
 """Share of the averages, at most."""
 ROUGH = 4.0
@@ -59,113 +68,122 @@ class Steadied:
     n_effective : float
     left_out : int64, shape (n_left_out,)
         Numbers of the parts that do not count: about a step.
-    below, above : float64, shape (n_channels,)
-        By how much the noise may be too high, or too low, for what responses do within parts: as a
-        fraction of the PSD of the motion.
+    within : float64, shape (n_bands, n_channels)
+        By how much the noise may be too high, or too low where it is negative, for what responses
+        do within parts: as a share of the noise.
     """
 
     csm: ComplexArray
     n_effective: float
     left_out: IntArray
-    below: FloatArray
-    above: FloatArray
+    within: FloatArray
 
 
 def steadied(
     parts: Parts,
     at: Maximum,
+    psd: FloatArray,
     *,
-    dims: tuple[int, ...],
     good: BoolArray,
-    changed: Sequence[int],
-) -> Steadied:
+    insides: Sequence[BoolArray],
+) -> Steadied | None:
     """Return averages without the changes of responses between parts.
+
+    None where a part has little motion, or most of it is in parts that would be left out: what the
+    regression then takes off is noise.
 
     Parameters
     ----------
     parts : Parts
     at : Maximum
         For the averages of all segments, or for those of a steadied bench; all frequencies.
-    dims : tuple of int
+    psd : float64, shape (n_freqs, n_channels)
+        Of these averages.
     good : bool, shape (n_freqs,)
         Frequencies by which changes are measured.
-    changed : sequence of int
-        Sensors whose responses change.
+    insides : sequence of bool, shape (n_freqs,)
+        Frequencies of each band.
     """
     n, q, p = parts.averages, at.n_factors, at.psi.shape[1]
     groups = grouped(n, LEAST * q)
-    fitted = at.converged & ~at.singular
-    places = np.flatnonzero(parts.bins < len(good))
-    places = places[fitted[parts.bins[places]]]
-    scores = ResponseScores(dims, len(groups))
-    n_values = len(parts.each) * p**2
-    for some in _pieces(places[good[parts.bins[places]]], n_values):
-        found = regression(parts.joined(some, groups), at.take(parts.bins[some]))
-        scores.add(found, np.eye(len(some)))
-    left, kept = _within(scores, dims, changed, np.array([n[some].sum() for some in groups]))
-    out = [some for some, is_kept in zip(groups, kept, strict=True) if not is_kept]
-    left_out = np.concatenate([np.zeros(0, np.int64), *out])
-    groups = [some for some, is_kept in zip(groups, kept, strict=True) if is_kept]
-    csm = np.full((len(good), p, p), np.nan, np.complex128)
     averages = np.array([n[some].sum() for some in groups])
+    places = np.flatnonzero(parts.bins < len(good))
+    places = places[(at.converged & ~at.singular)[parts.bins[places]]]
+    kept, courses = np.ones(len(groups), np.bool_), {}
+    apart, loud = np.zeros((2, len(groups)))
+    for number, inside in enumerate(insides if len(groups) > 1 else ()):
+        some = places[(good & inside)[parts.bins[places]]]
+        if len(some):
+            pieces = [_courses(found) for _, found in _regressions(parts, at, psd, some, groups)]
+            left, moved, squares, motion = (np.sum(e, axis=0) for e in zip(*pieces, strict=True))
+            loud = np.maximum(loud, motion / (q * len(some)))
+            courses[number] = left @ fisher.covariance(squares[None])[0]
+            # of few frequencies, the scatter of coefficients alone is apart at times
+            most = APART * (1 + APART / np.sqrt(q * len(some))) * median(moved)
+            apart = np.maximum(apart, (moved / most).max(axis=1))
+    for part in np.argsort(-apart).tolist():
+        out = averages[~kept].sum() + averages[part]
+        if apart[part] <= 1 or out > MOST_LEFT_OUT * averages.sum():
+            break
+        kept[part] = False
+    if courses and (loud.min() < LEAST_MOTION or loud[kept].sum() < LEAST_KEPT * loud.sum()):
+        return None
+    out = [some for some, is_kept in zip(groups, kept, strict=True) if not is_kept]
+    groups = [some for some, is_kept in zip(groups, kept, strict=True) if is_kept]
+    averages = averages[kept]
+    within = np.zeros((len(insides), p))
+    for number, course in courses.items():
+        within[number] = MARGIN * (averages / averages.sum()) @ course[kept]
+    csm = np.full((len(good), p, p), np.nan, np.complex128)
     more = float((averages - q).sum()) + q
-    for some in _pieces(places, n_values):
-        found = regression(parts.joined(some, groups), at.take(parts.bins[some]))
+    for some, found in _regressions(parts, at, psd, places, groups):
         U = found.directions
         motion = found.motion.sum(axis=0) / averages.sum()
         whole = U @ motion @ U.conj().swapaxes(1, 2)
         whole += np.tensordot(averages / more, found.left, axes=1)
         csm[parts.bins[some]] = whole / (found.scale[:, :, None] * found.scale[:, None, :])
-    below, above = bounds(MARGIN * left, len(changed))
-    return Steadied(csm, more, left_out, np.repeat(below, dims), np.repeat(above, dims))
+    return Steadied(csm, more, np.concatenate([np.zeros(0, np.int64), *out]), within)
 
 
-def _pieces(places: IntArray, n_values: int) -> list[IntArray]:
-    """Return frequencies that are regressed together, of so many values each."""
-    at_once = max(1, VALUES_AT_ONCE // n_values)
-    return np.array_split(places, -(-len(places) // at_once)) if len(places) else []
+def _regressions(
+    parts: Parts, at: Maximum, psd: FloatArray, places: IntArray, groups: Sequence[IntArray]
+) -> Iterator[tuple[IntArray, Regression]]:
+    """Yield few frequencies at a time, and the regressions of joined parts there."""
+    at_once = max(1, VALUES_AT_ONCE // (len(parts.each) * at.psi.shape[1] ** 2))
+    for some in np.array_split(places, -(-len(places) // at_once)) if len(places) else ():
+        bins = parts.bins[some]
+        yield some, regression(parts.joined(some, groups), at.take(bins), psd[bins])
 
 
-def _within(
-    scores: ResponseScores, dims: tuple[int, ...], changed: Sequence[int], averages: FloatArray
-) -> tuple[FloatArray, BoolArray]:
-    """Return the variance of each sensor's response within parts, and the parts that are kept."""
-    found = np.zeros((len(averages), len(dims)))
-    if len(averages) > 1:
-        for sensor in changed:
-            others = [each for each in changed if each != sensor]
-            score, information = scores.without(others).sensor(sensor)
-            inverse = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
-            course = (inverse @ score[:, :, None])[:, :, 0]
-            padded = np.concatenate(
-                [2 * course[:1] - course[1:2], course, 2 * course[-1:] - course[-2:-1]]
-            )
-            slope, bend = (padded[2:] - padded[:-2]) / 2, np.diff(padded, n=2, axis=0)
-            square = (slope**2 + ROUGH * bend**2) / 12
-            of_rows = square.reshape(len(averages), dims[sensor], -1).sum(axis=2)
-            found[:, sensor] = of_rows.max(axis=1)
-    most, kept = found.max(axis=1), np.ones(len(averages), np.bool_)
-    for part in np.argsort(-most).tolist():
-        out = averages[~kept].sum() + averages[part]
-        if most[part] <= APART * median(most) or out > MOST_LEFT_OUT * averages.sum():
-            break
-        kept[part] = False
-    weight = averages[kept] / averages[kept].sum()
-    return weight @ found[kept], kept
+def _courses(found: Regression) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return what courses of responses leave within parts, and how much they change.
 
-
-def bounds(variance: FloatArray, n_changed: int) -> tuple[FloatArray, FloatArray]:
-    """Return what variances of responses, shape (n_sensors,), add to the noise and take at most.
-
-    Beside sensors j and k, the noise of i changes by the mean of ``(g_i - g_j) (g_i - g_k)``: only
-    its own variance, where the others are steady.
+    Both of shape (n_parts, n_channels), beside the motion: sums over frequencies. The first is less
+    what scatter adds. The second is any change beside both neighbours, with its scatter. Third are
+    the squares of projectors, (n_channels, n_channels), from noise to what is beside the motion.
+    Fourth is the motion of each part.
     """
-    if n_changed < 2:
-        return variance, np.zeros_like(variance)
-    deviation = np.sqrt(variance)
-    below, above = np.zeros((2, len(variance)))
-    for i, own in enumerate(deviation):
-        k, j = np.sort(np.delete(deviation, i))[-2:]
-        below[i] = (own + j) * (own + k)
-        above[i] = below[i] - own**2
-    return below, above
+    n = len(found.motion)
+    each = np.eye(n)
+    padded = np.concatenate([[2 * each[0] - each[1]], each, [2 * each[-1] - each[-2]]])
+    slope, bend = (padded[2:] - padded[:-2]) / 2, np.diff(padded, n=2, axis=0)
+    inverse = np.linalg.inv(found.motion)
+    own = np.einsum("fpp->fp", found.projector).real
+    totals = found.averages + found.motion.shape[-1]
+    across = found.motion / totals[:, None, None, None]
+    scatter = np.einsum("jfab,kfba->kjf", inverse, across).real
+    power, expected = [], []
+    for course in (slope, bend):
+        D = np.tensordot(course, found.coefficients, axes=1)
+        power.append(((D @ across) * D.conj()).sum(axis=3).real)
+        expected.append(np.einsum("kj,kjf->kf", course**2, scatter)[..., None] * own)
+    left = (power[0] - expected[0] + ROUGH * (power[1] - expected[1])) / 12
+    U = found.directions
+    G = found.coefficients @ U.conj().swapaxes(1, 2)
+    D = (G[:, 2:] - G[:, :-2]) @ U[1:-1]
+    edges = ((D @ across[:, 1:-1]) * D.conj()).sum(axis=3).real
+    spread = np.einsum("kfab,kfba->kf", inverse, across).real[..., None] * own
+    left[:, 1:-1] += (edges - 2 * spread[:, 1:-1]) / 12
+    squares = (np.abs(found.projector) ** 2).sum(axis=0)
+    loud = np.einsum("kfaa->k", across).real
+    return left.sum(axis=1), (power[0] + power[1]).sum(axis=1), squares, loud

@@ -78,6 +78,9 @@ class Regression:
         From squares of residuals to the noise of channels.
     noise : float64, shape (n_parts, n_bins, n_channels)
         Noise of each part less that of the fit, over that of the fit.
+    explained : float64, shape (n_bins, n_channels)
+        Averages of what the regressions explain: scatter alone explains one of the covariance for
+        each direction of the motion in each part.
     """
 
     left: ComplexArray
@@ -90,17 +93,28 @@ class Regression:
     covariance: FloatArray
     inverse: FloatArray
     noise: FloatArray
+    explained: FloatArray
+
+    @property
+    def scatter(self) -> FloatArray:
+        """What regressions explain by scatter, shape (n_bins, n_channels)."""
+        q = self.motion.shape[-1]
+        total = (self.averages + q).sum()
+        return np.asarray(q * np.einsum("kfpp->fp", self.covariance) / total)
 
 
-def regression(parts: Divided, at: Maximum) -> Regression:
-    """Regress the residuals of every part on its motion."""
+def regression(parts: Divided, at: Maximum, psd: FloatArray) -> Regression:
+    """Regress the residuals of every part on its motion.
+
+    `psd`, shape (n_bins, n_channels), is that of the averages that were fitted: these may lack
+    parts, whose motion differs by scatter.
+    """
     n, q = parts.averages, at.n_factors
     U = at.eigenvectors
     share = (np.abs(U) ** 2 @ at.eigenvalues[:, :, None])[:, :, 0]
     fitted = np.einsum("fpp->fp", at.rest).real + share
     weight = n / n.sum()
-    power = np.einsum("k,kfpp->fp", weight, parts.csm).real
-    scale = np.sqrt(fitted / power)
+    scale = np.sqrt(fitted / psd)
     S = parts.csm * scale[:, :, None] * scale[:, None, :]
     SU = S @ U
     across = U.conj().swapaxes(1, 2) @ SU
@@ -117,6 +131,7 @@ def regression(parts: Divided, at: Maximum) -> Regression:
         covariance=covariance,
         inverse=inverse,
         noise=(inverse @ excess[..., None])[..., 0],
+        explained=np.einsum("k,kfpq,kfpq->fp", weight, D, PSU.conj(), optimize=True).real,
         coefficients=D,
         motion=n[:, None, None, None] * across,
         directions=U,
@@ -302,6 +317,8 @@ class ResponseChange:
         Seconds from the start: between these it changes. Equal for a step.
     statistic, degrees : float
         Chi-squared statistic of the test, and its degrees of freedom.
+    band : (float, float) or None
+        Frequencies that alone show it, Hz: `size` is then the standard deviation of a response.
     """
 
     sensor: int
@@ -313,6 +330,7 @@ class ResponseChange:
     end: float
     statistic: float
     degrees: float
+    band: tuple[float, float] | None = None
 
 
 def _patterns(d: int) -> list[tuple[int | None, bool, FloatArray]]:

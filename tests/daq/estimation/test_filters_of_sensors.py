@@ -5,46 +5,88 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pytest
 from scipy import signal
 
 import huddle
 from daq.estimation.settings import Settings
 from daq.results.result import Result
+from estimator.checks.advice_on_noise import ResponseChanges
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from daq.estimation.snapshot import Snapshot
+
+    Filter = Callable[[np.ndarray], np.ndarray]
 
 RATE = 40.0
 N = round(1200 * RATE)
 NOISE = 2 / RATE  # PSD of white noise of variance 1
 
 
-def high_pass(samples: np.ndarray, corner: float) -> np.ndarray:
+def high_pass(corner: float) -> Filter:
     sections = signal.butter(2, corner, "high", fs=RATE, output="sos")
-    return np.asarray(signal.sosfilt(sections, samples, axis=0))
+    return lambda samples: np.asarray(signal.sosfilt(sections, samples, axis=0))
 
 
-def estimated(seed: int, before: float, after: float) -> Snapshot:
-    """White motion 60 dB above the noise; the high-pass corner of B moves after 45 %."""
+def resonant(frequency: float) -> Filter:
+    peak = signal.iirpeak(frequency, 10, fs=RATE)
+    return lambda samples: samples + signal.lfilter(*peak, samples, axis=0)
+
+
+def in_an_octave(gain: float) -> Filter:
+    sections = signal.butter(2, [1, 2], "band", fs=RATE, output="sos")
+    return lambda samples: samples + gain * signal.sosfiltfilt(sections, samples, axis=0)
+
+
+def estimated(
+    seed: int, before: Filter, after: Filter, *, ratio: float = 1e6, octaves: bool = False
+) -> Snapshot:
+    """White motion of this ratio to white noise; B has one filter, after 45 % another."""
     rng = np.random.default_rng([seed, 474747])
-    motion = 1e3 * rng.standard_normal((N, 3))
+    motion = np.sqrt(ratio) * rng.standard_normal((N, 3))
     samples = {}
     for name in "ABC":
         felt = motion @ np.linalg.qr(rng.standard_normal((3, 3)))[0]
         if name == "B":
             early = np.arange(N)[:, None] < 0.45 * N
-            felt = np.where(early, high_pass(felt, before), high_pass(felt, after))
+            felt = np.where(early, before(felt), after(felt))
         samples[name] = felt + rng.standard_normal((N, 3))
-    return huddle.self_noise(samples, fs=RATE, segment="5s").snapshot
+    return huddle.self_noise(samples, fs=RATE, segment="5s", octaves=octaves).snapshot
 
 
 def held(snapshot: Snapshot) -> np.ndarray:
     """Return whether levels of two lines and of octaves hold the noise."""
-    edges = np.array([2, 3, 4, 8, 16, 32, 64, 90])
+    edges = np.searchsorted(snapshot.frequency, [0.4, 0.6, 0.8, 1.6, 3.2, 6.4, 12.8, 18.0])
     low, high = Result(snapshot, Settings()).spectrum("three-sensor").levels(edges).ends()
     return np.asarray((low <= NOISE) & (high >= NOISE))
 
 
 def test_what_leaks_is_in_the_interval_from_the_first_line_on() -> None:
     """The slope of a response at the first line is not known from lines on both sides of it."""
-    assert held(estimated(1, 0.8, 0.8)).mean() > 0.93
+    assert held(estimated(1, high_pass(0.8), high_pass(0.8))).mean() > 0.93
+
+
+@pytest.mark.parametrize("ratio", [1e4, 1e6])
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        (high_pass(0.8), high_pass(1.0)),
+        (resonant(8.0), resonant(8.2)),
+        (in_an_octave(0.0), in_an_octave(0.02)),
+    ],
+)
+def test_a_response_that_changes_at_some_frequencies_is_named_and_held(
+    before: Filter, after: Filter, ratio: float
+) -> None:
+    """Levels were up to 45 dB off, or another sensor was named, too."""
+    snapshot = estimated(2, before, after, ratio=ratio)
+    assert held(snapshot).mean() > 0.93
+    (change,) = [e for e in snapshot.diagnostics.advice if isinstance(e, ResponseChanges)]
+    assert change.sensors == (1,)
+
+
+def test_a_gain_that_changes_in_one_octave_is_held_with_octaves() -> None:
+    snapshot = estimated(3, in_an_octave(0.0), in_an_octave(0.02), octaves=True)
+    assert held(snapshot).mean() > 0.93

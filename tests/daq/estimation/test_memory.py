@@ -70,6 +70,7 @@ def test_segments_are_divided_without_a_copy_of_all_residuals() -> None:
             maximum,
             frequency,
             [np.ones(n_kept, np.bool_)],
+            psd=np.mean(np.abs(exact) ** 2, axis=0),
             dims=(3, 3, 3),
             n_effective=500.0,
             neighbours=HANN_HALF,

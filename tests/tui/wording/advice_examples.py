@@ -166,6 +166,21 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
         ("The gain of b fell to about zero at 420 s", "Check its place and its cable"),
     ),
     (
+        ResponseChanges(
+            rank=Rank.DELAYS,
+            sensors=(1,),
+            band=(0.4, 0.8),
+            channel=None,
+            is_turn=False,
+            size=0.03,
+            size_error=0.001,
+            begin=420.0,
+            end=420.0,
+            variance=9e-4,
+        ),
+        ("The response of b varied by 3 % at 0.4–0.8 Hz at 420 s", "0.09 % of the motion's PSD"),
+    ),
+    (
         NoiseChanges(
             rank=Rank.TO_KNOW,
             sensors=(1,),
