@@ -51,6 +51,8 @@ if TYPE_CHECKING:
 
 MIN_AVERAGES = 2.0
 """Without which nothing is diagnosed: in one average all channels are coherent, as copies are."""
+BY_CLOCKS = 0.2
+"""Change of a gain as a fraction, or of a direction in rad, from which wrong clocks explain it."""
 _MOST_RESIDUAL = 1e3  # s: beyond any segment; infinite where an error cannot be measured
 _MOST_TURN = 50.0  # rad²: no motion is left in common
 _UP = {"z", "up", "down", "vertical", "+z", "-z"}
@@ -134,6 +136,22 @@ class Findings:
             if not isinstance(each, ResponseChanges) or left.issuperset(each.sensors)
         )
         return replace(self, diagnosis=replace(whole, advice=tuple(advice), stability=steady))
+
+    def beside_clocks(self, clocks: Sequence[ClockState]) -> Findings:
+        """Return findings without changes that clocks explain, which drift or are unchecked.
+
+        These look like a gain or a turn beyond what benches do, or change some frequencies more.
+        """
+        whole = self.diagnosis
+        if whole is None or not any(each.drifts or each.unchecked for each in clocks):
+            return self
+        advice = tuple(
+            each
+            for each in whole.advice
+            if not isinstance(each, ResponseChanges)
+            or (each.band is None and abs(each.size) < BY_CLOCKS)
+        )
+        return replace(self, diagnosis=replace(whole, advice=advice))
 
     def of_all_segments(self, *, unless: bool = False) -> Findings:
         """Return findings of which the averages within parts are not used."""

@@ -312,6 +312,7 @@ class SnapshotBuilder:
                 self._findings = (
                     self._diagnose(recordings, passes, raw, bands_of_all, estimates, maxima=maxima)
                     .linear_first(nonlinear, psd, dims)
+                    .beside_clocks(clock_states(passes))
                     .of_all_segments(unless=final and bool(raw) and not sets)
                 )
             self._occasional_cost += self._diagnoses.cost
@@ -398,9 +399,11 @@ class SnapshotBuilder:
             again = self._estimates(
                 within, raw, recordings[0], passes[0], n, maxima=maxima, final=True
             )
-            self._findings = self._diagnose(
-                recordings, passes, raw, within, again, maxima=maxima
-            ).linear_first(nonlinear, psd, dims)
+            self._findings = (
+                self._diagnose(recordings, passes, raw, within, again, maxima=maxima)
+                .linear_first(nonlinear, psd, dims)
+                .beside_clocks(clock_states(passes))
+            )
             after = self._findings.stability
             if after is None or not after.changes:
                 self._findings = first.of_all_segments()
