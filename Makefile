@@ -27,11 +27,12 @@ demo: $(VENV)/.installed  ## the whole huddle test on a simulated bench, over it
 # The workers share the cores: threads of linear algebra would wait for each other in loops.
 test test-long: export OPENBLAS_NUM_THREADS := 1
 
-test: $(VENV)/.installed-dev  ## the tests but the long ones; three at a time on two cores, for many wait for their devices
-	$(BIN)/pytest -n 3
+# Three at a time on two cores: many tests wait for their devices.
+test: $(VENV)/.installed-dev  ## the tests but the long ones; with ALL=yes, these too, collected once
+	$(BIN)/pytest -n 3 $(if $(ALL),-m "not study")
 
 test-long: $(VENV)/.installed-dev  ## the tests that are studies, endurance or whole sessions
-	$(BIN)/pytest -n 3 -m long
+	$(BIN)/pytest -n 3 -m "long and not study"
 
 peers:  ## compile the program in Rust that the tests talk to; kept in the user's cache
 	cargo build --quiet --manifest-path $(PEER)/Cargo.toml --target-dir $(PEER_CACHE)
