@@ -11,7 +11,7 @@ import pytest
 
 from daq.devices.epson import commands
 from daq.devices.registry import driver_type
-from daq.errors import BenchFileError, NoAnswerError, NotConnectedError, WrongDeviceError
+from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.protocols.block import Block, BlockFlag, Reading
 from daq.transport.ports import open_port
 from sim_devices.errors import ServeError
@@ -212,19 +212,6 @@ async def test_silence_and_other_devices_are_distinguished() -> None:
         with pytest.raises(WrongDeviceError, match=r"not an Epson .* got 6c 6f 67 69 6e 3a 20"):
             await blocks(sensor, 1)
         await asyncio.gather(*filter(None, tasks))
-
-
-async def test_a_device_that_vanishes_ends_the_session() -> None:
-    table = device("A")
-    with serving(spec(table, speed=SPEED)) as (one,):
-        (sensor,) = sensors(one, table)
-        async with DRIVER.open([sensor], host_clock(SPEED)) as session:
-            stream = session.read()
-            assert isinstance(await anext(stream), Block)
-            one.kill()
-            with pytest.raises(NotConnectedError, match=r"'A' on /tmp/.*: the port closed"):
-                async for _ in stream:
-                    pass
 
 
 def test_a_spec_that_cannot_be_served_is_refused_with_its_cause() -> None:

@@ -151,16 +151,6 @@ async def test_an_absent_server_is_reported() -> None:
         await record(sensors(gone, TABLES[3])[0], 1)
 
 
-async def test_a_digitizer_that_vanishes_ends_the_session() -> None:
-    with serving(spec(TABLES[0], speed=SPEED)) as (one,):
-        async with reading.reading(DRIVER, sensors(one, TABLES[0]), speed=SPEED) as items:
-            assert isinstance(await anext(items), (Block, Event))
-            one.kill()
-            with pytest.raises(NotConnectedError, match="the port closed"):
-                async for _ in items:
-                    pass
-
-
 @contextlib.asynccontextmanager
 async def sending(streams: Sequence[str], n_blocks: int) -> AsyncIterator[str]:
     """Yield the port of a Scream server that sends so many blocks of each stream, and no more."""

@@ -24,12 +24,11 @@ from daq.recording.chunks.manifest import write_manifest
 from daq.recording.description import write_checksums
 from daq.recording.repair import write_results
 from daq.recording.signing import identity, make_key, sign
-from tests.tui.certificate.laboratory import CALIBRATED, Laboratory, key, laboratory, text_of
+from tests.tui.certificate.laboratory import CALIBRATED, Laboratory, laboratory, text_of
 from tests.tui.night_recording import record
 from tests.tui.report.written_report import ROOT
 from tui.certificate.dcc import NAME
 from tui.certificate.ledger import Ledger
-from tui.certificate.signing import PdfSignature, signatures
 from tui.certificate.verification import JSON_NAME
 from tui.commands.main import app
 from tui.service.records.store import NAME as RUNS
@@ -439,31 +438,6 @@ def test_the_ledger_of_a_recording_is_found_wherever_it_is(tmp_path: Path) -> No
     code, said = made.verify(made.recording, "--certificates", elsewhere)
     assert code == 0
     assert said.count("PIER-") == 2
-
-
-def test_a_signed_certificate_is_verified(
-    copied: Laboratory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    signing = key(tmp_path / "key.p12", b"secret")
-    arguments = ("--sign", str(signing), "--reason", "signed")
-    monkeypatch.setenv("HUDDLE_PASSPHRASE", "wrong")
-    whole = ["issue", str(copied.recording), "--by", "Ada", "--bench", str(copied.bench)]
-    refused = CliRunner().invoke(app, [*whole, *arguments])
-    assert refused.exit_code == 2
-    assert "passphrase is wrong" in refused.stderr
-    monkeypatch.setenv("HUDDLE_PASSPHRASE", "secret")
-    copied.issue(*arguments)
-    path = copied.certificate(1)
-    code, said = copied.verify(path)
-    assert code == 0, said
-    (found,) = signatures(path.read_bytes())
-    assert f"signed by Common Name: Pier Metrology with key {found.key_id}: intact" in said
-    assert f"ledger signed with key {found.key_id}" in said
-    assert found == PdfSignature("Common Name: Pier Metrology", found.key_id, is_intact=True)
-    changed = path.read_bytes().replace(b"/Title", b"/Tible", 1)
-    assert not signatures(changed)[0].is_intact
-    assert "not signed" in copied.verify(copied.certificate())[1]
-    assert len(Ledger(copied.certificates).entries()) == 2  # the refused one took no number
 
 
 def changed_certificate(made: Laboratory) -> list[Path]:

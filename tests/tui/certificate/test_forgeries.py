@@ -22,6 +22,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.serialization import pkcs12
 from pypdf import PdfReader, PdfWriter
 from pypdf.generic import ContentStream, NameObject
+from typer.testing import CliRunner
 
 from daq.recording.chunks.manifest import write_manifest
 from daq.recording.description import write_checksums
@@ -29,8 +30,9 @@ from tests.traced_memory import peak_of
 from tests.tui.certificate.laboratory import Laboratory, key, laboratory
 from tui.certificate import issuing
 from tui.certificate.ledger import NAME, Ledger
-from tui.certificate.signing import Signer
+from tui.certificate.signing import PdfSignature, Signer, signatures
 from tui.certificate.verification import JSON_NAME, Claims, VerificationError, _signatures, verify
+from tui.commands.main import app
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -291,8 +293,25 @@ def test_the_genuine_one_is(signing: Signed) -> None:
     for trusted in (False, True):
         code, said = signing.check(signing.certificate, signing.lab.recording, trusted=trusted)
         assert code == 0, said
-        assert "ledger signed with key" in said
         assert "the one certified, unchanged" in said
+    content = signing.certificate.read_bytes()
+    (found,) = signatures(content)
+    assert found == PdfSignature("Common Name: Pier Metrology", found.key_id, is_intact=True)
+    assert f"signed by Common Name: Pier Metrology with key {found.key_id}: intact" in said
+    assert f"ledger signed with key {found.key_id}" in said
+    assert not signatures(content.replace(b"/Title", b"/Tible", 1))[0].is_intact
+
+
+def test_who_does_not_know_the_passphrase_issues_nothing(
+    forged: Signed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HUDDLE_PASSPHRASE", "wrong")
+    arguments = ["issue", str(forged.lab.recording), "--by", "Ada", "--reason", "signed"]
+    arguments += ["--bench", str(forged.lab.bench), "--sign", str(forged.other)]
+    refused = CliRunner().invoke(app, arguments)
+    assert refused.exit_code == 2
+    assert "passphrase is wrong" in refused.stderr
+    assert len(Ledger(forged.lab.certificates).entries()) == 2  # it took no number
 
 
 @pytest.mark.parametrize(

@@ -69,6 +69,7 @@ def test_these_modules_would_run_in_an_unprotected_process(record: Path) -> None
 
 @pytest.mark.long
 def test_recorders_and_estimates_of_a_service_execute_none(record: Path) -> None:
+    """Nor what ends a recording at its condition."""
     with simulated(parse(demo_bench()), speed=8.0) as reachable:
         limits = (Limit(name="mask", frequency=(1.0, 30.0), psd=(1e-9, 1e-9)),)
         bench = reachable.model_copy(update={"limits": limits})
@@ -112,23 +113,6 @@ def test_the_installed_command_and_all_that_it_starts_run_none(record: Path) -> 
 
 
 @pytest.mark.long
-def test_what_ends_a_recording_at_its_condition_executes_none(record: Path) -> None:
-    with simulated(parse(demo_bench()), speed=8.0) as reachable:
-        Path("bench.toml").write_text(dump(reachable), encoding="utf-8")
-        command = Path(sys.executable).with_name("huddle")
-        done = subprocess.run(
-            [command, "record", "bench.toml", "--until", "90 %", "--out", "r.h5"],
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=limit(),
-        )
-    assert done.returncode == 0, done.stderr
-    assert Path("r.h5").exists()
-    assert not record.exists()
-
-
-@pytest.mark.long
 def test_processes_of_an_archive_execute_none(record: Path, tmp_path: Path) -> None:
     begin = months.START_NS
     paths = [
@@ -154,8 +138,7 @@ def test_no_process_of_python_is_started_in_any_other_way() -> None:
     interpreters = [name for name, text in sources.items() if "sys.executable" in text]
     assert interpreters == [str(Path("daq", "python_process.py"))]
     assert not [name for name, text in sources.items() if OTHER_STARTS.search(text)]
-    # Each has its own test above: simulated devices, the recorder,
-    # what ends it, archives, runs of a service.
+    # A test above has each: simulated devices, recorders with what ends them, archives, services.
     starts = {name for name, text in sources.items() if STARTS.search(text)}
     users = {  # run what the bench file or --on-event says
         str(Path("tui", "commands", "tui_controls.py")),
