@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,7 @@ N = round(1200 * RATE)
 NOISE = 2 / RATE  # PSD of white noise of variance 1
 
 
+@functools.cache  # several tests look at one bench
 def estimated(
     kind: str, seed: int, *, ratio: float = 1e4, n: int = N, option: str = ""
 ) -> Snapshot:
@@ -85,7 +87,7 @@ def test_a_response_that_changes_is_named_sized_and_dated(
 @pytest.mark.parametrize(("kind", "most"), [("step", 1.0), ("ramp", 2.5), ("settles", 1.0)])
 def test_levels_within_parts_are_those_of_a_steady_bench(kind: str, most: float) -> None:
     """Over all parts, motion 60 dB above the noise leaves up to 28 dB in it."""
-    snapshot = estimated(kind, 3, ratio=1e6)
+    snapshot = estimated(kind, 1, ratio=1e6)
     found = Result(snapshot, Settings()).spectrum("three-sensor").levels(np.array([5, 20, 45, 90]))
     assert np.abs(10 * np.log10(found.mean / NOISE)).max() < most
     noise = snapshot.results["three-sensor"]
@@ -94,6 +96,7 @@ def test_levels_within_parts_are_those_of_a_steady_bench(kind: str, most: float)
     assert snapshot.n_effective < 420  # of 455: every part has spent three
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("option", ["octaves", "reject"])
 def test_changes_are_found_with_every_option(option: str) -> None:
     snapshot = estimated("step", 4, ratio=1e6, option=option)
@@ -107,7 +110,7 @@ def test_changes_are_found_with_every_option(option: str) -> None:
     assert np.mean(((noise.low <= NOISE) & (noise.high >= NOISE))[known]) > 0.93
 
 
-@pytest.mark.parametrize("ratio", [1e4, 1e6])
+@pytest.mark.parametrize("ratio", [1e4, pytest.param(1e6, marks=pytest.mark.long)])
 def test_gains_that_follow_one_temperature_are_found(ratio: float) -> None:
     """Motion in which all sensors differ hides the noise of one: it seems to be zero."""
     snapshot = estimated("temperature", 2, ratio=ratio)
@@ -148,7 +151,7 @@ def test_steady_noise_of_more_than_4096_segments_scatters_as_all_of_them() -> No
 
 def test_a_gain_that_drifts_is_in_the_uncertainty_of_the_calibration() -> None:
     """A ramp of 3 % has the standard deviation 3 % / sqrt(12)."""
-    snapshot = estimated("ramp", 1)
+    snapshot = estimated("ramp", 1, ratio=1e4)
     found = calibrate(Result(snapshot, Settings()), None, reference="A")
     by_sensor = {
         budget.sensor: {each.source: each.relative for each in budget.components}

@@ -47,7 +47,7 @@ from tests.tui.thinned import thinned
 from tests.waiting import finish, wait_until
 from tui.commands.main import app
 from tui.output.archive.tables import course_table
-from tui.report.figures import drawing
+from tui.report.figures import archive, drawing
 from tui.report.figures.archive import days_figure, density_figure
 
 if TYPE_CHECKING:
@@ -197,17 +197,17 @@ def test_the_workers_of_a_cluster_write_the_same_values(folder: Path, tmp_path: 
 
 
 @pytest.mark.long
-def test_the_workers_of_a_cluster_take_days_of_all_stations(sds: Path, tmp_path: Path) -> None:
+def test_the_workers_of_a_cluster_take_days_of_all_stations(
+    sds: Path, whole: tuple[Path, Any], tmp_path: Path
+) -> None:
     pytest.importorskip("distributed")
-    whole, store = tmp_path / "whole", tmp_path / "store"
-    said = huddle(f"sds://{sds}", "--store", whole, *DAYS)
-    assert said.exit_code == 0
+    store = tmp_path / "store"
     code, errors = on_cluster(tmp_path, f"sds://{sds}", "--store", store, *DAYS)
     assert code == 0, errors
     assert errors.count("dashboard: http") == 1
     for name in ("XX.ABC", "XX.DEF"):
-        assert_same(Store.open(store / name), Store.open(whole / name))  # type: ignore[arg-type]  # there are
-    assert huddle("--store", store).stdout == said.stdout
+        assert_same(Store.open(store / name), Store.open(whole[0] / name))  # type: ignore[arg-type]  # there are
+    assert huddle("--store", store).stdout == whole[1].stdout
 
 
 def on_cluster(folder: Path, *arguments: object) -> tuple[int, str]:
@@ -365,10 +365,19 @@ def sds(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_stations_have_an_archive_each_and_a_line_in_the_table(sds: Path, tmp_path: Path) -> None:
-    store = tmp_path / "store"
+@pytest.fixture(scope="module")
+def whole(sds: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
+    """Archive the day files; tests change no store. Also what the command said."""
+    store = tmp_path_factory.mktemp("whole") / "store"
     said = huddle(f"sds://{sds}", "--store", store, *DAYS)
     assert said.exit_code == 0, said.output
+    return store, said
+
+
+def test_stations_have_an_archive_each_and_a_line_in_the_table(
+    sds: Path, whole: tuple[Path, Any], tmp_path: Path
+) -> None:
+    store, said = whole
     assert "2 stations: 3 days to take, 0 in the archive already" in said.stderr
     assert "left aside, with one sensor: XX.ONE" in said.stderr
     lines = [line.split() for line in said.stdout.splitlines()]
@@ -402,12 +411,16 @@ def test_stations_have_an_archive_each_and_a_line_in_the_table(sds: Path, tmp_pa
 
 
 @pytest.mark.long
-def test_figures_of_stations_have_a_folder_each(sds: Path, tmp_path: Path) -> None:
-    said = huddle(f"sds://{sds}", "--store", tmp_path / "store", *DAYS, "-o", tmp_path / "out")
+def test_figures_of_stations_have_a_folder_each(
+    whole: tuple[Path, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As PNG alone; another test has all formats."""
+    monkeypatch.setattr("tui.report.figures.archive._KINDS", archive._KINDS[:1])  # noqa: SLF001
+    said = huddle("--store", whole[0], "-o", tmp_path)
     assert said.exit_code == 0, said.output
     for name in ("XX.ABC", "XX.DEF"):
-        assert (tmp_path / "out" / name / "days.png").stat().st_size > 5000
-        assert (tmp_path / "out" / name / "figures.npz").exists()
+        assert (tmp_path / name / "days.png").stat().st_size > 5000
+        assert (tmp_path / name / "figures.npz").exists()
 
 
 def test_a_single_station_is_answered(sds: Path, tmp_path: Path) -> None:
@@ -474,9 +487,10 @@ def test_damage_in_a_file_is_named_and_the_day_is_taken(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_days_of_stations_survive_kills_of_the_command(sds: Path, tmp_path: Path) -> None:
-    whole, store = tmp_path / "whole", tmp_path / "store"
-    assert huddle(f"sds://{sds}", "--store", whole, *DAYS).exit_code == 0
+def test_days_of_stations_survive_kills_of_the_command(
+    sds: Path, whole: tuple[Path, Any], tmp_path: Path
+) -> None:
+    store = tmp_path / "store"
     command = [*python_command("tui"), "archive", f"sds://{sds}", "--store", str(store), *DAYS]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     with subprocess.Popen([*command, "--jobs", "2"], **quiet) as process:  # type: ignore[call-overload]
@@ -486,4 +500,4 @@ def test_days_of_stations_survive_kills_of_the_command(sds: Path, tmp_path: Path
     assert result.exit_code == 0, result.output
     assert "0 days to take" not in result.stderr
     for name in ("XX.ABC", "XX.DEF"):
-        assert_same(Store.open(store / name), Store.open(whole / name))  # type: ignore[arg-type]  # there are
+        assert_same(Store.open(store / name), Store.open(whole[0] / name))  # type: ignore[arg-type]  # there are

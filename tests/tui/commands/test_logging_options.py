@@ -80,7 +80,7 @@ def test_on_a_terminal_log_lines_stay_whole_beside_the_progress_bar(
     environment = os.environ | {"TERM": "xterm-256color", "COLUMNS": "60"}
     try:
         with subprocess.Popen(
-            run(bench, tmp_path, "1min"),  # simulated time runs fast
+            run(bench, tmp_path, "20s"),  # simulated time runs fast
             stdout=subprocess.DEVNULL,
             stderr=theirs,
             env=environment,

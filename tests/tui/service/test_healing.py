@@ -20,7 +20,7 @@ from daq.protocols.block import HostTime
 from daq.recording.file_format import SensorLayout
 from daq.recording.signing import identity, make_key, problem, signed_by
 from daq.recording.writer import RecordingWriter
-from tests.tui.service.bench_files import START, Place
+from tests.tui.service.bench_files import HOURLY, START, Place
 from tests.tui.service.test_continuations import record
 from tui.commands.main import app
 from tui.service.healing import heal
@@ -279,14 +279,15 @@ async def test_a_service_starts_on_a_damaged_database(tmp_path: Path) -> None:
     assert ("14:00", "done") in place.states()
 
 
-@pytest.mark.long
 @pytest.mark.virtual_time
-async def test_seven_daily_copies_are_kept(tmp_path: Path) -> None:
-    place = Place(tmp_path)
-    await place.serve(10 * 24 * HOUR)
-    names = [path.stem for path in place.store.copies()]
-    assert len(names) == COPIES
-    assert names[0] == "2026-12-01"
+async def test_the_newest_daily_copies_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert COPIES == 7
+    monkeypatch.setattr("tui.service.records.store.COPIES", 2)
+    place = Place(tmp_path, HOURLY.replace("0 * * * *", "0 12 * * *"))
+    await place.serve(4 * 24 * HOUR)
+    assert [path.stem for path in place.store.copies()] == ["2026-11-25", "2026-11-24"]
 
 
 def test_an_unfinished_run_is_taken_up_and_other_recordings_are_left_alone(tmp_path: Path) -> None:

