@@ -111,8 +111,13 @@ PLATFORMS = {
 }
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", PLATFORMS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("aarch64", marks=pytest.mark.long),
+        pytest.param("x86_64 of Apple", marks=pytest.mark.study),
+    ],
+)
 def test_wheels_of_all_that_a_service_needs_are_there(name: str, tmp_path: Path) -> None:
     platforms, extras = PLATFORMS[name]
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]

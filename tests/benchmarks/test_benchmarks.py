@@ -17,10 +17,9 @@ if TYPE_CHECKING:
 
     from benchmarks.row import Row
 
-STUDIES = {"application", "command_start", "reach", "recorder"}
-"""Benchmarks that run whole processes for most of a minute."""
-LONG = {"estimate_file", "following"}
-LONG |= {"gaps", "likelihood", "resampler", "signal", "spectra"}
+STUDIES = {"application", "command_start", "estimate_file", "following", "reach", "recorder"}
+"""Benchmarks that run whole processes, for most of a minute."""
+LONG = {"gaps", "likelihood", "resampler", "signal", "spectra"}
 """Those that take half a second and more."""
 NAMES = sorted(
     {module.name for module in pkgutil.iter_modules(benchmarks.__path__) if not module.ispkg}

@@ -22,9 +22,17 @@ from tui.commands.main import app
 if TYPE_CHECKING:
     from pathlib import Path
 
+LATENCIES = pytest.mark.parametrize(
+    "latency",
+    [
+        pytest.param(Latency("batching", 16e-3), marks=pytest.mark.long),
+        pytest.param(Latency(), marks=pytest.mark.study),
+    ],
+    ids=lambda x: x.kind,
+)
 
-@pytest.mark.long
-@pytest.mark.parametrize("latency", [Latency(), Latency("batching", 16e-3)], ids=lambda x: x.kind)
+
+@LATENCIES
 def test_refined_clocks_give_what_true_clocks_give(tmp_path: Path, latency: Latency) -> None:
     rows = {
         row.clocks: row for row in study(tmp_path, snr=1e4, duration=120.0, latency=latency, seed=3)
@@ -85,8 +93,7 @@ def test_what_is_left_is_stated_with_its_effect_on_the_noise(tmp_path: Path) -> 
     assert stated.noise_bias[at - 20 : at + 20, 4].mean() == pytest.approx(expected, rel=0.4)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("latency", [Latency(), Latency("batching", 16e-3)], ids=lambda x: x.kind)
+@LATENCIES
 def test_half_a_minute_is_stated_by_its_samples_not_by_its_arrivals(
     tmp_path: Path, latency: Latency
 ) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -84,7 +83,11 @@ WARMING = Oscillator(15.0, 30.0, 180.0)
 
 @pytest.mark.parametrize(
     ("snr", "polled"),
-    [(1e2, True), *(pytest.param(*each, marks=LONG) for each in ((1e4, False), (1e6, True)))],
+    [
+        (1e2, True),
+        pytest.param(1e4, False, marks=LONG),
+        pytest.param(1e6, True, marks=pytest.mark.study),
+    ],
 )
 def test_the_residual_of_a_rate_that_moves_with_the_temperature_is_true(
     tmp_path: Path, snr: float, *, polled: bool
@@ -132,8 +135,8 @@ def test_samples_lost_all_the_time_are_not_taken_for_a_fast_clock(tmp_path: Path
         pytest.param({"slips": {2: [(LATER, -1)]}}, {2: -1}, id="one counted twice", marks=LONG),
         pytest.param({"slips": {1: [(LATER, 100)]}}, {1: 100}, id="a block", marks=LONG),
         pytest.param({"slips": {1: [(20.0, 100)]}}, {1: 100}, id="a block at first", marks=LONG),
-        pytest.param({"leaps": {1: [(LATER, 37)]}}, {1: -37}, id="a gap that is none"),
-        pytest.param({"slips": {0: [(LATER, 2)]}}, {0: 2}, id="in the reference"),
+        pytest.param({"leaps": {1: [(LATER, 37)]}}, {1: -37}, id="a gap that is none", marks=LONG),
+        pytest.param({"slips": {0: [(LATER, 2)]}}, {0: 2}, id="in the reference", marks=LONG),
         pytest.param({"slips": {1: [(LATER, 1)]}, "polled": True}, {1: 1}, id="polled", marks=LONG),
         pytest.param(
             {"slips": {1: [(LATER, 1)]}, "snr": 3.0}, {1: 1}, id="weak motion", marks=LONG
@@ -207,10 +210,8 @@ def test_between_two_sensors_arrivals_say_which_lost_samples(tmp_path: Path) -> 
     [
         ("hum", False),
         pytest.param("coloured", True, marks=LONG),
-        *(
-            pytest.param(motion, polled, marks=LONG)
-            for motion, polled in itertools.product(("white", "red"), (False, True))
-        ),
+        pytest.param("white", False, marks=LONG),
+        pytest.param("red", True, marks=LONG),
     ],
 )
 def test_no_slip_is_found_in_a_healthy_recording(
@@ -241,8 +242,8 @@ def test_a_rate_that_follows_the_temperature_is_followed(
     assert_right(*errors(snapshot, scene))
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("seed", [1, 2])
+@LONG
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.study)])
 def test_sensors_that_all_restart_are_aligned_or_left_out(tmp_path: Path, seed: int) -> None:
     """Where restarts of several leave an epoch without a delay, arrivals hardly know it."""
     restarts = dict.fromkeys(range(3), (20.0, 40.0, 1.5))

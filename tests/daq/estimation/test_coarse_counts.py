@@ -44,7 +44,10 @@ def _levels(
     )
 
 
-@pytest.mark.parametrize(("n_sensors", "n_channels"), [(3, 1), (3, 3), (5, 1)])
+@pytest.mark.parametrize(
+    ("n_sensors", "n_channels"),
+    [(3, 1), *(pytest.param(*each, marks=pytest.mark.long) for each in ((3, 3), (5, 1)))],
+)
 def test_noise_that_is_rounded_alike_is_within_its_interval(
     n_sensors: int, n_channels: int
 ) -> None:

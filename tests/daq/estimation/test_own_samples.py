@@ -144,14 +144,14 @@ def test_the_noise_is_that_from_the_interpolated_grid(
 
 
 @pytest.mark.parametrize(
-    ("wander", "few"),
+    ("wander", "few", "fewest"),
     [
-        (0.0, True),
-        pytest.param(5e-6, False, marks=pytest.mark.long),
-        pytest.param(1e-4, False, marks=pytest.mark.long),
+        (0.0, True, 80),
+        pytest.param(0.0, True, 20, marks=pytest.mark.long),
+        pytest.param(5e-6, False, 20, marks=pytest.mark.long),
+        pytest.param(1e-4, False, 80, marks=pytest.mark.long),
     ],
 )
-@pytest.mark.parametrize("fewest", [80, pytest.param(20, marks=pytest.mark.long)])
 def test_delays_are_measured_in_few_segments_only_of_clocks_that_are_straight(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, wander: float, few: bool, fewest: int
 ) -> None:

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from daq.clocks.aligned_recording import AlignedRecording
     from estimator.spectra.welch import WelchSettings
 
-LONG = pytest.mark.long
+LONG, STUDY = pytest.mark.long, pytest.mark.study
 SETTINGS = Settings(segment=2.0, methods=("three-sensor",))
 RATE, SECONDS, NOISE = 50.0, 480.0, 1e-6  # unit²/Hz
 PPM = (0.0, 1.0, -2.0)
@@ -294,7 +294,7 @@ def test_single_delays_of_a_part_are_not_a_drift() -> None:
     assert drift(at, late, std) == 0
 
 
-@pytest.mark.parametrize("seed", [200, *(pytest.param(seed, marks=LONG) for seed in (203, 206))])
+@pytest.mark.parametrize("seed", [200, *(pytest.param(n, marks=STUDY) for n in (203, 206))])
 def test_exact_times_of_sensors_in_weak_motion_do_not_drift(tmp_path: Path, seed: int) -> None:
     scenario = {
         "seed": seed,
@@ -371,8 +371,8 @@ def test_steps_of_any_size_are_looked_at_closely(
     [
         (3.0, True),
         pytest.param(40.0, True, marks=LONG),
-        (-150.0, False),
-        pytest.param(400.0, False, marks=LONG),
+        pytest.param(-150.0, False, marks=LONG),
+        pytest.param(400.0, False, marks=pytest.mark.study),
     ],
 )
 def test_a_step_in_the_middle_is_not_taken_for_noise(
