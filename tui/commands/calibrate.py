@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
+    from tui.page.table import Table
+
 _GAP = 2
 """Characters between columns."""
 
@@ -62,7 +64,7 @@ def calibrate(
         angle_table,
         budget_table,
         matrix_table,
-        noise_rows,
+        noise_table,
         remarks,
         sensitivity_table,
         title,
@@ -82,7 +84,7 @@ def calibrate(
     sensitivities, noise = found.whole_band("sensitivity"), found.whole_band("noise")
     _show(screen, "Budget of the sensitivities, relative", budget_table(sensitivities))
     if noise:
-        _show(screen, "Noise, by the calibrated sensitivities", noise_rows(found, snapshot.unit))
+        _show(screen, "Noise, by the calibrated sensitivities", noise_table(found, snapshot.unit))
         _show(screen, "Budget of the noise PSD, relative", budget_table(noise))
     for line in (LEGEND, *remarks(found, snapshot)):
         screen.print(line)
@@ -93,28 +95,21 @@ def calibrate(
     hint(f"To sign: huddle report {files[0]}")
 
 
-def _show(
-    screen: Console, heading: str, content: tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]
-) -> None:
+def _show(screen: Console, heading: str, whole: Table) -> None:
     """Print a table; columns that do not fit beside the others follow below it."""
     from rich.cells import cell_len
 
-    from tui.page.table import Table
     from tui.page.terminal import terminal_table
 
-    header, rows = content
-    if not rows:
+    if not whole.rows:
         return
     if heading:
         screen.print(heading, style="bold")
-    widths = [max(map(cell_len, column)) + _GAP for column in zip(header, *rows, strict=True)]
-    for columns in side_by_side(widths, screen.width, n_keys=2 if header[1] == "channel" else 1):
-        cells = ([row[n] for n in columns] for row in rows)
-        right = {*header} - {"sensor", "channel"}
-        table = terminal_table(
-            Table.of([header[n] for n in columns], cells, right=right), wraps=False
-        )
-        needed = sum(widths[number] for number in columns)
+    columns = zip(whole.header, *whole.rows, strict=True)
+    widths = [max(map(cell_len, column)) + _GAP for column in columns]
+    for part in side_by_side(widths, screen.width, n_keys=len(whole.left)):
+        table = terminal_table(whole.with_columns(part), wraps=False)
+        needed = sum(widths[number] for number in part)
         screen.print(table, width=max(needed, screen.width), crop=False)
 
 

@@ -268,16 +268,15 @@ def show_result(
 def _show_parameters(screen: Console, found: Sequence[ChannelNoise], unit: str) -> None:
     """Print the noise parameters as tables."""
     from tui.output.noise_parameters import allan_table, notes, sheet_table, term_table
-    from tui.page.table import Table
     from tui.page.terminal import terminal_table
 
-    for title, (header, rows) in (
+    for title, table in (
         (f"Noise terms at 1 Hz, dB re 1 ({unit})²/Hz, with standard errors", term_table(found)),
         (f"Allan deviation of the self-noise in {unit}, with 95 % intervals", allan_table(found)),
         ("Data sheet", sheet_table(found)),
     ):
-        if rows:
+        if table.rows:
             screen.print(title, style="bold")
-            screen.print(terminal_table(Table(header, tuple(rows)), wraps=False))
+            screen.print(terminal_table(table, wraps=False))
     for line in notes(found):
         screen.print(line)

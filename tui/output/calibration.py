@@ -10,15 +10,15 @@ from daq.clocks.clock_model import RelativeTime
 from daq.results.clock_effect import relative_time
 from daq.results.uncertainty_budget import Budget, Component, student_quantile
 from estimator.wording import signed, span
+from tui.page.table import Table
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from daq.estimation.snapshot import Snapshot
     from daq.results.calibration import Calibration
     from estimator.responses.derived_quantities import Value
 
-Rows = tuple[tuple[str, ...], ...]
 _LEAST_SHOWN = 1e-5
 _VARIES = 1.5
 """Scatter over frequencies, over what errors explain, from which on a remark says so."""
@@ -111,7 +111,11 @@ def title(found: Calibration, snapshot: Snapshot) -> str:
     return f"Calibration against {name} ({basis}), {span(first.low, first.high)}"
 
 
-def sensitivity_table(found: Calibration, snapshot: Snapshot) -> tuple[tuple[str, ...], Rows]:
+def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+    return Table.of(header, rows, right={*header} - {"sensor", "channel"})
+
+
+def sensitivity_table(found: Calibration, snapshot: Snapshot) -> Table:
     """Return sensitivities, delays and skews of all channels."""
     k = _k(found)
     header = ("sensor", "channel", "sensitivity", "k", "delay (µs)", "skew (µs)", "angle (°)")
@@ -135,10 +139,10 @@ def sensitivity_table(found: Calibration, snapshot: Snapshot) -> tuple[tuple[str
                     ),
                 )
             )
-    return header, tuple(rows)
+    return _table(header, rows)
 
 
-def angle_table(found: Calibration, snapshot: Snapshot) -> tuple[tuple[str, ...], Rows]:
+def angle_table(found: Calibration, snapshot: Snapshot) -> Table:
     """Return rotations and deviations from right angles."""
     k = _k(found)
     reference = channels_of(snapshot, found.reference)
@@ -158,10 +162,10 @@ def angle_table(found: Calibration, snapshot: Snapshot) -> tuple[tuple[str, ...]
         )
         for each in found.sensors
     ]
-    return header, tuple(rows) if most or pairs else ()
+    return _table(header, rows if most or pairs else ())
 
 
-def matrix_table(found: Calibration, snapshot: Snapshot) -> tuple[tuple[str, ...], Rows]:
+def matrix_table(found: Calibration, snapshot: Snapshot) -> Table:
     """Return the relative response of every channel, cross-axis included."""
     k = _k(found)
     reference = channels_of(snapshot, found.reference)
@@ -180,10 +184,10 @@ def matrix_table(found: Calibration, snapshot: Snapshot) -> tuple[tuple[str, ...
         for each in found.sensors
         for row, channel in enumerate(channels_of(snapshot, each.sensor))
     ]
-    return ("sensor", "channel", *(f"to {name}.{each}" for each in reference)), tuple(rows)
+    return _table(("sensor", "channel", *(f"to {name}.{each}" for each in reference)), rows)
 
 
-def budget_table(budgets: Sequence[Budget]) -> tuple[tuple[str, ...], Rows]:
+def budget_table(budgets: Sequence[Budget]) -> Table:
     """Return budgets as a table: a row for each channel, a column for each source."""
     sources = list(dict.fromkeys(each.source for budget in budgets for each in budget.components))
     types = {each.source: each.kind for budget in budgets for each in budget.components}
@@ -211,10 +215,10 @@ def budget_table(budgets: Sequence[Budget]) -> tuple[tuple[str, ...], Rows]:
                 share(budget.k * budget.combined),
             )
         )
-    return header, tuple(rows)
+    return _table(header, rows)
 
 
-def noise_rows(found: Calibration, unit: str) -> tuple[tuple[str, ...], Rows]:
+def noise_table(found: Calibration, unit: str) -> Table:
     """Return the noise of every channel with its expanded uncertainty."""
     rows = []
     for each in found.whole_band("noise"):
@@ -228,7 +232,8 @@ def noise_rows(found: Calibration, unit: str) -> tuple[tuple[str, ...], Rows]:
                 f"+{decibels(high) - decibels(each.value):.2f} {down}",
             )
         )
-    return ("sensor", "channel", f"noise (dB re 1 ({unit})²/Hz)", "expanded (dB)"), tuple(rows)
+    header = ("sensor", "channel", f"noise (dB re 1 ({unit})²/Hz)", "expanded (dB)")
+    return _table(header, rows)
 
 
 def remarks(found: Calibration, snapshot: Snapshot) -> list[str]:

@@ -16,6 +16,7 @@ from daq.results.noise_parameters import (
 )
 from estimator.noise_parameters.fit import Term
 from estimator.wording import percent, span
+from tui.page.table import Table
 from tui.wording.formatting import level, scientific
 
 if TYPE_CHECKING:
@@ -49,8 +50,8 @@ MAX_TIMES = 5
 """Averaging times in the table of Allan deviations: what a terminal is wide."""
 
 
-def term_table(found: Sequence[ChannelNoise]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Return header and rows: each term's PSD at 1 Hz in dB, with its standard error."""
+def term_table(found: Sequence[ChannelNoise]) -> Table:
+    """Return each term's PSD at 1 Hz in dB, with its standard error."""
     header = ("channel", *COLUMNS.values(), "quantisation")
     rows = []
     for each in found:
@@ -60,7 +61,7 @@ def term_table(found: Sequence[ChannelNoise]) -> tuple[tuple[str, ...], list[tup
             cells = [_term(float(value), float(error)) for value, error in pairs]
         quantisation = "–" if math.isnan(each.quantisation_psd) else level(each.quantisation_psd)
         rows.append((each.label.name, *cells, quantisation))
-    return header, rows
+    return Table.of(header, rows, right=header[1:])
 
 
 def _term(value: float, error: float) -> str:
@@ -69,11 +70,11 @@ def _term(value: float, error: float) -> str:
     return f"< {level(max(value, 0.0) + SIGNIFICANT * error)}"
 
 
-def allan_table(found: Sequence[ChannelNoise]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Return header and rows: Allan deviation and its 95 % interval, by averaging time."""
+def allan_table(found: Sequence[ChannelNoise]) -> Table:
+    """Return the Allan deviation and its 95 % interval, by averaging time."""
     known = [each for each in found if each.allan is not None and len(each.allan.tau)]
     if not known or known[0].allan is None:
-        return (), []
+        return Table((), ())
     tau = known[0].allan.tau
     shown = tau[np.unique(np.linspace(0, len(tau) - 1, min(MAX_TIMES, len(tau))).astype(int))]
     rows = []
@@ -84,7 +85,8 @@ def allan_table(found: Sequence[ChannelNoise]) -> tuple[tuple[str, ...], list[tu
             for time in shown
         ]
         rows.append((each.label.name, *cells))
-    return ("channel", *(f"{time:g} s" for time in shown)), rows
+    times = [f"{time:g} s" for time in shown]
+    return Table.of(("channel", *times), rows, right=times)
 
 
 def _allan(found: AllanDeviation, at: int) -> str:
@@ -94,10 +96,10 @@ def _allan(found: AllanDeviation, at: int) -> str:
     return f"{scientific(value)} ±{percent((high - low) / 2 / value)}"
 
 
-def sheet_table(found: Sequence[ChannelNoise]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Return header and rows: every value of a data sheet beside the measured one."""
+def sheet_table(found: Sequence[ChannelNoise]) -> Table:
+    """Return every value of a data sheet beside the measured one."""
     header = ("channel", "quantity", "at", "data sheet", "measured", "95 % interval", "")
-    rows: list[tuple[str, ...]] = [
+    rows = [
         (
             each.label.name,
             f"{QUANTITIES[one.quantity]}, {one.unit}",
@@ -110,7 +112,7 @@ def sheet_table(found: Sequence[ChannelNoise]) -> tuple[tuple[str, ...], list[tu
         for each in found
         for one in each.comparisons
     ]
-    return header, rows
+    return Table.of(header, rows, right=header[2:6])
 
 
 def _where(one: Comparison) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from html import escape
 
-from tui.page.table import Cell, Table, Tone
+from tui.page.table import Table, tone_of
 
 _CLASSES = {"quiet": "muted", "plain": ""}
 
@@ -14,19 +14,18 @@ def html_table(table: Table, *, caption: str = "") -> str:
     names = [_cell("th", n, name, table, scope="col") for n, name in enumerate(table.header)]
     rows = [
         "".join(
-            _cell("td" if n else "th", n, cell, table, scope="" if n else "row", row=row)
+            _cell("td" if n else "th", n, cell, table, scope="" if n else "row")
             for n, cell in enumerate(cells)
         )
-        for row, cells in enumerate(table.rows)
+        for cells in table.rows
     ]
     body = "".join(f"<tr>{row}</tr>" for row in rows)
     above = f"<caption>{escape(caption)}</caption>" if caption else ""
     return f"<table>{above}<thead><tr>{''.join(names)}</tr></thead><tbody>{body}</tbody></table>"
 
 
-def _cell(tag: str, column: int, text: str, table: Table, *, scope: str, row: int = -1) -> str:
-    named = class_of(text, table.tones.get((row, column), "plain"))
-    classes = f"{named} {'number' * (column not in table.left)}".strip()
+def _cell(tag: str, column: int, text: str, table: Table, *, scope: str) -> str:
+    classes = f"{class_of(text)} {'number' * (column not in table.left)}".strip()
     about = f' class="{classes}"' if classes else ""
     about += f' scope="{scope}"' if scope else ""
     title = table.header[column] if tag == "td" else ""
@@ -34,7 +33,6 @@ def _cell(tag: str, column: int, text: str, table: Table, *, scope: str, row: in
     return f"<{tag}{about}>{escape(text)}</{tag}>"
 
 
-def class_of(text: str, tone: Tone = "plain") -> str:
-    """Return the class of a text by its tone; a text that is no cell has ``tone``."""
-    meant = text.tone if isinstance(text, Cell) else tone
-    return _CLASSES.get(meant, meant)
+def class_of(text: str) -> str:
+    """Return the class of a text by its tone."""
+    return _CLASSES.get(tone_of(text), tone_of(text))

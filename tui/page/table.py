@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, Self
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Sequence
 
 Tone = Literal["plain", "good", "bad", "doubtful", "quiet"]
 
@@ -47,6 +47,11 @@ class Cell(str):
         return made
 
 
+def tone_of(text: str) -> Tone:
+    """Return what a text means; nothing, if it is no cell."""
+    return text.tone if isinstance(text, Cell) else "plain"
+
+
 @dataclass(frozen=True, slots=True)
 class Table:
     """Rows under a header.
@@ -59,15 +64,12 @@ class Table:
         As wide as the header, or shorter. Cells that mean something are `Cell`.
     left : frozenset of int
         Columns of words, flush left; the others are numbers, flush right.
-    tones : mapping of (row, column) to Tone
-        Of cells that are plain texts.
     title : str
     """
 
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     left: frozenset[int] = frozenset({0})
-    tones: Mapping[tuple[int, int], Tone] = field(default_factory=dict)
     title: str = ""
 
     @classmethod
@@ -83,3 +85,9 @@ class Table:
         left = frozenset(n for n, name in enumerate(header) if name not in right)
         cells = (tuple(each if isinstance(each, str) else str(each) for each in r) for r in rows)
         return cls(tuple(header), tuple(cells), left, title=title)
+
+    def with_columns(self, numbers: Sequence[int]) -> Self:
+        """Return a table of some of the columns."""
+        header, *rows = (tuple(row[n] for n in numbers) for row in (self.header, *self.rows))
+        left = frozenset(at for at, n in enumerate(numbers) if n in self.left)
+        return replace(self, header=header, rows=tuple(rows), left=left)

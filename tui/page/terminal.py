@@ -62,10 +62,8 @@ def terminal_table(
             no_wrap=not wraps and name not in folded,
             overflow="fold" if wraps or name in folded else "ellipsis",
         )
-    for row, cells in enumerate(table.rows):
-        made.add_row(
-            *(styled(cell, table.tones.get((row, n), "plain")) for n, cell in enumerate(cells))
-        )
+    for cells in table.rows:
+        made.add_row(*map(styled, cells))
     return made
 
 
@@ -74,10 +72,10 @@ def screen_table(table: Table, *, gap: int = 2, folded: Collection[str] = ()) ->
     return terminal_table(table, header_style=SCREEN_HEADER, gap=gap, wraps=False, folded=folded)
 
 
-def styled(cell: str, tone: Tone = "plain") -> Text:
+def styled(cell: str) -> Text:
     """Return a cell in the colours of its meaning."""
     if not isinstance(cell, Cell):
-        return Text(cell, STYLES[tone])
+        return Text(cell)
     made = Text(cell, f"{'bold ' * cell.strong}{cell.colour or STYLES[cell.tone]}".strip())
     if cell.chosen:
         made.stylize("reverse", 2 * bool(cell.colour))

@@ -41,7 +41,7 @@ from tui.report.evidence import (
 )
 from tui.report.noise import limits_section, noise_section, verdict
 from tui.report.parameters import parameters_section
-from tui.report.parts import Facts, Paragraph, Part, Report, Section, Signatures, Table, Tone
+from tui.report.parts import Facts, Paragraph, Part, Report, Section, Signatures, Table
 from tui.report.uncertainty import uncertainty_section
 from tui.wording.formatting import is_known, local_time, utc_time
 
@@ -75,11 +75,7 @@ def calibration_section(result: Result) -> Section | None:
     parts: list[Part] = [Paragraph(f"{title(found, snapshot)}. {remarks(found, snapshot)[0]}")]
     if found.certificates:
         parts.append(_certificates(found, snapshot))
-    parts += [
-        Table(header, rows, left=frozenset({0, 1} if header[1] == "channel" else {0}), title=name)
-        for name, (header, rows) in tables
-        if rows
-    ]
+    parts += [replace(table, title=name) for name, table in tables if table.rows]
     parts += [Paragraph(line, "quiet") for line in (LEGEND, *remarks(found, snapshot)[1:])]
     return Section("Calibration", tuple(parts))
 
@@ -213,16 +209,14 @@ def _grouped(table: Table, sensors: Mapping[str, tuple[str, str]]) -> Table:
     if len(order) > len(set(order)):  # sorted by something else
         return table
     rows: list[tuple[str, ...]] = []
-    tones: dict[tuple[int, int], Tone] = {}
     before = ""
-    for number, (name, *cells) in enumerate(table.rows):
+    for name, *cells in table.rows:
         sensor, channel = sensors.get(name, ("", name))
         if sensor != before:
             rows.append((sensor, *[""] * len(cells)))
         before = sensor
-        tones |= {(len(rows), c): tone for (row, c), tone in table.tones.items() if row == number}
         rows.append((channel, *cells))
-    return replace(table, rows=tuple(rows), tones=tones)
+    return replace(table, rows=tuple(rows))
 
 
 def _test_section(found: Sequence[Source]) -> Section:

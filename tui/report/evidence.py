@@ -19,6 +19,7 @@ from estimator.checks.advice_on_sensors import ANY_AXES
 from estimator.checks.advice_on_signals import NoSharedMotion
 from estimator.likelihood.goodness_of_fit import rejected_below
 from estimator.wording import several, span
+from tui.page.table import Cell
 from tui.report.figures.drift import drift_plot
 from tui.report.figures.model_test import model_test_plot
 from tui.report.figures.standing import standing_plots
@@ -97,11 +98,9 @@ def model_test_section(result: Result) -> Section:
             plot,
         ]
     rows: list[tuple[str, ...]] = []
-    tones: dict[tuple[int, int], Tone] = {}
-    for number, band in enumerate(tested):
+    for band in tested:
         snr = band.snr[np.isfinite(band.snr)]
-        if fails(band):
-            tones[number, 6] = "bad" if _ratio(band) > 2 else "doubtful"
+        failed = Cell("fails", "bad" if _ratio(band) > 2 else "doubtful")
         rows.append(
             (
                 f"{band.low:.3g}–{band.high:.3g}",
@@ -110,7 +109,7 @@ def model_test_section(result: Result) -> Section:
                 plain_number(band.dimension, ".0f"),
                 f"{_snr(snr.min())} … {_snr(snr.max())}" if snr.size else NOTHING,
                 plain_number(_ratio(band), ".3f"),
-                "fails" if fails(band) else "holds",
+                failed if fails(band) else "holds",
                 probability(band.test.p_value),
             )
         )
@@ -119,7 +118,7 @@ def model_test_section(result: Result) -> Section:
         "statistic / expected", "test", "p",
     )  # fmt: skip
     parts += [
-        Table(header, tuple(rows), left=frozenset({6}), tones=tones),
+        Table(header, tuple(rows), left=frozenset({6})),
         Paragraph(
             f"A band fails where p is below {rejected:.2g}. One sound test in a hundred has a band "
             "that fails.",
@@ -240,7 +239,7 @@ def events_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
         (
             _when(each.utc_ns),
             each.sensor or "all",
-            each.kind,
+            each.kind if each.kind in _USUAL else Cell(each.kind, "doubtful"),
             each.text
             + (
                 f" ({count} of this kind, until {_when(last, after=each.utc_ns)})"
@@ -252,12 +251,7 @@ def events_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
     ]
     left = len(rows) - LISTED
     header = ("when (UTC)", "sensor", "what", "in words")
-    tones: dict[tuple[int, int], Tone] = {
-        (number, 2): "doubtful"
-        for number, (each, _, _) in enumerate(together[:LISTED])
-        if each.kind not in _USUAL
-    }
-    parts.append(Table(header, tuple(rows[:LISTED]), left=frozenset(range(4)), tones=tones))
+    parts.append(Table(header, tuple(rows[:LISTED]), left=frozenset(range(4))))
     if left > 0:
         parts.append(Paragraph(f"… and {several(left, 'further line')}: see the file.", "quiet"))
     return Section("What happened", tuple(parts))

@@ -14,8 +14,9 @@ from daq.results.vocabulary import FLAG_WORDS, PARTNER_WORDS
 from estimator.decision.verdict import Verdict
 from estimator.self_noise.result import Flag
 from estimator.wording import span
+from tui.page.table import Cell
 from tui.report.figures.curves import noise_plots
-from tui.report.parts import Paragraph, Part, Section, Table, Tone
+from tui.report.parts import Paragraph, Part, Section, Table
 from tui.wording.formatting import (
     NOT_KNOWN,
     NOTHING,
@@ -24,7 +25,7 @@ from tui.wording.formatting import (
     plain_number,
     scientific,
 )
-from tui.wording.verdict_text import WORDS, Decision, margin
+from tui.wording.verdict_text import TONES, WORDS, Decision, margin
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -42,12 +43,7 @@ STATEMENTS: Mapping[Statement, str] = {
 }
 MAX_BANDS = 7
 """Columns of the table of noise by octaves that a page is wide."""
-_TONES: Mapping[Verdict, Tone] = {
-    Verdict.FAIL: "bad",
-    Verdict.NOT_DECIDED: "doubtful",
-    Verdict.PASS: "good",
-}
-"""Worst first."""
+WORST_FIRST = (Verdict.FAIL, Verdict.NOT_DECIDED, Verdict.PASS)
 
 
 def verdict(result: Result) -> Paragraph:
@@ -55,7 +51,7 @@ def verdict(result: Result) -> Paragraph:
     decision = Decision.of(result)
     if decision is None:
         return Paragraph("No verdict: the bench file has no limits.", "quiet")
-    return Paragraph(" ".join([str(decision), *decision.remarks]), _TONES[decision.state])
+    return Paragraph(" ".join([str(decision), *decision.remarks]), TONES[decision.state])
 
 
 def limits_section(
@@ -68,16 +64,14 @@ def limits_section(
     if found is None:
         return None
     rows: list[tuple[str, ...]] = []
-    tones: dict[tuple[int, int], Tone] = {}
     # without a certificate of any sensitivity nothing is stated, and no rule matters
     is_stated = any(each.is_traceable for each in statements)
     by_rule = {(each.limit, each.sensor, each.channel): each for each in statements}
     order = list(dict.fromkeys(each.limit for each in found.limits))
-    ranks = list(_TONES)
-    for number, each in enumerate(
-        sorted(found.limits, key=lambda e: (order.index(e.limit), ranks.index(e.verdict)))
+    for each in sorted(
+        found.limits, key=lambda e: (order.index(e.limit), WORST_FIRST.index(e.verdict))
     ):
-        tones[number, 6] = _TONES[each.verdict]
+        words = WORDS[each.verdict] if each.known else "no estimate"
         rows.append(
             (
                 each.name,
@@ -86,7 +80,7 @@ def limits_section(
                 level(each.noise_psd, 1),
                 level(each.limit_psd, 1),
                 margin(each),
-                WORDS[each.verdict] if each.known else "no estimate",
+                Cell(words, TONES[each.verdict]),
             )
         )
         if by_rule:
@@ -105,9 +99,7 @@ def limits_section(
         "bands together, with all that widens them."
         + ("" if is_stated else " Risk: probability of noise above the limit in any band.")
     )
-    shown = Table(
-        header, tuple(rows), left=frozenset({0, 1, 6, *([7] if is_stated else [])}), tones=tones
-    )
+    shown = Table(header, tuple(rows), left=frozenset({0, 1, 6, *([7] if is_stated else [])}))
     parts: list[Part] = [shown, Paragraph(note, "quiet")]
     if by_rule and table is not None:
         parts[1:1] = [

@@ -19,6 +19,7 @@ import matplotlib as mpl
 from fpdf import FPDF, FontFace, TextStyle
 from fpdf.enums import TableBordersLayout, WrapMode, XPos, YPos
 
+from tui.page.table import Cell, tone_of
 from tui.report.figures import drawing, on_paper
 from tui.report.figures.curves import WIDTH as INNER
 from tui.report.parts import Facts, Items, Paragraph, Part, Plot, Report, Signatures, Table, Tone
@@ -390,10 +391,10 @@ class _Paper(FPDF):
             wrapmode=WrapMode.WORD,
         ) as table:
             table.row(part.header, v_align="BOTTOM")
-            for number, cells in enumerate(part.rows):
+            for cells in part.rows:
                 row = table.row()
-                for column, cell in enumerate(cells):
-                    tone = part.tones.get((number, column), "plain")
+                for cell in cells:
+                    tone = tone_of(cell)
                     style = FontFace(
                         emphasis=None if tone == "plain" else "BOLD", color=_COLOURS[tone]
                     )
@@ -507,8 +508,9 @@ class _Paper(FPDF):
         widths: list[float] = []
         for column, word in enumerate(table.header):
             head = max(self._width(part, bold=True) for part in word.split() or [""])
-            bold = any(place == column for _, place in table.tones)
-            widths.append(max([head, *(self._width(row[column], bold=bold) for row in table.rows)]))
+            cells = [row[column] for row in table.rows]
+            bold = any(isinstance(cell, Cell) for cell in cells)
+            widths.append(max([head, *(self._width(cell, bold=bold) for cell in cells)]))
         return widths
 
     def _width(self, text: str, *, bold: bool) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +18,7 @@ from tui.output.noise_parameters import (
     term_table,
 )
 from tui.report.figures import drawing
-from tui.report.parts import Items, Paragraph, Part, Plot, Section, Table
+from tui.report.parts import Items, Paragraph, Part, Plot, Section
 from tui.wording.formatting import power_of_ten
 
 if TYPE_CHECKING:
@@ -75,21 +75,19 @@ class _AllanPanel:
 
 def parameters_section(result: Result) -> Section | None:
     """Return noise terms, Allan deviation and data sheet; None where nothing can be fitted."""
-    snapshot = result.snapshot
+    snapshot, unit = result.snapshot, result.snapshot.unit
     found = noise_parameters(result, result.bench)
     if not any(each.parameters is not None for each in found):
         return None
     parts: list[Part] = []
     tables = (
-        (f"Noise terms at 1 Hz, dB re 1 ({snapshot.unit})²/Hz, with standard errors", term_table),
-        (f"Allan deviation in {snapshot.unit}, with 95 % intervals", allan_table),
-        ("Data sheet", sheet_table),
+        (f"Noise terms at 1 Hz, dB re 1 ({unit})²/Hz, with standard errors", term_table(found)),
+        (f"Allan deviation in {unit}, with 95 % intervals", allan_table(found)),
+        ("Data sheet", sheet_table(found)),
     )
     for title, table in tables:
-        header, rows = table(found)
-        if rows:
-            left = frozenset({0, 1, 6}) if table is sheet_table else frozenset({0})
-            parts.append(Table(header, tuple(rows), left=left, title=title))
+        if table.rows:
+            parts.append(replace(table, title=title))
     lines = [
         *notes(found),
         *quantisation_notes(snapshot.channels, quantisation_shares(result)),

@@ -14,6 +14,7 @@ from markupsafe import Markup, escape
 
 from daq.errors import HuddleError
 from daq.whole_file import write_whole
+from tui.page.table import tone_of
 from tui.report.contents import report_of
 from tui.report.figures import drawing
 from tui.report.figures.curves import WIDTH
@@ -73,6 +74,7 @@ def page(report: Report) -> str:
         footer=_css_string(
             f"{report.number}   {report.subtitle}" if report.number else report.subtitle
         ),
+        tone_of=tone_of,
         kind_of=lambda part: type(part).__name__,
         picture_of=partial(_picture, count(1)),
     )

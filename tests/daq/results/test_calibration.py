@@ -291,7 +291,8 @@ def test_sensors_of_one_channel_have_no_angle() -> None:
     settings = Settings(segment=2.0)
     snapshot = estimate([recording_of_arrays(samples, 50.0, unit="m/s²")], settings)
     found = calibrate(Result(snapshot, settings), None)
-    header, rows = sensitivity_table(found, snapshot)
+    table = sensitivity_table(found, snapshot)
+    header, rows = table.header, table.rows
     assert [row[header.index("angle (°)")] for row in rows] == ["–", "–"]
     assert any("cosines of their tilts" in line for line in remarks(found, snapshot))
 
@@ -301,7 +302,8 @@ def test_an_ambiguous_delay_is_said(snapshot: Snapshot) -> None:
     unknown = Value(np.full(3, np.nan), np.full(3, np.nan))
     first = replace(found.sensors[0], delay=unknown, is_ambiguous=True)
     changed = replace(found, sensors=(first, *found.sensors[1:]))
-    header, rows = sensitivity_table(changed, snapshot)
+    table = sensitivity_table(changed, snapshot)
+    header, rows = table.header, table.rows
     assert rows[0][header.index("delay (µs)")] == "?"
     said = [line for line in remarks(changed, snapshot) if "ambiguous" in line]
     assert len(said) == 1

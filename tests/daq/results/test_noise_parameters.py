@@ -62,7 +62,7 @@ def test_white_noise_of_every_channel_is_found() -> None:
         assert abs(each.parameters.value(Term.FLICKER)) < each.parameters.error(Term.FLICKER)
         assert each.comparisons == ()
         assert math.isnan(each.quantisation_share)
-    _, rows = term_table(found)
+    rows = term_table(found).rows
     assert rows[0][0] == "A.X"
     assert rows[0][3].startswith("−119.8")
     assert rows[0][2].startswith("< ")
@@ -110,7 +110,7 @@ def test_values_of_a_data_sheet_are_judged_by_the_interval(factor: float, outcom
     assert (
         noise_parameters(Result(snapshot, SETTINGS), sheet)[3].comparisons == ()
     )  # sensor B has none
-    assert len(sheet_table((first,))[1]) == 4
+    assert len(sheet_table((first,)).rows) == 4
 
 
 def test_a_data_sheet_has_its_own_unit_and_channels() -> None:

@@ -20,6 +20,7 @@ from tests.tui.night_recording import HOSTILE, N_SAMPLES, RATE, record
 from tests.tui.report.written_report import Reported, Words, by_channel, tables, texts_of
 from tui.commands.main import app
 from tui.output.json_document import result_document
+from tui.page.table import Cell, tone_of
 from tui.report.contents import by_sensor, report_of
 from tui.report.evidence import facts_section
 from tui.report.figures.drift import without_line
@@ -207,11 +208,12 @@ def test_the_result_comes_first(reported: Reported) -> None:
 
 def test_long_names_of_sensors_have_rows_of_their_own(reported: Reported) -> None:
     rows = tuple((label.name, "1") for label in reported.snapshot.channels)
-    section = Section("a", (Table(("channel", "x"), rows, tones={(2, 1): "bad"}),))
+    rows = (*rows[:2], (rows[2][0], Cell("1", "bad")), *rows[3:])
+    section = Section("a", (Table(("channel", "x"), rows),))
     (table,) = by_sensor(section, reported.snapshot).parts
     assert isinstance(table, Table)
     assert table.rows[:5] == (("A", ""), ("X", "1"), ("Y", "1"), ("B", ""), ("X", "1"))
-    assert table.tones == {(4, 1): "bad"}
+    assert [tone_of(row[1]) for row in table.rows[:5]] == [*["plain"] * 4, "bad"]
     assert list(by_channel(table)) == [label.name for label in reported.snapshot.channels]
     mixed = Section("a", (Table(("channel", "x"), (rows[0], rows[2], rows[1])),))
     assert by_sensor(mixed, reported.snapshot) == mixed
