@@ -16,10 +16,9 @@ from daq.bench.masks.mask_file import masks_named
 from daq.errors import WrongSettingError
 from daq.results.calibration import CONFIDENCE, Calibration
 from daq.results.calibration import calibrate as calibrated
-from tui.notebook.curve_files import MINISEED, WRITERS, write_curves, write_samples
+from tui.notebook.curve_files import MINISEED, WRITERS, loaded, write_curves, write_samples
 from tui.notebook.estimates import PathLike, estimate
 from tui.notebook.result import Result
-from tui.notebook.stored_curves import loaded
 from tui.output.extras import require
 from tui.output.json_document import provenance
 

@@ -179,7 +179,7 @@ def test_the_report_and_json_say_that_shared_noise_was_not_searched_for(
         facts_section(Result(snapshot, Settings()).facts),
         result_document(snapshot, next(iter(snapshot.results))),
     )
-    for module in ("daq.results.facts.methods", "tui.output.json_diagnostics"):
+    for module in ("daq.results.facts.methods", "tui.output.json_document"):
         monkeypatch.setattr(f"{module}.MAX_CHANNELS", 2)
     words = "Noise that two channels share is not searched for among more than 2 channels"
     assert words in str(facts_section(Result(snapshot, Settings()).facts))
