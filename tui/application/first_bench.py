@@ -72,15 +72,12 @@ class FirstBenchControls(Protocol):
 
     def listed_ports(self) -> Sequence[tuple[str, str]]:
         """Return ports that drivers list, such as CAN buses, and what they are. Blocks."""
-        ...
 
     def network_ports(self, target: str) -> Sequence[str]:
         """Return the ports to search for a port, a host or a network. Blocks."""
-        ...
 
     def find_devices(self, port: str) -> Sequence[DiscoveredDevice]:
         """Return the devices on a port. Blocks."""
-        ...
 
     def read(
         self,
@@ -89,11 +86,9 @@ class FirstBenchControls(Protocol):
         ended: threading.Event,
     ) -> None:
         """Show the sensors of a bench again and again, until `ended` is set. Blocks."""
-        ...
 
     def save(self, text: str) -> None:
         """Write the bench file."""
-        ...
 
 
 class NetworkForm(Form[list[str]]):

@@ -31,23 +31,18 @@ class Clock(Protocol):
 
     def now(self) -> datetime:
         """Return the time, in UTC."""
-        ...
 
     def elapsed(self) -> float:
         """Return seconds of a clock that is never set, and goes on while the computer sleeps."""
-        ...
 
     async def sleep(self, seconds: float, wake: asyncio.Event) -> None:
         """Let seconds pass, or fewer if the event is set."""
-        ...
 
     def is_synchronised(self) -> bool | None:
         """Return whether something keeps the clock right; None if unknown."""
-        ...
 
     def watched(self, on_step: Callable[[], None]) -> contextlib.AbstractContextManager[None]:
         """Call a function of the event loop whenever the clock was set, where the system can."""
-        ...
 
 
 class SystemTime:

@@ -48,23 +48,18 @@ class Recorder(Protocol):
 
     async def ends_within(self, seconds: float) -> bool:
         """Wait this long, or until it has ended; return whether it has."""
-        ...
 
     async def status(self) -> dict[str, Any] | None:
         """Return what it answers to ``status``; None where it does not answer."""
-        ...
 
     async def stop(self) -> None:
         """Let it close its recording, and wait for its end."""
-        ...
 
     def kill(self) -> None:
         """End it at once."""
-        ...
 
     def failure(self) -> str:
         """Return why it failed; empty where it did not."""
-        ...
 
 
 class Steps(Protocol):
@@ -72,27 +67,21 @@ class Steps(Protocol):
 
     def new_part(self, at: datetime) -> str:
         """Take a file name for a new recording."""
-        ...
 
     async def check(self) -> str:
         """Make the check list; return what fails, empty where nothing does."""
-        ...
 
     def start(self, part: str, seconds: float, until: EndCondition) -> Recorder:
         """Start a recorder."""
-        ...
 
     def running(self, part: str) -> Recorder | None:
         """Return the recorder of a recording, if one runs."""
-        ...
 
     async def finish(self, request: Request) -> Outcome:
         """Estimate the recordings of a run."""
-        ...
 
     def release(self, part: str) -> None:
         """Give back what `new_part` took, when a run is over."""
-        ...
 
 
 class ProcessSteps:
