@@ -11,12 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tui.commands.options import (
-    OutOption,
-    examples,
-    with_estimate_options,
-    with_logging,
-)
+from tui.commands.options import OutOption, command, with_estimate_options, with_logging
 from tui.output.extras import load, require
 
 if TYPE_CHECKING:
@@ -27,14 +22,7 @@ if TYPE_CHECKING:
     from daq.formats.sources import Selection
 
 
-@examples(
-    "huddle archive recordings/ --jobs 4 --out figures",
-    "huddle archive recordings/ --stretch day --segment 100s --store slow",
-    "huddle archive day-*.h5 --scheduler tls://10.0.0.1:8786 --store /shared/archive",
-    "huddle archive --store recordings/huddle-archive --band 1:20 --json - --csv days.csv",
-    "huddle archive sds:///data/sds --net XX --response stations.xml --jobs 4 --store archive",
-    first="store stretch jobs out band segment response channels json csv",
-)
+@command(first="store stretch jobs out band segment response channels json csv")
 @with_logging
 @with_estimate_options
 def archive(
@@ -115,6 +103,14 @@ def archive(
     file_overlap : refuse|first|last
         Where files overlap with different samples: refuse the channel of this day, or keep the
         samples of the file that starts first or last.
+
+    Examples
+    --------
+    huddle archive recordings/ --jobs 4 --out figures
+    huddle archive recordings/ --stretch day --segment 100s --store slow
+    huddle archive day-*.h5 --scheduler tls://10.0.0.1:8786 --store /shared/archive
+    huddle archive --store recordings/huddle-archive --band 1:20 --json - --csv days.csv
+    huddle archive sds:///data/sds --net XX --response stations.xml --jobs 4 --store archive
     """
     from daq.archive.plan import STRETCHES
     from daq.archive.sources import are_waveforms, folder_for

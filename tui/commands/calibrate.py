@@ -8,10 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tui.commands.estimate import estimated
-from tui.commands.options import (
-    examples,
-    with_estimate_options,
-)
+from tui.commands.options import command, with_estimate_options
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -24,10 +21,7 @@ _GAP = 2
 """Characters between columns."""
 
 
-@examples(
-    "huddle calibrate night.h5",
-    "huddle calibrate night.h5 --reference A --band 0.5:20 --confidence 0.99 --json -",
-)
+@command()
 @with_estimate_options
 def calibrate(
     files: list[Path],
@@ -55,6 +49,11 @@ def calibrate(
         first).
     confidence : P
         Level of confidence of expanded uncertainties.
+
+    Examples
+    --------
+    huddle calibrate night.h5
+    huddle calibrate night.h5 --reference A --band 0.5:20 --confidence 0.99 --json -
     """
     from rich.text import Text
 

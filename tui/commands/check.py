@@ -16,7 +16,7 @@ from daq.bench.editing import set_sensor_values
 from daq.bench.tables.toml_text import to_toml
 from daq.errors import DeviceError, NoAnswerError
 from tui.commands.devices import summaries
-from tui.commands.options import examples
+from tui.commands.options import command
 from tui.output import check_list
 from tui.output.exit_codes import ExitCode
 from tui.page.table import Table
@@ -28,22 +28,7 @@ if TYPE_CHECKING:
     from daq.preflight.device_check import DiscoveredDevice, Examination, SensorCheck
 
 
-@examples(
-    "huddle check lab.toml",
-    "huddle check lab.toml --no-devices --json -",
-    "huddle check lab.toml --write   (write serial numbers and port names into the file)",
-    "huddle check --port /dev/ttyUSB0   (identify a device without a bench file)",
-    worked="""\
-$ huddle check lab.toml
-Bench file lab.toml: no errors.
-✓ ports         every sensor answers and sends samples
-? identity      not checked, because the bench file has no serial number of A,
-                B and C: huddle check --write adds it
-✗ sensitivities A.X reads 0.102 of B and C (g in place of m/s², or the
-                reverse): correct its sensitivity
-
-✓ is right, ✗ must be corrected before a test, ? needs more to decide.""",
-)
+@command()
 def check(
     bench: Path | None = None,
     *,
@@ -71,6 +56,25 @@ def check(
     write
         Write missing serial numbers and persistent port names (/dev/serial/by-id) into the bench
         file.
+
+    Examples
+    --------
+    huddle check lab.toml
+    huddle check lab.toml --no-devices --json -
+    huddle check lab.toml --write   (write serial numbers and port names into the file)
+    huddle check --port /dev/ttyUSB0   (identify a device without a bench file)
+
+    Worked example
+    --------------
+    $ huddle check lab.toml
+    Bench file lab.toml: no errors.
+    ✓ ports         every sensor answers and sends samples
+    ? identity      not checked, because the bench file has no serial number of A,
+                    B and C: huddle check --write adds it
+    ✗ sensitivities A.X reads 0.102 of B and C (g in place of m/s², or the
+                    reverse): correct its sensitivity
+
+    ✓ is right, ✗ must be corrected before a test, ? needs more to decide.
     """
     if (bench is None) == (port is None):
         raise typer.BadParameter("expected either a bench file or --port PORT")

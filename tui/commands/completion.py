@@ -10,18 +10,13 @@ from typing import TYPE_CHECKING, Literal
 import typer
 
 from tui.commands.help import ASKED_BY_SHELL
-from tui.commands.options import examples
+from tui.commands.options import command
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
-@examples(
-    'eval "$(huddle completion bash)"',
-    "huddle completion zsh > ~/.zfunc/_huddle",
-    "huddle completion fish > ~/.config/fish/completions/huddle.fish",
-    "huddle completion man > ~/.local/share/man/man1/huddle.1",
-)
+@command()
 def completion(
     kind: Literal["bash", "zsh", "fish", "man"],
 ) -> None:
@@ -34,6 +29,13 @@ def completion(
     ----------
     kind : SHELL
         bash, zsh or fish; or man: the manual page.
+
+    Examples
+    --------
+    eval "$(huddle completion bash)"
+    huddle completion zsh > ~/.zfunc/_huddle
+    huddle completion fish > ~/.config/fish/completions/huddle.fish
+    huddle completion man > ~/.local/share/man/man1/huddle.1
     """
     if kind == "man":
         typer.echo("\n".join(manual()))

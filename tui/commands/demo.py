@@ -17,7 +17,7 @@ import typer
 
 from daq.bench.durations import format_duration
 from daq.bench.end_condition import EndCondition
-from tui.commands.options import DurationOption, SpeedOption, examples, with_logging
+from tui.commands.options import DurationOption, SpeedOption, command, with_logging
 from tui.commands.run import result_of
 from tui.output.exit_codes import ExitCode
 from tui.page.table import Cell, Table
@@ -36,7 +36,7 @@ SHOWN_SHARE = 0.01
 """Share of the noise above which the table states the effect of the clocks."""
 
 
-@examples("huddle demo", "huddle demo --duration 10min --speed 10 --keep demo.h5")
+@command()
 @with_logging
 def demo(
     *,
@@ -64,6 +64,11 @@ def demo(
         Copy the recording to this file.
     table
         Print the table instead of opening the application.
+
+    Examples
+    --------
+    huddle demo
+    huddle demo --duration 10min --speed 10 --keep demo.h5
     """
     from rich.text import Text
 

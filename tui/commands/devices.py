@@ -10,17 +10,11 @@ import typer
 
 from daq.bench.driver_settings import settings_of
 from daq.errors import DriverError
-from tui.commands.options import OutOption, SpeedOption, examples, with_logging
+from tui.commands.options import OutOption, SpeedOption, command, with_logging
 from tui.page.table import Table
 
 
-@examples(
-    "huddle devices   (list the ports of this computer)",
-    "huddle devices lab.toml",
-    "huddle devices --driver labjack   (list the settings of a driver)",
-    "huddle devices lab.toml --speed 10 -o simulated.toml   (then in another terminal:)",
-    "huddle run simulated.toml --duration 10min",
-)
+@command()
 @with_logging
 def devices(
     bench: Path | None = None,
@@ -56,6 +50,14 @@ def devices(
         Log every fault and everything sent, one JSON object per line.
     out : FILE
         Bench file to write (default: print it).
+
+    Examples
+    --------
+    huddle devices   (list the ports of this computer)
+    huddle devices lab.toml
+    huddle devices --driver labjack   (list the settings of a driver)
+    huddle devices lab.toml --speed 10 -o simulated.toml   (then in another terminal:)
+    huddle run simulated.toml --duration 10min
     """
     if bench is not None and driver is not None:
         raise typer.BadParameter("expected either a bench file or --driver NAME")

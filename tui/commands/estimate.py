@@ -13,11 +13,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from daq.foreign_files import import_command, is_foreign
-from tui.commands.options import (
-    DetailsOption,
-    examples,
-    with_estimate_options,
-)
+from tui.commands.options import DetailsOption, command, with_estimate_options
 from tui.output.exit_codes import ExitCode
 
 if TYPE_CHECKING:
@@ -30,24 +26,7 @@ if TYPE_CHECKING:
     from daq.results.result import Result
 
 
-@examples(
-    "huddle estimate night.h5",
-    "huddle estimate night.h5 --method all --band 1:20",
-    "huddle estimate night.h5 --segment 60s --overlap 0.75 --json - --csv noise.csv",
-    "huddle estimate night.h5 --octaves --dimension auto --details",
-    "huddle estimate night.h5 --noise-parameters",
-    "huddle estimate *.mseed --response station.xml",
-    first="methods segment band unit response start end diagnostics json csv",
-    worked="""\
-$ huddle estimate night.h5 --band 1:20
-Self-noise, mean over 1 to 20 Hz, dB re 1 (m/s²)²/Hz, with its 95 % interval
-sensor  channel    data   three-sensor
-A       X        −90.00  −114.02 ±0.13
-▲ The c.o.v. of the noise is 13 %, wanted 5 %: record for 72 min in all
-
-A.X recorded −90.00 dB, mostly motion; its own noise is between −114.15 and
-−113.89 dB. A recording four times as long halves the interval.""",
-)
+@command(first="methods segment band unit response start end diagnostics json csv")
 @with_estimate_options
 def estimate(
     files: list[Path],
@@ -75,6 +54,26 @@ def estimate(
     noise_parameters
         Fit white, flicker, random-walk and f² noise to every channel; show the Allan deviation, and
         compare with the data sheet in the bench file.
+
+    Examples
+    --------
+    huddle estimate night.h5
+    huddle estimate night.h5 --method all --band 1:20
+    huddle estimate night.h5 --segment 60s --overlap 0.75 --json - --csv noise.csv
+    huddle estimate night.h5 --octaves --dimension auto --details
+    huddle estimate night.h5 --noise-parameters
+    huddle estimate *.mseed --response station.xml
+
+    Worked example
+    --------------
+    $ huddle estimate night.h5 --band 1:20
+    Self-noise, mean over 1 to 20 Hz, dB re 1 (m/s²)²/Hz, with its 95 % interval
+    sensor  channel    data   three-sensor
+    A       X        −90.00  −114.02 ±0.13
+    ▲ The c.o.v. of the noise is 13 %, wanted 5 %: record for 72 min in all
+
+    A.X recorded −90.00 dB, mostly motion; its own noise is between −114.15 and
+    −113.89 dB. A recording four times as long halves the interval.
     """
     from tui.output.console import check_places, hint
 

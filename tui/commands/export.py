@@ -11,19 +11,10 @@ from typing import Annotated, Any
 import typer
 
 from tui.commands.estimate import estimated
-from tui.commands.options import (
-    OutOption,
-    examples,
-    with_estimate_options,
-    with_logging,
-)
+from tui.commands.options import OutOption, command, with_estimate_options, with_logging
 
 
-@examples(
-    "huddle export night.h5 --format mseed",
-    "huddle export night.h5 --format netcdf --method all --out noise.nc",
-    "huddle export monday.h5 tuesday.h5 --format uff58",
-)
+@command()
 @with_logging
 @with_estimate_options
 def export(
@@ -54,6 +45,12 @@ def export(
         Samples: mseed. Curves: csv, parquet, netcdf, zarr, mat, npz, uff58.
     out : FILE
         File (default: beside the recording).
+
+    Examples
+    --------
+    huddle export night.h5 --format mseed
+    huddle export night.h5 --format netcdf --method all --out noise.nc
+    huddle export monday.h5 tuesday.h5 --format uff58
     """
     from estimator.wording import several
     from tui.notebook.curve_files import MINISEED, WRITERS, write_curves

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import typer
 from typer.core import TyperArgument, TyperCommand, TyperGroup
 
-from tui.commands.options import ESSENTIAL, ESTIMATE_PANEL, GUIDES, LOG_PANEL, Guide, declared
+from tui.commands.options import ESSENTIAL, ESTIMATE_PANEL, LOG_PANEL, Guide, declared
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -91,7 +91,7 @@ class HelpfulCommand(TyperCommand):
     page and the documents do.
     """
 
-    guide = Guide((), frozenset(), "")
+    guide = Guide()
 
     def __init__(self, *args: Any, **declared: Any) -> None:
         super().__init__(*args, **declared)
@@ -139,7 +139,7 @@ class HelpfulCommand(TyperCommand):
         """Write the examples, each on a line of its own, and one with its output."""
         del ctx
         with formatter.section(_heading("Examples")):
-            formatter.write_text("\b\n" + "\n".join(self.guide.lines))
+            formatter.write_text("\b\n" + self.guide.lines)
         if self.guide.worked:
             with formatter.section(_heading("Worked example")):
                 formatter.write_text("\b\n" + self.guide.worked.replace("\n\n", "\n\n\b\n"))
@@ -247,10 +247,10 @@ def subcommand(name: str) -> Any:
     module = import_module(f"tui.commands.{_MODULES.get(name, name)}")
     function = getattr(module, name if hasattr(module, name) else f"{name}_")  # import_
     alone = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-    callback, text = declared(function)
+    callback, text, guide = declared(function)
     alone.command(name, cls=HelpfulCommand, help=text)(callback)
     command: Any = typer.main.get_command(alone)
-    command.guide = GUIDES[function.__name__]
+    command.guide = guide
     return command
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tui.commands.options import OutOption, examples
+from tui.commands.options import OutOption, command
 from tui.output.csv_text import csv_text
 from tui.output.extras import require
 from tui.service.records.run_state import utc_text
@@ -36,13 +36,7 @@ def _band(text: str) -> tuple[float, float]:
     return low, high
 
 
-@examples(
-    "huddle history lab.toml",
-    "huddle history lab.toml --band 1:10 --since 2026-01-01 --out noise.png",
-    "huddle history --sensor S4254475 --band 1:2   (its tests on all benches)",
-    "huddle history --sensor S4254475 --label S4254475.svg   (a label to print)",
-    "huddle history lab/recordings office/recordings --csv -   (sensors by serial number)",
-)
+@command()
 def history(
     sources: list[Path] | None = None,
     *,
@@ -80,6 +74,14 @@ def history(
         its last noise.
     out : FILE
         Picture: .png, .svg or .pdf.
+
+    Examples
+    --------
+    huddle history lab.toml
+    huddle history lab.toml --band 1:10 --since 2026-01-01 --out noise.png
+    huddle history --sensor S4254475 --band 1:2   (its tests on all benches)
+    huddle history --sensor S4254475 --label S4254475.svg   (a label to print)
+    huddle history lab/recordings office/recordings --csv -   (sensors by serial number)
     """
     from tui.output.console import check_places, for_people, write_json, write_text
     from tui.service.history.ledger import sensor_tests

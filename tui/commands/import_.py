@@ -12,12 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
-from tui.commands.options import (
-    examples,
-    read_option,
-    with_estimate_options,
-    with_logging,
-)
+from tui.commands.options import command, read_option, with_estimate_options, with_logging
 from tui.output.exit_codes import ExitCode
 from tui.page.table import Table
 
@@ -37,21 +32,7 @@ _ORIGINS = {
 }
 
 
-@examples(
-    "huddle import *.mseed --response RESP.XX.ABC.00.HNZ --out lab.h5",
-    "huddle import day*.mseed --channels 'HH?' --overlap first --out month.h5",
-    "huddle import sds://archive --net XX --start 2026-11-01 --end 2026-11-08 --out week.h5",
-    "huddle import 'fdsn://EARTHSCOPE/IU.ANMO.{00,10}.BH?' --start 2026-11-01 --end 2026-11-02"
-    " --out anmo.h5",
-    "huddle import samples.csv --bench lab.toml --out lab.h5",
-    "huddle import corrected.mseed --sample-unit m/s² --out lab.h5",
-    first="out response response_for channels bench start end columns sample_unit json",
-    worked="""\
-$ huddle import *.mseed --response station.xml --out lab.h5
-all channels: response, 1.2655e+09 counts per m/s; 11 poles, 6 zeros
-chosen for the estimate: segment 16m40s (lower corner 120 s); unit m/s²
-lab.h5 written; next: huddle estimate lab.h5""",
-)
+@command(first="out response response_for channels bench start end columns sample_unit json")
 @with_logging
 @with_estimate_options
 def import_(
@@ -115,6 +96,23 @@ def import_(
         Where files overlap with different samples: refuse the channel (default), or keep the
         samples of the file that starts first or last. A number, such as 0.75, is the overlap of
         segments.
+
+    Examples
+    --------
+    huddle import *.mseed --response RESP.XX.ABC.00.HNZ --out lab.h5
+    huddle import day*.mseed --channels 'HH?' --overlap first --out month.h5
+    huddle import sds://archive --net XX --start 2026-11-01 --end 2026-11-08 --out week.h5
+    huddle import 'fdsn://EARTHSCOPE/IU.ANMO.{00,10}.BH?' --start 2026-11-01 --end 2026-11-02
+        --out anmo.h5
+    huddle import samples.csv --bench lab.toml --out lab.h5
+    huddle import corrected.mseed --sample-unit m/s² --out lab.h5
+
+    Worked example
+    --------------
+    $ huddle import *.mseed --response station.xml --out lab.h5
+    all channels: response, 1.2655e+09 counts per m/s; 11 poles, 6 zeros
+    chosen for the estimate: segment 16m40s (lower corner 120 s); unit m/s²
+    lab.h5 written; next: huddle estimate lab.h5
     """
     segments = None if overlap in {None, "refuse", "first", "last"} else overlap
     import_recording(

@@ -13,7 +13,7 @@ import typer
 
 from daq.errors import BenchFileError, HuddleError, NoAnswerError, NotConnectedError
 from tui.commands.devices import print_others
-from tui.commands.options import examples
+from tui.commands.options import command
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,7 +31,7 @@ QUESTIONS = {
 }
 
 
-@examples("huddle init", "huddle init -o lab.toml", "huddle init --discover -o lab.toml")
+@command()
 def init(
     *,
     out: Annotated[Path, typer.Option("--out", "-o")] = Path("bench.toml"),
@@ -51,6 +51,12 @@ def init(
         Search the serial ports, and write the devices found.
     port : PORT
         With --discover: search this port; may be repeated.
+
+    Examples
+    --------
+    huddle init
+    huddle init -o lab.toml
+    huddle init --discover -o lab.toml
     """
     if port and not discover:
         raise typer.BadParameter("--port needs --discover")

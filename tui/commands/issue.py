@@ -13,22 +13,13 @@ import typer
 
 from tui.certificate.ledger import Ledger, LedgerError, ledger_of, ledgers_of
 from tui.commands.estimate import estimated, exit_with
-from tui.commands.options import (
-    examples,
-    with_estimate_options,
-)
+from tui.commands.options import command, with_estimate_options
 from tui.commands.verify import known_to_services
 from tui.output.extras import require
 from tui.page.table import Table
 
 
-@examples(
-    "huddle issue night.h5 --by 'A. Lovelace'",
-    "huddle issue night.h5 --by 'A. Lovelace' --bench lab.toml",
-    "huddle issue night.h5 --specimen",
-    "huddle issue night.h5 --by 'A. Lovelace' --segment 20s --reason 'resolution of 0.05 Hz'",
-    first="by reason bench folder allow_incomplete despite specimen sign start end",
-)
+@command(first="by reason bench folder allow_incomplete despite specimen sign start end")
 @with_estimate_options
 def issue(
     files: list[Path],
@@ -80,6 +71,13 @@ def issue(
     sign : FILE
         Key of the laboratory (.p12) that signs the PDF, and the ledger as far as this certificate.
         Its passphrase is asked for, or taken from HUDDLE_PASSPHRASE. Extra: sign.
+
+    Examples
+    --------
+    huddle issue night.h5 --by 'A. Lovelace'
+    huddle issue night.h5 --by 'A. Lovelace' --bench lab.toml
+    huddle issue night.h5 --specimen
+    huddle issue night.h5 --by 'A. Lovelace' --segment 20s --reason 'resolution of 0.05 Hz'
     """
     from daq.bench.masks.mask_file import masks_named
     from daq.devices.bench_file import load
@@ -133,7 +131,7 @@ def issue(
     exit_with(with_stated(result, examined).verdict)
 
 
-@examples("huddle issues certificates", "huddle issues night.h5 --json -")
+@command()
 def issues(
     source: Path = Path("certificates"),
     *,
@@ -147,6 +145,11 @@ def issues(
     ----------
     source : SOURCE
         Folder of certificates, or a recording of the laboratory.
+
+    Examples
+    --------
+    huddle issues certificates
+    huddle issues night.h5 --json -
     """
     from daq.recording.reader import Recording
     from tui.output.console import for_people, write_json

@@ -1,8 +1,8 @@
 """How commands declare what they take, and what several of them take.
 
 A command is a function: what it takes by position are arguments, by keyword options. Its docstring
-says of each the form and the help, in sections that are the panels of the help. What it does not
-describe is described here.
+says of each the form and the help, in sections that are the panels of the help; it has examples,
+and perhaps one with its output. What it does not describe is described here.
 
 Parameters
 ----------
@@ -99,32 +99,28 @@ ESSENTIAL = frozenset({"methods", "segment", "band", "unit"})
 class Guide:
     """What a command shows first: example lines, parameters, and an example with its output."""
 
-    lines: tuple[str, ...]
-    first: frozenset[str]
-    worked: str
+    lines: str = ""
+    first: frozenset[str] = frozenset()
+    worked: str = ""
 
 
-GUIDES: dict[str, Guide] = {}
+_FIRST: dict[str, frozenset[str]] = {}
 """By the name of the function of a command."""
 
 
-def examples(*lines: str, first: str = "", worked: str = "") -> Callable[[Command], Command]:
-    """Add examples to the help of a command.
+def command(*, first: str = "") -> Callable[[Command], Command]:
+    """Declare a command.
 
     Parameters
     ----------
-    *lines : str
-        Commands.
     first : str
         Names of the parameters that ``--help`` shows; all but those of an estimate and of log
         lines, if not given. ``--help-all`` shows all.
-    worked : str
-        A command with its output, and what that means.
     """
 
-    def keep(command: Command) -> Command:
-        GUIDES[command.__name__] = Guide(lines, frozenset(first.split()), worked)
-        return command
+    def keep(function: Command) -> Command:
+        _FIRST[function.__name__] = frozenset(first.split())
+        return function
 
     return keep
 
@@ -153,32 +149,39 @@ class _Described(NamedTuple):
     text: str | None = None
 
 
-def _described(docstring: str | None) -> tuple[str, dict[str, _Described]]:
-    """Return a docstring as far as its first section, and what the sections say by parameter."""
+def _sections(docstring: str | None) -> tuple[str, dict[str, str]]:
+    """Return a docstring as far as its first section, and the sections by their titles."""
     text, *sections = _SECTION.split(inspect.cleandoc(docstring or ""))
+    bodies = (each.strip() for each in sections[1::2])
+    return text.strip(), dict(zip(sections[::2], bodies, strict=True))
+
+
+def _described(sections: dict[str, str]) -> dict[str, _Described]:
+    """Return what sections say by parameter."""
     found = {}
-    for title, body in zip(sections[::2], sections[1::2], strict=True):
-        for entry in _ENTRY.split(body.strip()):
+    for title, body in sections.items():
+        for entry in _ENTRY.split(body):
             head, _, lines = entry.partition("\n")
             name, _, form = head.partition(" : ")
             panel = None if title == "Parameters" else title
             found[name] = _Described(panel, form or None, " ".join(lines.split()))
-    return text.strip(), found
+    return found
 
 
-def declared(command: Callable[..., None]) -> tuple[Callable[..., None], str]:
-    """Return a command as typer takes it, and its help without what is said of its parameters."""
-    text, own = _described(command.__doc__)
-    described = _described(__doc__)[1] | own
-    signature = inspect.signature(command, eval_str=True)
+def declared(function: Callable[..., None]) -> tuple[Callable[..., None], str, Guide]:
+    """Return a command as typer takes it, its help as far as the first section, and its guide."""
+    text, sections = _sections(function.__doc__)
+    lines, worked = (sections.pop(title, "") for title in ("Examples", "Worked example"))
+    described = _described(_sections(__doc__)[1]) | _described(sections)
+    signature = inspect.signature(function, eval_str=True)
     taken = [_declared(each, described) for each in signature.parameters.values()]
 
-    @wraps(command)
+    @wraps(function)
     def run(**given: Any) -> None:  # noqa: ANN401 - values of options
-        command(**given)
+        function(**given)
 
     vars(run)["__signature__"] = signature.replace(parameters=taken)
-    return run, text
+    return run, text, Guide(re.sub(r"\n +", " ", lines), _FIRST[function.__name__], worked)
 
 
 def _declared(given: inspect.Parameter, described: dict[str, _Described]) -> inspect.Parameter:

@@ -10,20 +10,10 @@ from typing import Annotated
 
 import typer
 
-from tui.commands.options import examples
+from tui.commands.options import command
 
 
-@examples(
-    "huddle plan lab.toml --snr 1000 --cov 0.05",
-    "huddle plan --sensors 2 --rate 200 --snr 30 --cov 0.05",
-    worked="""\
-$ huddle plan lab.toml
-method                  duration  segments    remaining bias  efficiency
-three-sensor              48m25s       580              none         99%
-
-Record for 49 minutes: the noise in the worst third of an octave from 1 Hz on
-then scatters by 5 %, where motion is 1000 times the noise (--snr).""",
-)
+@command()
 def plan(
     path: Path | None = None,
     *,
@@ -57,6 +47,20 @@ def plan(
         PSD of the motion divided by that of the noise.
     cov : COV
         Target coefficient of variation at one frequency.
+
+    Examples
+    --------
+    huddle plan lab.toml --snr 1000 --cov 0.05
+    huddle plan --sensors 2 --rate 200 --snr 30 --cov 0.05
+
+    Worked example
+    --------------
+    $ huddle plan lab.toml
+    method                  duration  segments    remaining bias  efficiency
+    three-sensor              48m25s       580              none         99%
+
+    Record for 49 minutes: the noise in the worst third of an octave from 1 Hz on
+    then scatters by 5 %, where motion is 1000 times the noise (--snr).
     """
     from tui.notebook.planning import plan as plan_of
     from tui.output.console import for_people, write_json

@@ -10,24 +10,13 @@ from typing import Annotated, Any
 import typer
 
 from tui.commands.estimate import estimated
-from tui.commands.options import (
-    OutOption,
-    examples,
-    with_estimate_options,
-)
+from tui.commands.options import OutOption, command, with_estimate_options
 from tui.output.extras import require
 
 SUFFIXES = (".svg", ".png", ".pdf")
 
 
-@examples(
-    "huddle plot night.h5 -o noise.svg",
-    "huddle plot night.h5 -o noise.pdf --models nlnm,nhnm --width 85",
-    "huddle plot night.h5 -o noise.png --method all --models brochure.csv",
-    "huddle plot night.h5 -o night.png --signal --start 2h --end 2h30min",
-    "huddle plot night.h5 -o sensors.svg --sensors",
-    first="out models signal sensors width start end band unit methods",
-)
+@command(first="out models signal sensors width start end band unit methods")
 @with_estimate_options
 def plot(
     files: list[Path],
@@ -60,6 +49,14 @@ def plot(
     sensors
         Draw how the sensors stand: the axes of each (rotation, lean, polarity), and the coherence
         of all pairs.
+
+    Examples
+    --------
+    huddle plot night.h5 -o noise.svg
+    huddle plot night.h5 -o noise.pdf --models nlnm,nhnm --width 85
+    huddle plot night.h5 -o noise.png --method all --models brochure.csv
+    huddle plot night.h5 -o night.png --signal --start 2h --end 2h30min
+    huddle plot night.h5 -o sensors.svg --sensors
     """
     from daq.bench.masks.mask_file import masks_named
     from tui.output.console import check_places, console, notices

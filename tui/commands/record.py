@@ -19,12 +19,7 @@ from daq.bench.end_condition import EndCondition
 from daq.errors import HuddleError, WrongSettingError
 from daq.python_process import python_command
 from daq.recording.storage.names import recording_path
-from tui.commands.options import (
-    DurationOption,
-    OutOption,
-    examples,
-    with_logging,
-)
+from tui.commands.options import DurationOption, OutOption, command, with_logging
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -37,15 +32,7 @@ GAP_INTERVAL = 60.0
 """Minimum seconds between two log lines about gaps; a polled sensor can have many."""
 
 
-@examples(
-    "huddle record lab.toml --duration 3h --out night.h5",
-    first="duration until until_stopped out check anyway operator json wire_log",
-    worked="""\
-$ huddle record lab.toml --duration 20min --out night.h5
-$ huddle estimate night.h5
-
-Records for 20 minutes. Ctrl-C ends earlier, and what was recorded is kept.""",
-)
+@command(first="duration until until_stopped out check anyway operator json wire_log")
 @with_logging
 def record(
     path: Path,
@@ -77,6 +64,17 @@ def record(
         Make the check list first; record nothing if a check fails.
     wire_log : FILE
         Also log every byte received and sent, for tests of drivers.
+
+    Examples
+    --------
+    huddle record lab.toml --duration 3h --out night.h5
+
+    Worked example
+    --------------
+    $ huddle record lab.toml --duration 20min --out night.h5
+    $ huddle estimate night.h5
+
+    Records for 20 minutes. Ctrl-C ends earlier, and what was recorded is kept.
     """
     from rich.live import Live
 

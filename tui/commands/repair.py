@@ -7,11 +7,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from daq.errors import RecordingError
-from tui.commands.options import examples
+from tui.commands.options import command
 from tui.page.table import Table
 
 
-@examples("huddle repair killed.h5", "huddle repair night.h5 --check --json -")
+@command()
 def repair(
     path: Path,
     *,
@@ -28,6 +28,11 @@ def repair(
         Recording (.h5).
     check
         Check only; change nothing.
+
+    Examples
+    --------
+    huddle repair killed.h5
+    huddle repair night.h5 --check --json -
     """
     from dataclasses import asdict
 

@@ -10,11 +10,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from tui.commands.estimate import estimated, exit_with
-from tui.commands.options import (
-    OutOption,
-    examples,
-    with_estimate_options,
-)
+from tui.commands.options import OutOption, command, with_estimate_options
 from tui.output.extras import require
 
 if TYPE_CHECKING:
@@ -30,18 +26,7 @@ SUFFIXES = (".html", ".htm", ".pdf", ".xml")
 _COLOURS = {"good": "green", "bad": "red", "doubtful": "yellow"}
 
 
-@examples(
-    "huddle report night.h5",
-    "huddle report night.h5 --out night.pdf --band 1:20",
-    "huddle report night.h5 --models nlnm,nhnm,brochure.csv",
-    "huddle report monday.h5 tuesday.h5 --method all --out week.html",
-    worked="""\
-$ huddle report night.h5 --band 1:20
-No verdict: the bench file has no limits.
-night.html written
-
-With limits in the bench file the first line is the verdict: PASS or FAIL.""",
-)
+@command()
 @with_estimate_options
 def report(
     files: list[Path],
@@ -70,6 +55,21 @@ def report(
         (default: .html beside the recording).
     force
         Replace a file that has other content.
+
+    Examples
+    --------
+    huddle report night.h5
+    huddle report night.h5 --out night.pdf --band 1:20
+    huddle report night.h5 --models nlnm,nhnm,brochure.csv
+    huddle report monday.h5 tuesday.h5 --method all --out week.html
+
+    Worked example
+    --------------
+    $ huddle report night.h5 --band 1:20
+    No verdict: the bench file has no limits.
+    night.html written
+
+    With limits in the bench file the first line is the verdict: PASS or FAIL.
     """
     from daq.bench.masks.mask_file import masks_named
     from tui.output.console import console

@@ -6,15 +6,11 @@ from __future__ import annotations
 
 import typer
 
-from tui.commands.options import OutOption, examples, with_logging
+from tui.commands.options import OutOption, command, with_logging
 from tui.output.exit_codes import ExitCode
 
 
-@examples(
-    "huddle reproduce fig4 fig9",
-    "huddle reproduce all --out figures --json points.json",
-    "huddle reproduce public FOLDER",
-)
+@command()
 @with_logging
 def reproduce(
     studies: list[str] | None = None,
@@ -40,6 +36,12 @@ def reproduce(
         with the FOLDER of each public huddle test after it.
     out : FOLDER
         Folder of the figures (default: reproduced).
+
+    Examples
+    --------
+    huddle reproduce fig4 fig9
+    huddle reproduce all --out figures --json points.json
+    huddle reproduce public FOLDER
     """
     from tui.studies import public
     from tui.studies.reproduce import DEFAULT_FOLDER, run

@@ -24,7 +24,7 @@ from tui.commands.options import (
     DetailsOption,
     DurationOption,
     OutOption,
-    examples,
+    command,
     with_estimate_options,
     with_logging,
 )
@@ -50,19 +50,7 @@ STATUS_INTERVAL = 1.0
 """Seconds between two looks at a recorder whose estimate has failed."""
 
 
-@examples(
-    "huddle run lab.toml --duration 3h",
-    "huddle run lab.toml --until-decided --duration 3h",
-    "huddle run lab.toml --until-cov 0.05 --band 1:20",
-    "huddle run lab.toml -d 20min --json result.json --report result.pdf",
-    first="duration until_decided until_cov anyway out report json band segment unit",
-    worked="""\
-$ huddle run lab.toml --until-decided --duration 3h --report result.pdf
-
-Reads the sensors of lab.toml until every limit is met or not met, for three
-hours at most, shows the noise meanwhile, and writes result.pdf. The exit code
-is 0 for PASS, 1 for FAIL, 4 for not decided. Ctrl-C ends the test early.""",
-)
+@command(first="duration until_decided until_cov anyway out report json band segment unit")
 @with_logging
 @with_estimate_options
 def run(
@@ -97,6 +85,21 @@ def run(
         Stop when all limits of the bench are decided.
     report : FILE
         Write the calibration report: .html or .pdf.
+
+    Examples
+    --------
+    huddle run lab.toml --duration 3h
+    huddle run lab.toml --until-decided --duration 3h
+    huddle run lab.toml --until-cov 0.05 --band 1:20
+    huddle run lab.toml -d 20min --json result.json --report result.pdf
+
+    Worked example
+    --------------
+    $ huddle run lab.toml --until-decided --duration 3h --report result.pdf
+
+    Reads the sensors of lab.toml until every limit is met or not met, for three
+    hours at most, shows the noise meanwhile, and writes result.pdf. The exit code
+    is 0 for PASS, 1 for FAIL, 4 for not decided. Ctrl-C ends the test early.
     """
     from daq.devices.bench_file import load
     from daq.estimation.settings import Settings

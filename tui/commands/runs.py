@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from daq.errors import HuddleError
-from tui.commands.options import examples
+from tui.commands.options import command
 from tui.output.csv_text import csv_text
 from tui.page.table import Cell, Table, Tone
 from tui.service.records.run_state import Run, RunState, utc_text
@@ -32,9 +32,7 @@ _COLUMNS = (
 )
 
 
-@examples(
-    "huddle runs lab.toml", "huddle runs lab.toml --last 10", "huddle runs recordings --csv -"
-)
+@command()
 def runs(
     source: Path,
     *,
@@ -52,6 +50,12 @@ def runs(
         Bench file, or a folder of recordings.
     last : N
         The last N runs (default on the screen: 100).
+
+    Examples
+    --------
+    huddle runs lab.toml
+    huddle runs lab.toml --last 10
+    huddle runs recordings --csv -
     """
     from tui.output.console import check_places, for_people, write_json, write_text
     from tui.service.records.places import Place
@@ -72,10 +76,7 @@ def runs(
         write_text(csv, csv_text(_COLUMNS, map(_cells, runs)))
 
 
-@examples(
-    "huddle pin lab.toml lab-20261121T220000Z.h5",
-    "huddle pin lab.toml '2026-11-21 22:00' --remove",
-)
+@command()
 def pin(
     source: Path,
     names: list[str],
@@ -92,6 +93,11 @@ def pin(
         Recording or due time, as in huddle runs.
     remove
         Allow their removal again.
+
+    Examples
+    --------
+    huddle pin lab.toml lab-20261121T220000Z.h5
+    huddle pin lab.toml '2026-11-21 22:00' --remove
     """
     from tui.output.console import for_people
     from tui.service.records.places import Place

@@ -18,11 +18,7 @@ from daq.bench.durations import format_duration
 from daq.bench.option_fit import shortest_duration
 from daq.errors import BenchFileError, FileFault, HuddleError
 from daq.recorder.schedule import all_due, utc_now
-from tui.commands.options import (
-    examples,
-    with_estimate_options,
-    with_logging,
-)
+from tui.commands.options import command, with_estimate_options, with_logging
 from tui.output.extras import require
 from tui.service.metrics import ServiceMetrics
 from tui.service.notify import Notifier, watchdog_interval
@@ -46,11 +42,7 @@ _LOGGER = logging.getLogger(__name__)
 SHOWN = 5
 
 
-@examples(
-    "huddle serve lab.toml",
-    "huddle serve lab.toml --list",
-    "huddle serve lab.toml --method all --reject",
-)
+@command()
 @with_logging
 @with_estimate_options
 def serve(
@@ -71,6 +63,12 @@ def serve(
     ----------
     show
         Show the times of the next runs, and exit.
+
+    Examples
+    --------
+    huddle serve lab.toml
+    huddle serve lab.toml --list
+    huddle serve lab.toml --method all --reject
     """
     import asyncio
 

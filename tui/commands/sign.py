@@ -9,13 +9,10 @@ from pathlib import Path
 import typer
 
 from daq.errors import RecordingError
-from tui.commands.options import examples
+from tui.commands.options import command
 
 
-@examples(
-    "huddle sign --new-key ~/lab.key",
-    "huddle sign lab.h5 --key ~/lab.key",
-)
+@command()
 def sign(
     recordings: list[Path] | None = None,
     *,
@@ -34,6 +31,11 @@ def sign(
         Private key (ed25519, PEM).
     new_key : FILE
         Make a key, and FILE.pub for others.
+
+    Examples
+    --------
+    huddle sign --new-key ~/lab.key
+    huddle sign lab.h5 --key ~/lab.key
     """
     from daq.recording.repair import verify
     from daq.recording.signing import make_key, sign

@@ -9,18 +9,10 @@ from typing import Annotated
 
 import typer
 
-from tui.commands.options import DurationOption, examples, with_logging
+from tui.commands.options import DurationOption, command, with_logging
 
 
-@examples(
-    "huddle simulate lab.toml --duration 3h --out model.h5",
-    worked="""\
-$ huddle simulate lab.toml --duration 10min --out night.h5
-night.h5: 600 s of A, B, C, simulated
-$ huddle estimate night.h5 --band 1:20
-
-The estimate shows the noise that the table [simulation] of lab.toml has.""",
-)
+@command()
 @with_logging
 def simulate(
     scenario: str,
@@ -38,6 +30,18 @@ def simulate(
         fig13, setup1, setup2, waves, two.
     out : FILE
         Recording to write (.h5).
+
+    Examples
+    --------
+    huddle simulate lab.toml --duration 3h --out model.h5
+
+    Worked example
+    --------------
+    $ huddle simulate lab.toml --duration 10min --out night.h5
+    night.h5: 600 s of A, B, C, simulated
+    $ huddle estimate night.h5 --band 1:20
+
+    The estimate shows the noise that the table [simulation] of lab.toml has.
     """
     from tui.simulation.write_recording import simulate_recording
 

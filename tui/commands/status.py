@@ -9,16 +9,21 @@ from pathlib import Path
 import typer
 
 from daq.recorder.schedule import utc_now
-from tui.commands.options import examples
+from tui.commands.options import command
 from tui.output.exit_codes import ExitCode
 from tui.service.records.store import RunStore
 
 
-@examples("huddle status lab.toml", "huddle status lab.toml --json -")
+@command()
 def status(path: Path, *, json: str | None = None) -> None:
     """Show the state of the service of a bench: runs, sensors, disk, clock.
 
     The exit code is 3 if no service runs.
+
+    Examples
+    --------
+    huddle status lab.toml
+    huddle status lab.toml --json -
     """
     from daq.devices.bench_file import load
     from tui.output.console import for_people, write_json

@@ -15,7 +15,7 @@ import typer
 from daq.errors import BenchFileError, FileFault
 from daq.foreign_files import OWN, SUFFIXES
 from tui.application.terminal.ascii_text import is_ascii_only
-from tui.commands.options import examples, with_estimate_options, with_log_file
+from tui.commands.options import command, with_estimate_options, with_log_file
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -32,7 +32,7 @@ BROWSER = "TEXTUAL_DRIVER"
 """Set by ``textual serve``: the application is shown in a browser, and needs no terminal."""
 
 
-@examples("huddle tui lab.toml", "huddle tui recordings/lab-20261121T030000Z.h5")
+@command()
 @with_log_file
 @with_estimate_options
 def tui(
@@ -63,6 +63,11 @@ def tui(
         port, otherwise unlimited).
     port : PORT
         Without a bench file: search this port (default: all serial ports); may be repeated.
+
+    Examples
+    --------
+    huddle tui lab.toml
+    huddle tui recordings/lab-20261121T030000Z.h5
     """
     from tui.runs.first_bench import is_first
 

@@ -12,20 +12,13 @@ import typer
 
 from daq.errors import RecordingError
 from tui.certificate.ledger import Ledger
-from tui.commands.options import examples
+from tui.commands.options import command
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
 
-@examples(
-    "huddle verify lab.toml",
-    "huddle verify recordings",
-    "huddle verify a.h5 --key lab.key.pub",
-    "huddle verify a.h5 b.h5 --json -",
-    "huddle verify certificates/HT-2026-0042-r0.pdf night.h5",
-    "huddle verify certificates/HT-2026-0042-r0.pdf --key lab.pem",
-)
+@command()
 def verify(
     sources: list[Path],
     *,
@@ -56,6 +49,15 @@ def verify(
     ledgers : FOLDER
         Folder of certificates that no bench file names, or ledger of a certificate that is
         elsewhere; may be repeated.
+
+    Examples
+    --------
+    huddle verify lab.toml
+    huddle verify recordings
+    huddle verify a.h5 --key lab.key.pub
+    huddle verify a.h5 b.h5 --json -
+    huddle verify certificates/HT-2026-0042-r0.pdf night.h5
+    huddle verify certificates/HT-2026-0042-r0.pdf --key lab.pem
     """
     from tui.certificate.verification import verified
     from tui.output.console import for_people, write_json

@@ -10,11 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tui.commands.estimate import exit_with, show_result
-from tui.commands.options import (
-    examples,
-    with_estimate_options,
-    with_logging,
-)
+from tui.commands.options import command, with_estimate_options, with_logging
 
 if TYPE_CHECKING:
     from daq.bench.model import Bench
@@ -24,7 +20,7 @@ if TYPE_CHECKING:
     from daq.results.result import Result
 
 
-@examples("huddle watch night.h5", "huddle watch night.h5 --json -   (one line of JSON per update)")
+@command()
 @with_logging
 @with_estimate_options
 def watch(
@@ -35,7 +31,13 @@ def watch(
     json: str | None = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
-    """Show the live estimate of a recording that another process writes."""
+    """Show the live estimate of a recording that another process writes.
+
+    Examples
+    --------
+    huddle watch night.h5
+    huddle watch night.h5 --json -   (one line of JSON per update)
+    """
     from daq.estimation.follow import follow
     from tui.runs.estimate_settings import settings_for
 

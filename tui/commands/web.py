@@ -13,16 +13,12 @@ from typing import Annotated, Any
 import typer
 
 from daq.errors import BenchFileError, FileFault
-from tui.commands.options import examples, with_logging
+from tui.commands.options import command, with_logging
 from tui.output.console import console
 from tui.output.extras import require
 
 
-@examples(
-    "huddle web lab.toml",
-    "huddle web lab.toml --address 192.168.1.20 --port 8443",
-    "huddle web --password   (print a line for read or steer in the table [web])",
-)
+@command()
 @with_logging
 def web(
     bench: Path | None = None,
@@ -54,6 +50,12 @@ def web(
         Ask for a password, and print its hash.
     token
         Make a random token, and print it with its hash.
+
+    Examples
+    --------
+    huddle web lab.toml
+    huddle web lab.toml --address 192.168.1.20 --port 8443
+    huddle web --password   (print a line for read or steer in the table [web])
     """
     if [bench is not None, password, token].count(True) != 1:
         raise typer.BadParameter("expected a bench file, or --password, or --token")
