@@ -95,9 +95,9 @@ def _estimate(screen: Console, bench: Bench, out: Path) -> int:
         table.add_row(
             one.method,
             f"{one.sensor}.{one.channel}",
-            level(one.true_psd),
+            level(one.true_noise_psd),
             level(one.noise_psd),
-            interval(one.low, one.high),
+            interval(one.noise_psd_low, one.noise_psd_high),
             "yes" if one.covers else "NO",
         )
     screen.print(table)

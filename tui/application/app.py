@@ -55,6 +55,8 @@ class StartForm(Form[TestPlan]):
         Name of the recording that is shown now; empty for none.
     """
 
+    HINTS = HINTS
+
     def __init__(self, bench: Bench | None, kept: str) -> None:
         self._operator = "" if bench is None else bench.operator
         usual = NEVER if bench is None else bench.usual_end
@@ -66,10 +68,6 @@ class StartForm(Form[TestPlan]):
         )
         title = f"start a test; {kept} is kept" if kept else "start a test"
         super().__init__(title, fields, does="starts")
-
-    def hint(self, name: str) -> str:
-        """Return what a field means."""
-        return HINTS[name]
 
     def problem(self, name: str) -> str:
         """Return what is wrong with the end; empty if nothing is."""

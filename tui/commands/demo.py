@@ -8,7 +8,7 @@ import logging
 import shutil
 import sys
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -111,7 +111,7 @@ def demo(
     compared = compare(result, scenario)
     screen = for_people(json)
     snapshot, (low, high) = result.snapshot, result.band
-    added = max(entry.clocks / entry.true_psd for entry in compared)
+    added = max(entry.added_by_clocks / entry.true_noise_psd for entry in compared)
     screen.print(
         Text.assemble(
             (f"Self-noise, mean over {low:g} to {high:g} Hz", "bold"),
@@ -137,22 +137,23 @@ class NoiseComparison:
     sensor: str
     channel: str
     method: str
-    true_psd: float
+    true_noise_psd: float
     noise_psd: float
-    low: float
-    high: float
-    clocks: float = 0.0
+    noise_psd_low: float
+    noise_psd_high: float
+    added_by_clocks: float = 0.0
     """Largest effect of the clocks; the lower limit allows for it."""
 
     @property
     def withdrawn(self) -> bool:
         """Whether the estimate is above what the other sensors leave unpredicted."""
-        return self.noise_psd > self.high
+        return self.noise_psd > self.noise_psd_high
 
     @property
     def covers(self) -> bool:
         """Whether the truth lies in the interval of an estimate that is not withdrawn."""
-        return not self.withdrawn and self.low <= self.true_psd <= self.high
+        is_inside = self.noise_psd_low <= self.true_noise_psd <= self.noise_psd_high
+        return is_inside and not self.withdrawn
 
 
 def _show(path: Path, settings: Settings) -> Path | None:
@@ -199,16 +200,17 @@ def compare(result: Result, scenario: Scenario) -> list[NoiseComparison]:
         for column, (label, mean) in enumerate(zip(snapshot.channels, means, strict=True)):
             place = places.get(label.sensor, 0)
             places[label.sensor] = place + 1
+            truth = scenario.true_noise_psd(label.sensor, place, inside)
             compared.append(
                 NoiseComparison(
                     sensor=label.sensor,
                     channel=label.channel,
                     method=method,
-                    true_psd=float(scenario.true_noise_psd(label.sensor, place, inside).mean()),
+                    true_noise_psd=float(truth.mean()),
                     noise_psd=float(mean.mean[0]),
-                    low=float(mean.low[0]),
-                    high=float(mean.high[0]),
-                    clocks=float(sum(each[column] for each in clocks)),
+                    noise_psd_low=float(mean.low[0]),
+                    noise_psd_high=float(mean.high[0]),
+                    added_by_clocks=float(sum(each[column] for each in clocks)),
                 )
             )
     return compared
@@ -233,14 +235,15 @@ def comparison_table(compared: list[NoiseComparison], result: Result) -> Table:
             for entry in compared
             if (entry.sensor, entry.channel) == (label.sensor, label.channel)
         }
-        row = [label.name, level(float(result.data[column])), level(found[METHODS[0]].true_psd)]
+        truth = found[METHODS[0]].true_noise_psd
+        row = [label.name, level(float(result.data[column])), level(truth)]
         for method in METHODS:
             entry = found[method]
             mark = "✓" if entry.covers else "✗"
             estimate = (
                 f"{level(entry.noise_psd)} withdrawn"
                 if entry.withdrawn
-                else level_with_error(entry.noise_psd, entry.high)
+                else level_with_error(entry.noise_psd, entry.noise_psd_high)
             )
             row.append(Cell(f"{estimate} {mark}", "good" if entry.covers else "bad"))
         rows.append(tuple(row))
@@ -254,8 +257,8 @@ def verdict(compared: list[NoiseComparison]) -> list[str]:
         entries = [entry for entry in compared if entry.method == method]
         covered = sum(entry.covers for entry in entries)
         withdrawn = sum(entry.withdrawn for entry in entries)
-        above = sum(entry.low > entry.true_psd for entry in entries)
-        below = sum(entry.high < entry.true_psd for entry in entries)
+        above = sum(entry.noise_psd_low > entry.true_noise_psd for entry in entries)
+        below = sum(entry.noise_psd_high < entry.true_noise_psd for entry in entries)
         lines.append(
             f"{method}: the 95 % interval covers the truth in "
             f"{covered} of {len(entries)} channels"
@@ -280,18 +283,7 @@ def _document(compared: list[NoiseComparison], snapshot: Snapshot) -> dict[str, 
         "segments": snapshot.n_segments,
         "unit": snapshot.unit,
         "channels": [
-            {
-                "sensor": entry.sensor,
-                "channel": entry.channel,
-                "method": entry.method,
-                "true_noise_psd": entry.true_psd,
-                "noise_psd": entry.noise_psd,
-                "noise_psd_low": entry.low,
-                "noise_psd_high": entry.high,
-                "added_by_clocks": entry.clocks,
-                "covers": entry.covers,
-                "withdrawn": entry.withdrawn,
-            }
+            {**asdict(entry), "covers": entry.covers, "withdrawn": entry.withdrawn}
             for entry in compared
         ],
     }

@@ -74,7 +74,7 @@ import re
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeAlias, TypeVar, get_args
 
@@ -260,44 +260,30 @@ LogLevelOption: TypeAlias = Annotated[LogLevel, typer.Option(show_default=False)
 LogFormatOption: TypeAlias = Annotated[LogFormat, typer.Option(show_default=False)]
 
 
-def _to_standard_error(
-    *, log_level: LogLevelOption = LogLevel.INFO, log_format: LogFormatOption = LogFormat.TEXT
-) -> None:
-    from tui.output.logs.lines import configure
+def with_logging(function: Callable[..., None], *, to_file: bool = False) -> Callable[..., None]:
+    """Add options of log lines to a command: on standard error, or in a file only."""
+    usual: dict[str, tuple[Any, Any]] = {
+        "log_level": (LogLevelOption, LogLevel.INFO),
+        "log_format": (LogFormatOption, LogFormat.TEXT),
+        **({"log_file": (Path | None, None)} if to_file else {}),
+    }
+    added = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=value, annotation=kind)
+        for name, (kind, value) in usual.items()
+    ]
+    own = inspect.signature(function, eval_str=True)
 
-    configure(log_level, log_format)
+    @wraps(function)
+    def logged(*args: Any, **given: Any) -> None:  # noqa: ANN401 - values of options
+        from tui.output.logs.lines import configure
 
+        level, style, *file = (given.pop(name, value) for name, (_, value) in usual.items())
+        configure(level, style, file=next(iter(file), None), screen=not to_file)
+        function(*args, **given)
 
-def _to_file(
-    *,
-    log_level: LogLevelOption = LogLevel.INFO,
-    log_format: LogFormatOption = LogFormat.TEXT,
-    log_file: Path | None = None,
-) -> None:
-    from tui.output.logs.lines import configure
-
-    configure(log_level, log_format, file=log_file, screen=False)
-
-
-def with_logging(command: Callable[..., None]) -> Callable[..., None]:
-    """Add options of log lines on standard error to a command."""
-    return _with(_to_standard_error, command)
-
-
-def with_log_file(command: Callable[..., None]) -> Callable[..., None]:
-    """Add options of log lines in a file to a command that uses the whole screen."""
-    return _with(_to_file, command)
+    vars(logged)["__signature__"] = own.replace(parameters=[*own.parameters.values(), *added])
+    return logged
 
 
-def _with(set_up: Callable[..., None], command: Callable[..., None]) -> Callable[..., None]:
-    added = inspect.signature(set_up).parameters
-    own = inspect.signature(command, eval_str=True)
-
-    @wraps(command)
-    def logging_command(*args: Any, **given: Any) -> None:  # noqa: ANN401 - values of options
-        set_up(**{name: given.pop(name) for name in added if name in given})
-        command(*args, **given)
-
-    signature = own.replace(parameters=[*own.parameters.values(), *added.values()])
-    vars(logging_command)["__signature__"] = signature
-    return logging_command
+with_log_file = partial(with_logging, to_file=True)
+"""Of a command that uses the whole screen."""

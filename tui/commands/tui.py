@@ -110,17 +110,11 @@ def _meant(source: Path) -> Path:
     return found if typer.confirm(f"{source} does not exist. Open {found}?", True) else source
 
 
-def open_application(
-    source: Path,
-    *,
-    on_event: str = "",
-    models: str = "",
-    baud: int | None = None,
-    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
-) -> None:
+def open_application(source: Path, **asked: Any) -> None:  # noqa: ANN401 - as of open_bench
     """Open the application on a bench file, or on a recording (``.h5``).
 
-    ``baud`` is the rate of the line to the terminal; None: that of a serial line, else fast.
+    `asked` is what `open_bench` takes; ``baud`` is the rate of the line to the terminal; None: that
+    of a serial line, else fast.
 
     Raises
     ------
@@ -130,7 +124,7 @@ def open_application(
         Standard input or output is not a terminal.
     """
     if source.suffix.lower() in {".h5", ".hdf5"}:
-        open_recording(source, on_event=on_event, models=models, baud=baud, **wanted)
+        open_recording(source, **asked)
     elif not source.exists() and source.suffix.lower() not in SUFFIXES:
         problem = (
             f"file does not exist; huddle init -o {source} writes a bench file, and huddle demo"
@@ -138,7 +132,7 @@ def open_application(
         )
         raise BenchFileError(FileFault("", problem), source=source)
     else:
-        open_bench(source, on_event=on_event, models=models, baud=baud, **wanted)
+        open_bench(source, **asked)
 
 
 def open_bench(

@@ -130,6 +130,9 @@ class _Controls:
     """What a bench and a recording have in common: messages to recorders, settings, events."""
 
     on_event: str
+    models: tuple[Mask, ...]
+    reports: Path | None = None
+    """Folder of reports; None: beside their recordings."""
 
     def stop(self, path: Path) -> None:
         """Ask the recorder of a file to stop."""
@@ -142,6 +145,18 @@ class _Controls:
     def announce(self, event: str, text: str, path: Path | None) -> None:
         """Start the command that the user gave for events."""
         announce(self.on_event, event, text, path)
+
+    def report(self, path: Path, result: Result) -> Path:
+        """Write the report."""
+        require("matplotlib", "jinja2")
+        from tui.report.writing import write  # noqa: PLC0415 - loads matplotlib
+
+        out = (self.reports or path.parent) / f"{path.stem}.html"
+        return write(result, out, models=self.models, taken="beside")[1]
+
+    def save(self, path: Path, result: Result) -> tuple[Path, ...]:
+        """Write CSV and JSON beside the recording, or with the reports."""
+        return save_result(path, result, folder=self.reports or path.parent)
 
     def noted(self, path: Path, result: Result) -> list[str]:
         """Write a test into the ledger of sensors; return how they have changed."""
@@ -200,7 +215,6 @@ class BenchControls(_Controls):
     settings: Settings
     can_start: bool = True
     reports: Path | None = None
-    """Folder of reports; None: beside their recordings."""
     on_event: str = ""
     """Command for the end of a test, and for trouble."""
     models: tuple[Mask, ...] = ()
@@ -329,14 +343,6 @@ class BenchControls(_Controls):
         """Return the bench as it is now, if the recording is of its sensors."""
         return self.bench if is_of(path, self.bench) else None
 
-    def report(self, path: Path, result: Result) -> Path:
-        """Write the report."""
-        return _report(path, result, folder=self.reports, models=self.models)
-
-    def save(self, path: Path, result: Result) -> tuple[Path, ...]:
-        """Write CSV and JSON beside the recording, or with the reports."""
-        return save_result(path, result, folder=self.reports or path.parent)
-
     def release(self) -> None:
         """Release the recorders, which continue."""
         for recorder in self.started:
@@ -442,14 +448,6 @@ class RecordingControls(_Controls):
     def keep(self, path: Path, result: Result) -> None:
         """Do nothing: the process that records writes the result."""
 
-    def report(self, path: Path, result: Result) -> Path:
-        """Write the report beside the recording."""
-        return _report(path, result, models=self.models)
-
-    def save(self, path: Path, result: Result) -> tuple[Path, ...]:
-        """Write CSV and JSON beside the recording."""
-        return save_result(path, result, folder=path.parent)
-
 
 def pin(source: Path, path: Path) -> str:
     """Keep a recording of a service, or no longer where it is pinned; return which.
@@ -533,20 +531,6 @@ def save_result(path: Path, result: Result, *, folder: Path) -> tuple[Path, ...]
     write_metadata(csv, provenance(result))
     write_json(str(json), document(result))
     return csv, json
-
-
-def _report(
-    path: Path,
-    result: Result,
-    *,
-    folder: Path | None = None,
-    models: tuple[Mask, ...] = (),
-) -> Path:
-    require("matplotlib", "jinja2")
-    from tui.report.writing import write  # noqa: PLC0415 - loads matplotlib
-
-    out = (folder or path.parent) / f"{path.stem}.html"
-    return write(result, out, models=models, taken="beside")[1]
 
 
 def without_comparison(settings: Settings) -> Settings:

@@ -25,11 +25,9 @@ from tui.simulation.devices import scenario_of
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from numpy.typing import NDArray
-
+    from estimator.types import FloatArray
     from sim_devices.world.scenario import Scenario
 
-    FloatArray = NDArray[np.float64]
 
 DEFAULT_DURATION = 600.0
 BLOCK_SECONDS = 1.0

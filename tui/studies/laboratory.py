@@ -27,12 +27,9 @@ from tui.studies.study import Curve, Panel, Point, ProgressCallback, Series, Stu
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from numpy.typing import NDArray
-
+    from estimator.types import ComplexArray, FloatArray
     from sim_devices.world.scenario import Scenario
 
-    FloatArray = NDArray[np.float64]
-    ComplexArray = NDArray[np.complex128]
 
 HANN = WelchSettings(
     sampling_rate=paper_scenarios.SAMPLING_RATE, segment_length=2000, overlap=0.5, window="hann"

@@ -27,10 +27,8 @@ from tui.studies.study import Panel, Point, ProgressCallback, Series, Study
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from numpy.typing import NDArray
+    from estimator.types import ComplexArray, FloatArray
 
-    FloatArray = NDArray[np.float64]
-    ComplexArray = NDArray[np.complex128]
 
 PAPER = WelchSettings(
     sampling_rate=paper_scenarios.SAMPLING_RATE,

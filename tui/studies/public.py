@@ -37,11 +37,9 @@ from tui.studies.study import Curve, Panel, Study
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from numpy.typing import NDArray
-
     from daq.estimation.snapshot import Snapshot
+    from estimator.types import FloatArray
 
-    FloatArray = NDArray[np.float64]
 
 PUBLIC = "public"
 BOUND = "bound"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
@@ -10,9 +10,8 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from numpy.typing import NDArray
+    from estimator.types import FloatArray
 
-    FloatArray = NDArray[np.float64]
 
 TOLERANCE = 4.0
 """Standard errors within which a point agrees with theory: 1 in 16,000 would not by chance."""
@@ -132,16 +131,8 @@ class Study:
                     "method": series.method,
                     "quantity": series.quantity,
                     "points": [
-                        {
-                            "x": point.x,
-                            "measured": point.measured,
-                            "theory": point.theory,
-                            "error": point.error,
-                            "allowed": point.allowed,
-                            "deviation": point.deviation,
-                            "agrees": point.agrees,
-                        }
-                        for point in series.points
+                        {**asdict(each), "deviation": each.deviation, "agrees": each.agrees}
+                        for each in series.points
                     ],
                 }
                 for panel, series in self.series()

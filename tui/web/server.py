@@ -391,20 +391,17 @@ class Server:
             code = HTTPStatus.TOO_MANY_REQUESTS
         elif isinstance(error, HTTPException):
             code, text = error.status_code, error.detail
-        return self._page(
-            request, "message", code=code, title=HTTPStatus(code).phrase, text=text, refresh=0
-        )
+        return self._message(request, HTTPStatus(code).phrase, text, code)
 
     async def _broken(self, request: Request, error: Exception) -> Response:
         _LOGGER.error("error in the page %s", request.scope["path"], exc_info=error)
-        return self._page(
-            request,
-            "message",
-            code=HTTPStatus.INTERNAL_SERVER_ERROR,
-            title="Error",
-            text="This is an error in huddle itself; its log has more. Please report it.",
-            refresh=0,
-        )
+        text = "This is an error in huddle itself; its log has more. Please report it."
+        return self._message(request, "Error", text, HTTPStatus.INTERNAL_SERVER_ERROR)
+
+    def _message(
+        self, request: Request, title: str, text: str, code: int, *, refresh: int = 0
+    ) -> Response:
+        return self._page(request, "message", code=code, title=title, text=text, refresh=refresh)
 
     async def _now(self, request: Request) -> Response:
         update = await self._live.latest()
@@ -525,13 +522,8 @@ class Server:
         return state, await self._made(request, self._tests.work, (kind, key), act)
 
     def _later(self, request: Request) -> Response:
-        return self._page(
-            request,
-            "message",
-            title="One moment",
-            text="The estimate is being made. This page shows it as soon as it is there.",
-            refresh=3,
-        )
+        text = "The estimate is being made. This page shows it as soon as it is there."
+        return self._message(request, "One moment", text, HTTPStatus.OK, refresh=3)
 
     async def _test(self, request: Request) -> Response:
         state = await self._state(request)

@@ -133,10 +133,12 @@ def test_demo_allows_for_what_clocks_add(share: float, added: float) -> None:
     noise = {(e.sensor, e.channel): e.noise_psd for e in exact if e.method == "three-sensor"}
     for before, after in zip(exact, ours, strict=True):
         wanted = added * noise[after.sensor, after.channel]  # by either method
-        assert after.clocks == pytest.approx(wanted, rel=1e-6, abs=1e-20)
-        assert after.high == before.high
+        assert after.added_by_clocks == pytest.approx(wanted, rel=1e-6, abs=1e-20)
+        assert after.noise_psd_high == before.noise_psd_high
         if after.method == "three-sensor":  # many of the other's are above the bound
-            assert before.low - after.low == pytest.approx(wanted, rel=1e-6, abs=1e-20)
+            assert before.noise_psd_low - after.noise_psd_low == pytest.approx(
+                wanted, rel=1e-6, abs=1e-20
+            )
 
 
 @pytest.mark.parametrize("minutes", [0.4, 1.7, 2.4, 14.0, 31.0, 240.0, 900.0, 6e3, 9e4])

@@ -46,6 +46,8 @@ class BenchForm(Form[str]):
         Whether sensors are named here too: nothing refers to their names yet.
     """
 
+    HINTS = HINTS
+
     def __init__(self, text: str, path: Path, *, is_first: bool = False) -> None:
         self._text, self._path = text, path
         self._given = answers_in(text)
@@ -54,10 +56,6 @@ class BenchForm(Form[str]):
             del self._given["names"]
         fields = [Field(key, TITLES.get(key, key), value) for key, value in self._given.items()]
         super().__init__("first bench" if is_first else "bench", fields, does="saves")
-
-    def hint(self, name: str) -> str:
-        """Return what a field means."""
-        return HINTS[name]
 
     def problem(self, name: str) -> str:
         """Return what is wrong with a field; empty if nothing is."""

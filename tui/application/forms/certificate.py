@@ -57,6 +57,8 @@ class CertificateForm(Form[str]):
         Of the bench file. Comments, and what is not asked for, stay.
     """
 
+    HINTS = HINTS
+
     def __init__(self, text: str) -> None:
         self._text = text
         given = tomllib.loads(text)
@@ -65,10 +67,6 @@ class CertificateForm(Form[str]):
             for name in HINTS
         ]
         super().__init__("certificate", fields, does="saves")
-
-    def hint(self, name: str) -> str:
-        """Return what a field means."""
-        return HINTS[name]
 
     def problem(self, name: str) -> str:
         """Return what is wrong with a field; empty if nothing is."""

@@ -12,7 +12,7 @@ from textual.screen import ModalScreen
 from textual.widgets import Input, Label, Static
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from textual.app import ComposeResult
     from textual.events import Resize
@@ -59,6 +59,9 @@ class Form(ModalScreen[Result | None], Generic[Result]):
         Binding("shift+tab", "app.focus_previous", "Previous", show=False, priority=True),
     ]
 
+    HINTS: ClassVar[Mapping[str, str]] = {}
+    """What each field means, by its name."""
+
     def __init__(self, title: str, fields: Sequence[Field], *, does: str) -> None:
         super().__init__()
         self._title, self._fields, self._does = title, fields, does
@@ -95,7 +98,7 @@ class Form(ModalScreen[Result | None], Generic[Result]):
 
     def hint(self, name: str) -> str:
         """Return what a field means."""
-        raise NotImplementedError
+        return self.HINTS[name]
 
     def submit(self) -> None:
         """Use the values: nothing is wrong with any."""

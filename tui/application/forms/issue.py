@@ -24,6 +24,8 @@ class IssueForm(Form[Mapping[str, str]]):
         What was given before, by field.
     """
 
+    HINTS = HINTS
+
     def __init__(self, name: str, kept: Mapping[str, str]) -> None:
         fields = [
             Field("by", "authorised by", kept.get("by", ""), "empty: a specimen"),
@@ -31,10 +33,6 @@ class IssueForm(Form[Mapping[str, str]]):
             Field("despite", "despite", kept.get("despite", "")),
         ]
         super().__init__(f"certificate of {name}", fields, does="makes it")
-
-    def hint(self, name: str) -> str:
-        """Return what a field means."""
-        return HINTS[name]
 
     def problem(self, name: str) -> str:
         """Return nothing: each text will do."""

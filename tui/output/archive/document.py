@@ -24,13 +24,11 @@ from tui.output.json_values import json_text
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from numpy.typing import NDArray
-
     from daq.archive.answers import Answer
     from daq.archive.changes import Course
     from daq.archive.store import Store
+    from estimator.types import FloatArray
 
-    FloatArray = NDArray[np.float64]
     AddStation: TypeAlias = Callable[[str, str], None]
 
 SCHEMA_VERSION = 2

@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from daq.archive.answers import Answer
     from daq.bench.masks.mask import Mask
 
-    FloatArray = NDArray[np.float64]
 
 WIDTH, HEIGHT = 2.4, 1.7
 """Of one pair of axes, in inches."""
