@@ -133,12 +133,13 @@ def run(
             snapshot = result_of(recorder, settings, end=end, bench=bench)
             result = Result(snapshot, settings, bench, (out,))
             # First into the recording, whatever becomes of screens and other files.
-            stored = _Stored(out, result)
+            trouble = _stored(out, result)
             show_result(result, json=json, csv=csv, diagnostics=diagnostics)
             recorder.check()  # its error says more than one that follows from it
             for line in noted(out, result):
                 for_people(json, csv).print(line, soft_wrap=True)
-            stored.check()
+            if trouble is not None:
+                raise trouble  # noqa: TRY301 - once all that is known has been shown
             if report is not None:
                 write_report(result, report, screen=for_people(json, csv))
     except BaseException:
@@ -153,22 +154,15 @@ def run(
     exit_with(result.verdict)
 
 
-class _Stored:
-    """Writes the results into the recording, and raises later what kept it from that."""
+def _stored(out: Path, result: Result) -> RecordingError | None:
+    """Write the results into the recording; return what kept it from that."""
+    from daq.results.store import store_results
 
-    def __init__(self, out: Path, result: Result) -> None:
-        from daq.results.store import store_results
-
-        self._error: RecordingError | None = None
-        try:
-            store_results(out, result.snapshot, result.verdict)
-        except RecordingError as error:
-            self._error = error
-
-    def check(self) -> None:
-        """Raise the error that occurred, if there was one."""
-        if self._error is not None:
-            raise self._error
+    try:
+        store_results(out, result.snapshot, result.verdict)
+    except RecordingError as error:
+        return error
+    return None
 
 
 def result_of(
@@ -192,8 +186,7 @@ def result_of(
     from daq.estimation.follow import RecordingLeftOpenError, follow
     from daq.recording.repair import repair
 
-    with _progress(end.duration) as bar:
-        observer = _Run(bar, bench)
+    with _progress(end.duration, bench) as observer:
         try:
             snapshot = follow(
                 recorder.out,
@@ -240,41 +233,6 @@ def _estimate_at_end(recorder: RecorderProcess, settings: Settings) -> Snapshot 
     return estimate([recorder.out], settings) if closed else None
 
 
-class _Run:
-    """Shows the progress of a run."""
-
-    def __init__(self, bar: _Bar, bench: Bench | None) -> None:
-        self._bar, self._bench = bar, bench
-        self._says_why = False
-        self._now: RecordingStatus | None = None
-
-    def status(self, status: RecordingStatus) -> None:
-        """Keep it for the progress line."""
-        self._now = status
-
-    def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
-        """Show the progress of the run."""
-        from daq.results.result import Result
-        from tui.wording.facts import why_no_estimate
-
-        if snapshot.closed:
-            return
-        result = Result(snapshot, settings, self._bench)
-        self._bar.estimated(result, self._now)
-        reason = why_no_estimate(result)
-        if reason and not self._says_why:
-            self._says_why = True
-            _LOGGER.warning("%s", reason)
-
-    def segments(self, n_segments: int, elapsed: float) -> None:
-        """Show the progress of the recording."""
-        self._bar.recording(n_segments, elapsed)
-
-    def progress(self, done: int, total: int) -> None:
-        """Show the progress of the result."""
-        self._bar.result(done, total)
-
-
 def refuse_hopeless(bench: Bench, settings: Settings, end: EndCondition) -> None:
     """Refuse a test that cannot end as wanted: too short for any estimate, or without limits.
 
@@ -297,56 +255,63 @@ def refuse_hopeless(bench: Bench, settings: Settings, end: EndCondition) -> None
         )
 
 
-class _Bar:
-    """Progress line of a run: time, segments, c.o.v., how long it takes."""
+class _Run:
+    """Shows the progress of a run in a line: time, segments, c.o.v., how long it takes."""
 
-    def __init__(self, bar: Progress, duration: float | None) -> None:
-        self._bar = bar
+    def __init__(self, bar: Progress, duration: float | None, bench: Bench | None) -> None:
+        self._bar, self._bench = bar, bench
         self._task = bar.add_task("0:00", total=None, state="")
         self._end = duration
         self._cov = math.nan
         self._left = ""
+        self._says_why = False
+        self._now: RecordingStatus | None = None
 
-    def estimated(self, result: Result, now: RecordingStatus | None) -> None:
+    def status(self, status: RecordingStatus) -> None:
+        """Keep it for the progress line."""
+        self._now = status
+
+    def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
         """Show the progress of the recording with the precision of its estimate."""
+        from daq.results.result import Result
+        from tui.wording.facts import why_no_estimate
         from tui.wording.verdict_text import how_long
 
-        snapshot, self._cov = result.snapshot, result.precision().cov
+        if snapshot.closed:
+            return
+        result, now = Result(snapshot, settings, self._bench), self._now
+        self._cov = result.precision().cov
         if now is not None and not self._bar.disable:
             left = result.remaining(now.until, now.elapsed)
             self._end = None if left.seconds is None else snapshot.elapsed + left.seconds
             self._left = how_long(left, now.in_local_time(left.seconds))
-        self.recording(snapshot.n_segments, snapshot.elapsed)
+        self.segments(snapshot.n_segments, snapshot.elapsed)
+        reason = why_no_estimate(result)
+        if reason and not self._says_why:
+            self._says_why = True
+            _LOGGER.warning("%s", reason)
 
-    def recording(self, n_segments: int, elapsed: float) -> None:
+    def segments(self, n_segments: int, elapsed: float) -> None:
         """Show the progress of the recording."""
         from estimator.wording import clock_time
 
         parts = [f"{n_segments} segments"]
         if not math.isnan(self._cov):
             parts.append(f"c.o.v. {self._cov:.3f}")
-        parts += [self._left] if self._left else []
-        self._bar.update(
-            self._task,
-            description=clock_time(elapsed),
-            completed=elapsed,
-            total=self._end,
-            state=" · ".join(parts),
-        )
+        state = " · ".join([*parts, *filter(None, [self._left])])
+        self._show(clock_time(elapsed), elapsed, self._end, state)
 
-    def result(self, done: int, total: int) -> None:
+    def progress(self, done: int, total: int) -> None:
         """Show the progress of the final estimate."""
-        self._bar.update(
-            self._task,
-            description="result",
-            completed=done,
-            total=total,
-            state=f"{done / total:.0%}",
-        )
+        self._show("result", done, total, f"{done / total:.0%}")
+
+    def _show(self, what: str, done: float, total: float | None, state: str) -> None:
+        task = self._task
+        self._bar.update(task, description=what, completed=done, total=total, state=state)
 
 
 @contextmanager
-def _progress(duration: float | None) -> Iterator[_Bar]:
+def _progress(duration: float | None, bench: Bench | None) -> Iterator[_Run]:
     from rich.progress import BarColumn, TextColumn
 
     from tui.output.console import progress
@@ -357,4 +322,4 @@ def _progress(duration: float | None) -> Iterator[_Bar]:
         TextColumn("{task.fields[state]}"),
         per_second=1,
     ) as bar:
-        yield _Bar(bar, duration)
+        yield _Run(bar, duration, bench)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import io
 import math
 from dataclasses import dataclass
+from functools import partial
 from itertools import cycle, groupby
 from typing import TYPE_CHECKING
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from daq.bench.units import levels_db
 from daq.results.decision.limits import concerns, mask_psd
@@ -85,44 +86,31 @@ class _NoisePanel:
         frequency = curve.frequency
         axes.set_title(self.name)
         logarithmic(axes, (float(curve.edges[0]), float(curve.edges[-1])))
-        axes.plot(frequency, levels_db(curve.data), color=drawing.DATA, lw=0.8, label="recorded")
+        line = partial(axes.plot, lw=0.8)
+        line(frequency, levels_db(curve.data), color=drawing.DATA, label="recorded")
         floor = 10 ** (scale[0] / 10)
         if curve.noise is not None:
             self._draw_noise(axes, curve.noise, floor)
-        for (label, psd), colour, dashes in zip(
-            curve.others.items(), drawing.LINES[1:], drawing.DASHES, strict=False
-        ):
-            axes.plot(
-                frequency, levels_db(psd), color=colour, lw=0.8, dashes=dashes, label=_shown(label)
-            )
+        styles = zip(drawing.LINES[1:], drawing.DASHES, strict=False)
+        for (label, psd), (colour, dashes) in zip(curve.others.items(), styles, strict=False):
+            line(frequency, levels_db(psd), color=colour, dashes=dashes, label=_shown(label))
         if (curve.quantisation > floor).any():
-            axes.plot(
-                frequency,
-                levels_db(curve.quantisation),
-                color=drawing.QUANTISATION,
-                lw=0.8,
-                dashes=(1, 1.5),
-                label="quantisation",
-            )
+            level, colour = levels_db(curve.quantisation), drawing.QUANTISATION
+            line(frequency, level, color=colour, dashes=(1, 1.5), label="quantisation")
         for at, mask in curve.limits:
-            axes.plot(
-                at, levels_db(mask), color=drawing.LIMIT, lw=1.0, dashes=(5, 2), label="limit"
-            )
-        for (label, (at, psd)), dashes in zip(
-            curve.models.items(), cycle(drawing.MODEL_DASHES), strict=False
-        ):
-            axes.plot(
-                at, levels_db(psd), color=drawing.MODEL, lw=0.7, dashes=dashes, label=_shown(label)
-            )
+            limit = levels_db(mask)
+            line(at, limit, color=drawing.LIMIT, lw=1.0, dashes=(5, 2), label="limit")
+        models = zip(curve.models.items(), cycle(drawing.MODEL_DASHES), strict=False)
+        for (label, (at, psd)), dashes in models:
+            level, name = levels_db(psd), _shown(label)
+            line(at, level, color=drawing.MODEL, lw=0.7, dashes=dashes, label=name)
         for edge in self.band or ():
             axes.axvline(edge, color=drawing.INK, lw=0.5, dashes=(1, 2))
         if curve.noise is not None:
             _nothing(axes, curve.edges, curve.noise)
         axes.set_ylim(scale)
         axes.yaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 2, 5, 10], integer=True))
-        axes.yaxis.set_major_formatter(
-            FuncFormatter(lambda value, _: f"{value:.0f}".replace("-", "−"))
-        )
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:.0f}".replace("-", "−"))
         axes.set_ylabel(f"dB re 1 ({self.unit})²/Hz")
         if self.with_amplitude:
             _amplitude_scale(axes, scale, self.unit)
@@ -130,32 +118,16 @@ class _NoisePanel:
     def _draw_noise(self, axes: Axes, noise: BandMeans, floor: float) -> None:
         frequency = self.curve.frequency
         is_bound = noise.is_bound
-        high = np.where((noise.high > 0) & ~is_bound, noise.high, np.nan)
+        high = levels_db(np.where((noise.high > 0) & ~is_bound, noise.high, np.nan))
+        low = levels_db(np.where(noise.low > floor, noise.low, floor))
+        draw = partial(axes.plot, frequency, color=drawing.NOISE)
         axes.fill_between(
-            frequency,
-            levels_db(np.where(noise.low > floor, noise.low, floor)),
-            levels_db(high),
-            color=drawing.NOISE,
-            alpha=0.25,
-            lw=0,
-            label="95 % interval",
+            frequency, low, high, color=drawing.NOISE, alpha=0.25, lw=0, label="95 % interval"
         )
-        axes.plot(
-            frequency,
-            levels_db(np.where(is_bound, np.nan, noise.mean)),
-            color=drawing.NOISE,
-            lw=0.9,
-            label=self.noise_label,
-        )
+        draw(levels_db(np.where(is_bound, np.nan, noise.mean)), lw=0.9, label=self.noise_label)
         if is_bound.any():
-            axes.plot(
-                frequency,
-                levels_db(np.where(is_bound, noise.high, np.nan)),
-                color=drawing.NOISE,
-                lw=0.8,
-                dashes=(3, 2),
-                label=f"{self.noise_label} is below",
-            )
+            bound, label = np.where(is_bound, noise.high, np.nan), f"{self.noise_label} is below"
+            draw(levels_db(bound), lw=0.8, dashes=(3, 2), label=label)
 
 
 def noise_plots(
@@ -348,7 +320,7 @@ def _amplitude_scale(axes: Axes, scale: tuple[float, float], unit: str) -> None:
     step = 20 * max(1, math.ceil((scale[1] - scale[0]) / 120))
     first = math.ceil(scale[0] / step) * step
     other.set_yticks(np.arange(first, scale[1] + 1, step))
-    other.yaxis.set_major_formatter(FuncFormatter(lambda value, _: power_of_ten(value / 20)))
+    other.yaxis.set_major_formatter(lambda value, _: power_of_ten(value / 20))
     other.set_ylabel(f"({unit})/√Hz")
 
 
@@ -378,7 +350,7 @@ def logarithmic(axes: Axes, span: tuple[float, float]) -> None:
     """Make the horizontal axis one of frequency."""
     axes.set_xscale("log")
     axes.set_xlim(span)
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_xlabel("frequency (Hz)")
 

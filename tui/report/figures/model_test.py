@@ -7,7 +7,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from matplotlib.ticker import LogLocator, NullLocator
 from scipy import special
 
 from estimator.levels.bands import log_edges
@@ -73,29 +73,16 @@ def _draw_test(
     axes.set_yscale("log")
     failing = ratio > limit
     axes.plot(centre, limit, color=drawing.LIMIT, lw=0.9, dashes=(5, 2), label="1 % limit")
-    axes.plot(
-        centre[~failing],
-        ratio[~failing],
-        "o",
-        ms=2.4,
-        color=drawing.NOISE,
-        label="explained",
-        clip_on=False,
-    )
+    draw = partial(axes.plot, ls="", clip_on=False)
+    holds = centre[~failing], ratio[~failing]
+    draw(*holds, marker="o", ms=2.4, color=drawing.NOISE, label="explained")
     if failing.any():
-        axes.plot(
-            centre[failing],
-            ratio[failing],
-            "D",
-            ms=2.6,
-            color=drawing.LIMIT,
-            label="not explained",
-            clip_on=False,
-        )
+        fails = centre[failing], ratio[failing]
+        draw(*fails, marker="D", ms=2.6, color=drawing.LIMIT, label="not explained")
     finite = np.concatenate([ratio[ratio > 0], limit[np.isfinite(limit)], [1.0]])
     finite = finite[np.isfinite(finite)]
     axes.set_ylim(min(0.7, 0.9 * finite.min()), max(1.6, 1.25 * finite.max()))
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_minor_locator(NullLocator())
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.set_ylabel("statistic / expected")
