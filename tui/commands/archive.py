@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tui.commands.options import OutOption, command, with_estimate_options, with_logging
+from tui.output.console import check_places, notices
 from tui.output.extras import load, require
 
 if TYPE_CHECKING:
@@ -117,7 +118,6 @@ def archive(
     from daq.bench.masks.mask_file import masks_named
     from daq.estimation.settings import Settings
     from tui.commands.archive_answers import Asked, watched
-    from tui.output.console import check_places, notices
     from tui.runs.archives import Filling
     from tui.runs.estimate_settings import chosen, settings_for
 
@@ -204,7 +204,6 @@ def _runner(jobs: int, scheduler: str | None) -> Run:
     if scheduler is None:
         return lambda tasks: carried_out(tasks, jobs=jobs)
     from estimator.wording import several
-    from tui.output.console import notices
 
     address, told = scheduler, set[str]()
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from tui.commands.estimate import estimated
 from tui.commands.options import command, with_estimate_options
+from tui.output.console import check_places, for_people, hint, write_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -68,7 +69,6 @@ def calibrate(
         sensitivity_table,
         title,
     )
-    from tui.output.console import check_places, for_people, hint, write_json
     from tui.output.json_document import calibration_document
 
     check_places(json)

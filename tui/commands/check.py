@@ -18,6 +18,7 @@ from daq.errors import DeviceError, NoAnswerError
 from tui.commands.devices import summaries
 from tui.commands.options import command
 from tui.output import check_list
+from tui.output.console import for_people, notices, write_json
 from tui.output.exit_codes import ExitCode
 from tui.page.table import Table
 
@@ -101,7 +102,6 @@ def check_bench(path: Path, *, devices: bool, write: bool = False, json: str | N
     from daq.devices.bench_file import is_simulated, load
     from daq.preflight.device_check import Examination
     from daq.results.facts.recordings import SIMULATED
-    from tui.output.console import for_people, write_json
 
     bench = load(path)
     screen = for_people(json)
@@ -164,8 +164,6 @@ def check_before_test(bench: Bench, *, duration: float | None = None, anyway: bo
     ExceptionGroup
         Likewise, with the errors of devices that cannot be read.
     """
-    from tui.output.console import notices
-
     examined = examined_bench(bench, duration=duration)
     lines = check_list.lines(examined.rows, failures_only=True)
     if not anyway:
@@ -214,7 +212,6 @@ def check_port(port: str, *, json: str | None) -> None:
     from daq.preflight.device_check import discover, search_description
     from daq.results.facts.recordings import SIMULATED
     from daq.transport.ports import is_simulated
-    from tui.output.console import for_people, write_json
 
     found = asyncio.run(discover(port, SystemClock()))
     simulated = is_simulated(port)

@@ -19,6 +19,7 @@ from daq.bench.durations import format_duration
 from daq.bench.end_condition import EndCondition
 from tui.commands.options import DurationOption, SpeedOption, command, with_logging
 from tui.commands.run import result_of
+from tui.output.console import check_places, for_people, notices, write_json
 from tui.output.exit_codes import ExitCode
 from tui.page.table import Cell, Table
 
@@ -77,7 +78,6 @@ def demo(
     from daq.estimation.estimation import estimate
     from daq.estimation.settings import Settings
     from daq.results.result import Result
-    from tui.output.console import check_places, for_people, write_json
     from tui.simulation.devices import scenario_of, simulated
 
     check_places(None if keep is None else str(keep))
@@ -164,7 +164,6 @@ def _show(path: Path, settings: Settings) -> Path | None:
 
 def _record(path: Path, out: Path, settings: Settings, duration: float, speed: float) -> bool:
     """Record; return whether Ctrl-C ended it."""
-    from tui.output.console import notices
     from tui.runs.recorder_process import RecorderProcess, defer_interrupt
 
     notices().print(

@@ -11,6 +11,7 @@ import typer
 from daq.bench.driver_settings import settings_of
 from daq.errors import DriverError
 from tui.commands.options import OutOption, SpeedOption, command, with_logging
+from tui.output.console import console, for_people, write_json
 from tui.page.table import Table
 
 
@@ -75,7 +76,6 @@ def list_ports(*, json: str | None) -> None:
     """Print the ports of this computer."""
     from daq.devices.registry import present_ports
     from daq.transport.serial_ports import serial_ports
-    from tui.output.console import for_people, write_json
 
     found, reasons = present_ports()
     rows = [(one.path, "", one.identity) for one in serial_ports()]
@@ -101,7 +101,6 @@ def list_settings(name: str, *, json: str | None) -> None:
         The driver is not installed.
     """
     from daq.devices.registry import driver_names, driver_type
-    from tui.output.console import for_people, write_json
 
     if name not in driver_names():
         known = "\n".join(f"  {other}  {summary}" for other, summary in summaries().items())
@@ -130,8 +129,6 @@ def summaries() -> dict[str, str]:
 
 def print_others(known: str) -> None:
     """Print the drivers of other packages, which a text does not name."""
-    from tui.output.console import console
-
     for name, summary in summaries().items():
         if f"#   {name} " not in known:
             console().print(f"  driver {name}: {summary}", markup=False, highlight=False)

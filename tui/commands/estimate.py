@@ -14,6 +14,15 @@ import typer
 
 from daq.foreign_files import import_command, is_foreign
 from tui.commands.options import DetailsOption, command, with_estimate_options
+from tui.output.console import (
+    STANDARD_OUTPUT,
+    check_places,
+    counted,
+    for_people,
+    hint,
+    write_json,
+    write_text,
+)
 from tui.output.exit_codes import ExitCode
 
 if TYPE_CHECKING:
@@ -75,8 +84,6 @@ def estimate(
     A.X recorded −90.00 dB, mostly motion; its own noise is between −114.15 and
     −113.89 dB. A recording four times as long halves the interval.
     """
-    from tui.output.console import check_places, hint
-
     check_places(json, csv)
     if any(map(is_foreign, files)):
         result = _of_foreign_files(
@@ -148,7 +155,6 @@ def _of_foreign_files(
     from daq.formats.importer import open_files
     from daq.results.result import Result
     from tui.commands.import_ import assigned, selected, show_chosen, show_taken
-    from tui.output.console import counted, for_people
     from tui.runs.estimate_settings import check_fit, chosen_for_files, spanned
 
     screen = for_people(json)
@@ -191,7 +197,6 @@ def estimated(
     from daq.estimation.estimation import estimate
     from daq.recording.reader import Recording
     from daq.results.result import Result
-    from tui.output.console import counted
     from tui.runs.estimate_settings import settings_of
 
     if any(map(is_foreign, files)):
@@ -220,7 +225,6 @@ def show_result(
     """Print the table, and write JSON and CSV if requested."""
     from daq.results.noise_parameters import quantisation_shares
     from estimator.decision.verdict import Verdict
-    from tui.output.console import STANDARD_OUTPUT, for_people, write_json, write_text
     from tui.output.diagnosis import details
     from tui.output.noise_parameters import quantisation_notes
     from tui.output.results import averages_line, curves_csv, result_table, result_title

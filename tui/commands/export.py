@@ -12,6 +12,7 @@ import typer
 
 from tui.commands.estimate import estimated
 from tui.commands.options import OutOption, command, with_estimate_options, with_logging
+from tui.output.console import for_people, write_json
 
 
 @command()
@@ -54,7 +55,6 @@ def export(
     """
     from estimator.wording import several
     from tui.notebook.curve_files import MINISEED, WRITERS, write_curves
-    from tui.output.console import for_people, write_json
     from tui.output.json_document import provenance
 
     if kind == MINISEED:
@@ -81,7 +81,6 @@ def export(
 def _export_samples(file: Path, out: Path, json: str | None) -> None:
     from estimator.wording import several
     from tui.notebook.curve_files import MINISEED, write_samples
-    from tui.output.console import for_people, write_json
 
     written, station = write_samples(file, out)
     screen = for_people(json)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tui.commands.options import OutOption, command
+from tui.output.console import check_places, for_people, write_json, write_text
 from tui.output.csv_text import csv_text
 from tui.output.extras import require
 from tui.service.records.run_state import utc_text
@@ -83,7 +84,6 @@ def history(
     huddle history --sensor S4254475 --label S4254475.svg   (a label to print)
     huddle history lab/recordings office/recordings --csv -   (sensors by serial number)
     """
-    from tui.output.console import check_places, for_people, write_json, write_text
     from tui.service.history.ledger import sensor_tests
     from tui.service.history.series import bands_of, history
     from tui.service.history.shown import (

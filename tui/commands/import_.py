@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from tui.commands.options import command, read_option, with_estimate_options, with_logging
+from tui.output.console import for_people, notices, write_json
 from tui.output.exit_codes import ExitCode
 from tui.page.table import Table
 
@@ -210,7 +211,6 @@ def import_recording(
     """
     from daq.bench.loading import parse
     from daq.formats.importer import import_files
-    from tui.output.console import write_json
     from tui.runs.estimate_settings import chosen_for_files
 
     described = None if bench is None else parse(bench.read_text(encoding="utf-8"), bench)
@@ -266,7 +266,6 @@ def _by_sensor(names: Sequence[str]) -> str:
 def _show(result: ImportResult, out: Path, json: str | None) -> None:
     from daq.bench.durations import format_duration
     from estimator.wording import several
-    from tui.output.console import for_people
     from tui.wording.formatting import utc
 
     rows = (
@@ -303,8 +302,6 @@ def _show(result: ImportResult, out: Path, json: str | None) -> None:
 
 def show_taken(result: ImportResult, screen: Console) -> None:
     """Print the calibration of every channel, and what was left aside or not imported."""
-    from tui.output.console import notices
-
     for line in _calibrations(result):
         screen.print(line, soft_wrap=True)
     for reason in sorted(set(result.left_aside.values())):

@@ -14,6 +14,7 @@ import typer
 from daq.errors import BenchFileError, HuddleError, NoAnswerError, NotConnectedError
 from tui.commands.devices import print_others
 from tui.commands.options import command
+from tui.output.console import check_places, console, write_text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -74,8 +75,6 @@ def write_template(out: Path, *, force: bool) -> None:
     typer.BadParameter
         The file exists, or its folder does not.
     """
-    from tui.output.console import check_places, console, write_text
-
     if out.exists() and not force:
         raise typer.BadParameter(f"{out}: exists already; --force replaces it")
     check_places(str(out))
@@ -100,7 +99,6 @@ def write_discovered(out: Path, ports: Sequence[str], *, force: bool) -> None:
     """
     from daq.devices.bench_file import parse
     from estimator.wording import listed, several
-    from tui.output.console import check_places, console, write_text
     from tui.runs.first_bench import answers_in, draft, with_device
 
     if out.exists() and not force:
@@ -132,7 +130,6 @@ def _search(ports: Sequence[str], *, is_asked: bool) -> tuple[list[str], list[Di
     from daq.preflight.device_check import network_ports
     from daq.transport.ports import is_simulated
     from daq.transport.serial_ports import serial_ports
-    from tui.output.console import console
 
     searched = list(ports) or [port.path for port in serial_ports()]
     screen = console()
@@ -169,7 +166,6 @@ def _search(ports: Sequence[str], *, is_asked: bool) -> tuple[list[str], list[Di
 
 def _asked(text: str) -> str:
     """Ask for what is common to all sensors, each again until it fits; return the new text."""
-    from tui.output.console import console
     from tui.runs.first_bench import answers_in, with_answers
 
     for name, question in QUESTIONS.items():

@@ -15,6 +15,7 @@ from tui.certificate.ledger import Ledger, LedgerError, ledger_of, ledgers_of
 from tui.commands.estimate import estimated, exit_with
 from tui.commands.options import command, with_estimate_options
 from tui.commands.verify import known_to_services
+from tui.output.console import console, for_people, notices, write_json
 from tui.output.extras import require
 from tui.page.table import Table
 
@@ -81,7 +82,6 @@ def issue(
     """
     from daq.bench.masks.mask_file import masks_named
     from daq.devices.bench_file import load
-    from tui.output.console import console, notices
 
     require("matplotlib", "jinja2", "fpdf", *(["pyhanko"] if sign is not None else []))
     from tui.certificate.issuing import Order, examine, issue, specimen, with_stated
@@ -152,7 +152,6 @@ def issues(
     huddle issues night.h5 --json -
     """
     from daq.recording.reader import Recording
-    from tui.output.console import for_people, write_json
 
     if source.is_dir():
         ledger = Ledger(source)

@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from tui.commands.options import command
+from tui.output.console import for_people, write_json
 
 
 @command()
@@ -63,7 +64,6 @@ def plan(
     then scatters by 5 %, where motion is 1000 times the noise (--snr).
     """
     from tui.notebook.planning import plan as plan_of
-    from tui.output.console import for_people, write_json
 
     if path is None and rate is None:
         raise typer.BadParameter("name a bench file, or give --rate and --sensors")

@@ -11,6 +11,7 @@ import typer
 
 from tui.commands.estimate import estimated
 from tui.commands.options import OutOption, command, with_estimate_options
+from tui.output.console import check_places, console, notices
 from tui.output.extras import require
 
 SUFFIXES = (".svg", ".png", ".pdf")
@@ -59,7 +60,6 @@ def plot(
     huddle plot night.h5 -o sensors.svg --sensors
     """
     from daq.bench.masks.mask_file import masks_named
-    from tui.output.console import check_places, console, notices
 
     require("matplotlib")
     out = files[0].with_suffix(".svg") if out is None else out
@@ -97,7 +97,6 @@ def _plot_signal(
     from daq.recording.reader import Recording
     from daq.results.signal import Signal
     from estimator.errors import EstimatorError
-    from tui.output.console import console, notices
     from tui.report.figures.curves import write_plots
     from tui.report.figures.signal import signal_plots
     from tui.runs.estimate_settings import settings_of

@@ -20,6 +20,7 @@ from daq.errors import HuddleError, WrongSettingError
 from daq.python_process import python_command
 from daq.recording.storage.names import recording_path
 from tui.commands.options import DurationOption, OutOption, command, with_logging
+from tui.output.console import notices, write_json
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -83,7 +84,6 @@ def record(
     from daq.recorder.recorder import run
     from daq.transport.wire_log import logging_to
     from estimator.checks.count_limits import share_of_repeats
-    from tui.output.console import notices, write_json
     from tui.simulation.host_time import host_time
 
     if until_stopped and duration is not None:

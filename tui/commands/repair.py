@@ -8,6 +8,7 @@ from pathlib import Path
 
 from daq.errors import RecordingError
 from tui.commands.options import command
+from tui.output.console import for_people, write_json
 from tui.page.table import Table
 
 
@@ -37,7 +38,6 @@ def repair(
     from dataclasses import asdict
 
     from daq.recording.repair import repair, verify
-    from tui.output.console import for_people, write_json
 
     report = verify(path) if check else repair(path)
     numbers = ("samples", "blocks", "gaps", "damaged blocks", "unacknowledged rows")

@@ -11,6 +11,7 @@ import typer
 
 from tui.commands.estimate import estimated, exit_with
 from tui.commands.options import OutOption, command, with_estimate_options
+from tui.output.console import check_places, console, notices
 from tui.output.extras import require
 
 if TYPE_CHECKING:
@@ -72,7 +73,6 @@ def report(
     With limits in the bench file the first line is the verdict: PASS or FAIL.
     """
     from daq.bench.masks.mask_file import masks_named
-    from tui.output.console import console
 
     masks = masks_named(models)
     out = checked(files[0].with_suffix(".html") if out is None else out)
@@ -92,8 +92,6 @@ def checked(out: Path) -> Path:
     MissingPackageError
         A package that writes reports is missing.
     """
-    from tui.output.console import check_places
-
     require("matplotlib", "jinja2", *(["fpdf"] if out.suffix.lower() == ".pdf" else []))
     if out.suffix.lower() not in SUFFIXES:
         raise typer.BadParameter(f"{out}: expected a file name that ends in .html, .pdf or .xml")
@@ -116,7 +114,6 @@ def write_report(
     ReportError
         If the file cannot be written.
     """
-    from tui.output.console import notices
     from tui.report.writing import write
 
     if out.suffix.lower() == ".xml":

@@ -29,6 +29,7 @@ from tui.commands.options import (
     with_logging,
 )
 from tui.commands.report import checked, write_report
+from tui.output.console import check_places, for_people, hint, progress
 from tui.output.exit_codes import ExitCode
 
 if TYPE_CHECKING:
@@ -105,7 +106,6 @@ def run(
     from daq.estimation.settings import Settings
     from daq.host_clock import SystemClock
     from daq.results.result import Result
-    from tui.output.console import check_places, for_people, hint
     from tui.runs.estimate_settings import check_fit, chosen
     from tui.runs.recorder_process import RecorderProcess, defer_interrupt
     from tui.service.history.ledger import noted
@@ -313,8 +313,6 @@ class _Run:
 @contextmanager
 def _progress(duration: float | None, bench: Bench | None) -> Iterator[_Run]:
     from rich.progress import BarColumn, TextColumn
-
-    from tui.output.console import progress
 
     with progress(
         TextColumn("{task.description}"),

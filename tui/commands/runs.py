@@ -11,6 +11,7 @@ import typer
 
 from daq.errors import HuddleError
 from tui.commands.options import command
+from tui.output.console import check_places, for_people, write_json, write_text
 from tui.output.csv_text import csv_text
 from tui.page.table import Cell, Table, Tone
 from tui.service.records.run_state import Run, RunState, utc_text
@@ -57,7 +58,6 @@ def runs(
     huddle runs lab.toml --last 10
     huddle runs recordings --csv -
     """
-    from tui.output.console import check_places, for_people, write_json, write_text
     from tui.service.records.places import Place
 
     check_places(json, csv)
@@ -99,7 +99,6 @@ def pin(
     huddle pin lab.toml lab-20261121T220000Z.h5
     huddle pin lab.toml '2026-11-21 22:00' --remove
     """
-    from tui.output.console import for_people
     from tui.service.records.places import Place
 
     pinned = not remove

@@ -19,6 +19,7 @@ from daq.bench.option_fit import shortest_duration
 from daq.errors import BenchFileError, FileFault, HuddleError
 from daq.recorder.schedule import all_due, utc_now
 from tui.commands.options import command, with_estimate_options, with_logging
+from tui.output.console import for_people, write_json
 from tui.output.extras import require
 from tui.service.metrics import ServiceMetrics
 from tui.service.notify import Notifier, watchdog_interval
@@ -71,8 +72,6 @@ def serve(
     huddle serve lab.toml --method all --reject
     """
     import asyncio
-
-    from tui.output.console import for_people, write_json
 
     bench = accepted(path, wanted)
     if show:

@@ -10,6 +10,7 @@ import typer
 
 from daq.errors import RecordingError
 from tui.commands.options import command
+from tui.output.console import for_people
 
 
 @command()
@@ -39,7 +40,6 @@ def sign(
     """
     from daq.recording.repair import verify
     from daq.recording.signing import make_key, sign
-    from tui.output.console import for_people
 
     recordings = recordings or []
     screen = for_people(None)

@@ -10,6 +10,7 @@ import typer
 
 from daq.recorder.schedule import utc_now
 from tui.commands.options import command
+from tui.output.console import for_people, write_json
 from tui.output.exit_codes import ExitCode
 from tui.service.records.store import RunStore
 
@@ -26,7 +27,6 @@ def status(path: Path, *, json: str | None = None) -> None:
     huddle status lab.toml --json -
     """
     from daq.devices.bench_file import load
-    from tui.output.console import for_people, write_json
     from tui.service.status import service_status, status_lines
 
     bench = load(path)

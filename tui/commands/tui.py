@@ -16,6 +16,7 @@ from daq.errors import BenchFileError, FileFault
 from daq.foreign_files import OWN, SUFFIXES
 from tui.application.terminal.ascii_text import is_ascii_only
 from tui.commands.options import command, with_estimate_options, with_log_file
+from tui.output.console import check_places, notices
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -180,7 +181,6 @@ def first_bench(path: Path, ports: Sequence[str], baud: int | None = None) -> Pa
     from daq.transport.serial_ports import serial_ports
     from tui.application.first_bench import FirstBenchApp
     from tui.commands.tui_controls import FirstBenchControls
-    from tui.output.console import check_places
     from tui.output.logs.lines import screen_taken
     from tui.runs.first_bench import draft
 
@@ -200,7 +200,6 @@ def _has_terminal() -> bool:
 
 def _run(app: HuddleApp, *, again: Path) -> None:
     """Run the application; print the name of its recording, and whether it continues."""
-    from tui.output.console import notices
     from tui.output.logs.lines import screen_taken
 
     if not _has_terminal():

@@ -13,6 +13,7 @@ import typer
 from daq.errors import RecordingError
 from tui.certificate.ledger import Ledger
 from tui.commands.options import command
+from tui.output.console import for_people, write_json
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -60,7 +61,6 @@ def verify(
     huddle verify certificates/HT-2026-0042-r0.pdf --key lab.pem
     """
     from tui.certificate.verification import verified
-    from tui.output.console import for_people, write_json
 
     certificates = [source for source in sources if source.suffix.lower() == ".pdf"]
     if certificates:
@@ -111,7 +111,6 @@ def _verify_certificates(
         If one is not genuine, or is of another recording.
     """
     from tui.certificate.verification import verify
-    from tui.output.console import for_people, write_json
 
     recordings = [source for source in sources if source not in certificates]
     found = []

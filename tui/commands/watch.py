@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from tui.commands.estimate import exit_with, show_result
 from tui.commands.options import command, with_estimate_options, with_logging
+from tui.output.console import console, write_text
 
 if TYPE_CHECKING:
     from daq.bench.model import Bench
@@ -70,7 +71,6 @@ class _Lines:
     def status(self, status: RecordingStatus) -> None:
         from daq.results.facts.recordings import SIMULATED
         from estimator.wording import clock_time
-        from tui.output.console import console
 
         before, self._now = self._now, status
         events = status.events[self._n_events :]
@@ -96,7 +96,6 @@ class _Lines:
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
         from daq.results.result import Result
         from estimator.wording import clock_time
-        from tui.output.console import console
         from tui.wording.facts import why_no_estimate
 
         result = Result(snapshot, settings, self._bench, (self._file,))
@@ -126,7 +125,6 @@ class _Lines:
         pass
 
     def _write(self, document: dict[str, Any]) -> None:
-        from tui.output.console import write_text
         from tui.output.json_values import json_text
 
         if self._json is not None:

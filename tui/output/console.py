@@ -6,26 +6,20 @@ otherwise be taken for markup and emoji. Colour is asked for with ``style=`` or 
 
 from __future__ import annotations
 
-import os
 import sys
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-import rich.table
 import typer
-from rich.console import Console, ConsoleOptions, RenderableType
-from rich.segment import Segment
 
 from daq.whole_file import written
-from tui.output.exit_codes import ExitCode
-from tui.page.table import Table
-from tui.page.terminal import terminal_table
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
+    from rich.console import Console
     from rich.progress import Progress, ProgressColumn
 
 STANDARD_OUTPUT = "-"
@@ -33,66 +27,26 @@ _SPEED_PERIOD = 3600.0
 """Seconds over which the time left is predicted: a step may take many minutes."""
 WIDTH_OF_FILES = 110
 """Columns of bars and rules that go into a file or a pipe."""
-WIDTH_OF_TABLES = 2000
-"""Columns that a table in a file or a pipe may need."""
 _for_json = False
-SHOWN_CONTROLS = {
-    code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) if chr(code) not in "\n\t"
-}
-
-
-class PlainConsole(Console):
-    """A console on which no text acts: control characters in names or files are shown as such.
-
-    Files and pipes get a row of a table, and a paragraph, on one line each.
-    """
-
-    def print(self, *objects: Any, **options: Any) -> None:  # noqa: ANN401 - the library's own
-        """Print texts and tables; unbroken where no terminal shows them."""
-        shown = [terminal_table(one) if isinstance(one, Table) else one for one in objects]
-        if self.is_terminal:
-            super().print(*shown, **options)
-            return
-        usual = self.width
-        if any(isinstance(each, rich.table.Table) for each in shown):
-            self.width = WIDTH_OF_TABLES
-        else:
-            options.setdefault("soft_wrap", True)
-        super().print(*shown, **options)
-        self.width = usual
-
-    def on_broken_pipe(self) -> None:
-        """End quietly, not as a limit that is not met."""
-        self.quiet = True
-        os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())
-        raise SystemExit(ExitCode.CLOSED_PIPE)
-
-    def render(
-        self, renderable: RenderableType, options: ConsoleOptions | None = None
-    ) -> Iterator[Segment]:
-        """Yield segments, with control characters only where Rich has put them."""
-        for segment in super().render(renderable, options):
-            if segment.control or segment.text == "\n" or segment.text.isprintable():
-                yield segment
-            else:
-                yield Segment(segment.text.translate(SHOWN_CONTROLS), segment.style)
 
 
 def console() -> Console:
     """Return standard output."""
-    return PlainConsole(highlight=False, markup=False, emoji=False, width=_width(sys.stdout))
+    return _plain(sys.stdout)
 
 
 @cache
 def notices() -> Console:
     """Return standard error, where progress and remarks go; nowhere if it carries JSON."""
+    return _plain(sys.stderr, stderr=True, quiet=_for_json)
+
+
+def _plain(stream: TextIO, *, stderr: bool = False, quiet: bool = False) -> Console:
+    from tui.output.plain_console import PlainConsole  # noqa: PLC0415 - help needs no Rich
+
+    width = None if stream.isatty() else WIDTH_OF_FILES
     return PlainConsole(
-        stderr=True,
-        highlight=False,
-        markup=False,
-        emoji=False,
-        width=_width(sys.stderr),
-        quiet=_for_json,
+        stderr=stderr, quiet=quiet, highlight=False, markup=False, emoji=False, width=width
     )
 
 
@@ -107,10 +61,6 @@ def hint(text: str) -> None:
     """Tell a person at the terminal what to do next; files and pipes get no hints."""
     if notices().is_terminal:
         notices().print(text, style="dim", soft_wrap=True)
-
-
-def _width(stream: TextIO) -> int | None:
-    return None if stream.isatty() else WIDTH_OF_FILES
 
 
 def shows_progress() -> bool:

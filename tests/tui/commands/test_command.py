@@ -27,7 +27,7 @@ from sim_devices.world.paper_scenarios import SCENARIOS
 from tui.commands.check import remarks
 from tui.commands.help import COMMANDS, PANELS, subcommand
 from tui.commands.main import app, main
-from tui.output.console import PlainConsole
+from tui.output.plain_console import PlainConsole
 from tui.studies.reproduce import STUDIES
 
 ROOT = Path(__file__).parents[3]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tui.output.console import PlainConsole
+from tui.output.plain_console import PlainConsole
 from tui.page.html import html_table
 from tui.page.table import Cell, Table
 from tui.page.terminal import styled

@@ -20,7 +20,9 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
+from tui.output.console import notices, reserve_standard_error
 from tui.output.logs.options import LogFormat, LogLevel
+from tui.output.plain_console import SHOWN_CONTROLS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -77,8 +79,6 @@ class _ConsoleHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         try:
-            from tui.output.console import notices
-
             line = self.format(record)
             if notices().is_terminal and not notices().quiet:
                 notices().print(line, soft_wrap=True)
@@ -113,8 +113,6 @@ def configure(
     OSError
         The file cannot be opened, or there is no journal.
     """
-    from tui.output.console import reserve_standard_error
-
     handler: logging.Handler
     if file is not None:
         handler = logging.FileHandler(file, encoding="utf-8")
@@ -197,8 +195,6 @@ def report_failure(lines: Sequence[str], *, exit_code: int) -> None:
 
     The record has the fields ``exit_code`` and ``errors``, by which a parent knows it.
     """
-    from tui.output.console import SHOWN_CONTROLS, notices
-
     if notices().quiet:
         fields = {"exit_code": exit_code, "errors": list(lines)}
         COMMAND.error("%s", "; ".join(lines), extra=fields)
