@@ -234,10 +234,7 @@ def issue(result: Result, examined: Examined, ledger: Ledger) -> tuple[Entry, Pa
         If the ledger was changed by hand or is in use.
     """
     found, about, order = examined.found, examined.about, examined.order
-    if examined.objections:
-        raise NotIssuedError("\n".join(map(str, examined.objections)))
-    if not order.by:
-        raise NotIssuedError("nobody authorises the certificate; expected --by NAME")
+    examined.check()
     if result.method == "multi-part":
         raise NotIssuedError(
             "the noise of two sensors assumes steady gains: no certificate is issued of it;"

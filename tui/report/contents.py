@@ -175,13 +175,10 @@ def report_of(
         title="Calibration certificate: self-noise" if issue else "Calibration report: self-noise",
         subtitle=f"Huddle test {name}" + (f", {utc_time(start)}" if is_known(start) else ""),
         verdict=sentence,
-        sections=(
-            *(by_sensor(each, snapshot) for each in sections if each is not None),
-            *(
-                replace(by_sensor(each, snapshot), is_annex=True)
-                for each in annex
-                if each is not None
-            ),
+        sections=tuple(
+            replace(by_sensor(each, snapshot), is_annex=number >= len(sections))
+            for number, each in enumerate((*sections, *annex))
+            if each is not None
         ),
         notices=(*notices(found, result, about, issue), *invalidating(facts)),
         watermark=watermark(found, issue),

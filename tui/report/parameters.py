@@ -18,7 +18,7 @@ from tui.output.noise_parameters import (
     term_table,
 )
 from tui.report.figures import drawing
-from tui.report.parts import Items, Paragraph, Part, Plot, Section
+from tui.report.parts import Items, Paragraph, Part, Plot, Section, three_to_a_row
 from tui.wording.formatting import power_of_ten
 
 if TYPE_CHECKING:
@@ -122,15 +122,5 @@ def _plots(found: tuple[ChannelNoise, ...], snapshot: Snapshot) -> list[Plot]:
         channels = tuple(each for each in found if each.label.sensor == sensor)
         if any(each.allan is not None and (each.allan.deviation > 0).any() for each in channels):
             panels.append(_AllanPanel(f"Sensor {sensor}", channels, snapshot.unit, scale))
-    return [
-        Plot(
-            "",
-            tuple(panels[first : first + 3]),
-            n_columns=min(3, max(2, len(panels))),
-            height=HEIGHT,
-            key_rows=1 if first == 0 else 0,
-            titled=True,
-            alt="Allan deviation of the noise against averaging time",
-        )
-        for first in range(0, len(panels), 3)
-    ]
+    alt = "Allan deviation of the noise against averaging time"
+    return three_to_a_row(panels, "", height=HEIGHT, alt=alt)

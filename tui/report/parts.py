@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from tui.page import table as page
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from matplotlib.axes import Axes
 
@@ -73,6 +73,18 @@ class Plot:
     right: float = 0.15
     key_rows: int = 0
     titled: bool = False
+
+
+def three_to_a_row(
+    panels: Sequence[Callable[[Axes], None]], title: str, *, height: float, alt: str
+) -> list[Plot]:
+    """Return a plot for each row of panels with titles of their own; the first has the key."""
+    columns = min(3, max(2, len(panels)))
+    rows = [tuple(panels[first : first + 3]) for first in range(0, len(panels), 3)]
+    return [
+        Plot(title * (not n), row, columns, height, alt, key_rows=int(not n), titled=True)
+        for n, row in enumerate(rows)
+    ]
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from estimator.levels.contributions import Source
 from estimator.wording import span
 from tui.report.figures import drawing
 from tui.report.figures.curves import logarithmic
-from tui.report.parts import Paragraph, Part, Plot, Section, Table
+from tui.report.parts import Paragraph, Part, Plot, Section, Table, three_to_a_row
 from tui.wording.formatting import NOTHING, level, plain_number, scientific
 
 if TYPE_CHECKING:
@@ -238,18 +238,8 @@ def _diagrams(
         panels.append(
             _Range(sensor, names, centres, rms_db[:, own], full_db[own], snapshot.unit, scale)
         )
-    return [
-        Plot(
-            "Operating range in half octaves" if first == 0 else "",
-            tuple(panels[first : first + 3]),
-            n_columns=min(3, max(2, len(panels))),
-            height=1.6,
-            key_rows=1 if first == 0 else 0,
-            titled=True,
-            alt="Noise in half octaves against frequency, below a sine of full scale",
-        )
-        for first in range(0, len(panels), 3)
-    ]
+    alt = "Noise in half octaves against frequency, below a sine of full scale"
+    return three_to_a_row(panels, "Operating range in half octaves", height=1.6, alt=alt)
 
 
 def _full_scale(snapshot: Snapshot, column: int, about: Bench | None) -> float:

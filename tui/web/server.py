@@ -109,6 +109,10 @@ _HEADERS = {
 _HSTS = {"strict-transport-security": "max-age=31536000"}
 
 
+class _LaterError(Exception):
+    """What is asked for is being made: the page comes again."""
+
+
 @dataclass(frozen=True, slots=True)
 class Place:
     """Where the server is reached."""
@@ -345,7 +349,7 @@ class Server:
         handlers: dict[Any, Any] = dict.fromkeys(
             (HuddleError, EstimatorError, HTTPException, OSError, ClientDisconnect), self._failed
         )
-        handlers[Exception] = self._broken
+        handlers |= {_LaterError: self._later, Exception: self._broken}
         made = Starlette(
             routes=[*routes, static, every], exception_handlers=handlers, lifespan=self._lifespan
         )
@@ -458,11 +462,8 @@ class Server:
             size=PAGE,
         )
 
-    async def _state(self, request: Request) -> State | None:
-        """Return the test that a request names, beside another one if it names two.
-
-        None while an estimate is being made.
-        """
+    async def _state(self, request: Request) -> State:
+        """Return the test that a request names, beside another one if it names two."""
         asked = [request.path_params["name"]]
         if other := request.query_params.get("with"):
             asked.append(other)
@@ -472,8 +473,6 @@ class Server:
             made = await self._made(
                 request, self._tests.work, key, partial(self._tests.estimate, key[0]), PATIENCE
             )
-            if made is None:
-                return None
             known.append(made)
         return known[0] if len(known) == 1 else compared(known[0], known[1])
 
@@ -485,10 +484,12 @@ class Server:
         act: Callable[[], Any],
         patience: float | None = None,
     ) -> Any:  # noqa: ANN401 - whatever is made
-        """Return what long work makes; None if it takes longer than the patience (s).
+        """Return what long work makes.
 
         Raises
         ------
+        _LaterError
+            If it takes longer than the patience (s).
         ClientDisconnect
             If the visitor leaves: work that nobody else wants is dropped.
         TooMuchWorkError
@@ -507,28 +508,24 @@ class Server:
             if gone.done():
                 raise ClientDisconnect
             lease = LEASE
-            return None
+            raise _LaterError
         finally:
             gone.cancel()
             work.leave(piece, lease=lease)
 
-    async def _report_of(self, request: Request, kind: str) -> tuple[State, bytes] | None:
-        """Return a test and its result as a file of a kind; None while the test is estimated."""
+    async def _report_of(self, request: Request, kind: str) -> tuple[State, bytes]:
+        """Return a test and its result as a file of a kind."""
         state = await self._state(request)
-        if state is None:
-            return None
         key = await run_in_threadpool(self._tests.key_of, request.path_params["name"])
         act = partial(self._tests.report, state, kind)
         return state, await self._made(request, self._tests.work, (kind, key), act)
 
-    def _later(self, request: Request) -> Response:
+    async def _later(self, request: Request, _: Exception) -> Response:
         text = "The estimate is being made. This page shows it as soon as it is there."
         return self._message(request, "One moment", text, HTTPStatus.OK, refresh=3)
 
     async def _test(self, request: Request) -> Response:
         state = await self._state(request)
-        if state is None:
-            return self._later(request)
         about = await run_in_threadpool(_chart, state, request.query_params)
         document, certificates, problem = await self._made(
             request,
@@ -564,15 +561,14 @@ class Server:
             return [], str(error)
 
     async def _test_curves(self, request: Request) -> Response:
-        state = await self._state(request)
-        if state is None:
+        try:
+            state = await self._state(request)
+        except _LaterError:
             return Response("the estimate is being made", HTTPStatus.SERVICE_UNAVAILABLE)
         return await self._curves(state, request.query_params)
 
-    async def _looked(self, request: Request, asked: Mapping[str, str]) -> dict[str, Any] | None:
+    async def _looked(self, request: Request, asked: Mapping[str, str]) -> dict[str, Any]:
         """Return what is asked to be seen of a recording against time.
-
-        None while it is read, or estimated where a spectrogram is asked for.
 
         Raises
         ------
@@ -582,15 +578,10 @@ class Server:
         key = await run_in_threadpool(self._tests.key_of, request.path_params["name"])
         act = partial(Opened.of, key[0])
         opened = await self._made(request, self._tests.work, ("signal", key), act, PATIENCE)
-        if opened is None:
-            return None
         look = Look.of(opened.signal, asked)
         snapshot = None
         if look.spectrum:
-            state = await self._state(request)
-            if state is None:
-                return None
-            snapshot = state.snapshot
+            snapshot = (await self._state(request)).snapshot
         found = await run_in_threadpool(drawn, opened, look, snapshot)
         return {**found, "is_simulated": opened.signal.recording.simulated}
 
@@ -600,8 +591,6 @@ class Server:
             about = await self._looked(request, request.query_params)
         except (ValueError, OverflowError, IndexError) as error:
             problem, about = str(error), await self._looked(request, {})
-        if about is None:
-            return self._later(request)
         name = request.path_params["name"]
         return self._page(
             request,
@@ -619,46 +608,35 @@ class Server:
             about = await self._looked(request, request.query_params)
         except (ValueError, OverflowError, IndexError) as error:
             return Response(str(error), HTTPStatus.BAD_REQUEST)
-        if about is None:
+        except _LaterError:
             return Response("the recording is being read", HTTPStatus.SERVICE_UNAVAILABLE)
         return HTMLResponse(about["picture"])
 
     async def _report(self, request: Request) -> Response:
         suffix = ".pdf" if request.scope["path"].endswith(".pdf") else ".html"
-        found = await self._report_of(request, suffix)
-        if found is None:
-            return self._later(request)
-        state, content = found
+        state, content = await self._report_of(request, suffix)
         if suffix == ".pdf":
             return _download(content, "application/pdf", f"{state.name}.pdf")
         return HTMLResponse(content, headers={"content-security-policy": REPORT_POLICY})
 
     async def _json(self, request: Request) -> Response:
         state = await self._state(request)
-        if state is None:
-            return self._later(request)
         found = await self._made(
-            request,
-            self._tests.reading,
-            None,
-            lambda: json_text(self._tests.document(state)),
+            request, self._tests.reading, None, lambda: json_text(self._tests.document(state))
         )
         return _download(found.encode(), "application/json", f"{state.name}.json")
 
     async def _csv(self, request: Request) -> Response:
         state = await self._state(request)
-        if state is None or state.snapshot is None:
-            return self._later(request)
+        if state.snapshot is None:
+            raise _LaterError
         text = await run_in_threadpool(curves_csv, state.snapshot)
         return _download(text.encode(), "text/csv; charset=utf-8", f"{state.name}.csv")
 
     async def _certificate(self, request: Request) -> Response:
         state = await self._state(request)
-        if state is None:
-            return self._later(request)
-        found = await self._made(
-            request, self._tests.reading, None, lambda: self._tests.certificates(state)
-        )
+        act = partial(self._tests.certificates, state)
+        found = await self._made(request, self._tests.reading, None, act)
         number = _number(request.path_params["number"], -1)
         if not 0 <= number < len(found):
             raise NoSuchTestError("no such certificate")

@@ -270,12 +270,14 @@ def _error_db(psd: float, low: float, high: float) -> float:
     return max(decibels(high) - decibels(psd), decibels(psd) - decibels(low))
 
 
-def _opened() -> sqlite3.Connection | None:
-    """Return the ledger for reading, if there is one."""
+def _rows(question: str, serial_number: str) -> list[Any]:
+    """Return what the ledger says of a sensor; nothing, if there is no ledger."""
     place = ledger_path()
     if place is None or not place.exists():
-        return None
-    return sqlite3.connect(f"{place.resolve().as_uri()}?mode=ro", uri=True)
+        return []
+    with closing(sqlite3.connect(f"{place.resolve().as_uri()}?mode=ro", uri=True)) as ledger:
+        firmware = "firmware" if "firmware" in _columns(ledger) else "NULL"
+        return ledger.execute(question.format(firmware=firmware), (serial_number,)).fetchall()
 
 
 def _columns(ledger: sqlite3.Connection) -> list[str]:
@@ -291,12 +293,7 @@ def sensor_tests(serial_number: str) -> list[SensorTest]:
     sqlite3.Error
         If the ledger cannot be read.
     """
-    ledger = _opened()
-    if ledger is None:
-        return []
-    with closing(ledger):
-        firmware = "firmware" if "firmware" in _columns(ledger) else "NULL"
-        rows = ledger.execute(_TESTS.format(firmware=firmware), (serial_number,)).fetchall()
+    rows = _rows(_TESTS, serial_number)
     found = [
         SensorTest(
             datetime.fromtimestamp(row[0], UTC),
@@ -321,11 +318,7 @@ def noise_of(serial_number: str) -> list[Found]:
     sqlite3.Error
         If the ledger cannot be read.
     """
-    ledger = _opened()
-    if ledger is None:
-        return []
-    with closing(ledger):
-        rows = ledger.execute(_OF_SENSOR, (serial_number,)).fetchall()
+    rows = _rows(_OF_SENSOR, serial_number)
     is_simulated = all(row[2] for row in rows)
     return [
         (bench, datetime.fromtimestamp(started, UTC), BandNoise.of(*values), is_simulated)
