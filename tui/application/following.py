@@ -14,23 +14,9 @@ from textual.reactive import var
 from daq.errors import HuddleError
 from daq.estimation.follow import follow
 from estimator.errors import EstimatorError
+from tui.application import messages
 from tui.application.bench_view.view import BenchView
 from tui.application.dialogs import StopScreen
-from tui.application.messages import (
-    BenchEdited,
-    DeletionRequested,
-    ErrorReported,
-    Messenger,
-    OpeningRequested,
-    PinRequested,
-    Progress,
-    RecordingOpened,
-    ReferenceReady,
-    ReferenceRequested,
-    SensorsNoted,
-    SnapshotReady,
-    StatusUpdated,
-)
 from tui.application.recordings_view.view import RecordingsView
 from tui.application.reference import reference_of
 from tui.application.result_view.view import ResultView
@@ -155,8 +141,8 @@ class FollowingApp(ThemedApp[None]):
 
     # ------------------------------------------------------------------ following
 
-    @on(RecordingOpened)
-    async def _on_following(self, message: RecordingOpened) -> None:
+    @on(messages.RecordingOpened)
+    async def _on_following(self, message: messages.RecordingOpened) -> None:
         own = message.settings is None
         settings = self._controls.settings if own else message.settings
         self._bench = self._controls.bench if own else message.bench
@@ -172,7 +158,7 @@ class FollowingApp(ThemedApp[None]):
     def _follow(
         self, path: Path, settings: Settings | None, ended: threading.Event, *, is_kept: bool
     ) -> None:
-        messenger = Messenger(self, ended, path, self._bench)
+        messenger = messages.Messenger(self, ended, path, self._bench)
         with self._reading:
             if ended.is_set():  # another one was opened meanwhile
                 return
@@ -195,27 +181,27 @@ class FollowingApp(ThemedApp[None]):
                 self._try(partial(self._controls.keep, path, result))
                 lines = self._try(partial(self._controls.noted, path, result))
                 if lines and not ended.is_set():
-                    self.post_message(SensorsNoted(path, tuple(lines)))
+                    self.post_message(messages.SensorsNoted(path, tuple(lines)))
 
-    @on(SensorsNoted)
-    def _on_noted(self, message: SensorsNoted) -> None:
+    @on(messages.SensorsNoted)
+    def _on_noted(self, message: messages.SensorsNoted) -> None:
         if message.path == self.path:
             self.state = replace(self.state, sensors_since=message.lines)
 
-    @on(StatusUpdated)
-    def _on_looked(self, message: StatusUpdated) -> None:
+    @on(messages.StatusUpdated)
+    def _on_looked(self, message: messages.StatusUpdated) -> None:
         self.state = replace(self.state, now=message.now)
         lost = frozenset(sensor.name for sensor in message.now.sensors if sensor.state.is_lost)
         if lost - self._lost and not message.now.closed:
             self.announce("trouble", f"lost: {', '.join(sorted(lost))}")
         self._lost = lost
 
-    @on(Progress)
-    def _on_progress(self, message: Progress) -> None:
+    @on(messages.Progress)
+    def _on_progress(self, message: messages.Progress) -> None:
         self.state = replace(self.state, note=note(self.now, message.done, message.total))
 
-    @on(SnapshotReady)
-    async def _on_fresh(self, message: SnapshotReady) -> None:
+    @on(messages.SnapshotReady)
+    async def _on_fresh(self, message: messages.SnapshotReady) -> None:
         result, before = message.result, self.snapshot
         snapshot = result.snapshot
         moved = () if snapshot.closed else self._recent.strangers(snapshot)
@@ -244,8 +230,8 @@ class FollowingApp(ThemedApp[None]):
         else:
             self.notify("The test has ended: 3 shows its result.", timeout=30)
 
-    @on(ErrorReported)
-    def _on_trouble(self, message: ErrorReported) -> None:
+    @on(messages.ErrorReported)
+    def _on_trouble(self, message: messages.ErrorReported) -> None:
         starting = self.state.is_starting
         self.state = replace(self.state, is_starting=False, note="")
         if message.ended:
@@ -256,17 +242,16 @@ class FollowingApp(ThemedApp[None]):
         else:
             self.notify(message.text, title="Error", severity="error", timeout=30, markup=False)
 
-    @on(OpeningRequested)
+    @on(messages.OpeningRequested)
     @work(thread=True, group="control")
-    def _on_opening(self, message: OpeningRequested) -> None:
+    def _on_opening(self, message: messages.OpeningRequested) -> None:
         found = self._try(partial(self._controls.about, message.path, message.changes))
         if found is not None:
-            self.post_message(
-                RecordingOpened(message.path, message.view, *found, is_kept=not message.changes)
-            )
+            opened = partial(messages.RecordingOpened, message.path, message.view, *found)
+            self.post_message(opened(is_kept=not message.changes))
 
-    @on(ReferenceRequested)
-    def _on_reference_request(self, message: ReferenceRequested) -> None:
+    @on(messages.ReferenceRequested)
+    def _on_reference_request(self, message: messages.ReferenceRequested) -> None:
         if message.path is None:
             self.state = replace(self.state, reference=None)
             return
@@ -280,24 +265,24 @@ class FollowingApp(ThemedApp[None]):
             partial(reference_of, path, settings, self._controls.about, ended=self._quitting)
         )
         if reference is not None:
-            self.post_message(ReferenceReady(reference))
+            self.post_message(messages.ReferenceReady(reference))
 
-    @on(ReferenceReady)
-    def _on_reference(self, message: ReferenceReady) -> None:
+    @on(messages.ReferenceReady)
+    def _on_reference(self, message: messages.ReferenceReady) -> None:
         self.state = replace(self.state, reference=message.reference)
         name = message.reference.path.name
         self.notify(f"compared with {name}: 2 curves, 3 differences", timeout=8, markup=False)
 
-    @on(PinRequested)
+    @on(messages.PinRequested)
     @work(thread=True, group="control")
-    def _on_pin(self, message: PinRequested) -> None:
+    def _on_pin(self, message: messages.PinRequested) -> None:
         answer = self._try(partial(self._controls.pin, message.path))
         if answer is not None:
             self.call_from_thread(self.notify, answer, timeout=8, markup=False)
 
-    @on(BenchEdited)
+    @on(messages.BenchEdited)
     @work(thread=True, group="control")
-    def _on_edited(self, message: BenchEdited) -> None:
+    def _on_edited(self, message: messages.BenchEdited) -> None:
         def save() -> None:
             self._controls.save_bench(message.text)
             self.call_from_thread(self._show_bench)
@@ -308,8 +293,8 @@ class FollowingApp(ThemedApp[None]):
         self.state = replace(self.state, bench=self._controls.bench, failure="")
         self.notify("The bench file is saved.", timeout=5)
 
-    @on(DeletionRequested)
-    def _on_deletion(self, message: DeletionRequested) -> None:
+    @on(messages.DeletionRequested)
+    def _on_deletion(self, message: messages.DeletionRequested) -> None:
         if message.path == self.path:
             if self.recording:
                 self.notify("It is being recorded: stop it first.", severity="warning")
@@ -352,5 +337,5 @@ class FollowingApp(ThemedApp[None]):
         try:
             return act()
         except (HuddleError, EstimatorError, OSError) as error:
-            self.post_message(ErrorReported(str(error)))
+            self.post_message(messages.ErrorReported(str(error)))
         return None

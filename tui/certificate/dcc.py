@@ -19,15 +19,7 @@ from daq.results.decision.conformity import Conformity, Statement, conformity, w
 from daq.results.sources import Condition, Source, conditions
 from daq.results.uncertainty_budget import Budget, band_budgets, third_octave_budgets
 from estimator.wording import span
-from tui.report.certificate import (
-    PROCEDURE,
-    QUANTITIES,
-    SCOPE,
-    SPECIMEN,
-    Issue,
-    manufacturers,
-    outside_range,
-)
+from tui.report import certificate
 from tui.report.noise import decision_rule
 
 if TYPE_CHECKING:
@@ -60,7 +52,7 @@ _UNITS = {
 def dcc(
     result: Result,
     *,
-    issue: Issue | None = None,
+    issue: certificate.Issue | None = None,
     about: Bench | None = None,
 ) -> bytes:
     """Return the DCC of an estimate; without an `issue` it is a draft and says so.
@@ -87,7 +79,7 @@ def dcc(
 
 
 def _administrative(
-    root: ET.Element, found: Sequence[Source], about: Bench | None, issue: Issue | None
+    root: ET.Element, found: Sequence[Source], about: Bench | None, issue: certificate.Issue | None
 ) -> None:
     laboratory = Laboratory() if about is None else about.laboratory
     customer = Customer() if about is None else about.customer
@@ -109,13 +101,13 @@ def _administrative(
     _persons(_add(part, "respPersons"), responsible, found[0].operator)
     _contact(_add(part, "customer"), (customer.name, customer.address), email=customer.email)
     statements = _add(part, "statements")
-    lines = [SCOPE, f"Traceability: {table.traceability or 'not given'}"]
+    lines = [certificate.SCOPE, f"Traceability: {table.traceability or 'not given'}"]
     if laboratory.accreditation:
         lines.append(laboratory.accreditation)
     if any(source.simulated for source in found):
         lines.insert(0, "SIMULATED SENSORS: no instrument was measured.")
     if issue is None or issue.is_specimen:
-        what = "DRAFT" if issue is None else SPECIMEN
+        what = "DRAFT" if issue is None else certificate.SPECIMEN
         lines.insert(0, f"{what}: not a certificate.")
     if issue is not None and issue.despite:
         lines.append(f"Issued despite facts that invalidate the result: {issue.despite}")
@@ -127,7 +119,7 @@ def _core(
     core: ET.Element,
     found: Sequence[Source],
     table: CertificateTable,
-    issue: Issue | None,
+    issue: certificate.Issue | None,
     *,
     country: str,
     order: str,
@@ -161,7 +153,7 @@ def _core(
 def _items(items: ET.Element, last: Source, about: Bench | None) -> None:
     """Add the sensors."""
     condition = "" if about is None else about.certificate.condition
-    makers = manufacturers(about)
+    makers = certificate.manufacturers(about)
     for sensor in last.sensors:
         item = _add(items, "item")
         _text(item, "name", sensor.name)
@@ -197,7 +189,7 @@ def _results(
     methods = _add(one, "usedMethods")
     method = _add(methods, "usedMethod")
     _text(method, "name", f"Huddle test, {result.method} method")
-    _content(_add(method, "description"), PROCEDURE)
+    _content(_add(method, "description"), certificate.PROCEDURE)
     if table.procedure:
         _add(method, "reference", table.procedure)
     stated = conformity(with_rule(found[0].bench, about), result)
@@ -240,7 +232,7 @@ def _conditions(condition: ET.Element, stated: Sequence[Condition]) -> None:
     for each in stated:
         if not isinstance(each.quantity, Quantity):
             continue
-        name, unit = QUANTITIES[each.quantity], _STATED_IN[each.quantity]
+        name, unit = certificate.QUANTITIES[each.quantity], _STATED_IN[each.quantity]
         of = each.sensor or "the computer that recorded"
         for which, value in (("Lowest", each.lowest), ("Highest", each.highest)):
             quantity = _add(data, "quantity")
@@ -248,7 +240,7 @@ def _conditions(condition: ET.Element, stated: Sequence[Condition]) -> None:
             real = _si(quantity, "real")
             _si(real, "value", _number(value))
             _si(real, "unit", unit)
-    for text in outside_range(stated):
+    for text in certificate.outside_range(stated):
         _content(_add(data, "text"), text)
     if not any(each.sensor and each.quantity == Quantity.TEMPERATURE for each in stated):
         _content(_add(data, "text"), "Temperature: not stated by the devices.")

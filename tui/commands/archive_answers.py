@@ -13,13 +13,7 @@ from daq.archive.execution import failure_of
 from daq.archive.stations import summaries
 from daq.errors import ArchiveError
 from estimator.wording import several
-from tui.output.archive.document import (
-    STATIONS_HEADER,
-    archive_json,
-    days_csv,
-    stations_csv,
-    stations_json,
-)
+from tui.output.archive import document
 from tui.output.archive.tables import course_table, course_title, remarks, stations_table
 from tui.output.console import counted, for_people, growing, hint, notices, progress, write_text
 from tui.output.csv_text import csv_text
@@ -125,9 +119,9 @@ class Asked:
         screen = for_people(self.json, self.csv)
         _print(screen, found, str(self.zone))
         if self.json is not None:
-            write_text(self.json, archive_json(found, archive, len(entries), wrong) + "\n")
+            write_text(self.json, document.archive_json(found, archive, len(entries), wrong) + "\n")
         if self.csv is not None:
-            write_text(self.csv, days_csv(found))
+            write_text(self.csv, document.days_csv(found))
         if self.out is not None:
             from tui.report.figures.archive import write_figures  # noqa: PLC0415 - an extra
 
@@ -164,9 +158,9 @@ class Asked:
         """
         n_figures = 0
         with contextlib.ExitStack() as stack:
-            add = stack.enter_context(stations_json(self.json, problems))
+            add = stack.enter_context(document.stations_json(self.json, problems))
             write = stack.enter_context(growing(self.csv))
-            write(csv_text(STATIONS_HEADER, ()))
+            write(csv_text(document.STATIONS_HEADER, ()))
             columns = "answers", "{task.completed} of {task.total} stations"
             bar = stack.enter_context(progress(*columns))
             for name, archive in bar.track(archives.items()):
@@ -178,9 +172,9 @@ class Asked:
                     problems.append(f"{name}: {error}")
                     continue
                 if self.json is not None:
-                    add(name, archive_json(found, archive, len(entries)))
+                    add(name, document.archive_json(found, archive, len(entries)))
                 if self.csv is not None:
-                    write(stations_csv(name, found))
+                    write(document.stations_csv(name, found))
                 if self.out is not None:
                     from tui.report.figures.archive import write_figures  # noqa: PLC0415
 

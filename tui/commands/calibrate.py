@@ -59,16 +59,7 @@ def calibrate(
     from rich.text import Text
 
     from daq.results.calibration import calibrate
-    from tui.output.calibration import (
-        LEGEND,
-        angle_table,
-        budget_table,
-        matrix_table,
-        noise_table,
-        remarks,
-        sensitivity_table,
-        title,
-    )
+    from tui.output import calibration as shown
     from tui.output.json_document import calibration_document
 
     check_places(json)
@@ -76,16 +67,17 @@ def calibrate(
     snapshot = result.snapshot
     found = calibrate(result, result.bench, reference=reference, confidence=confidence)
     screen = for_people(json)
-    screen.print(Text(title(found, snapshot), "bold"))
-    _show(screen, "", sensitivity_table(found, snapshot))
-    _show(screen, "Rotation, and deviation from right angles", angle_table(found, snapshot))
-    _show(screen, "Relative response, cross-axis included", matrix_table(found, snapshot))
+    screen.print(Text(shown.title(found, snapshot), "bold"))
+    _show(screen, "", shown.sensitivity_table(found, snapshot))
+    _show(screen, "Rotation, and deviation from right angles", shown.angle_table(found, snapshot))
+    _show(screen, "Relative response, cross-axis included", shown.matrix_table(found, snapshot))
     sensitivities, noise = found.whole_band("sensitivity"), found.whole_band("noise")
-    _show(screen, "Budget of the sensitivities, relative", budget_table(sensitivities))
+    _show(screen, "Budget of the sensitivities, relative", shown.budget_table(sensitivities))
     if noise:
-        _show(screen, "Noise, by the calibrated sensitivities", noise_table(found, snapshot.unit))
-        _show(screen, "Budget of the noise PSD, relative", budget_table(noise))
-    for line in (LEGEND, *remarks(found, snapshot)):
+        table = shown.noise_table(found, snapshot.unit)
+        _show(screen, "Noise, by the calibrated sensitivities", table)
+        _show(screen, "Budget of the noise PSD, relative", shown.budget_table(noise))
+    for line in (shown.LEGEND, *shown.remarks(found, snapshot)):
         screen.print(line)
     for each in result.facts:
         if each.needs_action:

@@ -84,16 +84,9 @@ def history(
     huddle history --sensor S4254475 --label S4254475.svg   (a label to print)
     huddle history lab/recordings office/recordings --csv -   (sensors by serial number)
     """
+    from tui.service.history import shown
     from tui.service.history.ledger import sensor_tests
     from tui.service.history.series import bands_of, history
-    from tui.service.history.shown import (
-        history_figure,
-        history_lines,
-        history_table,
-        label_lines,
-        label_svg,
-        tests_table,
-    )
 
     wanted = None if band is None else _band(band)
     since = None if since is None else since.replace(tzinfo=UTC)
@@ -118,10 +111,10 @@ def history(
     screen = for_people(json, csv)
     tests = sensor_tests(sensor) if sensor and not sources else []
     if tests:
-        screen.print(tests_table(tests))
+        screen.print(shown.tests_table(tests))
         screen.print()
-    screen.print(history_table(found))
-    for line in history_lines(found, scatter=scatter, false_alarms=false_alarms):
+    screen.print(shown.history_table(found))
+    for line in shown.history_lines(found, scatter=scatter, false_alarms=false_alarms):
         screen.print(line, soft_wrap=True)
     write_json(
         json,
@@ -135,12 +128,12 @@ def history(
     if csv is not None:
         write_text(csv, csv_text(_COLUMNS, _rows(found)))
     if label is not None:
-        write_text(str(label), label_svg(sensor, label_lines(found)))
+        write_text(str(label), shown.label_svg(sensor, shown.label_lines(found)))
     if out is not None:
         from daq.whole_file import write_whole
 
         content = io.BytesIO()
-        history_figure(found).savefig(content, format=out.suffix.removeprefix("."), dpi=150)
+        shown.history_figure(found).savefig(content, format=out.suffix.removeprefix("."), dpi=150)
         write_whole(out, content.getvalue())
 
 

@@ -14,31 +14,8 @@ from daq.results.calibration import Calibration, calibrate
 from daq.results.decision.conformity import conformity, with_rule
 from estimator.errors import InsufficientDataError
 from estimator.wording import span
-from tui.output.calibration import (
-    LEGEND,
-    angle_table,
-    budget_table,
-    matrix_table,
-    remarks,
-    sensitivity_table,
-    title,
-)
-from tui.report.certificate import (
-    Issue,
-    conditions_section,
-    manufacturers,
-    notices,
-    parties_section,
-    watermark,
-)
-from tui.report.evidence import (
-    alignment_section,
-    clocks_section,
-    events_section,
-    facts_section,
-    invalidating,
-    model_test_section,
-)
+from tui.output import calibration as shown
+from tui.report import certificate, evidence
 from tui.report.noise import limits_section, noise_section, verdict
 from tui.report.parameters import parameters_section
 from tui.report.parts import Facts, Paragraph, Part, Report, Section, Signatures, Table
@@ -66,17 +43,19 @@ def calibration_section(result: Result) -> Section | None:
         return None
     sensitivities = tuple(each for each in found.budgets if each.quantity != "noise")
     found = replace(found, budgets=sensitivities, without_noise=())  # Uncertainty has the noise
+    budgets = found.whole_band("sensitivity")
     tables = [
-        ("Sensitivity, delay and misalignment", sensitivity_table(found, snapshot)),
-        ("Relative response, cross-axis included", matrix_table(found, snapshot)),
-        ("Rotation about the axes of the reference", angle_table(found, snapshot)),
-        ("Uncertainty budget of the sensitivities", budget_table(found.whole_band("sensitivity"))),
+        ("Sensitivity, delay and misalignment", shown.sensitivity_table(found, snapshot)),
+        ("Relative response, cross-axis included", shown.matrix_table(found, snapshot)),
+        ("Rotation about the axes of the reference", shown.angle_table(found, snapshot)),
+        ("Uncertainty budget of the sensitivities", shown.budget_table(budgets)),
     ]
-    parts: list[Part] = [Paragraph(f"{title(found, snapshot)}. {remarks(found, snapshot)[0]}")]
+    first, *remarks = shown.remarks(found, snapshot)
+    parts: list[Part] = [Paragraph(f"{shown.title(found, snapshot)}. {first}")]
     if found.certificates:
         parts.append(_certificates(found, snapshot))
     parts += [replace(table, title=name) for name, table in tables if table.rows]
-    parts += [Paragraph(line, "quiet") for line in (LEGEND, *remarks(found, snapshot)[1:])]
+    parts += [Paragraph(line, "quiet") for line in (shown.LEGEND, *remarks)]
     return Section("Calibration", tuple(parts))
 
 
@@ -111,7 +90,7 @@ def report_of(
     result: Result,
     models: Sequence[Mask] = (),
     *,
-    issue: Issue | None = None,
+    issue: certificate.Issue | None = None,
     about: Bench | None = None,
 ) -> Report:
     """Return the whole report.
@@ -151,18 +130,18 @@ def report_of(
         noise_section(result, models),
     ]
     annex = [
-        facts_section(facts),
+        evidence.facts_section(facts),
         uncertainty_section(result, about),
         parameters_section(result),
         calibration_section(result),
-        model_test_section(result),
-        alignment_section(result),
-        clocks_section(result),
-        events_section(snapshot, found),
-        parties_section(found, about, issue),
+        evidence.model_test_section(result),
+        evidence.alignment_section(result),
+        evidence.clocks_section(result),
+        evidence.events_section(snapshot, found),
+        certificate.parties_section(found, about, issue),
         _test_section(found),
         _sensors_section(snapshot, found, about),
-        conditions_section(found, about, result.settings),
+        certificate.conditions_section(found, about, result.settings),
         _settings_section(result),
         Section(
             "Signed off",
@@ -180,8 +159,8 @@ def report_of(
             for number, each in enumerate((*sections, *annex))
             if each is not None
         ),
-        notices=(*notices(found, result, about, issue), *invalidating(facts)),
-        watermark=watermark(found, issue),
+        notices=(*certificate.notices(found, result, about, issue), *evidence.invalidating(facts)),
+        watermark=certificate.watermark(found, issue),
         number="" if issue is None else issue.name,
     )
 
@@ -249,7 +228,7 @@ def _test_section(found: Sequence[Source]) -> Section:
 
 
 def _sensors_section(snapshot: Snapshot, found: Sequence[Source], about: Bench | None) -> Section:
-    makers = manufacturers(about)
+    makers = certificate.manufacturers(about)
     sensors = found[-1].sensors
     clocks = {clock.sensor: clock for clock in snapshot.clocks}
     rows = tuple(

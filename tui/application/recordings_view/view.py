@@ -12,15 +12,9 @@ from textual.binding import Binding, BindingType
 from textual.widgets import DataTable, Input, Static
 
 from estimator.wording import clock_time
+from tui.application import messages
 from tui.application.dialogs import QuestionScreen
 from tui.application.forms.estimate import SettingsForm
-from tui.application.messages import (
-    CatalogueRead,
-    DeletionRequested,
-    OpeningRequested,
-    PinRequested,
-    ReferenceRequested,
-)
 from tui.application.state import RECORDINGS, RESULT, TEST, State
 from tui.application.view import MUTED, View
 from tui.runs.catalogue import Entry, catalogue
@@ -186,10 +180,10 @@ class RecordingsView(View):
             else catalogue(folder, known, besides=self.state.path, cancelled=self._gone.is_set)
         )
         if not self._gone.is_set():
-            self.post_message(CatalogueRead(tuple(found)))
+            self.post_message(messages.CatalogueRead(tuple(found)))
 
-    @on(CatalogueRead)
-    def _on_read(self, message: CatalogueRead) -> None:
+    @on(messages.CatalogueRead)
+    def _on_read(self, message: messages.CatalogueRead) -> None:
         self._entries, self._is_read = message.entries, True
         self._list()
 
@@ -276,7 +270,7 @@ class RecordingsView(View):
         chosen = self._chosen()
         if chosen is not None and not chosen.problem:
             view = TEST if chosen.is_growing else RESULT
-            self.post_message(OpeningRequested(chosen.path, changes, view))
+            self.post_message(messages.OpeningRequested(chosen.path, changes, view))
 
     def action_estimate(self) -> None:
         """Ask for settings, and open the recording with them."""
@@ -294,13 +288,13 @@ class RecordingsView(View):
         """Compare the chosen recording with what is shown."""
         chosen = self._chosen()
         if chosen is not None:
-            self.post_message(ReferenceRequested(chosen.path))
+            self.post_message(messages.ReferenceRequested(chosen.path))
 
     def action_pin(self) -> None:
         """Keep the chosen recording, or no longer."""
         chosen = self._chosen()
         if chosen is not None:
-            self.post_message(PinRequested(chosen.path))
+            self.post_message(messages.PinRequested(chosen.path))
 
     def action_delete(self) -> None:
         """Delete the chosen recording, once that has been confirmed."""
@@ -314,4 +308,4 @@ class RecordingsView(View):
 
     def _delete(self, chosen: Entry, really: bool | None) -> None:
         if really:
-            self.post_message(DeletionRequested(chosen.path))
+            self.post_message(messages.DeletionRequested(chosen.path))
