@@ -498,7 +498,7 @@ def _band(
     levels, of_runs, responses = [], [], []
     scores = _Scores(len(groups), sum(dims))
     explained, spread = np.zeros((3, sum(dims))), 0.0
-    squares = np.zeros((sum(dims), sum(dims)))
+    squares, of_parts = np.zeros((sum(dims), sum(dims))), np.zeros((len(groups), sum(dims)))
     for some in np.array_split(places, -(-len(places) // at_once)):
         bins = parts.bins[some]
         lags = np.minimum(np.abs(bins[:, None] - bins), len(correlation) - 1)
@@ -509,6 +509,7 @@ def _band(
         scatter = found.scatter
         beside = np.einsum("fpp->fp", found.projector).real
         explained += [e.sum(axis=0) for e in (found.explained, scatter, beside)]
+        of_parts += np.einsum("kfpp->kp", found.covariance)
         squares += (np.abs(found.projector) ** 2).sum(axis=0)
         spread += own.sum()
         piece = noise_levels(found, own)
@@ -523,7 +524,8 @@ def _band(
     whole = Levels.joined(levels)
     known = median(np.ravel(whole.degrees)) >= LEAST_DEGREES
     left = parts.averages.sum() / len(groups) - maximum.n_factors
-    degrees = 2 * len(places) ** 2 / spread * len(groups) * maximum.n_factors
+    n_alike = of_parts.sum(axis=0) ** 2 / (of_parts**2).sum(axis=0)  # parts, of equal noise
+    degrees = 2 * len(places) ** 2 / spread * float(n_alike.min()) * maximum.n_factors
     return _Band(
         _Explained(
             power=explained[0] / len(places),
