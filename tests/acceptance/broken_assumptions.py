@@ -21,7 +21,7 @@ import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -186,6 +186,31 @@ def _turns_at_once(scene: Scene) -> None:
         scene.felt[BROKEN, :, :1], scene.felt[BROKEN, :, 1:2] = a + late * b, b - late * a
     else:
         scene.felt[BROKEN] *= 1 + 0.01 * (scene.time > 400)[:, None]
+
+
+def _filter_moves(before: FloatArray, after: FloatArray) -> Callable[[Scene], None]:
+    """Filter what a sensor feels by other sections from 45 % of the time on."""
+
+    def breaks(scene: Scene) -> None:
+        early, late = (signal.sosfilt(e, scene.felt[BROKEN], axis=0) for e in (before, after))
+        scene.felt[BROKEN] = np.where(scene.time[:, None] < 0.45 * scene.time[-1], early, late)
+
+    return breaks
+
+
+def _corner(at: float, kind: Literal["high", "low"] = "high") -> FloatArray:
+    return np.asarray(signal.butter(2, at, kind, fs=RATE, output="sos"))
+
+
+def _peak(at: float) -> FloatArray:
+    b, a = signal.iirpeak(at, 10, fs=RATE)
+    return np.asarray(signal.tf2sos(a + 2 * b, a))
+
+
+def _octave_gains(scene: Scene) -> None:
+    band = signal.butter(2, [0.5, 1], "band", fs=RATE, output="sos")
+    late = scene.time[:, None] > 0.45 * scene.time[-1]
+    scene.felt[BROKEN] += 0.02 * late * signal.sosfiltfilt(band, scene.felt[BROKEN], axis=0)
 
 
 def _compresses(at: float) -> Callable[[Scene], None]:
@@ -487,6 +512,14 @@ KINDS: Mapping[str, Kind] = {
     "one direction without motion": Kind(_one_axis_still),
     "a channel stands still for 30 s": Kind(_stands_still, ("ChannelsStoodStill",)),
     "a sensor that feels other motion": Kind(_alone, ("NoSharedMotion", "ModelMisfit")),
+    "a high-pass corner moves from 0.4 to 0.5 Hz": Kind(
+        _filter_moves(_corner(0.4), _corner(0.5)), STEADY
+    ),
+    "a low-pass corner moves from 19 to 20 Hz": Kind(
+        _filter_moves(_corner(19, "low"), _corner(20, "low")), STEADY
+    ),
+    "a resonance moves from 8 to 8.2 Hz": Kind(_filter_moves(_peak(8), _peak(8.2)), STEADY),
+    "gain of an octave rises by 2 % at once": Kind(_octave_gains, STEADY),
 }
 PAIRS = (
     ("gain of a sensor rises by 3 %", "a channel has a square of 2e-3 of its rms"),

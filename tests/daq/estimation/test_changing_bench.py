@@ -11,7 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import huddle
+from daq.estimation.estimation import Estimation
 from daq.estimation.settings import Settings
+from daq.formats.arrays import recording_of_arrays
 from daq.results.calibration import calibrate
 from daq.results.result import Result
 from estimator.checks.advice_on_noise import NoiseChanges, ResponseChanges
@@ -24,10 +26,7 @@ N = round(1200 * RATE)
 NOISE = 2 / RATE  # PSD of white noise of variance 1
 
 
-@functools.cache  # several tests look at one bench
-def estimated(
-    kind: str, seed: int, *, ratio: float = 1e4, n: int = N, option: str = ""
-) -> Snapshot:
+def recorded(kind: str, seed: int, ratio: float = 1e4, n: int = N) -> dict[str, np.ndarray]:
     """White motion of this ratio to white noise; something changes in sensor B."""
     rng = np.random.default_rng([seed, 4747])
     time = np.arange(n) / n
@@ -50,6 +49,14 @@ def estimated(
         elif kind == "temperature":
             felt *= 1 + 0.02 * rng.standard_normal(3) * (np.sin(np.pi * time) - 0.5)[:, None]
         samples[name] = felt + rng.standard_normal((n, 3))
+    return samples
+
+
+@functools.cache  # several tests look at one bench
+def estimated(
+    kind: str, seed: int, *, ratio: float = 1e4, n: int = N, option: str = ""
+) -> Snapshot:
+    samples = recorded(kind, seed, ratio, n)
     return huddle.self_noise(
         samples, fs=RATE, segment="5s", octaves=option == "octaves", reject=option == "reject"
     ).snapshot
@@ -94,6 +101,19 @@ def test_levels_within_parts_are_those_of_a_steady_bench(kind: str, most: float)
     inside = slice(5, 90)
     assert np.mean((noise.low[inside] <= NOISE) & (noise.high[inside] >= NOISE)) > 0.93
     assert snapshot.n_effective < 420  # of 455: every part has spent three
+
+
+def test_an_estimate_that_still_grows_holds_what_a_step_adds() -> None:
+    """Averages are those of all segments until it is finished: noise of B is anything below."""
+    recording = recording_of_arrays(recorded("step", 5), RATE)
+    with Estimation([recording], Settings(segment=5.0)) as live:
+        while live.update():
+            pass
+        noise = live.snapshot().results["three-sensor"]
+    inside = slice(5, 90)
+    low, high = noise.low[inside], noise.high[inside]
+    assert np.mean((low <= NOISE) & (high >= NOISE)) > 0.93
+    assert np.mean(low[:, 3] <= 0) > 0.93
 
 
 @pytest.mark.long
