@@ -299,12 +299,11 @@ class _Bus:
 
     async def start(self, nodes: Sequence[int]) -> None:
         """Let devices send, then let the first of them start SYNC."""
-        for node in nodes:
-            await self.set(node, protocol.SAMPLE_COUNTER, 0, 0, 2)
+        for node in nodes:  # no others: their counters are to begin when they are configured
+            await self.start_node(node)
         self._messages.clear()
         self.signs.clear()
         self.n_syncs = self.n_quiet = 0
-        await asyncio.to_thread(self._network.nmt.send_command, NMT_OPERATIONAL)
         self.producer = nodes[0]
         produces = protocol.SYNC | protocol.PRODUCES_SYNC
         await self.set(nodes[0], protocol.SYNC_COB_ID, 0, produces, 4)

@@ -117,8 +117,8 @@ class Peer:
                 if node.is_there and data[1] in (0, node.number):
                     node.state = {1: OPERATIONAL, 128: PRE_OPERATIONAL}[data[0]]
         asked = self.nodes.get(cob_id - 0x600)
-        if asked is not None and asked.is_there:
-            self.send(0x580 + asked.number, asked.ask(data))
+        if asked is not None and asked.is_there and (reply := asked.ask(data)):
+            self.send(0x580 + asked.number, reply)
 
     def _run(self) -> None:
         begin = time.monotonic()

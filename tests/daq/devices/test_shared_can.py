@@ -121,6 +121,19 @@ async def test_a_node_that_is_missing_at_first_joins_at_its_place() -> None:
     assert len(rows_of(found, "B")[0]) > 50
 
 
+async def test_a_node_that_replied_too_late_is_started_with_its_counter() -> None:
+    with bus() as (peer, sensors):
+        node = peer.nodes[2]
+        ask, n_asked = node.ask, itertools.count()
+        node.ask = lambda request: ask(request) if next(n_asked) not in range(3, 5) else b""  # type: ignore[method-assign]
+        information, found, _ = await session(sensors, 600)
+    assert [bool(one.trouble) for one in information] == [False, True, False]
+    check_rows(found, complete={"A", "C"})
+    index, ticks = rows_of(found, "B")
+    assert ticks == node.sent[: len(ticks)]
+    assert index == list(range(index[0], index[-1] + 1))
+
+
 async def test_a_node_that_boots_while_it_is_configured_is_configured_again() -> None:
     with bus() as (peer, sensors):
         node = peer.nodes[2]
