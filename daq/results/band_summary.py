@@ -43,6 +43,11 @@ MUCH_SHARED = 0.01
 _SHAPE_LENGTH = 512  # only the window's shape and overlap matter to the correlation of bins
 
 
+def held(mean: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Return estimates, NaN where their intervals exclude them: nothing exports those."""
+    return np.where((mean < low) | (mean > high), np.nan, mean)
+
+
 @dataclass(frozen=True, slots=True)
 class BandMeans:
     """Means of one channel's noise over bands, shape (n_bands,), in the unit of the spectrum.
@@ -62,6 +67,11 @@ class BandMeans:
         default_factory=dict, kw_only=True
     )
     is_bound: BoolArray = field(default_factory=lambda: np.zeros(1, np.bool_), kw_only=True)
+
+    @property
+    def estimate(self) -> FloatArray:
+        """The mean, NaN where its interval excludes it."""
+        return held(self.mean, self.low, self.high)
 
     @property
     def outside(self) -> BoolArray:

@@ -214,7 +214,7 @@ def level_budget(
         quantity="noise",
         low=band[0],
         high=band[1],
-        value=level,
+        value=level if low <= level <= high else math.nan,
         components=tuple(parts),
         confidence=confidence,
         ends=(low, high),

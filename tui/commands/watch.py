@@ -181,7 +181,7 @@ def _update(result: Result, now: RecordingStatus | None) -> dict[str, Any]:
         document["noise"] = {
             method: {
                 label.name: {
-                    "psd": float(mean.mean[0]),
+                    "psd": float(mean.estimate[0]),
                     "low": float(mean.low[0]),
                     "high": float(mean.high[0]),
                 }

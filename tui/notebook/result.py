@@ -12,6 +12,7 @@ from daq.bench.masks.mask_file import masks_named
 from daq.bench.units import levels_db
 from daq.errors import WrongSettingError
 from daq.results import result as results
+from daq.results.band_summary import held
 from daq.results.sources import LoggedEvent, uncounted_events
 from estimator.levels.bands import band_edges
 from tui.notebook import text
@@ -381,7 +382,7 @@ class Result:
             self.method,
             self.channels,
             np.average(self.data_psd[inside], axis=0, weights=width),
-            found.mean[0],
+            held(found.mean, *found.ends())[0],
             noise_low[0],
             noise_high[0],
             confidence,

@@ -15,6 +15,7 @@ import numpy as np
 
 from daq.results.band_summary import (
     averages_at,
+    held,
     known_range,
     without_partners,
 )
@@ -274,7 +275,7 @@ class Bands:
             channel=label.channel,
             method=method,
             frequency=number(found.centre),
-            noise_psd=number(found.mean),
+            noise_psd=number(held(found.mean, found.outer_low, found.outer_high)),
             low=number(found.outer_low),
             high=number(found.outer_high),
             limit_psd=number(found.mask),

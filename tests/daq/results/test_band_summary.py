@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from daq.results.band_summary import Levels, Spectrum
+from daq.results.uncertainty_budget import level_budget
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
 
 
@@ -40,3 +42,18 @@ def test_a_level_below_its_bound_keeps_its_ends() -> None:
     assert not found.withdrawn().any()
     assert (low > 0.1 * found.mean).all()
     assert (high > found.mean).all()
+
+
+@pytest.mark.parametrize("share", [1e-3, 0.01, 0.1, 0.3, 0.6, 0.9, 1.1, 3.0, 100.0])
+def test_no_estimate_is_exported_beside_an_interval_that_excludes_it(share: float) -> None:
+    """The mean of a band was 194 beside an upper end of 40.7, in JSON and certificates."""
+    found, labels = bounded_by(share), made_snapshot().channels
+    for column, label in enumerate(labels):
+        means = found.of_channel(column)
+        for row, (estimate, low, high) in enumerate(
+            zip(means.estimate, means.low, means.high, strict=True)
+        ):
+            budget = level_budget(found, column, label, (1.0, 2.0), row=row)
+            is_held = low <= means.mean[row] <= high
+            assert np.isnan(estimate) if not is_held else estimate == means.mean[row]
+            np.testing.assert_equal(budget.value, estimate)

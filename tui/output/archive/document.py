@@ -15,6 +15,7 @@ import numpy as np
 
 from daq.archive.density import LOWEST_DB, Density
 from daq.archive.facts import facts_of_archive
+from daq.results.band_summary import held
 from tui.output.archive.tables import day_text
 from tui.output.console import growing
 from tui.output.csv_text import csv_text
@@ -84,7 +85,7 @@ def archive_json(answer: Answer, store: Store, n_recordings: int, wrong: Sequenc
     }
     levels = answer.levels
     arrays = {
-        "noise_psd": levels.mean,
+        "noise_psd": held(levels.mean, levels.low, levels.high),
         "noise_psd_low": levels.low,
         "noise_psd_high": levels.high,
     }

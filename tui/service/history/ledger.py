@@ -173,7 +173,7 @@ def band_noise(
             notes.append(f"no noise for the history: {error}")
             continue
         for label, each in zip(snapshot.channels, means, strict=True):
-            values = (float(each.mean[0]), float(each.low[0]), float(each.high[0]))
+            values = (float(each.estimate[0]), float(each.low[0]), float(each.high[0]))
             model, serial_number = about.get(label.sensor, ("", ""))
             own = (label.sensor, model, serial_number, label.channel, label.unit)
             found.append(BandNoise(*own, method, float(band[0]), float(band[1]), *values))
