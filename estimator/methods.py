@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -32,6 +33,8 @@ SMOOTH = 400.0
 EQUATIONS = 2
 """Equations of like channels over their number, from which pooled directions of further dimensions
 give every noise: with six sensors of one channel and three dimensions the tails are heavy."""
+
+DIMENSIONS_OF_MOTION = 3
 
 Method: TypeAlias = "Callable[..., SelfNoise]"
 """``method(csm, *, dims, n_effective, correct, **options)``."""
@@ -146,6 +149,13 @@ def _shared(dims: tuple[int, ...]) -> int:
     return sorted(dims)[-3] if len(dims) > 2 else 0
 
 
+def _most_pooled(dims: tuple[int, ...]) -> int:
+    """Return how many dimensions sensors of one or two channels divide from their noise."""
+    n, d = len(dims), max(dims)
+    alike = n - math.ceil(math.sqrt(2 * EQUATIONS * n))  # of 8 sensors, a fourth takes noise
+    return d * alike if d < DIMENSIONS_OF_MOTION else 0
+
+
 def _scale(psd: FloatArray, rest: FloatArray, block: IntArray, n_effective: float) -> FloatArray:
     """Return the unit of every channel at every bin, shape (n_bins, n_channels).
 
@@ -227,6 +237,7 @@ def _with_neighbours(
         matrix,
         number,
         n_dims[rows],
+        most=_most_pooled(live) if further.any() else 0,
         dims=live,
         n_effective=n_effective,
         correlation=correlation,

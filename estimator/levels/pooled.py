@@ -188,6 +188,7 @@ def pooled_noise(
     block: IntArray,
     n_dims: IntArray,
     *,
+    most: int = 0,
     dims: tuple[int, ...],
     n_effective: float,
     correlation: FloatArray,
@@ -202,6 +203,8 @@ def pooled_noise(
         Block of each bin, non-decreasing.
     n_dims : int64, shape (n_freqs,)
         Dimensions of the motion, equal within a block.
+    most : int
+        Dimensions up to which weaker ones are looked for, that several bins together show.
     dims : tuple of int
     n_effective : float
         Independent averages of one bin.
@@ -220,7 +223,16 @@ def pooled_noise(
     for group in np.split(some, np.flatnonzero(np.diff(before)) + 1):
         if len(group):
             q = n_dims[edges[group]]
-            _pool(found, matrix, edges[group], sizes[group], q, sensor=sensor, averages=table)
+            _pool(
+                found,
+                matrix,
+                edges[group],
+                sizes[group],
+                q,
+                most=most,
+                sensor=sensor,
+                averages=table,
+            )
     return found
 
 
@@ -231,6 +243,7 @@ def _pool(
     sizes: IntArray,
     q: IntArray,
     *,
+    most: int,
     sensor: IntArray,
     averages: FloatArray,
 ) -> None:
@@ -248,7 +261,7 @@ def _pool(
 
     at = np.arange(len(begin))
     parts, mean = cut(at, sizes)
-    whole = fit = _fitted(mean, parts, q, sensor, n_effective=n_effective, resolve=False)
+    whole = fit = _fitted(mean, parts, q, sensor, n_effective=n_effective, most=most, resolve=False)
     level, whitener, best = fit.level.copy(), fit.whitener.copy(), fit.resolved.copy()
     as_whole = np.ones(len(at), np.bool_)
     enough = int(np.searchsorted(averages[1:], max(FEW * q.max(), 1.5 * p))) + 1
@@ -263,7 +276,7 @@ def _pool(
         more = at[r > best[at]]
         if len(more):
             parts, mean = cut(more, k[more])
-            fit = _fitted(mean, parts, q[more], sensor, n_effective=n_effective)
+            fit = _fitted(mean, parts, q[more], sensor, n_effective=n_effective, most=most)
             # a strong dimension whose response varies looks like a further one in a larger
             # sub-block; what leaks of it makes the noise of some channels larger
             noise = (np.abs(np.linalg.inv(whitener[more])) ** 2).sum(axis=2)
@@ -312,6 +325,7 @@ def _fitted(
     sensor: IntArray,
     *,
     n_effective: float,
+    most: int = 0,
     resolve: bool = True,
 ) -> _Fit:
     """Find directions and noise of blocks in a few rounds; no dimension resolved unless asked.
@@ -322,6 +336,7 @@ def _fitted(
     own, N, whole = parts.block, parts.averages, parts.whole
     a, b = pairs(sensor)
     r, wanted = np.zeros(len(q), np.int64), q
+    at_most = np.maximum(q, most)
     whitener = _start(mean, parts, sensor)
     for turn in range(ROUNDS):
         X = white(mean, whitener[own])
@@ -338,9 +353,8 @@ def _fitted(
             g = N / np.where(source == np.arange(len(own)), N - r[own], N + r[own])
         T = parts.mean(g[:, None, None] * (P @ X @ P)) if resolve else X
         A = np.linalg.eigh(T)[1]
-        q = r + _shown(
-            T, A, parts.mean(P), resolved=r, wanted=wanted, averages=whole, sensor=sensor
-        )
+        kept = parts.mean(P)
+        q = r + _shown(T, A, kept, resolved=r, wanted=at_most, averages=whole, sensor=sensor)
         weak = q - r
         Q = P
         if weak.any():

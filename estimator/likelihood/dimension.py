@@ -24,6 +24,7 @@ from estimator.likelihood.goodness_of_fit import (
     likelihood_ratio,
     model_test,
     pool,
+    upper_tail,
 )
 from estimator.likelihood.maximum_likelihood import standard_error
 from estimator.likelihood.prior import expected_noise, kinds, maximise_expecting
@@ -165,8 +166,9 @@ class BandDimension:
 
     @property
     def is_biased(self) -> bool:
-        """Whether no dimension explains the band, at a level of one in a hundred."""
-        return not self.accepted and self.test.p_value < MISFIT_LEVEL
+        """Whether no dimension explains the band, by itself or with others."""
+        few = self.n_sensors < MIN_DETERMINED_SENSORS
+        return not self.accepted and (self.test.p_value < MISFIT_LEVEL or not few)
 
 
 def noise_groups(
@@ -326,17 +328,17 @@ def choose_dimension(
         usual=usual,
         level=level,
     )
+    open_bands += _rejected_together([b for b in tried if b not in open_bands], tried, most, usual)
     shared = sharers.found(tried, open_bands) if len(there.sensors) >= SHARING else {}
     for b, sharing in shared.items():
         tried[b][sharing.n_factors :] = [sharing.test]
-    open_bands = [b for b in open_bands if b not in shared]
     choices = tuple(
         BandDimension(
             low=float(frequency[number == b][0]),
             high=float(frequency[number == b][-1]),
             n_factors=len(tests) - 1,
             usual=usual,
-            accepted=b not in open_bands
+            accepted=(b in shared or b not in open_bands)
             and not (len(tests) - 1 > usual and len(there.sensors) < MIN_DETERMINED_SENSORS),
             n_sensors=len(there.sensors),
             test=tests[-1],
@@ -349,6 +351,22 @@ def choose_dimension(
     )
     chosen = {b: len(tests) - 1 for b, tests in tried.items()}
     return np.array([chosen[int(b)] for b in number]), choices
+
+
+def _rejected_together(
+    some: list[int], tried: dict[int, list[BandTest]], most: int, usual: int
+) -> list[int]:
+    """Return the bands of further dimensions, where their tests fail together and none can be more.
+
+    What a band alone hardly shows, such as weak gradients, biases the noise of all.
+    """
+    further = [b for b in some if len(tried[b]) - 1 > usual]
+    if all(len(tried[b]) - 1 < most for b in further):
+        return []
+    tests = [tried[b][-1] for b in further]
+    statistic = sum(test.statistic / test.spread for test in tests)
+    degrees = sum(test.degrees / test.spread for test in tests)
+    return further if upper_tail(degrees, statistic) < MISFIT_LEVEL else []
 
 
 def most_testable(dims: tuple[int, ...]) -> int:

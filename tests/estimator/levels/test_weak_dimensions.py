@@ -1,0 +1,30 @@
+"""Motion that several frequencies show together, and no single one does, is no noise."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.formats.arrays import recording_of_arrays
+from daq.results.result import Result
+
+RATE, SECONDS, RATIO = 100.0, 400.0, 1e3
+UNIT = 2 / RATE
+
+
+def test_gradients_of_the_motion_are_not_in_the_noise_of_sensors_off_plumb() -> None:
+    """Twelve sensors, 1 degree, gradients of 1 %: 7 of 108 intervals were off by up to 34 %."""
+    rng, n = np.random.default_rng([461, 0, 12, 3]), round(SECONDS * RATE)
+    motion = np.sqrt(RATIO) * rng.standard_normal((n, 3))
+    gradients = 0.01 * np.sqrt(RATIO) * rng.standard_normal((n, 2))
+    samples = {}
+    for number in range(12):
+        axis = np.array([*np.radians(1) / np.sqrt(2) * rng.standard_normal(2), 1.0])
+        felt = motion @ axis + gradients @ rng.uniform(-1, 1, 2)
+        samples[f"s{number:02}"] = felt + rng.standard_normal(n)
+    settings = Settings(segment=2.0)
+    result = Result(estimate([recording_of_arrays(samples, RATE)], settings), settings)
+    for band in ((2.0, 10.0), (10.0, 30.0)):
+        for noise in result.means(result.method, band):
+            assert 0.93 * noise.low[0] <= UNIT <= 1.07 * noise.high[0]
