@@ -123,7 +123,8 @@ def self_noise(
             found = SelfNoise.of(method, found.noise_psd, scale * found.cumulants, found.flags)
     if blocks is not None and method in {"three-sensor", "maximum-likelihood"}:
         every = np.arange(len(dims))[None] if groups is None else groups
-        for group in np.unique(every, axis=0):
+        # With counts, for without them NumPy imports its masked arrays.
+        for group in np.unique(every, axis=0, return_counts=True)[0]:
             here = (every == group).all(axis=1) & ~is_real
             found = _with_neighbours(
                 found,
