@@ -11,7 +11,6 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
 from daq.results.result import Result
-from estimator.checks.advice_on_noise import SharedNoise
 
 if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
@@ -76,13 +75,14 @@ def test_noise_that_changes_is_no_gradient_of_the_motion() -> None:
 
 
 def test_noise_that_two_channels_share_is_in_their_intervals() -> None:
-    """A further dimension takes it for motion, and the one channel predicts it of the other."""
+    """It is no further dimension of the motion, and the one channel predicts it of the other."""
     rng = np.random.default_rng(1)
     noise = white(rng, 5)
     noise[:2, :, 0] += 0.7 * rng.standard_normal(N_SAMPLES)
     snapshot = estimated(felt(rng, 5, 1e3), noise)
-    assert any(isinstance(each, SharedNoise) for each in snapshot.diagnostics.advice)
-    assert any(each.n_factors > each.usual for each in snapshot.diagnostics.dimensions)
+    choices = snapshot.diagnostics.dimensions
+    assert {each.pairs for each in choices} <= {(), ((0, 1),)}
+    assert any(each.pairs for each in choices)
     inside = held(snapshot, noise)
     assert inside[:, [0, 3]].all()
     assert inside.mean() >= 0.93
