@@ -35,8 +35,9 @@ def test_no_total_is_narrower_than_its_statistical_part(n_effective: float, shar
     snapshot = made_snapshot(n_effective=n_effective, clock_share=share)
     for method in SETTINGS.methods:
         found = band_budgets(Result(snapshot, replace(SETTINGS, methods=(method,))))
-        assert found
-        for each in found:
+        kept = [each for each in found if not math.isnan(each.value)]  # the others are withdrawn
+        assert kept
+        for each in kept:
             low, high = (end / abs(each.value) for end in each.interval)
             below, above = (1 + end for end in each.components[0].reach)
             assert low <= below + 1e-12
