@@ -83,7 +83,7 @@ class SignalView(View):
         Binding("up", "channel(-1)", "Channel", show=False),
         Binding("g", "spectrum", "Spectrum"),
         Binding("t", "go", "Time"),
-        Binding("n", "mark(1)", "Mark"),
+        Binding("n", "mark(1)", "Mark", show=False),
         Binding("x", "exclude", "Exclude"),
         Binding("N", "mark(-1)", "Mark before", show=False),
         Binding("full_stop", "cursor(0.02)", "Cursor right", show=False),
