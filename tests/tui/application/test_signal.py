@@ -154,6 +154,13 @@ async def test_a_stretch_is_excluded_and_taken_back(path: Path) -> None:
         assert not view.look.excluded
 
 
+def test_the_end_of_an_excluded_stretch_is_in_it() -> None:
+    """The result states its ends to a microsecond; the cursor was left there."""
+    stretch = (START, START + 9.468)
+    assert Look(cursor=START + 9.4680004, excluded=(stretch,)).here == stretch
+    assert Look(cursor=START + 9.5, excluded=(stretch,)).here is None
+
+
 def _n_excluded(app: HuddleApp) -> int:
     result = app.state.result
     return 0 if result is None else result.snapshot.left_out.get(Reason.CHOSEN, 0)

@@ -25,6 +25,7 @@ TICK_ROOM, FREQUENCY_ROWS = 14, 4
 NAME_WIDTH = 13, 16
 """Least and most width of what stands left of the columns: a name, and ` 1.27 mm/s²`."""
 RECORDED, NOISE = "recorded", "noise"
+_NEAR = 1e-3  # seconds
 BESIDE = 4
 """Rows that are neither waveform nor spectrogram: title, marks, times, and what is read off."""
 
@@ -62,7 +63,8 @@ class Look:
         at = self.cursor
         if at is None:
             return None
-        return next((each for each in self.excluded if each[0] <= at <= each[1]), None)
+        # Ends of stretches are known to a microsecond, the cursor is not.
+        return next((s for s in self.excluded if s[0] - _NEAR <= at <= s[1] + _NEAR), None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
