@@ -105,7 +105,7 @@ class Session:
     def ask(self, question: str, *keys: str, answer: str) -> str:
         """Press keys; keep the row of the answer, and the seconds that it took to come."""
         self.press(*keys)
-        seconds = self._terminal.wait_for(answer, timeout=10)
+        seconds = self._terminal.wait_for(answer, timeout=60)
         row = next(row for row in self._terminal.rows if answer in row)
         shown = " ".join(_FRAME.sub(" ", row.rpartition("▌")[2]).split())[:70]
         pressed = " ".join(NAMES.get(key, key) for each in keys for key in _KEY.findall(each))
@@ -185,7 +185,7 @@ def drive(session: Session) -> None:
     )
     session.press("x", "y")
     session.see("recording  ", "channel    data", "w Report")
-    session.ask("Which tests are there?", "4", answer="⏎ Open")
+    session.ask("Which tests are there?", "4", answer="e Estimate")
     session.ask(
         "How does this compare with the test before?", "\x1b[B", "c", answer="compared with"
     )
