@@ -9,6 +9,9 @@ from estimator.checks.advice import Advice, Names, Rank
 from estimator.records import Seconds, Share, record
 from estimator.wording import Words, listed, percent, several, time_of_day
 
+LARGE_FALL = -0.8
+"""Change of a gain, of its mean over the segments, below which its size is not known."""
+
 
 @record
 class SharedNoise(Advice):
@@ -189,15 +192,12 @@ class ResponseChanges(Advice):
 
     def _words(self, names: Names) -> Words:
         own = names.list_sensors(self.sensors)
+        turn = f"{math.degrees(self.size_error):.1g}°"
+        error = f" (standard error {turn if self.is_turn else percent(self.size_error)})"
         return Words(
             f"{_response_change(self, names)}; {_remedy(self)}",
-            f"{_response_change(self, names)} (standard error "
-            + (
-                f"{math.degrees(self.size_error):.1g}°"
-                if self.is_turn
-                else f"{percent(self.size_error)}"
-            )
-            + f"). Over all segments, this leaves up to {percent(self.variance)} of the motion's "
+            f"{_response_change(self, names)}{'' if _is_large_fall(self) else error}. "
+            f"Over all segments, this leaves up to {percent(self.variance)} of the motion's "
             f"PSD in the noise of {own}. Noise is estimated within parts of time where these have "
             "enough averages; intervals include what is left.",
             f"{_remedy(self).capitalize()} and record again, or estimate the time before or "
@@ -215,13 +215,10 @@ def _response_change(advice: ResponseChanges, names: Names) -> str:
     else:
         whose = sensor if advice.channel is None else names.channels[advice.channel]
         direction = "rose" if advice.size > 0 else "fell"
-        by = "to about zero" if _is_lost(advice) else f"by {percent(abs(advice.size))}"
-        what = f"The gain of {whose} {direction} {by}"
+        by = "more than half" if _is_large_fall(advice) else percent(abs(advice.size))
+        what = f"The gain of {whose} {direction} by {by}"
     begin, end = (_clock_time(names, at) for at in (advice.begin, advice.end))
     return f"{what} at {begin}" if begin == end else f"{what} from {begin} to {end}"
-
-
-_LOST = -0.8  # of a gain: its scatter in parts with little motion reaches the rest
 
 
 def _clock_time(names: Names, seconds: float) -> str:
@@ -230,13 +227,16 @@ def _clock_time(names: Names, seconds: float) -> str:
     return time_of_day(names.start_utc_ns + round(seconds * 1e9))
 
 
-def _is_lost(advice: ResponseChanges) -> bool:
-    """Return whether a gain fell to so little that the sensor was moved, or its cable pulled."""
-    return not advice.is_turn and advice.size < _LOST
+def _is_large_fall(advice: ResponseChanges) -> bool:
+    """Return whether a gain fell by so much that its size, of the mean gain, is not known.
+
+    As of a sensor that was moved, or a cable that was pulled or crossed.
+    """
+    return not advice.is_turn and advice.size < LARGE_FALL
 
 
 def _remedy(advice: ResponseChanges) -> str:
-    if _is_lost(advice):
+    if _is_large_fall(advice):
         return "check its place and its cable"
     return "fix the sensor" if advice.is_turn else "let the sensor settle"
 

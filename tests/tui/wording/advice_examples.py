@@ -163,7 +163,7 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
             end=420.0,
             variance=0.2,
         ),
-        ("The gain of b fell to about zero at 420 s", "Check its place and its cable"),
+        ("The gain of b fell by more than half at 420 s. Over", "Check its place and its cable"),
     ),
     (
         ResponseChanges(
