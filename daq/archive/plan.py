@@ -26,7 +26,7 @@ STRETCHES = {"hour": 3600, "day": 86400}
 """Seconds; stretches begin at whole hours or days of UTC."""
 SHAPING = (
     *("segment", "overlap", "window", "detrend", "clocks", "reject"),
-    *("octaves", "equalise", "bridge"),
+    *("octaves", "equalise", "bridge", "exclude"),
 )
 """Settings that shape spectra."""
 
@@ -113,7 +113,8 @@ class Plan:
         """
         given = {name: value for name, value in wanted.items() if value is not None}
         other = [
-            f"{OPTIONS[name].flags[0]} {given[name]} (the archive: {getattr(self.settings, name)})"
+            f"{OPTIONS[name].flags[0]} {_shown(given[name])} (the archive:"
+            f" {_shown(getattr(self.settings, name))})"
             for name in SHAPING
             if name in given and given[name] != getattr(self.settings, name)
         ]
@@ -216,6 +217,10 @@ def described(each: Pass) -> tuple[tuple[str, tuple[tuple[str, str], ...]], ...]
     for sensor, channel in each.aligned.channels:
         sensors.setdefault(sensor, []).append((channel.name, channel.unit))
     return tuple((name, tuple(channels)) for name, channels in sensors.items())
+
+
+def _shown(value: object) -> str:
+    return (", ".join(value) or "none") if isinstance(value, tuple) else f"{value}"
 
 
 def _text(sensors: tuple[tuple[str, tuple[tuple[str, str], ...]], ...]) -> str:

@@ -159,7 +159,7 @@ def check_span(passes: Sequence[Pass], settings: Settings) -> None:
             + "; ".join(covered)
         )
     for number, text in enumerate(settings.exclude):
-        spans = [(each.chosen()[number], each.aligned.n_available) for each in passes]
+        spans = [(each.excluded()[number], each.aligned.n_available) for each in passes]
         if covered and all(after <= 0 or first >= n for (first, after), n in spans):
             begin, end = (_utc(datetime.fromisoformat(at).timestamp()) for at in text.split("/"))
             raise WrongSettingError(f"exclude {begin}/{end}: nothing there: {'; '.join(covered)}")

@@ -310,7 +310,7 @@ class SnapshotBuilder:
             with self._diagnoses:
                 bands_of_all = bands if raw else ()
                 self._findings = (
-                    self._diagnose(recordings, passes, raw, bands_of_all, estimates, maxima=maxima)
+                    self._diagnose(passes, raw, bands_of_all, estimates, maxima=maxima)
                     .linear_first(nonlinear, psd, dims)
                     .beside_clocks(clock_states(passes))
                     .of_all_segments(unless=final and bool(raw) and not sets)
@@ -400,7 +400,7 @@ class SnapshotBuilder:
                 within, raw, recordings[0], passes[0], n, maxima=maxima, final=True
             )
             self._findings = (
-                self._diagnose(recordings, passes, raw, within, again, maxima=maxima)
+                self._diagnose(passes, raw, within, again, maxima=maxima)
                 .linear_first(nonlinear, psd, dims)
                 .beside_clocks(clock_states(passes))
             )
@@ -433,7 +433,6 @@ class SnapshotBuilder:
 
     def _diagnose(
         self,
-        recordings: Sequence[ReadableRecording],
         passes: Sequence[Pass],
         raw: tuple[Band, ...],
         bands: tuple[Band, ...],
@@ -443,7 +442,7 @@ class SnapshotBuilder:
     ) -> Findings:
         """Diagnose the test: too costly for every snapshot."""
         dims, channels = passes[0].aligned.dims, passes[0].aligned.channels
-        counts = limits_by_column(recordings, channels)
+        counts = limits_by_column(passes, channels)
         stood_still = still_for_a_while(passes, self._settings)
         found = diagnosis(
             bands,

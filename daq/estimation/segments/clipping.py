@@ -18,16 +18,18 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.channel import Channel
-    from daq.recording.interface import ReadableRecording, ReadableSensor
+    from daq.estimation.segments.segment_pass import Pass
+    from daq.recording.interface import ReadableSensor
 
 _STRETCHES = 16
 _ROWS = 2048  # of each
 
 
-def limits_of(record: ReadableSensor) -> CountLimits:
+def limits_of(record: ReadableSensor, unused: NDArray[np.float64] | None = None) -> CountLimits:
     """Return what the counts of a sensor show of their limits, by column of the sensor.
 
-    Blocks flagged as clipped are skipped: the estimate excludes them.
+    Blocks flagged as clipped are skipped, and samples from each first to each second of `unused`:
+    the estimate excludes them.
     """
     rows = _rows(record)
     if len(rows) == 0:
@@ -36,8 +38,12 @@ def limits_of(record: ReadableSensor) -> CountLimits:
     which = np.concatenate([np.arange(first, last) for first, last in rows])
     blocks = record.blocks
     begins = np.concatenate([[0], np.cumsum(blocks["n_samples"])])[:-1]
-    flags = blocks["flags"][np.searchsorted(begins, which, side="right") - 1]
-    used = np.repeat((flags & int(BlockFlag.CLIPPED))[:, None] == 0, counts.shape[1], axis=1)
+    block = np.searchsorted(begins, which, side="right") - 1
+    kept = blocks["flags"][block] & int(BlockFlag.CLIPPED) == 0
+    sample = blocks["first_sample"][block] + which - begins[block]
+    for first, end in () if unused is None else unused:
+        kept &= (sample < first) | (sample >= end)
+    used = np.repeat(kept[:, None], counts.shape[1], axis=1)
     for column, begin, end in record.absent:
         used[(which >= begin) & (which < end), column] = False
     main = [n for n, channel in enumerate(record.channels) if not channel.auxiliary]
@@ -45,7 +51,7 @@ def limits_of(record: ReadableSensor) -> CountLimits:
 
 
 def limits_by_column(
-    recordings: Iterable[ReadableRecording], channels: Sequence[tuple[str, Channel]]
+    passes: Iterable[Pass], channels: Sequence[tuple[str, Channel]]
 ) -> CountLimits:
     """Return what the counts of all channels of an estimate show of their limits.
 
@@ -53,14 +59,15 @@ def limits_by_column(
     """
     columns = {(sensor, channel.name): column for column, (sensor, channel) in enumerate(channels)}
     whole = CountLimits()
-    for recording in recordings:
-        for record in recording.sensors:
+    for each in passes:
+        unused = each.unused()
+        for record in each.recording.sensors:
             known = {
                 n: columns[record.name, channel.name]
                 for n, channel in enumerate(record.channels)
                 if (record.name, channel.name) in columns
             }
-            whole = whole.joined(limits_of(record).of_columns(known))
+            whole = whole.joined(limits_of(record, unused.get(record.name)).of_columns(known))
     return whole
 
 

@@ -199,6 +199,7 @@ class Pass:
         )
         names = {sensor for sensor, _ in self.aligned.channels}
         self._sensors = [record for record in recording.sensors if record.name in names]
+        self._rates = np.array([record.sampling_rate for record in self._sensors])
         rate = self.aligned.sampling_rate
         self.welch = WelchSettings(
             sampling_rate=rate,
@@ -210,8 +211,8 @@ class Pass:
         self.n_channels = len(self.aligned.channels)
         self._settings = settings
         created = created_at(recording)
-        stretches = [stretch(each, created) for each in settings.exclude]
-        self._excluded = [(_ns(begin), _ns(end)) for begin, end in stretches]
+        ends = (stretch(each, created) for each in settings.exclude)
+        self._stretches = [(_ns(begin), _ns(end)) for begin, end in ends]
         self.filters: Equaliser | None = None
         self._every = 1  # of which segments delays are measured
         self._tolerance = _FINAL_TOLERANCE
@@ -444,14 +445,15 @@ class Pass:
             samples = np.where(present, samples, 0.0)
         self._silence(samples)
         unwanted = self._unwanted(begin, len(samples))
-        raw, flat = samples[reach : reach + n_hops], usable[reach : reach + n_hops]
+        raw = samples[reach : reach + n_hops]
+        kept = self._kept(begin + reach, n_hops) & usable[reach : reach + n_hops]
         if filters is not None:
             samples = filters.apply(samples)
             usable = surrounded(usable, reach)
             if present is not None:
                 present = np.column_stack([surrounded(column, reach) for column in present.T])
             unwanted = None if unwanted is None else ~surrounded(~unwanted, reach)
-        return _Samples(samples, usable, present, unwanted, raw, flat)
+        return _Samples(samples, usable, present, unwanted, raw, kept)
 
     def _survey(self) -> None:
         """Set free clocks from a few segments, before all are taken.
@@ -487,7 +489,7 @@ class Pass:
         """Set clocks from one segment in `every`; return the error of one delay, in s."""
         numbers = np.arange(self.n_complete)
         begins = numbers[_is_picked(numbers, every)] * self.welch.hop
-        begins = begins[~self._is_chosen(begins, self.welch.segment_length)]
+        begins = begins[~self._touch_excluded(begins, self.welch.segment_length)]
         for first in range(0, len(begins), _READ_TOGETHER):
             some = begins[first : first + _READ_TOGETHER]
             whole, spectra = self._spectra_apart(some)
@@ -553,12 +555,12 @@ class Pass:
         samples, usable, unwanted = part.samples, part.usable, part.unwanted
         hop, length, reach = self.welch.hop, self.welch.segment_length, self.reach
         begin = first * hop
-        self.stillness.add(part.raw, part.raw_usable)
+        self.stillness.add(part.raw, part.raw_kept)
         starts = np.arange(count) * hop
         whole = whole_segments(usable, starts, length)
         clean = whole if unwanted is None else whole_segments(usable & ~unwanted, starts, length)
         self.left_out[Reason.GAP] += count - int(whole.sum())
-        chosen = self._is_chosen(begin + starts, length + 2 * reach)
+        chosen = self._touch_excluded(begin + starts, length + 2 * reach)
         self.left_out[Reason.CHOSEN] += int((whole & chosen).sum())
         self.left_out[Reason.CLIPPED] += int((whole & ~clean & ~chosen).sum())
         starts = starts[clean]
@@ -591,13 +593,13 @@ class Pass:
     def _take_spectra(self, part: OwnSpectra, first: int) -> None:
         """Add whole segments by their spectra; `first` is the number of the first of them."""
         count, length, hop = len(part.spectra), self.welch.segment_length, self.welch.hop
-        self.stillness.add(part.raw, np.ones(len(part.raw), dtype=np.bool_))
+        self.stillness.add(part.raw, self._kept(first * hop, len(part.raw)))
         starts = np.arange(count) * hop
         unwanted = self._unwanted(first * hop, int(starts[-1]) + length)
         spectra = part.spectra
         if unwanted is not None:
             clean = whole_segments(~unwanted, starts, length)
-            chosen = self._is_chosen(first * hop + starts, length)
+            chosen = self._touch_excluded(first * hop + starts, length)
             self.left_out[Reason.CHOSEN] += int(chosen.sum())
             self.left_out[Reason.CLIPPED] += int((~clean & ~chosen).sum())
             spectra, starts = spectra[clean], starts[clean]
@@ -624,30 +626,64 @@ class Pass:
                 return np.ones(len(samples), dtype=np.bool_)
         return np.asarray(np.isfinite(samples).all(axis=1))
 
-    def chosen(self) -> list[tuple[int, int]]:
+    def excluded(self) -> list[tuple[int, int]]:
         """Return the first grid sample of each excluded stretch, and the one after its last."""
         per_ns, origin = self.welch.sampling_rate * 1e-9, self.aligned.start_utc_ns
         return [
             (math.ceil((begin - origin) * per_ns), math.ceil((end - origin) * per_ns))
-            for begin, end in self._excluded
+            for begin, end in self._stretches
         ]
 
-    def _is_chosen(self, begins: NDArray[np.int64], length: int) -> BoolArray:
+    def _touch_excluded(self, begins: NDArray[np.int64], length: int) -> BoolArray:
         """Return which segments that begin at these grid samples touch an excluded stretch."""
         found = np.zeros(len(begins), dtype=np.bool_)
-        for first, end in self.chosen():
+        for first, end in self.excluded():
             found |= (begins < end) & (begins + length > first)
         return found
 
     def _unwanted(self, start: int, n_samples: int) -> NDArray[np.bool_] | None:
         """Return which grid samples are in excluded stretches or clipped blocks; None if none."""
         clipped = self._clipped(start, n_samples)
-        if not self._excluded:
+        if not self._stretches:
             return clipped
-        found = np.zeros(n_samples, dtype=np.bool_) if clipped is None else clipped
-        for first, end in self.chosen():
-            found[max(0, first - start) : max(0, end - start)] = True
+        excluded = ~self._kept(start, n_samples)
+        found = excluded if clipped is None else clipped | excluded
         return found if found.any() else None
+
+    def _kept(self, start: int, n_samples: int) -> BoolArray:
+        """Return which grid samples are in no excluded stretch."""
+        kept = np.ones(n_samples, dtype=np.bool_)
+        for first, end in self.excluded():
+            kept[max(0, first - start) : max(0, end - start)] = False
+        return kept
+
+    def unused(self) -> dict[str, FloatArray]:
+        """Return the samples of each sensor that the settings leave out, by its name.
+
+        Those of excluded stretches, before the start and after the end. Empty without any, or
+        before all sensors have samples.
+
+        Returns
+        -------
+        dict of str to float64, shape (n, 2)
+            First sample, and the one after the last.
+        """
+        asked = self._settings.start is not None, self._settings.end is not None
+        if not self.aligned.clocks or not (self._stretches or any(asked)):
+            return {}
+        ends = np.array([(0, self.aligned.n_available), *self.excluded()], np.float64)
+        spans = (self._seconds_of_sensors(ends.ravel()) * self._rates).reshape(*ends.shape, -1)
+        (start, end), excluded = spans[0], spans[1:]
+        beside = [(np.full(len(start), -np.inf), start), (end, np.full(len(end), np.inf))]
+        found = np.array([*itertools.compress(beside, asked), *excluded])
+        names = [record.name for record in self._sensors]
+        return {name: found[..., number].reshape(-1, 2) for number, name in enumerate(names)}
+
+    def _seconds_of_sensors(self, at: FloatArray) -> FloatArray:
+        """Return the sample of each sensor at grid samples, as seconds since the first."""
+        origin = self.aligned.start_utc_ns - self.recording.created_at.utc_ns
+        seconds = origin * 1e-9 + at / self.welch.sampling_rate
+        return np.asarray(seconds[:, None] - self.aligned.delays(at))
 
     def _clipped(self, start: int, n_samples: int) -> NDArray[np.bool_] | None:
         """Return which grid samples lie in blocks that are clipped; None if none do."""
@@ -655,10 +691,7 @@ class Pass:
             return None
 
         def times() -> FloatArray:
-            at = np.arange(start, start + n_samples, dtype=np.float64)
-            origin = self.aligned.start_utc_ns - self.recording.created_at.utc_ns
-            seconds = origin * 1e-9 + at / self.welch.sampling_rate
-            return np.asarray(seconds[:, None] - self.aligned.delays(at))
+            return self._seconds_of_sensors(np.arange(start, start + n_samples, dtype=np.float64))
 
         return in_clipped_blocks(self._sensors, times)
 
@@ -775,7 +808,7 @@ class _Samples:
     """Which channel has each sample, shape (n_samples, n_channels); None where all have all."""
     unwanted: NDArray[np.bool_] | None
     raw: FloatArray
-    raw_usable: NDArray[np.bool_]
+    raw_kept: NDArray[np.bool_]
     spectra: ComplexArray | None = None
     """Of all segments, also those that are left out."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,18 +15,35 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.results.facts.segments import SegmentsExcluded
 from daq.results.result import Result
+from estimator.checks.advice import Rank
 from estimator.spectra.segment_rejection import Reason
-from tests.daq.clocks.recordings import Sensor, write
+from tests.daq.clocks.recordings import ORIGIN, Sensor, write
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    Fault = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 RATE, SECONDS = 100, 120
 LORRY = slice(40 * RATE, 52 * RATE)
 EXCLUDED = "40s/52s"
+START = datetime.fromtimestamp(ORIGIN.utc_ns * 1e-9, UTC)
+FAULTS: dict[str, Fault] = {
+    "channels-clipped": lambda counts: np.clip(200 * counts, -20_000, 20_000),
+    "readings-repeat": lambda counts: np.repeat(counts[::4], 4),
+    "channels-stood-still": lambda counts: np.full_like(counts, 5),
+}
 
 
-def recording(path: Path, disturbance: float, **of_sensor: Any) -> Path:  # noqa: ANN401 - fields of Sensor
+def recording(
+    path: Path,
+    disturbance: float,
+    fault: Fault = lambda counts: counts,
+    **of_sensor: Any,  # noqa: ANN401 - fields of Sensor
+) -> Path:
     """Write three sensors with common motion, all but alike: what B reads in `LORRY` differs."""
     rng = np.random.default_rng(4)
     motion = rng.normal(0, 300, RATE * SECONDS)
@@ -33,7 +51,7 @@ def recording(path: Path, disturbance: float, **of_sensor: Any) -> Path:  # noqa
     for name in "ABC":
         counts = motion + rng.normal(0, 30, len(motion))
         if name == "B":
-            counts[LORRY] += disturbance * np.sin(np.arange(12 * RATE))
+            counts[LORRY] = fault(counts[LORRY] + disturbance * np.sin(np.arange(12 * RATE)))
         sensors[name] = Sensor(np.round(counts).astype(np.int32)[:, None], RATE, **of_sensor)
     return write(path, sensors)
 
@@ -67,6 +85,25 @@ def test_no_sample_of_an_excluded_stretch_counts(
         np.testing.assert_array_equal(loud.results[method].high, found.high)
     without = estimate([tmp_path / "90000.h5"], replace(settings, exclude=()))
     assert (without.n_segments, without.left_out[Reason.CHOSEN]) != (quiet.n_segments, n_chosen)
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+@pytest.mark.parametrize(
+    "options", [{"exclude": (EXCLUDED,)}, {"end": START + timedelta(seconds=40)}]
+)
+def test_no_fact_is_about_samples_that_are_left_out(
+    tmp_path: Path, kind: str, options: dict[str, Any]
+) -> None:
+    """B clips, repeats its values or stands still, there alone."""
+    path = recording(tmp_path / "r.h5", 0, FAULTS[kind])
+    settings = Settings(segment=4.0)
+    assert kind in invalidating(path, settings)
+    assert invalidating(path, replace(settings, **options)) == set()
+
+
+def invalidating(path: Path, settings: Settings) -> set[str]:
+    facts = Result(estimate([path], settings), settings).facts
+    return {each.name for each in facts if each.rank is Rank.INVALIDATES}
 
 
 def test_instants_and_times_after_the_start_are_alike(tmp_path: Path) -> None:

@@ -144,6 +144,7 @@ def test_what_is_wrong_is_named_and_the_rest_is_shown(folder: Path, tmp_path: Pa
         (["--segment", "20s"], "--segment 20.0 (the archive: 10.0)"),
         (["--stretch", "day"], "--stretch day (the archive: hour)"),
         (["--equalise", "auto"], "--equalise auto (the archive: off)"),
+        (["--exclude", "0s/60s"], "--exclude 0s/60s (the archive: none)"),
         (["--stretch", "week"], "expected hour or day"),
         (["--time-zone", "Mars"], "Europe/London"),
         (["--thin-hours"], "give --thin-after DAYS"),
