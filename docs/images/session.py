@@ -28,7 +28,7 @@ SIZE = (120, 36)
 SPEED = 4.0
 PORT = re.compile(r"/\w+/huddle-\w+/huddle-\w+/tty")
 _KEY = re.compile(r"\x1b\[[A-D]|\x1b\[6~|.", re.DOTALL)
-_FRAME = re.compile("[|│━╌\u2800-\u28ff]+|/tmp/\\S*")
+_FRAME = re.compile(rf"[|│━╌\u2800-\u28ff]+|{re.escape(tempfile.gettempdir())}\S*")
 NAMES = {"\t": "tab", "\r": "enter", "\x1b": "esc", "\x1b[B": "↓", "\x1b[6~": "page down"}
 QUESTIONS = """
 ## Twenty questions

@@ -428,8 +428,8 @@ def self_signed(folder: Path) -> tuple[ssl.SSLContext, str]:
     """Return a context with a new certificate for this machine, and its file for clients."""
     try:
         from cryptography import x509  # noqa: PLC0415 -- an extra
-        from cryptography.hazmat.primitives import hashes, serialization  # noqa: PLC0415
-        from cryptography.hazmat.primitives.asymmetric import ec  # noqa: PLC0415
+        from cryptography.hazmat.primitives import hashes, serialization  # noqa: PLC0415 -- an extra
+        from cryptography.hazmat.primitives.asymmetric import ec  # noqa: PLC0415 -- an extra
     except ImportError as error:
         raise ServeError(f"tls needs cryptography: {error}") from error
     key = ec.generate_private_key(ec.SECP256R1())

@@ -650,7 +650,7 @@ def _dated(cell: str, order: str) -> int:
         year = int(parts["y"])
         year += 2000 if year < 100 else 0
         day = datetime(year, int(parts["m"]), int(parts["d"]))  # noqa: DTZ001 - days only
-        ns = (day - datetime(1970, 1, 1)) // timedelta(seconds=1) * NS_PER_S  # noqa: DTZ001
+        ns = (day - datetime(1970, 1, 1)) // timedelta(seconds=1) * NS_PER_S  # noqa: DTZ001 - days only
     if clock is None:
         return ns
     hour = int(clock["h"])
