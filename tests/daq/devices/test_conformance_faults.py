@@ -225,6 +225,6 @@ def hold_against_the_world(served: Served, mode: str, sensor: SensorRecord) -> N
     assert np.count_nonzero(far_off) <= len(parts) / 2
     if mode in COUNT_ON:
         kinds = {"reset"}
-        if mode.startswith("seedlink"):  # late arrivals of a fast world confirm few gaps
+        if mode.startswith(("scream", "seedlink")):  # late arrivals confirm few gaps
             kinds = set(FAULTS[mode])
         assert len(parts) <= 1 + sum(one["kind"] in kinds for one in served.struck(mode))
