@@ -27,10 +27,10 @@ demo: $(VENV)/.installed  ## the whole huddle test on a simulated bench, over it
 # The workers share the cores: threads of linear algebra would wait for each other in loops.
 test test-long: export OPENBLAS_NUM_THREADS := 1
 
-# Three at a time on two cores: many tests wait for their devices.
+# Three at a time on two cores: many tests wait for their devices; of the long ones, more do.
 # With AGAIN=yes, what failed runs once more, alone: a busy computer makes devices late.
 test: $(VENV)/.installed-dev  ## the tests but the long ones; with ALL=yes, these too, collected once
-	$(BIN)/pytest -n 3 $(if $(ALL),-m "not study")$(if $(AGAIN), || { [ $$? = 1 ] && $(BIN)/pytest --last-failed -m ""; })
+	$(BIN)/pytest -n $(if $(ALL),4 -m "not study",3)$(if $(AGAIN), || { [ $$? = 1 ] && $(BIN)/pytest --last-failed -m ""; })
 
 test-long: $(VENV)/.installed-dev  ## the tests that are studies, endurance or whole sessions
 	$(BIN)/pytest -n 3 -m "long and not study"
