@@ -1,7 +1,7 @@
 """Devices on a CAN bus, from CiA 301 and Epson's data sheet; shares no code with the driver.
 
-Ax of each sample is the number of ticks since the bus began, Ay the node. A schedule tells at which
-tick a node leaves or comes back; ticks go on while nobody produces SYNC.
+Ax of each sample is the number of ticks since the first SYNC, Ay the node. A schedule tells at
+which tick a node leaves or comes back; ticks go on while nobody produces SYNC any more.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Peer:
         self.schedule: Schedule = {}
         self.tick = 0
         self._bus = can.Bus(channel, interface="virtual")
-        self._lock = threading.RLock()
+        self.lock = threading.RLock()
         self._ended = threading.Event()
         self._period = 1 / rate
         self._threads = [
@@ -108,7 +108,7 @@ class Peer:
             message = self._bus.recv(0.05)
             if message is None:
                 continue
-            with self._lock:
+            with self.lock:
                 self._received(message.arbitration_id, bytes(message.data))
 
     def _received(self, cob_id: int, data: bytes) -> None:
@@ -121,17 +121,23 @@ class Peer:
             self.send(0x580 + asked.number, reply)
 
     def _run(self) -> None:
+        while not self._has_producer and not self._ended.wait(self._period):
+            pass
         begin = time.monotonic()
         while not self._ended.wait(max(0.0, begin + self.tick * self._period - time.monotonic())):
-            with self._lock:
+            with self.lock:
                 for act in self.schedule.get(self.tick, ()):
                     act()
-                if any(node.produces for node in self.nodes.values()):
+                if self._has_producer:
                     self.send(0x80, b"")
                     for node in self.nodes.values():
                         if node.is_on:
                             self._sample(node)
             self.tick += 1
+
+    @property
+    def _has_producer(self) -> bool:
+        return any(node.produces for node in self.nodes.values())
 
     def _sample(self, node: Node) -> None:
         number = node.number

@@ -47,8 +47,6 @@ class Server:
         self.rates: dict[str, int] = {}
         self.n_turns = 0
         self.n_connections = 0
-        self.sending = asyncio.Event()
-        """Set when a connection gets records."""
         self._size, self._padded = size, padded
         self._streams: dict[asyncio.StreamWriter, dict[str, int]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
@@ -102,7 +100,6 @@ class Server:
                     continue
                 if command == "END":
                     self._streams[writer] = chosen
-                    self.sending.set()
                     self._send(writer, chosen)
                     continue
                 if command == "STATION":

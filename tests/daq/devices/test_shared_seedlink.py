@@ -22,7 +22,7 @@ from daq.errors import NotConnectedError, WrongDeviceError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, Event, EventKind
 from tests.daq.devices.seedlink_peer import PER_RECORD, RATE, Server, record, value
-from tests.waiting import limit
+from tests.waiting import limit, wait_until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -36,7 +36,7 @@ DRIVER = driver_type("seedlink")
 NAMES = ["AAA", "BBB", "CCC"]
 
 
-def sensors(port: str) -> list[Sensor]:
+def sensors(port: str, patience: float = 60.0) -> list[Sensor]:
     return [
         Sensor(
             name=name,
@@ -44,7 +44,7 @@ def sensors(port: str) -> list[Sensor]:
             port=port,
             sampling_rate=RATE,
             channels=(Channel(name="HNZ", sensitivity=1e6),),
-            settings={"network": "XX", "station": name, "late": 0.2, "patience": 5.0},
+            settings={"network": "XX", "station": name, "late": 0.2, "patience": patience},
         )
         for name in NAMES
     ]
@@ -93,11 +93,7 @@ async def test_a_refused_station_costs_the_others_nothing_and_comes_back(
     monkeypatch.setattr(shared_port, "FIRST_RETRY", 0.1)
     async with Server(NAMES) as server:
         server.refuses = {"BBB"}
-        opening = asyncio.create_task(_opened(server))
-        while not opening.done():
-            server.make()
-            await asyncio.wait([opening], timeout=0.05)
-        session, stack, reader, task = opening.result()
+        session, stack, reader, task = await _opened(server)
         about = {one.sensor: one.trouble for one in session.information}
         assert "ERROR" in about["BBB"]
         assert not about["AAA"]
@@ -115,20 +111,15 @@ async def test_a_refused_station_costs_the_others_nothing_and_comes_back(
         with pytest.raises(NotConnectedError):
             await task
         await stack.aclose()
-        opening = asyncio.create_task(_opened(server, session))
-        while not opening.done():
-            server.make()
-            await asyncio.wait([opening], timeout=0.05)
-        session, stack, again, task = opening.result()
+        session, stack, _, task = await _opened(server, session, reader)
         assert [bool(one.trouble) for one in session.information] == [True, False, True]
-        again.items, again.rows = reader.items, reader.rows
-        await again.until(server, BBB=200)
+        await reader.until(server, BBB=200)
         server.refuses = {"CCC"}
-        await again.until(server, BBB=200, AAA=200)
+        await reader.until(server, BBB=200, AAA=200)
         server.refuses = set()
-        await again.until(server, BBB=200, AAA=200, CCC=200)
+        await reader.until(server, BBB=200, AAA=200, CCC=200)
         for name in NAMES:
-            again.check(name)
+            reader.check(name)
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
         await stack.aclose()
@@ -140,11 +131,7 @@ async def test_a_station_that_a_later_connection_refuses_is_requested_again(
     monkeypatch.setattr(shared_port, "FIRST_RETRY", 0.1)
     async with Server(NAMES) as server:
         server.refuses = {"BBB"}
-        opening = asyncio.create_task(_opened(server))
-        while not opening.done():
-            server.make()
-            await asyncio.wait([opening], timeout=0.05)
-        _, stack, reader, task = opening.result()
+        _, stack, reader, task = await _opened(server)
         server.refuses = {"CCC"}
         await reader.until(server, BBB=200)
         server.refuses = set()
@@ -158,58 +145,61 @@ async def test_a_station_that_a_later_connection_refuses_is_requested_again(
 
 async def test_records_that_come_while_a_connection_is_opened_and_lost_are_recorded() -> None:
     async with Server(NAMES) as server:
-        server.away = {"AAA"}  # awaited for the patience of 1 s
+        server.away = {"AAA"}  # awaited for the patience
         clock = SystemClock(5.0)
-        opening = asyncio.create_task(_opened(server, clock=clock))
-        while not opening.done():
-            server.make()
-            await asyncio.wait([opening], timeout=0.05)
-        session, stack, reader, task = opening.result()
+        session, stack, reader, task = await _opened(server, clock=clock, patience=5.0)
+        assert isinstance(session, driver.SeedLinkSession)
         await reader.until(server, BBB=200, CCC=200)
         server.hang_up()
         await asyncio.gather(task, return_exceptions=True)
         await stack.aclose()
-        server.sending.clear()
-        failing = asyncio.create_task(_opened(server, session, clock=clock))
-        async with asyncio.timeout(limit(30)):
-            await server.sending.wait()
-        for _ in range(5):
-            server.make()
-        await asyncio.sleep(0.3)
+        failing = asyncio.create_task(_opened(server, session, clock=clock, patience=1e3))
+        await asyncio.to_thread(wait_until, lambda: bool(session.decoder.waiting), "records")
         server.hang_up()
         with pytest.raises(NotConnectedError):
             await failing
-        _, stack, again, task = await _opened(server, session, clock=clock)
-        again.items, again.rows = reader.items, reader.rows
-        await again.until(server, BBB=200, CCC=200)
+        _, stack, _, task = await _opened(server, session, reader, clock=clock, patience=5.0)
+        await reader.until(server, BBB=200, CCC=200)
         for name in ("BBB", "CCC"):
-            again.check(name)
+            reader.check(name)
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
         await stack.aclose()
 
 
-async def _opened(
-    server: Server, before: Session | None = None, *, clock: HostClock | None = None
+async def _opening(
+    server: Server, before: Session | None, reader: Reader, clock: HostClock, patience: float
 ) -> tuple[Session, contextlib.AsyncExitStack, Reader, asyncio.Task[None]]:
     stack = contextlib.AsyncExitStack()
-    bench, clock = sensors(server.port), clock or SystemClock()
+    bench = sensors(server.port, patience)
     opened: AbstractAsyncContextManager[Session] = (
         DRIVER.open(bench, clock) if before is None else DRIVER.resume(bench, clock, before)
     )
     session = await stack.enter_async_context(opened)
-    reader = Reader()
     return session, stack, reader, asyncio.create_task(reader.run(session))
+
+
+async def _opened(
+    server: Server,
+    before: Session | None = None,
+    reader: Reader | None = None,
+    *,
+    clock: HostClock | None = None,
+    patience: float = 60.0,
+) -> tuple[Session, contextlib.AsyncExitStack, Reader, asyncio.Task[None]]:
+    """Open the port while the server makes rows."""
+    reader, clock = reader or Reader(), clock or SystemClock()
+    opening = asyncio.create_task(_opening(server, before, reader, clock, patience))
+    while not opening.done():
+        server.make()
+        await asyncio.wait([opening], timeout=0.05)
+    return opening.result()
 
 
 async def test_a_station_of_another_rate_costs_the_others_nothing() -> None:
     async with Server(NAMES) as server:
         server.rates = {"BBB": 50}
-        opening = asyncio.create_task(_opened(server))
-        while not opening.done():
-            server.make()
-            await asyncio.wait([opening], timeout=0.05)
-        session, stack, reader, task = opening.result()
+        session, stack, reader, task = await _opened(server)
         about = {one.sensor: one.trouble for one in session.information}
         assert "has 50 Hz; expected 100 Hz: correct sampling_rate" in about["BBB"]
         assert not about["AAA"]
@@ -230,12 +220,8 @@ async def test_a_station_of_another_rate_costs_the_others_nothing() -> None:
 async def test_a_server_with_other_rates_only_is_named() -> None:
     async with Server(NAMES) as server:
         server.rates = dict.fromkeys(NAMES, 50)
-        opening = asyncio.create_task(_opened(server))
-        while not opening.done():
-            server.make()
-            await asyncio.wait([opening], timeout=0.05)
         with pytest.raises(WrongDeviceError, match="has 50 Hz; expected 100 Hz"):
-            opening.result()
+            await _opened(server)
 
 
 async def test_a_server_that_refuses_all_stations_is_named() -> None:
