@@ -76,12 +76,26 @@ def sums(
         steps=sum(each.kind == EventKind.RESET for each in events),
     )
     estimated = {b.first_sample for b in blocks if BlockFlag.MISSING_ESTIMATED in b.flags}
+    return found + compared(index, truth, estimated)
+
+
+def compared(
+    index: NDArray[np.int64], truth: NDArray[np.int64], estimated: set[int]
+) -> Counter[str]:
+    """Return how many gaps recorded rows have, and how many are wrong and not estimated.
+
+    Parameters
+    ----------
+    index, truth : (n_rows,) int arrays
+        Recorded and true indices.
+    estimated : set of int
+        Indices behind estimated gaps.
+    """
+    found = Counter[str]()
     for row in np.flatnonzero((np.diff(truth) > 1) | (np.diff(index) > 1)).tolist():
         off = abs(int(np.diff(index[row : row + 2])[0] - np.diff(truth[row : row + 2])[0]))
         is_estimated = int(index[row + 1]) in estimated
-        found["gaps"] += 1
-        found["estimated"] += is_estimated
-        found["wrong"] += off > 1 and not is_estimated
+        found += Counter(gaps=1, estimated=is_estimated, wrong=off > 1 and not is_estimated)
     return found
 
 
