@@ -217,7 +217,7 @@ def _written(
             not_understood=tuple(
                 clock.sensor for clock in each.aligned.clocks if not clock.is_understood
             ),
-            counts=limits_by_column([each], channels),
+            counts=limits_by_column([(each.recording, each.unused())], channels),
             stood_still=still_for_a_while([each], settings),
             simulated=recording.simulated,
             lacking=each.sets.lacking(each.n_channels),

@@ -442,7 +442,7 @@ class SnapshotBuilder:
     ) -> Findings:
         """Diagnose the test: too costly for every snapshot."""
         dims, channels = passes[0].aligned.dims, passes[0].aligned.channels
-        counts = limits_by_column(passes, channels)
+        counts = limits_by_column([(each.recording, each.unused()) for each in passes], channels)
         stood_still = still_for_a_while(passes, self._settings)
         found = diagnosis(
             bands,

@@ -13,13 +13,12 @@ from daq.protocols.block import BlockFlag
 from estimator.checks.count_limits import CountLimits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from daq.bench.channel import Channel
-    from daq.estimation.segments.segment_pass import Pass
-    from daq.recording.interface import ReadableSensor
+    from daq.recording.interface import ReadableRecording, ReadableSensor
 
 _STRETCHES = 16
 _ROWS = 2048  # of each
@@ -51,17 +50,18 @@ def limits_of(record: ReadableSensor, unused: NDArray[np.float64] | None = None)
 
 
 def limits_by_column(
-    passes: Iterable[Pass], channels: Sequence[tuple[str, Channel]]
+    recordings: Iterable[tuple[ReadableRecording, Mapping[str, NDArray[np.float64]]]],
+    channels: Sequence[tuple[str, Channel]],
 ) -> CountLimits:
     """Return what the counts of all channels of an estimate show of their limits.
 
-    Of several recordings the largest share, and the first wraps and codes.
+    The recordings come with the samples of each sensor that are not used, as in `limits_of`. Of
+    several recordings the largest share, and the first wraps and codes.
     """
     columns = {(sensor, channel.name): column for column, (sensor, channel) in enumerate(channels)}
     whole = CountLimits()
-    for each in passes:
-        unused = each.unused()
-        for record in each.recording.sensors:
+    for recording, unused in recordings:
+        for record in recording.sensors:
             known = {
                 n: columns[record.name, channel.name]
                 for n, channel in enumerate(record.channels)
