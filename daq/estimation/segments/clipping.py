@@ -30,7 +30,7 @@ def limits_of(record: ReadableSensor, unused: NDArray[np.float64] | None = None)
     Blocks flagged as clipped are skipped, and samples from each first to each second of `unused`:
     the estimate excludes them.
     """
-    rows = _rows(record)
+    rows = _rows(record, unused)
     if len(rows) == 0:
         return CountLimits()
     counts = np.concatenate([record.intact_counts(int(a), int(b))[0] for a, b in rows])
@@ -39,9 +39,6 @@ def limits_of(record: ReadableSensor, unused: NDArray[np.float64] | None = None)
     begins = np.concatenate([[0], np.cumsum(blocks["n_samples"])])[:-1]
     block = np.searchsorted(begins, which, side="right") - 1
     kept = blocks["flags"][block] & int(BlockFlag.CLIPPED) == 0
-    sample = blocks["first_sample"][block] + which - begins[block]
-    for first, end in () if unused is None else unused:
-        kept &= (sample < first) | (sample >= end)
     used = np.repeat(kept[:, None], counts.shape[1], axis=1)
     for column, begin, end in record.absent:
         used[(which >= begin) & (which < end), column] = False
@@ -90,10 +87,31 @@ def in_clipped_blocks(
     return found
 
 
-def _rows(record: ReadableSensor) -> NDArray[np.int64]:
-    """First and last + 1 row of every stretch, shape (n, 2)."""
-    n_rows = record.n_samples
-    if n_rows <= _STRETCHES * _ROWS:
-        return np.array([[0, n_rows]] if n_rows else np.empty((0, 2)), dtype=np.int64)
-    first = np.linspace(0, n_rows - _ROWS, _STRETCHES).astype(np.int64)
-    return np.column_stack([first, first + _ROWS])
+def _rows(record: ReadableSensor, unused: NDArray[np.float64] | None) -> NDArray[np.int64]:
+    """First and last + 1 row of every stretch, shape (n, 2), spread over what is used."""
+    used = _used(record, unused)
+    lengths = used[:, 1] - used[:, 0]
+    ends = np.cumsum(lengths)
+    if not len(used) or ends[-1] <= _STRETCHES * _ROWS:
+        return used
+    at = np.linspace(0, ends[-1] - _ROWS, _STRETCHES).astype(np.int64)
+    span = np.searchsorted(ends, at, side="right")
+    first = used[span, 0] + at - (ends - lengths)[span]
+    return np.column_stack([first, np.minimum(first + _ROWS, used[span, 1])])
+
+
+def _used(record: ReadableSensor, unused: NDArray[np.float64] | None) -> NDArray[np.int64]:
+    """First and last + 1 row of every span of samples that are used, shape (n, 2)."""
+    if not record.n_samples:
+        return np.empty((0, 2), dtype=np.int64)
+    begins, n_samples = record.blocks["first_sample"], record.blocks["n_samples"]
+    ends = np.cumsum(n_samples)
+    found, end = [], 0
+    for first, last in sorted(() if unused is None else unused.tolist()):
+        asked = np.ceil(np.clip([first, last], begins[0], begins[-1] + n_samples[-1]))
+        block = np.searchsorted(begins, asked, side="right") - 1
+        rows = ends[block] - n_samples[block] + np.minimum(asked - begins[block], n_samples[block])
+        found.append((end, int(rows[0])))
+        end = max(end, int(rows[1]))
+    found.append((end, record.n_samples))
+    return np.array([(a, b) for a, b in found if a < b], dtype=np.int64).reshape(-1, 2)

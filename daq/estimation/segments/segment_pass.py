@@ -60,6 +60,7 @@ def whole_segments(
 
 
 _Piece = TypeVar("_Piece")
+_NEAR = 0.05  # samples by which a stretch may begin or end later: fitted clocks are off by some µs
 _Read = TypeVar("_Read")
 
 _READERS = 2  # pieces being read while one is worked on
@@ -628,11 +629,9 @@ class Pass:
 
     def excluded(self) -> list[tuple[int, int]]:
         """Return the first grid sample of each excluded stretch, and the one after its last."""
-        per_ns, origin = self.welch.sampling_rate * 1e-9, self.aligned.start_utc_ns
-        return [
-            (math.ceil((begin - origin) * per_ns), math.ceil((end - origin) * per_ns))
-            for begin, end in self._stretches
-        ]
+        rate, origin = self.welch.sampling_rate, self.aligned.start_utc_ns
+        edges = ((np.array(each) - origin) * 1e-9 * rate for each in self._stretches)
+        return [(int(first), int(end)) for first, end in (np.ceil(at - _NEAR) for at in edges)]
 
     def _touch_excluded(self, begins: NDArray[np.int64], length: int) -> BoolArray:
         """Return which segments that begin at these grid samples touch an excluded stretch."""
