@@ -223,10 +223,15 @@ def residuals(
     return dict(zip((state.sensor for state in clocks), residual.tolist(), strict=True)), against
 
 
+def last_aligned(passes: Sequence[Pass]) -> Pass:
+    """Return the last recording with aligned sensors: in the last of all one may be silent."""
+    return next((each for each in reversed(passes) if each.aligned.clocks), passes[-1])
+
+
 def clock_states(passes: Sequence[Pass]) -> tuple[ClockState, ...]:
     """Return what is known of the clocks in the last recording, and of stated UTC in any."""
     states = []
-    for number, state in enumerate(passes[-1].aligned.clocks):
+    for number, state in enumerate(last_aligned(passes).aligned.clocks):
         every = [p.aligned.clocks[number] for p in passes if p.aligned.clocks]
         wrong = [each.residual for each in every if each.drifts]
         states.append(

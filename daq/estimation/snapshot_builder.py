@@ -25,6 +25,7 @@ from daq.estimation.diagnosis import (
     bias_of_clocks,
     clock_states,
     diagnosis,
+    last_aligned,
     synchronisation,
 )
 from daq.estimation.equalisation import METHOD
@@ -343,7 +344,7 @@ class SnapshotBuilder:
             start_utc_ns=first.aligned.start_utc_ns,
             sensors=_totals(recordings, events),
             clocks=clock_states(passes),
-            drift=last.drift(),
+            drift=last_aligned(passes).drift(),
             closed=all(map(is_complete, recordings, (*recordings[1:], None))),
             left_out=_left_out(passes, sum(each.n_segments for each in sets) - n_unused),
             channel_segments=_segments_of(sets, n_segments if raw else 0, first.n_channels),
@@ -406,10 +407,10 @@ class SnapshotBuilder:
             )
             after = self._findings.stability
             if after is None or not after.changes:
-                self._findings = first.of_all_segments()
-                return bands, estimates
+                break
         else:
             return within, again
+        self._findings = first.of_all_segments()
         return bands, estimates
 
     def _sets(self, passes: Sequence[Pass], raw: tuple[Band, ...]) -> tuple[ChannelSet, ...]:

@@ -380,7 +380,7 @@ def _fitted(
     # motion that the sensors' agreement does not show may be in the other dimensions
     n_sensors = sensor[-1] + 1
     hidden = SHOWN * np.sqrt(2 * _degrees(sensor, q)) / ((1 - 1 / n_sensors) * p * n_sensors)
-    unseen = 1 + UNSEEN * hidden * (1 - q / np.maximum(wanted, 1)) * (wanted > 0)
+    unseen = 1 + UNSEEN * hidden * np.maximum(1 - q / np.maximum(wanted, 1), 0) * (wanted > 0)
     root = np.asarray(np.linalg.inv(whitener), np.complex128)
     # noise of a bin is linear in the projected matrix
     weight = weights_beside(root, own, U, sensor)

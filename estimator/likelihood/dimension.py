@@ -166,9 +166,10 @@ class BandDimension:
 
     @property
     def is_biased(self) -> bool:
-        """Whether no dimension explains the band, by itself or with others."""
+        """Whether tests reject all dimensions, in the band or with others; not without a test."""
         few = self.n_sensors < MIN_DETERMINED_SENSORS
-        return not self.accepted and (self.test.p_value < MISFIT_LEVEL or not few)
+        fails = self.test.p_value < (MISFIT_LEVEL if few else 1.0)
+        return not self.accepted and fails
 
 
 def noise_groups(

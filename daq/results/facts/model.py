@@ -236,15 +236,17 @@ def _gradients(choices: Sequence[BandDimension]) -> list[str]:
 
 def _choice(choice: BandDimension) -> str:
     """Return an unusual dimension, and its cost in precision."""
-    price = f"the c.o.v. of one frequency is {choice.cov:.2g}"
-    if math.isfinite(choice.usual_cov):
-        price += f" instead of {choice.usual_cov:.2g}"
+    price = ""
+    if math.isfinite(choice.cov):
+        price = f"; the c.o.v. of one frequency is {choice.cov:.2g}"
+        if math.isfinite(choice.usual_cov):
+            price += f" instead of {choice.usual_cov:.2g}"
     at = f"At {span(choice.low, choice.high)}"
     if choice.n_factors < choice.usual:
-        return f"{at} the motion has {choice.n_factors} of {choice.usual} dimensions; {price}."
+        return f"{at} the motion has {choice.n_factors} of {choice.usual} dimensions{price}."
     return (
         f"{at} the sensors do not share one motion of {choice.usual} dimensions; "
-        f"{choice.n_factors} dimensions explain the averages; {price}."
+        f"{choice.n_factors} dimensions explain the averages{price}."
     )
 
 

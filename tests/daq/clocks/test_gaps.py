@@ -178,6 +178,7 @@ def test_a_sensor_that_is_silent_in_one_of_two_files_is_named(
     settings = Settings(segment=4.0)
     found = estimate([tmp_path / "r.h5"], settings)
     assert found.n_segments == (26 if silent == ("D", "D") else 13)
+    assert [clock.sensor for clock in found.clocks][:3] == ["A", "B", "C"]
     facts = Result(found, settings).facts
     lost = [each for each in facts if isinstance(each, SensorLost)]
     late = [each for each in facts if isinstance(each, SpanShortened)]

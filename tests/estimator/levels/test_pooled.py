@@ -266,3 +266,23 @@ def test_eight_sensors_off_plumb_are_known_although_motion_has_more_dimensions()
         ratios.append(level.mean[0])
     assert np.mean(held) > 0.95 - 4 * np.sqrt(0.05 * 0.95 / 96)
     assert np.mean(ratios) == pytest.approx(1, abs=0.02)
+
+
+def test_more_dimensions_than_were_chosen_do_not_narrow_the_intervals() -> None:
+    """Twelve sensors; the lower half has four weak dimensions more, which bins show together."""
+    rng = np.random.default_rng(0)
+    axes = np.linalg.qr(np.column_stack([np.ones(12), rng.standard_normal((12, 4))]))[0] * 12**0.5
+    strengths = np.repeat([[100, 0.3, 0.3, 0.3, 0.3], [100, 30, 0, 0, 0]], 40, axis=0)
+    csm = (axes * strengths[:, None, :]) @ axes.T + np.eye(12)
+    held = []
+    for _ in range(8):
+        found = self_noise(
+            "maximum-likelihood",
+            drawn(rng, csm.astype(np.complex128), 100),
+            dims=(1,) * 12,
+            n_effective=100,
+            n_factors=np.repeat([1, 2], 40),
+            blocks=np.repeat([0, 1], 40),
+        )
+        held.append((found.low[:40] <= 1) & (found.high[:40] >= 1))
+    assert np.mean(held) == pytest.approx(0.95, abs=0.02)

@@ -358,3 +358,12 @@ def test_a_level_for_all_bands_together() -> None:
         )
         rejected += not all(choice.accepted for choice in choices)
     assert rejected <= 1
+
+
+def test_a_band_without_averages_is_not_called_biased() -> None:
+    rng, frequency = np.random.default_rng(1), np.linspace(0.1, 10, 100)
+    averages = wishart(np.broadcast_to(np.eye(6) + 100, (100, 6, 6)), 200, rng)[0]
+    averages[75:] = np.nan
+    _, choices = choose_dimension(averages, frequency, dims=(1,) * 6, n_effective=200)
+    assert not choices[-1].accepted
+    assert not any(each.is_biased for each in choices)
