@@ -356,15 +356,21 @@ def _taken_for_motion(snapshot: Snapshot, method: str) -> FloatArray:
 
 
 def _of_two(snapshot: Snapshot, method: str, psd: FloatArray) -> Iterator[Contribution]:
-    """Yield what noise that two sensors share may be instead: a motion that no other feels."""
+    """Yield what noise that two sensors share may be instead: a motion that no other feels.
+
+    Methods that take noise for independent may be wrong by any amount.
+    """
     below, above = np.zeros((2, *psd.shape))
-    for choice in snapshot.diagnostics.dimensions if method == "maximum-likelihood" else ():
+    share = np.zeros(len(psd))
+    for choice in snapshot.diagnostics.dimensions:
         if choice.pairs:
             inside = (snapshot.frequency >= choice.low) & (snapshot.frequency <= choice.high)
+            share[inside] = 0.0 if method == "maximum-likelihood" else math.inf
             below[inside] = (1 - np.array(choice.least)) * psd[inside]
             above[inside] = (np.array(choice.most) - 1) * psd[inside]
     if below.any():
-        yield contribution(Source.SHARED_NOISE, psd.shape, below=below, above=above)
+        shares = share[:, None]
+        yield contribution(Source.SHARED_NOISE, psd.shape, below=below, above=above, share=shares)
 
 
 def _misfits(snapshot: Snapshot, explained: BoolArray) -> dict[Source, FloatArray]:

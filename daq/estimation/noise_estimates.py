@@ -297,8 +297,11 @@ def with_sets(
                 whole = _spread(noise, columns, shape, name)
                 parts.setdefault(name, []).append(whole)
                 counted += [] if each in counted else [each]
-        if is_whole and len(each.frequency) == len(frequency):
-            dimensions = dimensions or found.dimensions
+        its_own = found.dimensions
+        if is_whole and len(each.frequency) == len(frequency) and its_own and not dimensions:
+            here = np.flatnonzero(left).tolist()
+            chosen_of_all = (e.of_all(here, columns, len(sensor_of)) for e in its_own.chosen)
+            dimensions = replace(its_own, chosen=tuple(chosen_of_all))
     blocks = blocks_of(frequency)
     results = {name: combined(found, blocks) for name, found in parts.items()}
     refused = {name: why for name, why in refused.items() if name not in results}

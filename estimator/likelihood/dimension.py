@@ -7,7 +7,7 @@ then further factors of the same model.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -40,7 +40,7 @@ from estimator.self_noise.coherency import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from estimator.records import Hertz
     from estimator.self_noise.coherency import Presence
@@ -163,6 +163,21 @@ class BandDimension:
         excess = max(0.0, self.test.statistic - self.test.degrees + overfit + scatter)
         raised = n_effective * n_channels * (n_channels / self.usual - 1) * left / self.usual
         return float(np.sqrt(excess / max(1, self.test.n_frequencies) / raised))
+
+    def of_all(
+        self, sensors: Sequence[int], channels: Sequence[int], n_channels: int
+    ) -> BandDimension:
+        """Return the choice for these sensors and channels, by the numbers of all."""
+        if not self.pairs:
+            return self
+        pairs, alternatives = (
+            tuple((sensors[i], sensors[j]) for i, j in each)
+            for each in (self.pairs, self.alternatives)
+        )
+        over = np.ones((2, n_channels))
+        over[:, list(channels)] = self.least, self.most
+        least, most = (tuple(each) for each in over.tolist())
+        return replace(self, pairs=pairs, alternatives=alternatives, least=least, most=most)
 
     @property
     def is_biased(self) -> bool:
@@ -346,8 +361,8 @@ def choose_dimension(
             tried=tuple(tests),
             cov=cov.get((b, len(tests) - 1), float("nan")),
             usual_cov=cov.get((b, usual), float("nan")),
-            **({} if b not in shared else shared[b].of_all(there, sum(dims))),
-        )
+            **(shared[b].fields() if b in shared else {}),
+        ).of_all(there.sensors, there.channels, sum(dims))
         for b, tests in tried.items()
     )
     chosen = {b: len(tests) - 1 for b, tests in tried.items()}

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
     from estimator.likelihood.goodness_of_fit import BandTest
-    from estimator.self_noise.coherency import Presence
     from estimator.types import ComplexArray, FloatArray, IntArray
 
     Pair: TypeAlias = tuple[int, int]
@@ -99,19 +98,12 @@ class Sharing:
     alternatives: tuple[Pair, ...]
     range: FloatArray
 
-    def of_all(self, there: Presence, n_channels: int) -> dict[str, Any]:
-        """Return the fields of `BandDimension`, by the numbers of all sensors and channels."""
-        least, most = np.ones((2, n_channels))
-        least[list(there.channels)], most[list(there.channels)] = self.range
-        pairs, alternatives = (
-            tuple((there.sensors[i], there.sensors[j]) for i, j in each)
-            for each in (self.pairs, self.alternatives)
-        )
-        return {
-            "pairs": pairs,
-            "alternatives": alternatives,
-            "least": tuple(least.tolist()),
-            "most": tuple(most.tolist()),
+    def fields(self) -> dict[str, Any]:
+        """Return the fields of `BandDimension`."""
+        least, most = (tuple(each) for each in self.range.tolist())
+        return {"pairs": self.pairs, "alternatives": self.alternatives} | {
+            "least": least,
+            "most": most,
         }
 
 

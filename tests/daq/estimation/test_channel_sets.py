@@ -17,6 +17,7 @@ from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
 from daq.formats.importer import import_files
 from daq.recording.reader import Recording
+from daq.results.facts.model import SharedByTwo
 from daq.results.facts.recordings import SpanShortened
 from daq.results.facts.segments import ChannelsAbsent
 from daq.results.result import Result
@@ -237,6 +238,24 @@ def test_short_holes_in_a_channel_are_gaps_as_before() -> None:
     snapshot = estimate([recording_of_arrays(given, RATE)], SETTINGS)
     assert snapshot.channel_segments == ()
     assert snapshot.left_out  # those with holes
+
+
+@pytest.mark.parametrize("methods", [("auto",), ("maximum-likelihood", "three-sensor")])
+def test_two_that_share_noise_are_named_beside_a_channel_with_gaps(
+    methods: tuple[str, ...],
+) -> None:
+    """The others count by themselves; C and D share noise, and keep their places."""
+    rng, n = np.random.default_rng(3), 6000
+    motion, source = rng.normal(0, 1, n), rng.normal(0, 4, n)
+    given = {name: motion + rng.normal(0, 1, n) + source * (name in "CD") for name in "ABCDEFG"}
+    given["A"][50::40] = np.nan
+    settings = Settings(segment=2.0, methods=methods, bridge=0.0, dimension="auto")
+    result = Result(estimate([recording_of_arrays(given, RATE)], settings), settings)
+    (fact,) = (each for each in result.facts if isinstance(each, SharedByTwo))
+    assert fact.sensors == ("C", "D")
+    for method in result.snapshot.results:
+        low = [means.low[0] for means in result.means(method, (3.0, 9.0))]
+        assert max(low[2:4]) < 2 * 2 / RATE
 
 
 def imported(tmp_path: Path, lacking: dict[str, list[int]]) -> Path:
