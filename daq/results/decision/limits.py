@@ -1,7 +1,7 @@
 """The limits of a bench file, and which channels are below them: `estimator.decision` decides.
 
 A limit is judged in bands a third of an octave wide, divided at notches, peaks and steps of the
-mask. The ends of the intervals are those of every table (`daq.results.band_summary.levels`), at the
+mask. The ends of the intervals are those of every table (`daq.results.band_summary`), at the
 quantile that holds for all channels, limits and bands together.
 """
 
