@@ -174,6 +174,14 @@ class SampleTimes:
         self._offset = (self._offset or 0.0) + max(GAIN, 1 / self._n_seen) * off
         return self._take(samples)
 
+    def settle(self) -> Place | None:
+        """Return the position of the doubtful samples, if any: nothing follows them."""
+        doubtful, self._doubtful = self._doubtful, None
+        if doubtful is None:
+            return None
+        late = self._pace.late(self._set_at + self._next + doubtful.n - 1, doubtful.at)
+        return Place("before", self._pace.lost(late), is_exact=False)
+
     def _fills(self, samples: _Samples, doubtful: _Samples, width: float) -> bool:
         """Return whether samples continue the count, overtaken by the doubtful ones."""
         in_time = samples.at.monotonic_ns - doubtful.at.monotonic_ns <= LATE_NS

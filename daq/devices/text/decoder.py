@@ -131,15 +131,15 @@ class Packets:
         insort(self._waiting, _Waiting(time_ns, resolution_ns, at, {name: values}), key=_TIME)
         return 0
 
-    def ready(self, times: SampleTimes) -> Iterator[Group]:
-        """Yield the groups that need not wait.
+    def ready(self, times: SampleTimes, *, patience: int = PATIENCE) -> Iterator[Group]:
+        """Yield the groups that need not wait; all that are complete, without patience.
 
         The caller must place each group with ``times`` before it requests the next one.
         """
         while self._waiting:
             first = self._waiting[0]
             in_turn = self._is_whole(first) and not times.missing(first.time_ns)
-            if not in_turn and sum(map(self._is_whole, self._waiting[1:])) < PATIENCE:
+            if not in_turn and sum(map(self._is_whole, self._waiting[1:])) < patience:
                 return
             del self._waiting[0]
             if self._is_whole(first):
@@ -249,6 +249,15 @@ class TextDecoder:
         finder = MessageFinder(self._format.terminator.encode())
         messages = finder.receive(data + self._format.terminator.encode())
         return [*self._given_up(finder, at), *self._messages(messages, at)]
+
+    def flush(self) -> Iterator[Block | Event]:
+        """Yield the samples that wait for others: nothing follows them."""
+        for group in self._packets.ready(self._times, patience=0):
+            yield from self._timed([group])
+        place, doubtful = self._times.settle(), self._doubtful
+        if place is not None and doubtful is not None:
+            self._flags |= BlockFlag.MISSING_ESTIMATED
+            yield from self._decided(place, doubtful.received)
 
     def _given_up(self, finder: MessageFinder, at: HostTime) -> Iterator[Event]:
         n, finder.n_given_up = finder.n_given_up, 0

@@ -251,9 +251,14 @@ class TextSession(Session):
         self.source.discard()
         if self.settings.start:
             await self.source.send(self.settings.start.encode())
-        while True:
-            for item in await self.source.receive():
+        try:
+            while True:
+                for item in await self.source.receive():
+                    yield item
+        except DeviceError:
+            for item in self.decoder.flush():
                 yield item
+            raise
 
 
 class TextDriver(Driver[TextSettings]):

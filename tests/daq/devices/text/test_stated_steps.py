@@ -5,15 +5,26 @@ The logger is `tests.peers.text_logger`, which shares no code with the driver.
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
+from daq.bench.channel import Channel
+from daq.bench.model import Sensor
+from daq.devices.registry import driver_type
 from daq.devices.text.decoder import TextDecoder
 from daq.devices.text.format import RASPBERRY_SHAKE, TextFormat
+from daq.errors import NotConnectedError
+from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, EventKind, HostTime
 from tests.peers.text_logger import CHANNELS, UNIX, TextLogger
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 ROWS = TextFormat(columns=(1, 2, 3), time_column=0, whole=True)
 SIZES = [0.02, 0.3, 1.0, 3600.0]
@@ -26,7 +37,8 @@ def arrival(seconds: float) -> HostTime:
 
 def by_rows(logger: TextLogger) -> list[DeviceItem]:
     decoder = TextDecoder("A", ROWS, sampling_rate=100.0)
-    return [item for data, at in logger.rows() for item in decoder.receive(data, arrival(at))]
+    found = [item for data, at in logger.rows() for item in decoder.receive(data, arrival(at))]
+    return [*found, *decoder.flush()]
 
 
 def by_packets(logger: TextLogger) -> list[DeviceItem]:
@@ -35,11 +47,11 @@ def by_packets(logger: TextLogger) -> list[DeviceItem]:
     found: list[DeviceItem] = []
     for data, at in logger.packets():
         found += decoder.receive_datagram(data, arrival(at))
-    return found
+    return [*found, *decoder.flush()]
 
 
 def check(
-    found: list[DeviceItem], logger: TextLogger, *, n_open: int = 0, n_lost: int = 0
+    found: list[DeviceItem], logger: TextLogger, *, n_lost: int = 0
 ) -> tuple[list[Block], list[Event]]:
     """See that every row is recorded once, with its index up to estimated gaps."""
     blocks = [each for each in found if isinstance(each, Block)]
@@ -48,7 +60,7 @@ def check(
     known = {tuple(row): n for n, row in enumerate(logger.samples.tolist())}
     true = np.array([known[tuple(row)] for row in rows.tolist()])
     assert (np.diff(true) > 0).all()
-    assert len(true) >= len(logger.samples) - n_open - n_lost
+    assert len(true) == len(logger.samples) - n_lost
     estimated = [b.first_sample for b in blocks if BlockFlag.MISSING_ESTIMATED in b.flags]
     sure = index < min(estimated, default=index[-1] + 1)
     assert np.array_equal(index[sure], true[sure])
@@ -93,6 +105,42 @@ def test_lost_rows_are_a_gap_of_their_length(n: int) -> None:
     (gap,) = [b for b in blocks if b.reason]
     assert (BlockFlag.MISSING_ESTIMATED in gap.flags) == (n == 1)
     assert gap.first_sample == 6000 + n
+
+
+@pytest.mark.parametrize(("receive", "length"), [(by_rows, 1), (by_packets, 25)])
+@pytest.mark.parametrize(("n_lost", "step"), [(4, 0.0), (0, -0.5), (0, 3600.0)])
+def test_what_begins_a_jump_as_the_last_of_a_session_is_recorded(
+    receive: Callable[[TextLogger], list[DeviceItem]], length: int, n_lost: int, step: float
+) -> None:
+    last = 4000 // length - 1
+    lost = frozenset(range(last - n_lost, last))
+    logger = TextLogger(40.0, lost=lost, steps=((last * length / 100, step),))
+    blocks, _ = check(receive(logger), logger, n_lost=n_lost * length)
+    assert BlockFlag.MISSING_ESTIMATED in blocks[-1].flags
+
+
+async def test_a_row_that_begins_a_jump_before_a_hang_up_is_recorded() -> None:
+    async def serve(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        rows = [f"{n / 100 + 9 * (n == 299):.2f},{n}\n" for n in range(300)]
+        writer.write("".join(rows).encode())
+        writer.close()
+
+    numbers: list[int] = []
+    async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
+        one = Sensor(
+            name="A",
+            driver="text",
+            port=f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}",
+            sampling_rate=100.0,
+            channels=(Channel(name="X", sensitivity=1.0),),
+            settings={"columns": [1], "time_column": 0},
+        )
+        async with driver_type("text").open([one], SystemClock()) as session:
+            with contextlib.suppress(NotConnectedError):
+                async for item in session.read():
+                    if isinstance(item, Block):
+                        numbers += item.counts[:, 0].astype(int).tolist()
+    assert numbers == list(range(1, 300))  # the first may lack its start
 
 
 @pytest.mark.parametrize(("seed", "packets"), [(0, True), (1, True), (1, False)])
