@@ -25,13 +25,16 @@ if TYPE_CHECKING:
 
 
 def facts_of(estimate: Estimate) -> list[Fact]:
-    """Return all facts of an estimate; not those of its verdict."""
+    """Return all facts of an estimate; not those of its verdict.
+
+    What counts show comes before what spectra show: it is often the cause.
+    """
     snapshot = estimate.snapshot
     return [
+        *facts_of_channels(snapshot),
         *_findings(snapshot, estimate.concern),
         *facts_of_recordings(snapshot),
         *facts_of_segments(snapshot),
-        *facts_of_channels(snapshot),
         *facts_of_rounding(snapshot),
         *facts_of_linearity(snapshot),
         *facts_of_clocks(snapshot),

@@ -66,8 +66,7 @@ class ChannelsWrap(Fact):
         each = zip(self.channels, self.bits, strict=True)
         who = ", ".join(f"{name} (at {bits} bits)" for name, bits in each)
         return Words(
-            f"the counts of {who} wrap, so the noise is too high: use a larger range, or less "
-            "motion",
+            f"Counts of {who} wrap, so the noise is too high: use a larger range, or less motion",
             f"Overflow: the counts of {who} wrap: a value beyond one end of the range continues "
             "at the other end. The noise of these channels is too high.",
             "Use a larger range, or less motion. If the device sends more bits than the bench "
