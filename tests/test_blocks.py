@@ -11,10 +11,14 @@ import io
 import json
 import re
 import shlex
+import textwrap
+import tomllib
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
+import tomlkit
 from typer.testing import CliRunner
 
 from tui.commands.main import app
@@ -23,17 +27,31 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs" / "examples").glob("*.md"))]
+HOW_TOS = ROOT / "docs" / "examples"
+PAGES = [ROOT / "README.md", ROOT / "docs" / "method.md", *sorted(HOW_TOS.glob("*.md"))]
+TABLES = [
+    page
+    for page in [*ROOT.glob("docs/*.md"), *HOW_TOS.glob("*.md"), ROOT / "SECURITY.md"]
+    if page.name not in {"driver-guide.md", "responses.md"}  # the one of an import names its file
+    and "```toml" in page.read_text(encoding="utf-8")
+]
 TOLERANCE = 0.021
 """Of numbers in dB and in %, of the last of two digits that are shown."""
-_BLOCK = re.compile(r"^( *)```console\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
+_BLOCK = re.compile(r"^ *```(\w+)\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
 _NUMBER = re.compile(r"[−-]?\d+\.\d+")
+
+
+def blocks(page: Path, language: str) -> Iterator[str]:
+    """Yield the blocks of a page in one language, without their indent."""
+    for word, block in _BLOCK.findall(page.read_text(encoding="utf-8")):
+        if word == language:
+            yield textwrap.dedent(block)
 
 
 def sessions(page: Path) -> Iterator[tuple[str, list[str]]]:
     """Yield each command of a page and the lines that it prints."""
-    for indent, block in _BLOCK.findall(page.read_text(encoding="utf-8")):
-        lines = [line.removeprefix(indent) for line in block.splitlines()]
+    for block in blocks(page, "console"):
+        lines = block.splitlines()
         starts = [n for n, line in enumerate(lines) if line.startswith("$ ")]
         for start, end in zip(starts, [*starts[1:], len(lines)], strict=True):
             yield lines[start][2:], lines[start + 1 : end]
@@ -79,6 +97,55 @@ def test_commands_print_what_is_shown(
         done = CliRunner().invoke(app, words, terminal_width=200)
         assert done.exit_code == 0, done.output
         assert_prints(shown, done.stdout)
+
+
+def merged(whole: Any, part: Any) -> Any:  # noqa: ANN401 - a value of TOML
+    """Return a bench file with the tables of a page; of sensors and channels those of the first."""
+    if isinstance(whole, list):
+        first = part[0] if isinstance(part, list) else part
+        return [merged(whole[0], first), *whole[1:]]
+    if isinstance(whole, dict):
+        return whole | {
+            key: merged(whole[key], value) if key in whole else value for key, value in part.items()
+        }
+    return part
+
+
+@pytest.mark.parametrize("page", TABLES, ids=lambda page: page.name)
+def test_tables_of_bench_files_are_accepted(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert CliRunner().invoke(app, ["init", "-o", "lab.toml"]).exit_code == 0
+    Path("mask.csv").write_text("frequency (Hz),noise (µg/√Hz)\n1,1\n10,2\n", encoding="utf-8")
+    secret = f'"sha256:{0:064x}"'
+    for number, block in enumerate(blocks(page, "toml")):
+        part = tomllib.loads(re.sub(r'"(scrypt|sha256):…"', secret, block))
+        bench = Path(f"{number}.toml")
+        whole = tomllib.loads(Path("lab.toml").read_text(encoding="utf-8"))
+        bench.write_text(tomlkit.dumps(merged(whole, part)), encoding="utf-8")
+        done = CliRunner().invoke(app, ["check", str(bench), "--no-devices"])
+        assert done.exit_code == 0, done.output
+
+
+@pytest.mark.long
+def test_shell_commands_of_how_tos_run_on_simulated_sensors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """But those that read devices. An issued certificate is refused: sensors are simulated."""
+    monkeypatch.chdir(tmp_path)
+    pages = ("issue-a-certificate.md", "limits.md", "miniseed-to-noise.md")
+    lines = "".join(
+        chain.from_iterable(blocks(HOW_TOS / page, "sh") for page in pages)
+    ).splitlines()
+    for line in [
+        "huddle simulate fig9 --duration 2min --out night.h5",
+        "huddle simulate fig9 --duration 1min --out recordings/lab.h5",
+        "huddle export night.h5 --format mseed --out bench.mseed",
+        *(line for line in lines if not line.startswith("huddle run ")),
+    ]:
+        done = CliRunner().invoke(app, shlex.split(line)[1:])
+        assert done.exit_code == (2 if "--by" in line else 0), (line, done.output)
 
 
 def test_the_python_of_the_readme_prints_what_is_shown() -> None:
