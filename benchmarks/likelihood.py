@@ -65,7 +65,9 @@ def _precision(n_draws: int) -> list[Row]:
     rows = []
     for name, (directions, noise_psd, dims) in geometries.items():
         csm = common_motion(directions, noise_psd, snr=1e3)
-        bound = fisher.cramer_rao_cov(csm[None], noise_psd[None], n_effective=N_AVERAGES)[0]
+        bound = fisher.cramer_rao_cov(
+            csm[None], noise_psd[None], n_effective=N_AVERAGES, dims=dims
+        )[0]
         averages = wishart(csm, N_AVERAGES, rng, n_draws=n_draws)
         found = maximum_likelihood(averages, dims=dims, n_effective=N_AVERAGES)
         cov = found.noise_psd.std(axis=0) / noise_psd

@@ -116,6 +116,8 @@ def self_noise(
         )
     found = known
     if found is None:
+        if blocks is not None and method == "maximum-likelihood":
+            options["matrices"] = False  # the engine has them
         found = METHODS[method](csm, dims=dims, n_effective=n_effective, correct=correct, **options)
         if is_real.any():
             # half the degrees of freedom: a coefficient of a real series has no imaginary part

@@ -19,6 +19,7 @@ from estimator.checks.shared_motion import CanonicalCoherence
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.likelihood.changing_motion import bound_of_parts
 from estimator.likelihood.fisher import covariance, cramer_rao_cov, efficiency
+from estimator.likelihood.maximum_likelihood import sensors
 from estimator.methods import METHODS, self_noise
 from estimator.self_noise.coherency import check_dims, own_channels
 from estimator.spectra.windows import effective_averages, get_window
@@ -171,7 +172,8 @@ def plan(
             _plan_of_two(csm, noise_psd, dims, settings, cov=cov, change=change)
             for change in CHANGES
         ]
-    bound = cramer_rao_cov(csm, noise_psd, n_effective=REFERENCE)
+    own = sensors(dims, max(dims))
+    bound = cramer_rao_cov(csm, noise_psd, n_effective=REFERENCE, dims=own)
     unknown = np.full_like(bound, np.nan)
     plans = []
     for method in METHODS:

@@ -332,7 +332,8 @@ def _effect(
     if len(dims) >= 3:
         off = three_sensor(shared, dims=dims, n_effective=MANY).noise_psd
         closed = (off - three_sensor(sound, dims=dims, n_effective=MANY).noise_psd) / psi
-    likely = np.expm1(np.clip(shift(maximum, rows, scores, amounts), -MAX_SHIFT, MAX_SHIFT))
+    likely = shift(maximum, rows, scores, amounts, dims=dims)
+    likely = np.expm1(np.clip(likely, -MAX_SHIFT, MAX_SHIFT))
     return _median(closed), _median(likely)
 
 

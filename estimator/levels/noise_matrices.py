@@ -1,9 +1,7 @@
 """The noise of every sensor as a matrix, beside q dimensions of motion: ``S = A A* + N``.
 
-N has one Hermitian block for each sensor. Whitened by N, and with the projector P off the q leading
-eigenvectors, Fisher's scoring solves ``(P B P)_ij = (P X P)_ij`` for the elements B_ij of the noise
-in the blocks, from which the next N follows. As the motion is projected off, this takes few steps
-at any signal-to-noise ratio.
+N has one Hermitian block for each sensor. Here is the algebra of its elements in the blocks, beside
+the motion; `estimator.likelihood.factor_analysis` and `estimator.levels.pooled` solve for them.
 """
 
 from __future__ import annotations
@@ -15,17 +13,11 @@ import numpy as np
 if TYPE_CHECKING:
     from estimator.types import ComplexArray, FloatArray, IntArray
 
-STEPS = 30
-SETTLED = 1e-6
-"""Decrease of the discrepancy in a step from which there is no further step."""
 MANY = 8
 """Sensors with equal numbers of channels from which information is inverted sensor by sensor."""
 _SINGULAR = 0.2  # eigenvalue of the information of one sensor below which all are inverted at once
 _RIDGE = 1e-10  # of the diagonal, added to information
 _NEGLIGIBLE = 1e-6  # of a trace, as a share of its largest value
-_LEAST = 0.05  # of the noise in any direction, over that before the step
-_SHORTER = 0.4  # of a step that gains nothing
-_TRIALS = 6
 
 
 def pairs(sensor: IntArray) -> tuple[IntArray, IntArray]:
@@ -303,75 +295,3 @@ def apart(noise: ComplexArray, own: IntArray, other: IntArray) -> FloatArray:
     left = 1 - np.sqrt(np.clip(w, 0.0, 1.0))
     rest = np.einsum("nik,nk,nik->ni", root @ u, left, (root @ u).conj()).real
     return np.asarray(rest / np.einsum("nii->ni", first).real)
-
-
-def fitted(csm: ComplexArray, n_factors: int, sensor: IntArray) -> tuple[FloatArray, ComplexArray]:
-    """Return the discrepancy of the model at its maximum likelihood, and the noise there.
-
-    Parameters
-    ----------
-    csm : complex128, shape (n_freqs, n_channels, n_channels)
-        Positive definite; with a unit diagonal, say.
-    n_factors : int
-        Dimensions of the motion, q; ``(p - q)**2`` must exceed the number of `pairs`.
-    sensor : int64, shape (n_channels,)
-        Or group of sensors: non-decreasing.
-
-    Returns
-    -------
-    discrepancy : float64, shape (n_freqs,)
-        ``sum(w - ln w - 1)`` over the p - q smallest eigenvalues w of the whitened matrix
-        (`estimator.likelihood.goodness_of_fit.likelihood_ratio` makes a test of it).
-    noise : complex128, shape (n_freqs, n_channels, n_channels)
-    """
-    p = csm.shape[1]
-    a, b = pairs(sensor)
-    within = sensor[:, None] == sensor
-    # noise at first: what the other sensors do not predict
-    alone = np.linalg.inv(np.where(within, np.linalg.inv(csm), 0))
-    whitener = np.linalg.inv(np.linalg.cholesky((alone + alone.conj().swapaxes(1, 2)) / 2))
-    floor = np.full(csm.shape[:2], _LEAST)
-    value, X, u = _point(csm, whitener, n_factors)
-    going = np.arange(len(csm))
-    for _ in range(STEPS):
-        V = u[going][:, :, p - n_factors :]
-        P = np.eye(p) - V @ V.conj().swapaxes(1, 2)
-        solved = times(inverse(coupling(P, a, b)), (P @ X[going] @ P)[:, a, b])
-        size, axes = axes_of(solved, floor[going], sensor)
-        gained = np.zeros(len(going))
-        power, left = -0.5 * np.log(size), np.arange(len(going))
-        for _ in range(_TRIALS):
-            rows = going[left]
-            turn = axes[left]
-            step = (turn * np.exp(power[left])[:, None, :]) @ turn.conj().swapaxes(1, 2)
-            trial = step @ whitener[rows]
-            new, its, vectors = _point(csm[rows], trial, n_factors)
-            better = new < value[rows]
-            at = rows[better]
-            gained[left[better]] = value[at] - new[better]
-            value[at], X[at], u[at], whitener[at] = (
-                each[better] for each in (new, its, vectors, trial)
-            )
-            left = left[~better]
-            if not len(left):
-                break
-            power[left] *= _SHORTER
-        going = going[gained > SETTLED]
-        if not len(going):
-            break
-    root = np.linalg.inv(whitener)
-    return value, np.asarray(root @ root.conj().swapaxes(1, 2))
-
-
-def discrepancy(csm: ComplexArray, n_factors: int, sensor: IntArray) -> FloatArray:
-    """Return the discrepancy of `fitted` alone."""
-    return fitted(csm, n_factors, sensor)[0]
-
-
-def _point(
-    csm: ComplexArray, whitener: ComplexArray, q: int
-) -> tuple[FloatArray, ComplexArray, ComplexArray]:
-    X = white(csm, whitener)
-    w, u = np.linalg.eigh(X)
-    rest = np.maximum(w[:, : w.shape[1] - q], 1e-12)
-    return np.asarray((rest - np.log(rest) - 1).sum(axis=1)), X, u

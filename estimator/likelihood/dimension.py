@@ -13,15 +13,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.errors import InsufficientDataError, InvalidMatrixError
-from estimator.levels.noise_matrices import fitted, together
+from estimator.levels.noise_matrices import together
 from estimator.levels.pooled import blocks_of
-from estimator.likelihood.factor_analysis import Maxima, max_factors
+from estimator.likelihood.factor_analysis import Maxima, max_factors, maximise, n_noise
 from estimator.likelihood.goodness_of_fit import (
     HANN_HALF,
     REJECT,
     BandTest,
     ModelTest,
-    likelihood_ratio,
     model_test,
     pool,
     upper_tail,
@@ -63,9 +62,8 @@ biased it by up to 57 %."""
 MIN_BINS = 8
 MAX_BINS = 64
 """Maximum number of tested frequencies per band: of more, every second, third, …"""
-_REGULAR = 1e-12  # least eigenvalue of a coherency
-SENSOR_BINS = 16
-"""The same where the noise of a sensor is a matrix, whose fit takes longer."""
+SENSOR_BINS, SENSOR_STEPS = 16, 30
+"""The same where the noise of a sensor is a matrix, whose fit takes longer; steps of that fit."""
 FIRST_LOOK = 8
 """Dimensions are tried at every so many frequencies first; there the test often rejects them."""
 HOPELESS = 1e-12
@@ -489,28 +487,19 @@ class _Search:
         With the noise, shape (n_rows, n_channels, n_channels); None where nothing is left to test.
         """
         order, dims = together(self._dims, group)
-        p, unknown = len(order), sum(d * d for d in dims)
-        if (p - q) ** 2 <= unknown:
+        if (len(order) - q) ** 2 <= n_noise(dims):
             return None
         rows = np.flatnonzero(self._number == band)
         every = -(-len(rows) // SENSOR_BINS)
         rows = rows[every // 2 :: every]
-        rows = rows[np.isfinite(self._matrix[rows]).all(axis=(1, 2))]
-        rows = rows[np.linalg.eigvalsh(self._matrix[rows])[:, 0] > _REGULAR]
         matrix = self._matrix[rows[:, None, None], order[:, None], order]
-        discrepancy, noise = fitted(matrix, q, np.repeat(np.arange(len(dims)), dims))
-        test = likelihood_ratio(
-            discrepancy,
-            np.full(len(rows), float(unknown)),
-            n_channels=p,
-            n_factors=q,
-            n_effective=self._n_effective,
-        )
+        fit = maximise(matrix, q, dims=dims, most=SENSOR_STEPS)
+        test = model_test(fit, n_effective=self._n_effective)
         step = every * self._stride[band]
         back = np.argsort(order)
         return (
-            pool(test, np.ones(len(rows), np.bool_), neighbours=neighbours[step - 1 :: step]),
-            noise[:, back[:, None], back],
+            pool(test, ~fit.singular, neighbours=neighbours[step - 1 :: step]),
+            fit.noise[~fit.singular][:, back[:, None], back],
         )
 
     def expect(self, fit: _Fit, open_bands: list[int]) -> None:

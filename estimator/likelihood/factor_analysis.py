@@ -1,16 +1,19 @@
-"""Maximum likelihood of complex factor analysis, ``S = A A* + diag(psi)``, at all frequencies.
+"""Maximum likelihood of complex factor analysis, ``S = A A* + N``, at all frequencies.
 
-For given psi the best A is known: with ``w`` the eigenvalues (descending) and ``U`` the
-eigenvectors of ``psi^(-1/2) S psi^(-1/2)``, it explains the q largest eigenvalues above one, and
-the remainder of -2/n times the log likelihood ratio is twice
+N has one Hermitian block for each sensor: what only the channels of one sensor share is noise. With
+sensors of one channel it is ``diag(psi)``. For given N the best A is known: with ``w`` the
+eigenvalues (descending) and ``U`` the eigenvectors of the matrix whitened by N, it explains the q
+largest eigenvalues above one, and the remainder of -2/n times the log likelihood ratio is twice
 
-    f(psi) = sum over the other eigenvalues of (w - ln w - 1)           (Lawley and Maxwell)
+    f(N) = sum over the other eigenvalues of (w - ln w - 1)             (Lawley and Maxwell)
 
-which is minimised over x = ln psi by Newton's method: exact gradient and Hessian from one
-eigendecomposition, with a trust region. All frequencies are iterated together; converged ones are
-left out. If the Hessian is not convex, its expectation replaces it as long as the expected gain is
-large; near the end, negative curvature is reversed. A channel that tends to zero noise, where
-Newton's steps in ln psi become one each, is set to zero directly if the likelihood improves.
+which is minimised by Fisher's scoring. With P the projector off the motion and R the whitened
+matrix without it, the step to the noise B (whitened, one block for each sensor) solves
+
+    (P B P)_ij = R_ij     for the elements ij within the sensors.
+
+As the motion is projected off, this takes three to six steps at any signal-to-noise ratio. A
+direction whose noise tends to zero is held at a bound while the others are solved for.
 """
 
 from __future__ import annotations
@@ -23,30 +26,44 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from estimator.errors import EstimatorError, InsufficientDataError, InvalidMatrixError
+from estimator.levels.noise_matrices import axes_of, coupling_beside, pairs
 from estimator.self_noise.coherency import TOLERANCE, blocks
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
-_MIN_CURVATURE = 1e-9
-_FAR_APART = 0.1  # largest residual eigenvalue over a factor's, for a series in it
-_NEGLIGIBLE = 1e-9
 _FEW = 16  # channels whose matrices are diagonalised whole
 _NEARLY_ONE = 1e-4  # share of a channel beside the factors, near zero noise
 _SAFE = 1e-9  # least eigenvalue of a coherency that inverts without doubt
 _BESIDE, _ROUNDS, _ROUNDING = 3, 4, 1e-11  # of subspace iteration
-_CONVEX = 1e-6  # least pivot of a Hessian that is solved as it is
-_FAR = 0.1  # part of the discrepancy that a step by the Hessian's expectation has to promise
-MAX_STEP = 2.0  # in ln psi, the first trust region
+_LEAST = 0.05  # of the noise in any direction, over that before the step
+_DAMPING, _DAMPED, _MOST = 1e-3, 10.0, 1e6  # of steps that gain nothing: first, more, last
+_FALLING = 0.1  # of the noise at first: from there directions are tried at zero
+_AT_BOUND = 0.5  # of the bound of zero over the noise
+_RIDGE = 1e-10  # of the diagonal, added to information
+_HELD = 4  # rounds in which directions are held at their bounds
+MAX_ITERATIONS = 200
+DECREMENT = 1e-7
+"""Gain of the discrepancy promised by the next step, times two, at which a frequency has converged:
+ln psi is then within 3e-4 standard errors of a single average, and a final short step lowers this
+error."""
+KEPT_BYTES = 1 << 26
+BOUNDARY = 1e-6
+"""Noise below this fraction of what other sensors do not predict counts as zero."""
+_LAST_STEP = 0.01  # of the noise: longer final steps may decrease a nearly flat likelihood
+
+
+def _adjoint(matrices: ComplexArray) -> ComplexArray:
+    return np.asarray(matrices.conj().swapaxes(-1, -2))
 
 
 @dataclass(slots=True)
 class Point:
-    """The likelihood at one psi per frequency: q factors, and the matrix without them."""
+    """The likelihood at one N = V V* per frequency: q factors, and the matrix without them."""
 
-    x: FloatArray
+    root: ComplexArray
     discrepancy: FloatArray
     eigenvalues: FloatArray
     eigenvectors: ComplexArray
@@ -54,21 +71,12 @@ class Point:
 
     def take(self, index: IntArray | BoolArray) -> Point:
         """Return the same for some frequencies only."""
-        return Point(
-            self.x[index],
-            self.discrepancy[index],
-            self.eigenvalues[index],
-            self.eigenvectors[index],
-            self.rest[index],
-        )
+        return Point(*(getattr(self, each.name)[index] for each in fields(self)))
 
     def put(self, index: IntArray | BoolArray, other: Point) -> None:
         """Replace some frequencies."""
-        self.x[index] = other.x
-        self.discrepancy[index] = other.discrepancy
-        self.eigenvalues[index] = other.eigenvalues
-        self.eigenvectors[index] = other.eigenvectors
-        self.rest[index] = other.rest
+        for each in fields(self):
+            getattr(self, each.name)[index] = getattr(other, each.name)
 
 
 def _beside(u: ComplexArray) -> ComplexArray:
@@ -90,134 +98,6 @@ def _beside(u: ComplexArray) -> ComplexArray:
     return projector
 
 
-def newton(
-    at: Point, lowest: FloatArray, penalty: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Gradient, Newton step, its decrement (twice the gain expected), channels at the boundary."""
-    w, u = at.eigenvalues, at.eigenvectors
-    moving = w > 1  # a factor of an eigenvalue below one vanishes
-    i = np.arange(at.x.shape[1])
-    projector = _beside(u * moving[:, None, :])
-    weighted = at.rest
-    if not moving.all():
-        weighted = weighted + (u * np.where(moving, 0.0, w)[:, None, :]) @ u.conj().swapaxes(1, 2)
-    gradient = (projector[:, i, i] - weighted[:, i, i]).real + at.x @ penalty
-    hessian = _together(weighted, projector)
-    hessian += penalty
-    if moving.any():
-        hessian += _turning(w, u, moving, weighted, projector - weighted)
-    at_boundary = (at.x <= lowest) & (gradient > 0)
-    free = ~at_boundary
-    among = free[:, :, None] & free[:, None, :]
-    hessian *= among
-    hessian[:, i, i] += at_boundary
-    downhill = np.where(free, gradient, 0.0)
-    step = np.zeros_like(downhill)
-    convex = _least_pivot(hessian) > _CONVEX
-    step[convex] = _solved(hessian[convex], downhill[convex])
-    bent = np.flatnonzero(~convex)
-    if len(bent):
-        expected = (projector.real[bent] ** 2 + projector.imag[bent] ** 2 + penalty) * among[bent]
-        expected[:, i, i] += at_boundary[bent] + _MIN_CURVATURE
-        step[bent] = _solved(expected, downhill[bent])
-        gain = -(step[bent] * downhill[bent]).sum(axis=1)
-        size = np.abs(step[bent]).max(axis=1)
-        bent = bent[(gain < _FAR * at.discrepancy[bent]) | (size > MAX_STEP)]
-        step[bent] = _turned(hessian[bent], downhill[bent])
-    return gradient, step, -(step * downhill).sum(axis=1), at_boundary
-
-
-def _together(a: ComplexArray, b: ComplexArray) -> FloatArray:
-    """Return the real part of ``a * conj(b)``."""
-    return np.asarray(a.real * b.real + a.imag * b.imag)
-
-
-def _solved(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
-    return np.asarray(-np.linalg.solve(curvature, downhill[:, :, None])[:, :, 0])
-
-
-def _least_pivot(matrices: FloatArray) -> FloatArray:
-    """Least pivot of Gaussian elimination, shape (n,): positive if all eigenvalues are.
-
-    By Cholesky's factors where all matrices have them. Else all matrices at once, none beyond a
-    pivot under `_CONVEX`: a tenth of the time of eigenvalues.
-    """
-    try:
-        factors = np.linalg.cholesky(matrices)
-    except np.linalg.LinAlgError:
-        pass
-    else:
-        return np.asarray(np.einsum("fii->fi", factors).min(axis=1) ** 2)
-    left = np.moveaxis(matrices, 0, 2).copy()  # the matrices' own axis last: contiguous
-    least = left[0, 0].copy()
-    for k in range(1, len(left)):
-        pivot = np.where(least > _CONVEX, left[k - 1, k - 1], np.inf)
-        left[k:, k:] -= left[k:, k - 1, None] * (left[k - 1, k:] / pivot)
-        least = np.minimum(least, left[k, k])
-    return np.asarray(least, np.float64)
-
-
-def _turned(hessian: FloatArray, downhill: FloatArray) -> FloatArray:
-    """Newton step with negative curvature turned round."""
-    curvature, axes = np.linalg.eigh(hessian)
-    floor = _MIN_CURVATURE * np.maximum(curvature[:, -1:], 1.0)
-    curvature = np.maximum(np.abs(curvature), floor)
-    along = np.einsum("fik,fi->fk", axes, downhill)
-    return np.asarray(-np.einsum("fik,fk->fi", axes, along / curvature))
-
-
-def _turning(
-    w: FloatArray,
-    u: ComplexArray,
-    moving: BoolArray,
-    weighted: ComplexArray,
-    beside: ComplexArray,
-) -> FloatArray:
-    """Second derivatives by ln psi that come of the factors' turning, shape (n_freqs, p, p).
-
-    Factor m and residual eigenvector r contribute ``(1 - w_r) (w_m + w_r) / (w_m - w_r)``, which is
-    a function of the residual matrix W: ``(P - W) (1 + 2 W / w_m + 2 (W / w_m)**2 + …)``. Where
-    motion is strong, its series has few terms.
-    """
-    found = _together((u * moving[:, None, :]) @ u.conj().swapaxes(1, 2), beside)
-    strength = np.where(moving, w, np.inf)
-    ratio = np.sqrt(_together(weighted, weighted).sum(axis=(1, 2))) / strength.min(axis=1)
-    near = ratio > _FAR_APART
-    far = slice(None) if not near.any() else ~near
-    term, conj = beside[far], u[far].conj().swapaxes(1, 2)
-    power, left = np.ones_like(strength[far]), ratio[far].max(initial=0.0)
-    worst = left
-    while worst > _NEGLIGIBLE:
-        term = term @ weighted[far]
-        power = power / strength[far]
-        found[far] += 2 * _together((u[far] * power[:, None, :]) @ conj, term)
-        worst *= left
-    if near.any():
-        identity = np.eye(u.shape[1])
-        for m in range(w.shape[1]):
-            some = np.flatnonzero(near & moving[:, m])
-            own, column = w[some, m, None, None], u[some, :, m, None]
-            # a residual eigenvalue as large as the factor's would make the matrix singular
-            resolvent = np.linalg.inv(own * (1 + 1e-6) * identity - weighted[some])
-            term = 2 * beside[some] @ (own * resolvent - identity)
-            found[some] += _together(column @ column.conj().swapaxes(1, 2), term)
-    return found
-
-
-MAX_ITERATIONS = 200
-DECREMENT = 1e-7
-"""Newton decrement at which a frequency has converged: ln psi is then within 3e-4 standard errors
-of a single average, and a final short step squares this error."""
-KEPT_BYTES = 1 << 26
-BOUNDARY = 1e-6
-"""psi below this fraction of the channel's partial spectrum 1 / (S^-1)_ii counts as zero."""
-_LAST_STEP = 0.01  # in ln psi: longer final steps may decrease a nearly flat likelihood
-_MIN_RADIUS = 1e-9
-_FALLING = np.log(0.1 / BOUNDARY)
-"""A channel that still decreases from less than this above its boundary is tried at the boundary:
-ln psi would otherwise decrease by only one per step."""
-
-
 @dataclass(frozen=True, slots=True)
 class Maximum:
     """The maximum of the likelihood.
@@ -236,15 +116,20 @@ class Maximum:
         Their eigenvectors, as columns.
     rest : float64, shape (n_freqs, n_channels, n_channels)
         Real part of the whitened matrix without them.
+    root : complex128, shape (n_freqs, n_pairs)
+        Elements within the sensors (`estimator.levels.noise_matrices.pairs`) of V over the root of
+        psi, ``N = V V*``; ones with sensors of one channel.
     n_factors : int
+    sensor : int64, shape (n_channels,)
     iterations : int64, shape (n_freqs,)
         Number of evaluations of the likelihood and its derivatives.
-    gradient_norm : float64, shape (n_freqs,)
-        Largest derivative of the discrepancy by ln psi, except for boundary channels.
+    decrement : float64, shape (n_freqs,)
+        Twice the gain of the discrepancy that the next step promises.
     converged : bool, shape (n_freqs,)
     boundary : bool, shape (n_freqs, n_channels)
-        Whether the likelihood increases towards psi = 0 (Heywood case); psi is then the small
-        positive number at which the search stopped.
+        Whether the likelihood increases towards noise of zero (Heywood case): of the channel, or of
+        a direction of its sensor. The noise there is the small positive number at which the search
+        stopped.
     singular : bool, shape (n_freqs,)
         Whether the matrix is not Hermitian and positive definite, so that no maximum exists.
     penalty : float64, shape (n_channels, n_channels)
@@ -256,9 +141,11 @@ class Maximum:
     eigenvalues: FloatArray
     eigenvectors: ComplexArray
     rest: FloatArray
+    root: ComplexArray
     n_factors: int
+    sensor: IntArray
     iterations: IntArray
-    gradient_norm: FloatArray
+    decrement: FloatArray
     converged: BoolArray
     boundary: BoolArray
     singular: BoolArray
@@ -266,35 +153,52 @@ class Maximum:
 
     def take(self, index: IntArray | BoolArray | slice) -> Maximum:
         """Return a copy with only some frequencies."""
-        return Maximum(
-            psi=self.psi[index],
-            discrepancy=self.discrepancy[index],
-            eigenvalues=self.eigenvalues[index],
-            eigenvectors=self.eigenvectors[index],
-            rest=self.rest[index],
-            n_factors=self.n_factors,
-            iterations=self.iterations[index],
-            gradient_norm=self.gradient_norm[index],
-            converged=self.converged[index],
-            boundary=self.boundary[index],
-            singular=self.singular[index],
-            penalty=self.penalty,
-        )
+        return replace(self, **{name: getattr(self, name)[index] for name in _OF_FREQUENCIES})
 
     @property
     def projector(self) -> ComplexArray:
         """Projector on the directions without motion, shape (n_freqs, n_channels, n_channels)."""
         return _beside(self.eigenvectors)
 
+    @property
+    def noise_root(self) -> ComplexArray:
+        """V over the root of psi, shape (n_freqs, n_channels, n_channels)."""
+        a, b = pairs(self.sensor)
+        root = np.zeros(self.rest.shape, np.complex128)
+        root[:, a, b] = self.root
+        return root
 
-def max_factors(n_channels: int | IntArray) -> IntArray:
-    """Return the maximum number of identifiable factors q, ``(p - q)**2 >= p``."""
-    return np.floor(n_channels - np.sqrt(n_channels) + 1e-12).astype(np.int64)
+    @property
+    def noise(self) -> ComplexArray:
+        """N, unit**2/Hz, shape (n_freqs, n_channels, n_channels)."""
+        root = self.noise_root * np.sqrt(self.psi)[:, :, None]
+        return np.asarray(root @ _adjoint(root))
 
 
-def check_factors(n_factors: int | IntArray, n_channels: int) -> None:
+_OF_FREQUENCIES = tuple(
+    each.name for each in fields(Maximum) if each.name not in {"n_factors", "sensor", "penalty"}
+)
+
+
+def max_factors(n_channels: int | IntArray, n_noise: int | IntArray | None = None) -> IntArray:
+    """Return the maximum number of identifiable factors q, ``(p - q)**2 >= n_noise``.
+
+    `n_noise` is the number of real parameters of the noise, the sum of the squares of the sensors'
+    channels; by default one for each channel.
+    """
+    unknown = n_channels if n_noise is None else n_noise
+    most = np.floor(n_channels - np.sqrt(unknown) + 1e-12)
+    return np.asarray(most, np.float64).astype(np.int64)
+
+
+def n_noise(dims: Sequence[int]) -> int:
+    """Return the number of real parameters of the noise of sensors of so many channels."""
+    return sum(d * d for d in dims)
+
+
+def check_factors(n_factors: int | IntArray, n_channels: int, n_noise: int | None = None) -> None:
     """Raise an error unless this number of channels identifies this number of factors."""
-    factors, most = np.asarray(n_factors), max_factors(n_channels)
+    factors, most = np.asarray(n_factors), max_factors(n_channels, n_noise)
     if factors.dtype.kind not in "iu":
         raise EstimatorError(f"{n_factors} factors of motion: expected a whole number")
     wrong = factors[(factors < 0) | (factors > most)]
@@ -308,20 +212,27 @@ def maximise(
     csm: ComplexArray,
     n_factors: int,
     *,
+    dims: Sequence[int] | None = None,
     penalty: FloatArray | None = None,
+    most: int = MAX_ITERATIONS,
 ) -> Maximum:
-    """Return the maximum likelihood noise PSD of every channel, for all frequencies.
+    """Return the maximum likelihood noise of every sensor, for all frequencies.
 
     Parameters
     ----------
     csm : complex128, shape (n_freqs, n_channels, n_channels)
         One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``.
     n_factors : int
-        Dimension q of the common motion, ``0 <= q`` and ``(p - q)**2 >= p``.
+        Dimension q of the common motion, ``0 <= q`` and ``(p - q)**2 >= sum d_i**2``.
+    dims : sequence of int, optional
+        Number of channels of each sensor, whose noise is one matrix; default: the noise of every
+        channel is independent.
     penalty : float64, shape (n_channels, n_channels), optional
         Adds ``x' penalty x / 2``, x = ln psi, to the discrepancy: the precision of a Gaussian
         prior of x divided by the number of averages. Positive semidefinite, with rows summing to
-        zero.
+        zero; only for independent noise.
+    most : int
+        Evaluations at most: a test of a wrong model, which takes the most, needs few.
 
     Returns
     -------
@@ -336,18 +247,18 @@ def maximise(
 
     Notes
     -----
-    The search starts from the best multiple of ``1 / (S^-1)_ii``; a frequency that has not
-    converged after `MAX_ITERATIONS` has ``converged`` False. The gradient is
-    ``sum_m (1 - w_m) |u_im|**2`` over the residual eigenvalues; the Hessian is that of Clarke
-    (1970), generalised to complex matrices. Its expectation ``|P_ij|**2``, with P the projector on
-    the residual eigenvectors, is the Fisher information of ln psi with A eliminated.
+    The search starts from the best multiple of ``block(S^-1)^-1``; a frequency that has not
+    converged after so many has ``converged`` False.
     """
     if csm.ndim != 3 or csm.shape[1] != csm.shape[2]:
         raise InvalidMatrixError(
             f"cross-spectral matrix of shape {csm.shape}: expected (n_freqs, p, p)"
         )
     p = csm.shape[-1]
-    check_factors(n_factors, p)
+    own = (1,) * p if dims is None else dims
+    sensor = np.repeat(np.arange(len(own)), own)
+    check_factors(n_factors, p, n_noise(own))
+    a, b = pairs(sensor)
     n_freqs = len(csm)
     found = Maximum(
         psi=np.full((n_freqs, p), np.nan),
@@ -357,9 +268,11 @@ def maximise(
             np.eye(p, n_factors, dtype=np.complex128), (n_freqs, p, n_factors)
         ).copy(),
         rest=np.zeros(csm.shape),
+        root=np.broadcast_to((a == b).astype(np.complex128), (n_freqs, len(a))).copy(),
         n_factors=n_factors,
+        sensor=sensor,
         iterations=np.zeros(n_freqs, np.int64),
-        gradient_norm=np.full(n_freqs, np.nan),
+        decrement=np.full(n_freqs, np.nan),
         converged=np.zeros(n_freqs, np.bool_),
         boundary=np.zeros((n_freqs, p), np.bool_),
         singular=np.ones(n_freqs, np.bool_),
@@ -372,21 +285,11 @@ def maximise(
             continue
         whole = bool(usable.all())
         given = _Given(
-            csm[some] if whole else csm[some][usable], precision if whole else precision[usable]
+            csm[some] if whole else csm[some][usable],
+            precision if whole else precision[usable],
+            sensor,
         )
-        partial = 1 / np.real(np.einsum("fii->fi", given.precision))
-        lowest = np.log(partial * BOUNDARY)
-        start = partial
-        if n_factors == 0 and penalty is None:  # the diagonal is the maximum
-            start = np.real(np.einsum("fii->fi", given.matrix))
-        _search(
-            given,
-            np.log(start),
-            lowest=lowest,
-            rounding=rounding[usable],
-            found=found,
-            where=some.start + np.flatnonzero(usable),
-        )
+        _search(given, rounding[usable], found, some.start + np.flatnonzero(usable), most)
     return found
 
 
@@ -398,19 +301,29 @@ class Maxima:
     """
 
     def __init__(self) -> None:
-        self._found: dict[tuple[int, bytes], tuple[Maximum, int]] = {}
+        self._found: dict[tuple[int, tuple[int, ...] | None, bytes], tuple[Maximum, int]] = {}
         self._bytes = 0
 
-    def maximise(self, csm: ComplexArray, n_factors: int, *, last: bool = False) -> Maximum:
+    def maximise(
+        self,
+        csm: ComplexArray,
+        n_factors: int,
+        *,
+        dims: tuple[int, ...] | None = None,
+        last: bool = False,
+    ) -> Maximum:
         """Return `maximise` without a penalty, of some matrices perhaps from before.
 
         Nothing is kept of those that are wanted the `last` time.
         """
-        keys = [(n_factors, sha256((each + 0.0).data).digest()) for each in csm]  # no minus zeros
+        keys = [  # no minus zeros
+            (n_factors, dims, sha256((each + 0.0).data).digest()) for each in csm
+        ]
         before = [self._found.pop(key, None) if last else self._found.get(key) for key in keys]
         missing = [row for row, each in enumerate(before) if each is None]
         if missing or not len(csm):
-            new = maximise(csm if len(missing) == len(csm) else csm[missing], n_factors)
+            wanted = csm if len(missing) == len(csm) else csm[missing]
+            new = maximise(wanted, n_factors, dims=dims)
             if not last and self._bytes + new.rest.nbytes <= KEPT_BYTES:
                 self._bytes += new.rest.nbytes
                 self._found |= {keys[row]: (new, at) for at, row in enumerate(missing)}
@@ -445,12 +358,11 @@ def _assembled(
     """Return fits of which some frequencies come from each of several others."""
     one = placed[0][0]
     arrays: dict[str, Any] = {}
-    for field in fields(Maximum):
-        if field.name not in {"n_factors", "penalty"}:
-            like = getattr(one, field.name)
-            arrays[field.name] = found = np.empty((n_freqs, *like.shape[1:]), like.dtype)
-            for part, places, rows in placed:
-                found[rows] = getattr(part, field.name)[places]
+    for name in _OF_FREQUENCIES:
+        like = getattr(one, name)
+        arrays[name] = found = np.empty((n_freqs, *like.shape[1:]), like.dtype)
+        for part, places, rows in placed:
+            found[rows] = getattr(part, name)[places]
     return replace(one, **arrays)
 
 
@@ -496,122 +408,255 @@ def _inverted(matrices: ComplexArray) -> tuple[FloatArray, ComplexArray]:
 
 
 def _search(
-    given: _Given,
-    x0: FloatArray,
-    *,
-    lowest: FloatArray,
-    rounding: FloatArray,
-    found: Maximum,
-    where: IntArray,
+    given: _Given, rounding: FloatArray, found: Maximum, where: IntArray, most: int
 ) -> None:
-    """Search from x0, with the lower bound `lowest`; write results to the rows `where`."""
-    q = found.n_factors
-    n = len(x0)
-    penalty = found.penalty
-    best = _scaled(given.whitened(x0, None, q, np.arange(n)))
-    gradient, step, decrement, at_boundary = newton(best, lowest, penalty)
-    falling = _falling(best.x, step, lowest)
-    radius = np.full(n, MAX_STEP)
-    iterations = np.ones(n, np.int64)
-    converged = decrement < DECREMENT
-    going = np.flatnonzero(~converged)
-    for _ in range(MAX_ITERATIONS):
-        if not len(going):
-            break
-        size = np.abs(np.where(falling[going], 0.0, step[going])).max(axis=1)
-        shrink = np.minimum(1.0, radius[going] / np.maximum(size, _MIN_RADIUS))
-        goal = best.x[going] + step[going] * shrink[:, None]
-        goal = np.where(falling[going], lowest[going], np.maximum(goal, lowest[going]))
-        trial = given.whitened(goal, best.eigenvectors[going], q, going)
+    """Maximise the likelihood of some matrices; write results to the rows `where`."""
+    q, sensor, n = found.n_factors, found.sensor, len(where)
+    penalty = found.penalty if found.penalty.any() else None
+    root = given.start(with_motion=bool(q) or penalty is not None)
+    begin = np.asarray(np.linalg.inv(root), np.complex128)
+    best = _scaled(given.whitened(root, None, q, np.arange(n)))
+    iterations, decrement = np.ones(n, np.int64), np.full(n, np.inf)
+    held = np.zeros((n, len(sensor)), np.bool_)
+    size, axes = np.ones((n, len(sensor))), np.zeros(best.root.shape, np.complex128)
+    damping, going = np.zeros(n), np.arange(n)
+    while len(going):
+        step = scoring(
+            best.take(going),
+            begin[going],
+            held[going],
+            damping[going],
+            sensor=sensor,
+            penalty=penalty,
+        )
+        size[going], axes[going], decrement[going], held[going] = step
+        going = going[(decrement[going] >= DECREMENT) & (iterations[going] < most)]
+        longer = _with_sizes(axes[going], np.sqrt(size[going]))
+        trial = given.whitened(best.root[going] @ longer, best.eigenvectors[going], q, going)
         iterations[going] += 1
-        expected = decrement[going] * shrink * (1 - shrink / 2)
         gain = best.discrepancy[going] - trial.discrepancy
-        gain += _quadratic(best.x[going], penalty) - _quadratic(trial.x, penalty)
-        accept = gain >= 1e-4 * expected - rounding[going]
-        poor = gain < 0.25 * expected - rounding[going]
-        poor &= ~falling[going].any(axis=1)  # there the jump to the boundary failed, not the step
-        falling[going] = False
-        radius[going] = np.where(
-            poor,
-            0.25 * np.minimum(size, radius[going]),
-            np.where(shrink < 1, 2.0, 1.0) * radius[going],
-        )
-        moved = going[accept]
-        point = trial.take(accept)
-        best.put(moved, point)
-        gradient[moved], step[moved], decrement[moved], at_boundary[moved] = newton(
-            point, lowest[moved], penalty
-        )
-        falling[moved] = _falling(point.x, step[moved], lowest[moved])
-        converged[moved] = decrement[moved] < DECREMENT
-        stuck = radius < _MIN_RADIUS
-        going = np.flatnonzero(~converged & ~stuck)
-    sure = converged & (np.abs(step).max(axis=1) < _LAST_STEP)
-    last = np.where(sure[:, None], step, 0.0)
-    found.psi[where] = np.exp(np.maximum(best.x + last, lowest))
-    found.discrepancy[where] = best.discrepancy
-    found.eigenvalues[where] = best.eigenvalues
-    found.eigenvectors[where] = best.eigenvectors
-    found.rest[where] = best.rest.real
-    found.iterations[where] = iterations
-    found.gradient_norm[where] = np.abs(np.where(at_boundary, 0.0, gradient)).max(axis=1)
-    found.converged[where] = converged
-    found.boundary[where] = at_boundary
+        if penalty is not None:
+            gain += _quadratic(best.root[going], penalty) - _quadratic(trial.root, penalty)
+        better = gain > -rounding[going]
+        best.put(going[better], trial.take(better))
+        before = damping[going]
+        less = np.where(before < _DAMPING, 0.0, before / _DAMPED)
+        damping[going] = np.where(better, less, np.maximum(before * _DAMPED, _DAMPING))
+        going = going[(~better & (damping[going] < _MOST)) | (gain > 0)]
+    sure = (decrement < DECREMENT) & (np.abs(size - 1).max(axis=1) < _LAST_STEP)
+    final = best.root @ _with_sizes(axes, np.where(sure[:, None], np.sqrt(size), 1.0))
+    of_sensor = np.stack([held[:, sensor == i].any(axis=1) for i in range(sensor[-1] + 1)], axis=1)
+    for name, values in (
+        *_of_noise(best, final, sensor),
+        ("discrepancy", best.discrepancy),
+        ("eigenvalues", best.eigenvalues),
+        ("iterations", iterations),
+        ("decrement", decrement),
+        ("converged", decrement <= np.maximum(DECREMENT, rounding)),
+        ("boundary", of_sensor[:, sensor]),
+    ):
+        getattr(found, name)[where] = values
 
 
-def _falling(x: FloatArray, step: FloatArray, lowest: FloatArray) -> BoolArray:
-    """Return the channels that tend to zero noise: near the boundary and still at full steps."""
-    return np.asarray((x > lowest) & (x < lowest + _FALLING) & (step < -0.5))
+def _with_sizes(axes: ComplexArray, size: FloatArray) -> ComplexArray:
+    return np.asarray((axes * size[:, None, :]) @ _adjoint(axes))
+
+
+def _of_noise(
+    best: Point, final: ComplexArray, sensor: IntArray
+) -> Iterator[tuple[str, FloatArray | ComplexArray]]:
+    """Yield the noise and what is whitened by it, with the `final` root."""
+    a, b = pairs(sensor)
+    psi = (np.abs(final) ** 2).sum(axis=2)
+    yield "psi", psi
+    rest, u = best.rest, best.eigenvectors
+    if len(a) > len(sensor):
+        # axes of each sensor that share no motion: where one has no noise, others keep theirs
+        turn = axes_of(-(u @ _adjoint(u))[:, a, b], np.full(psi.shape, -np.inf), sensor)[1]
+        final, u, rest = final @ turn, _adjoint(turn) @ u, _adjoint(turn) @ rest @ turn
+    yield "root", (final / np.sqrt(psi)[:, :, None])[:, a, b]
+    yield "rest", rest.real
+    yield "eigenvectors", u
+
+
+def scoring(
+    at: Point,
+    begin: ComplexArray,
+    held: BoolArray,
+    damping: FloatArray,
+    *,
+    sensor: IntArray,
+    penalty: FloatArray | None,
+) -> tuple[FloatArray, ComplexArray, FloatArray, BoolArray]:
+    """Return the next noise over that of a point: sizes and axes, decrement, directions held.
+
+    `begin` is the inverse root of the noise at which the search began, and `held` tells which
+    frequencies had directions at a bound before.
+    """
+    w, u = at.eigenvalues, at.eigenvectors
+    n, p, q = u.shape
+    a, b = pairs(sensor)
+    moving = w > 1  # a factor of an eigenvalue below one vanishes
+    U = u * moving[:, None, :] if q else np.zeros((n, p, 1), np.complex128)
+    rest = at.rest
+    if not moving.all():
+        rest = rest + (u * np.where(moving, 0.0, w)[:, None, :]) @ _adjoint(u)
+    toward, i = rest - _beside(U), np.arange(p)
+    if penalty is not None:
+        toward[:, i, i] -= np.log(np.abs(at.root[:, i, i]) ** 2) @ penalty
+    change = _solved(_damped(U, sensor, damping, penalty), toward[:, a, b])
+    if len(a) == p:
+        size = 1 + change.real
+        axes = np.broadcast_to(np.eye(p, dtype=np.complex128), toward.shape).copy()
+    else:
+        size, axes = axes_of(change + (a == b), np.full((n, p), -np.inf), sensor)
+    low = np.full((n, p), _LEAST)
+    doubtful = np.flatnonzero(held.any(axis=1) | (size < _LEAST).any(axis=1))
+    fixed = np.zeros((n, p), np.bool_)
+    if len(doubtful):
+        turned = begin[doubtful] @ at.root[doubtful]
+        for number in range(int(sensor[-1]) + 1):
+            of_one = np.flatnonzero(sensor == number)
+            block = turned[:, of_one[:, None], of_one]
+            least = np.linalg.eigvalsh(block @ _adjoint(block))[:, :1]
+            least = np.minimum(BOUNDARY / np.maximum(least, 1e-300), 1.0)
+            low[doubtful[:, None], of_one] = np.where(least > BOUNDARY / _FALLING, least, _LEAST)
+        near = 1 + (low - 1) / (1 + damping[:, None])
+        size[doubtful], axes[doubtful], fixed[doubtful] = _bounded(
+            size[doubtful],
+            axes[doubtful],
+            U[doubtful],
+            toward[doubtful],
+            low=near[doubtful],
+            damping=damping[doubtful],
+            sensor=sensor,
+            penalty=penalty,
+        )
+    toward *= sensor[:, None] == sensor
+    decrement = np.einsum("fij,fij->f", _with_sizes(axes, size - 1).conj(), toward).real
+    falling = (fixed & (low != _LEAST) & (low < _AT_BOUND)).any(axis=1)
+    decrement = np.where(falling, np.maximum(decrement, DECREMENT), decrement)
+    return size, axes, decrement, fixed
+
+
+def _solved(J: ComplexArray | FloatArray, wanted: ComplexArray) -> ComplexArray:
+    """Solve with information on the noise, scaled to a unit diagonal."""
+    i = np.arange(J.shape[1])
+    unit = np.sqrt(np.maximum(J[:, i, i].real, 1e-30))
+    scaled = J / (unit[:, :, None] * unit[:, None, :])
+    scaled[:, i, i] += _RIDGE
+    by = (wanted if np.iscomplexobj(J) else wanted.real) / unit
+    return np.asarray(np.linalg.solve(scaled, by[:, :, None])[:, :, 0] / unit, np.complex128)
+
+
+def _damped(
+    U: ComplexArray, sensor: IntArray, damping: FloatArray, penalty: FloatArray | None
+) -> ComplexArray | FloatArray:
+    """Return the information on the noise, with more on its diagonal (Marquardt 1963)."""
+    whole = coupling_beside(U, sensor)
+    J: ComplexArray | FloatArray = whole
+    if J.shape[1] == len(sensor):
+        J = whole.real.copy() if penalty is None else whole.real + penalty
+    i = np.arange(J.shape[1])
+    J[:, i, i] *= 1 + damping[:, None]
+    return J
+
+
+def _bounded(
+    size: FloatArray,
+    axes: ComplexArray,
+    U: ComplexArray,
+    toward: ComplexArray,
+    *,
+    low: FloatArray,
+    damping: FloatArray,
+    sensor: IntArray,
+    penalty: FloatArray | None,
+) -> tuple[FloatArray, ComplexArray, BoolArray]:
+    """Solve with directions of the noise that would fall below `low` held there."""
+    a, b = pairs(sensor)
+    size, frame = size.copy(), np.broadcast_to(np.eye(size.shape[1]), axes.shape).astype(complex)
+    axes, held = axes.copy(), np.zeros(size.shape, np.bool_)
+    for _ in range(_HELD):
+        below = (size < low) & ~held
+        some = np.flatnonzero(below.any(axis=1))
+        if not len(some):
+            break
+        held[some] |= below[some]
+        frame[some] = turn = frame[some] @ axes[some]  # in it directions are coordinates
+        J = _damped(_adjoint(turn) @ U[some], sensor, damping[some], penalty)
+        wanted = (_adjoint(turn) @ toward[some] @ turn)[:, a, b]
+        fixed = held[some][:, a] | held[some][:, b]
+        value = np.where(held[some][:, a] & (a == b), low[some][:, a] - 1, 0.0)
+        wanted = np.where(fixed, value, wanted - (J @ value[:, :, None])[:, :, 0])
+        J = np.where(fixed[:, :, None] | fixed[:, None], np.eye(len(a)) * fixed[:, None], J)
+        change = _solved(J, wanted)
+        size[some], axes[some] = axes_of(
+            change + (a == b), np.full(held[some].shape, -np.inf), sensor
+        )
+        held[some] = (np.abs(axes[some]) ** 2 * held[some][:, :, None]).sum(axis=1) > 0.5
+    return np.maximum(size, low), frame @ axes, held
 
 
 class _Given:
-    """Matrices and their inverses, to be whitened by psi and split into factors and the rest.
+    """Matrices and their inverses, to be whitened and split into factors and the rest.
 
     Parameters
     ----------
     matrix, precision : complex128, shape (n_freqs, p, p)
+    sensor : int64, shape (p,)
     """
 
-    def __init__(self, matrix: ComplexArray, precision: ComplexArray) -> None:
+    def __init__(self, matrix: ComplexArray, precision: ComplexArray, sensor: IntArray) -> None:
         self.matrix, self.precision = matrix, precision
-        self._log_partial = np.log(np.einsum("fii->fi", precision).real)
+        self._within = sensor[:, None] == sensor
         self._log_determinant = np.linalg.slogdet(matrix)[1] if matrix.shape[1] > _FEW else None
 
-    def whitened(self, x: FloatArray, guess: ComplexArray | None, q: int, rows: IntArray) -> Point:
-        """Whiten some matrices by ``psi = exp(x)``; `guess` has nearly the factors' directions."""
+    def start(self, *, with_motion: bool) -> ComplexArray:
+        """Return a root of the noise to begin with: what other sensors do not predict."""
+        if not with_motion:  # the maximum
+            alone = np.where(self._within, self.matrix, 0.0)
+        else:
+            alone = np.linalg.inv(np.where(self._within, self.precision, 0.0))
+            alone = (alone + alone.conj().swapaxes(1, 2)) / 2
+        return np.asarray(np.linalg.cholesky(alone), np.complex128)
+
+    def whitened(
+        self, root: ComplexArray, guess: ComplexArray | None, q: int, rows: IntArray
+    ) -> Point:
+        """Whiten some matrices by N = V V*; `guess` has nearly the factors' directions."""
         if self._log_determinant is None:
-            return self._diagonalised(x, q, rows)
-        white, scale = _rows(self.matrix, rows), np.exp(-0.5 * x)
-        white = white * scale[:, :, None]
-        white *= scale[:, None, :]
+            return self._diagonalised(root, q, rows)
+        back = np.asarray(np.linalg.inv(root), np.complex128)
+        white = back @ _rows(self.matrix, rows) @ _adjoint(back)
         w, u, good = leading(white, q, guess)
-        good &= (x + self._log_partial[rows]).min(axis=1) > np.log(_NEARLY_ONE)
+        precision = _rows(self.precision, rows) @ root
+        good &= np.einsum("fai,fai->fi", root.conj(), precision).real.min(axis=1) > _NEARLY_ONE
         moving = w > 1
         trace = np.einsum("fii->f", white).real
-        log_determinant = self._log_determinant[rows] - x.sum(axis=1)
+        log_determinant = self._log_determinant[rows] - 2 * np.linalg.slogdet(root)[1]
         taken = np.where(moving, w - np.log(np.where(moving, w, 1.0)) - 1, 0.0).sum(axis=1)
-        white -= (u * w[:, None, :]) @ u.conj().swapaxes(1, 2)
-        point = Point(x.copy(), trace - log_determinant - x.shape[1] - taken, w, u, white)
+        white = white - (u * w[:, None, :]) @ _adjoint(u)
+        point = Point(root, trace - log_determinant - root.shape[1] - taken, w, u, white)
         if not good.all():
             poor = np.flatnonzero(~good)
-            point.put(poor, self._diagonalised(x[poor], q, rows[poor]))
+            point.put(poor, self._diagonalised(root[poor], q, rows[poor]))
         return point
 
-    def _diagonalised(self, x: FloatArray, q: int, rows: IntArray) -> Point:
+    def _diagonalised(self, root: ComplexArray, q: int, rows: IntArray) -> Point:
         """Diagonalise the inverse.
 
         In it the residual eigenvalues are the large ones, and so keep their precision for strong
-        motion and for small psi.
+        motion and for little noise.
         """
-        scale = np.exp(0.5 * x)
-        precision = _rows(self.precision, rows)
-        inverse, u = np.linalg.eigh(precision * scale[:, :, None] * scale[:, None, :])
+        inner = _adjoint(root) @ _rows(self.precision, rows) @ root
+        inverse, u = np.linalg.eigh((inner + _adjoint(inner)) / 2)
         w = 1 / np.maximum(inverse, 1e-18 * inverse[:, -1:])
         left = (np.arange(w.shape[1]) >= q) | (w <= 1)
         discrepancy = np.where(left, w - np.log(w) - 1, 0.0).sum(axis=1)
         free = u[:, :, q:]
-        rest = (free * w[:, None, q:]) @ free.conj().swapaxes(1, 2)
-        return Point(x.copy(), discrepancy, w[:, :q], u[:, :, :q], rest)
+        rest = (free * w[:, None, q:]) @ _adjoint(free)
+        return Point(root, discrepancy, w[:, :q], u[:, :, :q], rest)
 
 
 def _rows(matrices: ComplexArray, rows: IntArray) -> ComplexArray:
@@ -663,14 +708,14 @@ def leading(
 
 
 def _scaled(at: Point) -> Point:
-    """Go to the best multiple of all psi, where the residual eigenvalues have a mean of one."""
+    """Go to the best multiple of the noise, where the residual eigenvalues have a mean of one."""
     p, q = at.eigenvectors.shape[1:]
     total = np.einsum("fii->f", at.rest).real
     mean = total / (p - q)
     logs = total - (p - q) + _unused(at.eigenvalues) - at.discrepancy  # of the residual ones
     w = at.eigenvalues / mean[:, None]
     return Point(
-        at.x + np.log(mean)[:, None],
+        at.root * np.sqrt(mean)[:, None, None],
         (p - q) * np.log(mean) - logs + _unused(w),
         w,
         at.eigenvectors,
@@ -683,5 +728,6 @@ def _unused(w: FloatArray) -> FloatArray:
     return np.asarray(np.where(w <= 1, w - np.log(w) - 1, 0.0).sum(axis=1))
 
 
-def _quadratic(x: FloatArray, penalty: FloatArray) -> FloatArray:
+def _quadratic(root: ComplexArray, penalty: FloatArray) -> FloatArray:
+    x = np.log(np.einsum("fii->fi", np.abs(root) ** 2))
     return np.asarray(0.5 * np.einsum("fi,ij,fj->f", x, penalty, x))

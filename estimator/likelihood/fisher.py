@@ -1,40 +1,44 @@
 """Information of the averages on the noise: Fisher information, bounds, small-sample bias.
 
-In channels whitened by their noise the model is ``I + A A*``. P is the projector on the directions
-without motion (the eigenvectors of the p - q smallest eigenvalues). The information on ``ln psi``
-with unknown A is, per average,
+In channels whitened by the noise N of their sensors the model is ``I + A A*``. P is the projector
+on the directions without motion (the eigenvectors of the p - q smallest eigenvalues). The
+information on the elements of the noise within the sensors, with unknown A, is, per average,
 
-    J_ij = |P_ij|**2
+    J_ab,cd = P_ac conj(P_bd)
 
-which is ``Re tr(S^-1 dS S^-1 dS)`` after projecting out all directions ``dA A* + A dA*``.
+which is ``Re tr(S^-1 dS S^-1 dS)`` after projecting out all directions ``dA A* + A dA*``. With
+sensors of one channel these are ``|P_ij|**2``, the information on ``ln psi``.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias, overload
 
 import numpy as np
 
 from estimator.errors import InvalidMatrixError
+from estimator.levels.noise_matrices import coupling_beside, pairs, traces
 from estimator.self_noise.coherency import blocks, check_averages
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Sequence
 
     from estimator.likelihood.factor_analysis import Maximum
-    from estimator.types import ComplexArray, FloatArray, IntArray
+    from estimator.types import ComplexArray, FloatArray
+
+Covariance: TypeAlias = "ComplexArray | FloatArray"
+"""Of the noise: of elements within sensors, real where each has one channel."""
 
 _LEAST_INFORMATION = 1e-12
 _DOUBTFUL = 1e-6
 """Of the largest inverse: beyond this share, eigenvalues decide whether there is one."""
-_CANCELS = 100.0
-"""Covariance of ln psi, per average, beyond which sums of traces cancel."""
+_EQUAL = 1e-9  # of an efficiency: rounding
 _PRODUCT_BYTES = 1 << 21
 """Of the products of channels that are made at a time."""
 
 
-def information(maximum: Maximum) -> FloatArray:
-    """Return the Fisher information of ln psi per average, for unknown A, without the prior's.
+def information(maximum: Maximum) -> Covariance:
+    """Return the Fisher information of the noise per average, for unknown A, without the prior's.
 
     Parameters
     ----------
@@ -42,28 +46,35 @@ def information(maximum: Maximum) -> FloatArray:
 
     Returns
     -------
-    float64, shape (n_freqs, n_channels, n_channels)
-        ``|P_ij|**2``.
+    complex128 or float64, shape (n_freqs, n_pairs, n_pairs)
+        Of the elements of the noise within the sensors (`estimator.levels.noise_matrices.pairs`),
+        whitened: ``P_ac conj(P_bd)``; ``|P_ij|**2`` with sensors of one channel.
     """
-    return _squares(maximum.projector)
+    if maximum.root.shape[1] == maximum.psi.shape[1]:
+        return _squares(maximum.projector)
+    return coupling_beside(maximum.eigenvectors, maximum.sensor)
 
 
 def _squares(projector: ComplexArray) -> FloatArray:
     return np.asarray(projector.real**2 + projector.imag**2)
 
 
-def covariance(per_average: FloatArray) -> FloatArray:
+@overload
+def covariance(per_average: FloatArray) -> FloatArray: ...
+@overload
+def covariance(per_average: Covariance) -> Covariance: ...
+def covariance(per_average: Covariance) -> Covariance:
     """Return the inverse of the information; NaN if it is singular.
 
     Parameters
     ----------
-    per_average : float64, shape (n_freqs, n_channels, n_channels)
+    per_average : float64 or complex128, shape (n_freqs, n, n)
         From `information`, positive semidefinite.
 
     Returns
     -------
-    float64, shape (n_freqs, n_channels, n_channels)
-        Covariance of ln psi times the number of averages.
+    float64 or complex128, shape (n_freqs, n, n)
+        Covariance of the noise times the number of averages.
 
     Notes
     -----
@@ -71,7 +82,7 @@ def covariance(per_average: FloatArray) -> FloatArray:
     information decreases as psi**2, without effect on the information on the others.
     """
     n_channels = per_average.shape[-1]
-    root = np.sqrt(np.einsum("fii->fi", per_average))
+    root = np.sqrt(np.einsum("fii->fi", per_average).real)
     known = (root > np.finfo(np.float64).tiny).all(axis=1)
     scale = 1 / np.where(known[:, None], root, 1.0)
     scaled = np.where(known[:, None, None], per_average, np.eye(n_channels))
@@ -80,22 +91,23 @@ def covariance(per_average: FloatArray) -> FloatArray:
         found = np.linalg.inv(scaled)
     except np.linalg.LinAlgError:
         found = np.full_like(scaled, np.nan)
-    diagonal = np.einsum("fii->fi", found)
+    diagonal = np.einsum("fii->fi", found).real
     # the trace bounds the eigenvalues of the inverse, if it is positive definite
     doubtful = ~(diagonal.min(axis=1, initial=1.0) > 0)
     doubtful |= ~(diagonal.sum(axis=1) < _DOUBTFUL / _LEAST_INFORMATION)
     if doubtful.any():
         w, u = np.linalg.eigh(scaled[doubtful])
         known[doubtful] &= w[:, 0] > _LEAST_INFORMATION
-        w = np.where(w[:, :1] > _LEAST_INFORMATION, w, np.nan)
-        found[doubtful] = (u / w[:, None, :]) @ u.swapaxes(-1, -2)
-    found = (found + found.swapaxes(-1, -2)) / 2
+        enough = w[:, :1] > _LEAST_INFORMATION
+        over = np.where(enough, 1 / np.where(enough, w, 1.0), np.nan)
+        found[doubtful] = (u * over[:, None, :]) @ u.conj().swapaxes(-1, -2)
+    found = (found + found.conj().swapaxes(-1, -2)) / 2
     found[~known] = np.nan
     return np.asarray(found * scale[:, :, None] * scale[:, None, :])
 
 
-def spread(maximum: Maximum) -> FloatArray:
-    """Return the covariance of ln psi, with that of the prior, times the number of averages.
+def spread(maximum: Maximum) -> Covariance:
+    """Return the covariance of the whitened noise, with that of the prior, times the averages.
 
     Parameters
     ----------
@@ -103,16 +115,55 @@ def spread(maximum: Maximum) -> FloatArray:
 
     Returns
     -------
-    float64, shape (n_freqs, n_channels, n_channels)
-        NaN where the noise is undetermined.
+    complex128 or float64, shape (n_freqs, n_pairs, n_pairs)
+        As `information`; NaN where the noise is undetermined.
     """
-    found = np.empty((*maximum.psi.shape, maximum.psi.shape[1]))
-    for some in blocks(*maximum.psi.shape):
-        found[some] = covariance(information(maximum.take(some)) + maximum.penalty)
+    found = information(maximum)
+    for some in blocks(len(found), found.shape[1]):
+        found[some] = covariance(found[some] + (maximum.penalty if maximum.penalty.any() else 0))
     return found
 
 
-def cramer_rao_cov(csm: ComplexArray, noise_psd: FloatArray, *, n_effective: float) -> FloatArray:
+def weights(maximum: Maximum, inverse: Covariance) -> Covariance:
+    """Return the part of each element of the whitened matrix in psi, as a fraction of it.
+
+    Parameters
+    ----------
+    maximum : Maximum
+    inverse : complex128 or float64, shape (n_freqs, n_pairs, n_pairs)
+        From `spread`.
+
+    Returns
+    -------
+    complex128 or float64, shape (n_freqs, n_channels, n_pairs)
+    """
+    if np.isrealobj(inverse):
+        return inverse
+    return _elements(maximum) @ inverse
+
+
+def _elements(maximum: Maximum) -> ComplexArray:
+    """Return ``V_ia conj(V_ib)``: psi of channel i by elements of the whitened noise."""
+    a, b = pairs(maximum.sensor)
+    root = maximum.noise_root
+    return np.asarray(root[:, :, a] * root[:, :, b].conj())
+
+
+def variance(maximum: Maximum, inverse: Covariance) -> FloatArray:
+    """Return the variance of ln psi times the averages, (n_freqs, n_channels); of `spread`."""
+    if np.isrealobj(inverse):
+        return np.asarray(np.einsum("fii->fi", inverse))
+    elements = _elements(maximum)
+    return np.asarray(np.einsum("fim,fim->fi", elements @ inverse, elements.conj()).real)
+
+
+def cramer_rao_cov(
+    csm: ComplexArray,
+    noise_psd: FloatArray,
+    *,
+    n_effective: float,
+    dims: Sequence[int] | None = None,
+) -> FloatArray:
     """Return the smallest coefficient of variation of any unbiased estimate of the noise.
 
     Parameters
@@ -123,6 +174,9 @@ def cramer_rao_cov(csm: ComplexArray, noise_psd: FloatArray, *, n_effective: flo
         True noise, positive; the rest of `csm` must have low rank.
     n_effective : float
         Number of independent averages.
+    dims : sequence of int, optional
+        Number of channels of each sensor, which may share noise unknown to the estimate; default:
+        the estimate knows that the noise of all channels is independent.
 
     Returns
     -------
@@ -154,9 +208,13 @@ def cramer_rao_cov(csm: ComplexArray, noise_psd: FloatArray, *, n_effective: flo
     scale = 1 / np.sqrt(noise_psd)
     w, u = np.linalg.eigh(csm * scale[:, :, None] * scale[:, None, :])
     free = w < 1 + 1e-9 * np.maximum(w[:, -1:], 1.0)
-    residual = u * free[:, None, :]
-    per_average = _squares(residual @ residual.conj().swapaxes(1, 2))
-    bound = np.sqrt(np.einsum("fii->fi", covariance(per_average)) / n_effective)
+    own = (1,) * csm.shape[1] if dims is None else dims
+    sensor = np.repeat(np.arange(len(own)), own)
+    a, b = pairs(sensor)
+    most = max(1, int((~free).sum(axis=1).max(initial=0)))
+    motion = (u * ~free[:, None, :])[:, :, u.shape[2] - most :]
+    found = covariance(coupling_beside(motion, sensor))
+    bound = np.sqrt(np.einsum("fii->fi", found[:, a == b][:, :, a == b]).real / n_effective)
     return np.where(np.isnan(bound), np.inf, bound)
 
 
@@ -175,16 +233,17 @@ def efficiency(cov: FloatArray, bound: FloatArray) -> FloatArray:
     float64, shape (n_freqs, n_channels)
         ``(bound / cov)**2``, at most 1 for an unbiased estimate.
     """
-    return np.asarray((bound / cov) ** 2)
+    found = (bound / cov) ** 2
+    return np.where(np.abs(found - 1) < _EQUAL, 1.0, found)
 
 
-def cumulants(maximum: Maximum, inverse: FloatArray, *, n_effective: float) -> FloatArray:
+def cumulants(maximum: Maximum, inverse: Covariance, *, n_effective: float) -> FloatArray:
     """Return the cumulants of psi, for `estimator.levels.interval.interval`.
 
     Parameters
     ----------
     maximum : Maximum
-    inverse : float64, shape (n_freqs, n_channels, n_channels)
+    inverse : complex128 or float64, shape (n_freqs, n_pairs, n_pairs)
         From `spread`.
     n_effective : float
         Number of independent averages.
@@ -197,84 +256,20 @@ def cumulants(maximum: Maximum, inverse: FloatArray, *, n_effective: float) -> F
     Notes
     -----
     psi_i is, to first order, ``tr(K_i W)`` of the residual matrix W, a Wishart matrix of unit
-    covariance with n - q averages: ``K_i = P diag(a_i) P`` with ``a = inv(J)``. As ``P = 1 - U U*``
-    with the q directions U of the motion, its powers have the traces
-
-        tr(K**2) = tr D**2 - 2 tr B_2 + tr B_1**2,
-        tr(K**3) = tr D**3 - 3 tr B_3 + 3 tr B_1 B_2 - tr B_1**3,
-        tr(K**4) = tr D**4 - 4 tr B_4 + 4 tr B_1 B_3 + 2 tr B_2**2 - 4 tr B_1**2 B_2 + tr B_1**4
-
-    with ``D = diag(a_i)`` and the q x q matrices ``B_m = U* D**m U``. Where a is large, these sums
-    cancel; with ``Q_i = P diag(a_i) P``,
-
-        tr(K_i**2) = sum_j a_ij Q_ijj,   tr(K_i**3) = sum_jl a_ij a_il Re(Q_ijl conj(P_jl)),
-        tr(K_i**4) = sum_jl a_ij a_il |Q_ijl|**2.
-
-    Without a penalty ``tr(K_i**2) = inv(J)_ii``.
+    covariance with n - q averages: ``K_i = P C_i P``, and C_i has the elements `weights` within the
+    sensors. Without a penalty ``tr(K_i**2)`` is the `variance`.
     """
-    p, q = maximum.psi.shape[1], maximum.n_factors
+    p = maximum.psi.shape[1]
     found = np.full((3, *maximum.psi.shape), np.nan)
-    size = np.abs(inverse).max(axis=(1, 2), initial=0.0)
-    for some in _pieces(np.flatnonzero(size < _CANCELS), 16 * p * max(p, q * q)):
-        found[:, some] = _traces(maximum.eigenvectors[some], inverse[some])
-    for some in _pieces(np.flatnonzero(size >= _CANCELS), 8 * p**2 * (p + 1)):
-        found[:, some] = _traces_of_products(maximum.take(some).projector, inverse[some])
-    averages = n_effective - q
+    step = max(1, _PRODUCT_BYTES // (16 * p**3))
+    for low in range(0, len(inverse), step):
+        some = slice(low, low + step)
+        part = maximum.take(some)
+        weight = weights(part, inverse[some]).astype(np.complex128)
+        found[:, some] = traces(weight, part.projector, maximum.sensor)
+    averages = n_effective - maximum.n_factors
     scales = [maximum.psi ** (m + 2) / averages ** (m + 1) for m in range(3)]
     return np.asarray(found * np.stack(scales))
-
-
-def _pieces(rows: IntArray, size: int) -> Iterator[IntArray]:
-    step = max(1, _PRODUCT_BYTES // size)
-    for low in range(0, len(rows), step):
-        yield rows[low : low + step]
-
-
-def _traces(u: ComplexArray, a: FloatArray) -> FloatArray:
-    n, p, q = u.shape
-    pairs = (u.conj()[:, :, :, None] * u[:, :, None, :]).reshape(n, p, q * q)
-    D, B = [], []
-    for m in range(1, 5):
-        power = a**m
-        D.append(power.sum(axis=2))
-        B.append((power @ pairs.view(np.float64)).view(np.complex128).reshape(n, p, q, q))
-    square = B[0] @ B[0]
-    return np.stack(
-        [
-            D[1] - 2 * _trace(B[1]) + _trace(square),
-            D[2] - 3 * _trace(B[2]) + 3 * _product(B[0], B[1]) - _product(B[0], square),
-            D[3]
-            - 4 * _trace(B[3])
-            + 4 * _product(B[0], B[2])
-            + 2 * _product(B[1], B[1])
-            - 4 * _product(square, B[1])
-            + _product(square, square),
-        ]
-    )
-
-
-def _traces_of_products(P: ComplexArray, a: FloatArray) -> FloatArray:
-    j, k = np.triu_indices(P.shape[1])
-    products = np.take(P, j, axis=2).conj() * np.take(P, k, axis=2)
-    Q = (a @ products.view(np.float64)).view(np.complex128)
-    weight = np.take(a, j, axis=2) * np.take(a, k, axis=2) * np.where(j == k, 1.0, 2.0)
-    along = Q.real * P[:, None, j, k].real + Q.imag * P[:, None, j, k].imag
-    return np.stack(
-        [
-            (a * Q[:, :, j == k].real).sum(axis=2),
-            (weight * along).sum(axis=2),
-            (weight * (Q.real**2 + Q.imag**2)).sum(axis=2),
-        ]
-    )
-
-
-def _trace(matrices: ComplexArray) -> FloatArray:
-    return np.asarray(np.einsum("...ii->...", matrices).real)
-
-
-def _product(a: ComplexArray, b: ComplexArray) -> FloatArray:
-    """Return the trace of the product of two Hermitian matrices."""
-    return np.asarray((a.real * b.real + a.imag * b.imag).sum(axis=(-2, -1)))
 
 
 def spiked_eigenvalues(sample: FloatArray, n_residual: int, n_effective: float) -> FloatArray:
@@ -307,14 +302,14 @@ def spiked_eigenvalues(sample: FloatArray, n_residual: int, n_effective: float) 
     return np.asarray(np.maximum(half + root, edge))
 
 
-def bias(maximum: Maximum, inverse: FloatArray, *, n_effective: float) -> FloatArray:
+def bias(maximum: Maximum, inverse: Covariance, *, n_effective: float) -> FloatArray:
     """Return the fractional bias of the maximum likelihood estimate, to first order in 1 / n.
 
     Parameters
     ----------
     maximum : Maximum
         From `estimator.likelihood.factor_analysis.maximise`.
-    inverse : float64, shape (n_freqs, n_channels, n_channels)
+    inverse : complex128 or float64, shape (n_freqs, n_pairs, n_pairs)
         From `spread`.
     n_effective : float
         Number of independent averages.
@@ -326,16 +321,15 @@ def bias(maximum: Maximum, inverse: FloatArray, *, n_effective: float) -> FloatA
 
     Notes
     -----
-    Cox and Snell's (1968) formula. The model is linear in psi, so only its curvature in A
-    matters: the bias is minus the regression of ``P E[dA dA*] P`` on the information,
+    Cox and Snell's (1968) formula. The model is linear in N, so only its curvature in A matters:
+    the bias is minus the regression of ``P E[dA dA*] P`` on the information,
 
-        -(1/n) [ sum_k w_k / (w_k - 1) + J^-1 diag(P (J^-1 o K) P) ],
-        K = sum_k u_k u_k* / (w_k - 1).
+        -(1/n) [ sum_k w_k / (w_k - 1) + J^-1 (P E[dN K dN] P) ],   K = sum_k u_k u_k* / (w_k - 1).
 
-    The first term is the noise removed by the factors for any psi. At high SNR it is exactly q:
+    The first term is the noise removed by the factors for any N. At high SNR it is exactly q:
     the remainder is a Wishart matrix with n - q degrees of freedom and a covariance linear in
-    psi, whose maximum likelihood estimate has no bias of first order. The second term is due to
-    the rotation of the factors by the error of psi.
+    N, whose maximum likelihood estimate has no bias of first order. The second term is due to
+    the rotation of the factors by the error dN of N, of covariance J^-1.
     """
     eigenvalues, n_factors = maximum.eigenvalues, maximum.n_factors
     if n_factors == 0:
@@ -348,8 +342,10 @@ def bias(maximum: Maximum, inverse: FloatArray, *, n_effective: float) -> FloatA
         taken = (w / (w - 1)).sum(axis=1)
     u = maximum.eigenvectors
     projector = maximum.projector
-    turned = projector @ (inverse * ((u / (w - 1)[:, None, :]) @ u.conj().swapaxes(1, 2)))
-    diagonal = (turned * projector.swapaxes(1, 2)).sum(axis=2).real
-    second = np.einsum("fij,fj->fi", inverse, diagonal)
+    a, b = pairs(maximum.sensor)
+    K = (u / (w - 1)[:, None, :]) @ u.conj().swapaxes(1, 2)
+    to = np.eye(u.shape[1])[a]
+    turned = projector @ (to.T @ (inverse * K[:, b[:, None], b]) @ to) @ projector
+    second = (weights(maximum, inverse) @ turned[:, a, b, None])[:, :, 0].real
     total = taken[:, None] + np.where(np.isfinite(second), second, 0.0)
     return np.asarray(-total / n_effective)

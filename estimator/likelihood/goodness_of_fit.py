@@ -213,51 +213,23 @@ def model_test(maximum: Maximum, *, n_effective: float) -> ModelTest:
 
     Notes
     -----
-    ``2 n sum(w - ln w - 1)`` over the p - q smallest eigenvalues has ``(p - q)**2 - p``
-    degrees of freedom. It is too large at small n. At high SNR the averages without the motion are
+    ``2 n sum(w - ln w - 1)`` over the p - q smallest eigenvalues has ``(p - q)**2 - k`` degrees of
+    freedom, with k the sum of the squares of the sensors' numbers of channels. It is too large at
+    small n. At high SNR the averages without the motion are
     a Wishart matrix of order m = p - q over n - q averages, so that the statistic against a
     *known* psi has the mean
 
         -2 (n - q) [sum_{i<m} digamma(n - q - i) - m ln(n - q)],
 
-    which estimation of psi reduces by ``p (1 + 1 / (6 (n - q)))``. Division by mean over degrees of
-    freedom (Bartlett) gives false alarms of 0.9 % at the 1 % level from n = 20 on (three to
-    five sensors of one to three channels). At low SNR, where n averages do not resolve q factors
+    which estimation of the noise reduces by ``k (1 + 1 / (6 (n - q)))``. Division by mean over
+    degrees of freedom (Bartlett) gives false alarms of 0.9 % at the 1 % level from n = 20 on (three
+    to five sensors of one to three channels). At low SNR, where n averages do not resolve q factors
     (about n SNR**2 < 100), the test is conservative. With a penalty, psi has
     ``tr J (J + penalty)^-1`` effective parameters instead of p, as in ridge regression.
     """
-    p = maximum.psi.shape[1]
-    return likelihood_ratio(
-        maximum.discrepancy,
-        _estimated_parameters(maximum),
-        n_channels=p,
-        n_factors=maximum.n_factors,
-        n_effective=n_effective,
-    )
-
-
-def likelihood_ratio(
-    discrepancy: FloatArray,
-    estimated: FloatArray,
-    *,
-    n_channels: int,
-    n_factors: int,
-    n_effective: float,
-) -> ModelTest:
-    """Return the test of a model from its discrepancy, as `model_test`.
-
-    Parameters
-    ----------
-    discrepancy : float64, shape (n_freqs,)
-        At the maximum of the likelihood.
-    estimated : float64, shape (n_freqs,)
-        Real parameters of the noise: the channels or, with a matrix for each sensor, the sum of the
-        squares of their numbers of channels.
-    n_channels, n_factors : int
-    n_effective : float
-    """
+    p, q = maximum.psi.shape[1], maximum.n_factors
+    estimated = _estimated_parameters(maximum)
     check_averages(n_effective)
-    p, q = n_channels, n_factors
     order, averages = p - q, n_effective - q
     if order**2 - estimated.max(initial=0.0) < 1:
         raise InsufficientDataError(
@@ -270,7 +242,7 @@ def likelihood_ratio(
     logs = sum(digamma(averages - i) for i in range(order)) - order * np.log(averages)
     degrees = order**2 - estimated
     mean = -2 * averages * logs - estimated * (1 + 1 / (6 * averages))
-    statistic = 2 * averages * discrepancy * degrees / mean
+    statistic = 2 * averages * maximum.discrepancy * degrees / mean
     return ModelTest(statistic, degrees, p_values(degrees, statistic))
 
 
@@ -280,7 +252,7 @@ def p_values(degrees: FloatArray, statistic: FloatArray) -> FloatArray:
 
 
 def _estimated_parameters(maximum: Maximum) -> FloatArray:
-    n_freqs, p = maximum.psi.shape
+    n_freqs, p = len(maximum.psi), maximum.root.shape[1]
     if not maximum.penalty.any():
         return np.full(n_freqs, float(p))
     information = fisher.information(maximum)

@@ -25,6 +25,7 @@ from estimator.likelihood.factor_analysis import (
     check_factors,
     max_factors,
     maximise,
+    n_noise,
 )
 from estimator.likelihood.goodness_of_fit import model_test
 from estimator.likelihood.prior import NOISE_SPREAD, expected_noise, kinds, maximise_expecting
@@ -81,7 +82,8 @@ def resolved(
     rows = np.arange(len(csm))
     while maximum.n_factors > 0 and n_effective > csm.shape[1]:
         doubtful = np.flatnonzero(_doubtful(maximum, n_effective))
-        fewer = maximise(csm[rows[doubtful]], maximum.n_factors - 1)
+        dims = np.bincount(maximum.sensor).tolist()
+        fewer = maximise(csm[rows[doubtful]], maximum.n_factors - 1, dims=dims)
         misfit, degrees = _misfit(fewer, n_effective)
         before, degrees_before = _misfit(maximum.take(doubtful), n_effective)
         parameters = degrees - degrees_before
@@ -171,24 +173,49 @@ def _misfit_without_noise(
 def _misfit(maximum: Maximum, n_effective: float) -> tuple[FloatArray, FloatArray]:
     """Return statistic and degrees of freedom of the model test; zero without any freedom."""
     n_freqs, p = maximum.psi.shape
-    if (p - maximum.n_factors) ** 2 <= p:
+    if (p - maximum.n_factors) ** 2 <= maximum.root.shape[1]:
         return np.zeros(n_freqs), np.zeros(n_freqs)
     test = model_test(maximum, n_effective=n_effective)
     return test.statistic, test.degrees
 
 
 def _doubtful(maximum: Maximum, n_effective: float) -> BoolArray:
-    """Return whether a factor may be scatter: it is weak, or explains nearly all of a channel.
+    """Return whether a factor may be scatter: it is weak, or explains nearly all of a sensor.
 
-    A factor fitted to the noise of one channel has a large strength in it: its strength is computed
-    without its largest channel.
+    A factor fitted to the noise of one sensor has a large strength in it: its strength is computed
+    without its largest sensor.
     """
     p = maximum.psi.shape[1]
-    share = np.abs(maximum.eigenvectors) ** 2
+    first = np.flatnonzero(np.diff(maximum.sensor, prepend=-1))
+    share = np.add.reduceat(np.abs(maximum.eigenvectors) ** 2, first, axis=1)
     strength = ((maximum.eigenvalues - 1) * (1 - share.max(axis=1))).min(axis=1)
     weak = strength < CERTAIN * np.sqrt(p / n_effective)
-    captured = 1 - share.sum(axis=2).max(axis=1) < CAPTURED
+    captured = least_beside(maximum) < CAPTURED
     return np.asarray(~maximum.singular & (weak | captured))
+
+
+def least_beside(maximum: Maximum) -> FloatArray:
+    """Return the least part of any direction of a sensor that is without motion, (n_freqs,)."""
+    projector = maximum.projector
+    if maximum.root.shape[1] == projector.shape[1]:
+        return np.asarray(np.einsum("fii->fi", projector).real.min(axis=1))
+    within = maximum.sensor[:, None] == maximum.sensor
+    return np.asarray(np.linalg.eigvalsh(np.where(within, projector, 0.0))[:, 0])
+
+
+def sensors(dims: tuple[int, ...], n_factors: int) -> tuple[int, ...] | None:
+    """Return the sensors whose noise is one matrix, or None if that leaves too few equations.
+
+    Without any one sensor, two groups of others must each have a channel for every factor.
+    """
+    live = sorted((d for d in dims if d), reverse=True)
+    for own in range(len(live)):
+        groups = [0, 0]
+        for d in live[:own] + live[own + 1 :]:
+            groups[int(np.argmin(groups))] += d
+        if min(groups) < n_factors:
+            return None
+    return dims if n_factors <= max_factors(sum(live), n_noise(live)) else None
 
 
 EXTRA_FACTORS = 2
@@ -203,6 +230,7 @@ def maximum_likelihood(
     correct: bool = True,
     n_factors: int | IntArray | None = None,
     noise_spread: float = NOISE_SPREAD,
+    matrices: bool = True,
     maxima: Maxima | None = None,
 ) -> SelfNoise:
     """Return the self-noise PSD of every channel of three or more collocated sensors.
@@ -230,6 +258,10 @@ def maximum_likelihood(
         like channels, about the ratios at frequencies of fewer factors. The matrix alone may not
         determine their noise, and c.o.v. and interval depend on this prior (see
         `estimator.likelihood.prior`).
+    matrices : bool
+        The channels of a sensor may share noise, where the sensors leave enough equations and
+        `n_factors` does not exceed ``max(dims)``; otherwise the noise of all channels is
+        independent.
     maxima : Maxima, optional
         Fits of the same matrices, to share.
 
@@ -289,13 +321,18 @@ def maximum_likelihood(
     noise_psd, scatter = np.full((n_freqs, p), np.nan), np.full((3, n_freqs, p), np.nan)
     flags = given.flags.copy()
     flags[few] |= np.where(absent[few], 0, Flag.NO_COUNTERPART)
-    for q in np.unique(factors[~few]):  # ascending: usual fits come first, and give the prior
-        rows = np.flatnonzero((factors == q) & ~few)
+    with_matrices = _with_matrices(alive, factors, dims) & matrices
+    # ascending: usual fits come first, and give the prior
+    for q, blocked in sorted(
+        {*zip(factors[~few].tolist(), with_matrices[~few].tolist(), strict=True)}
+    ):
+        rows = np.flatnonzero((factors == q) & (with_matrices == blocked) & ~few)
         fit: _Fit
         if q <= max(dims):
             fit = partial(
                 _usual,
                 q=int(q),
+                dims=dims if blocked else None,
                 n_effective=n_effective,
                 correct=correct,
                 maxima=maxima or Maxima(),
@@ -311,11 +348,12 @@ def maximum_likelihood(
                 n_effective=n_effective,
                 spread=noise_spread,
             )
-        for here, maximum, error, covariance in _in_blocks(fit, matrix, rows):
+        for here, maximum, error, covariance in _in_blocks(fit, matrix, rows, n_noise(dims)):
             gain = np.ones(maximum.psi.shape)
             if correct:
                 gain = small_sample_correction(maximum, covariance, n_effective=n_effective)
-            noise_psd[here] = np.where(maximum.boundary, 0.0, maximum.psi) * gain
+            one = maximum.root.shape[1] == p
+            noise_psd[here] = np.where(maximum.boundary & one, 0.0, maximum.psi) * gain
             found = fisher.cumulants(maximum, covariance, n_effective=n_effective)
             found[0] = error**2  # which includes all factors
             scatter[:, here] = found * np.stack([gain**m for m in (2, 3, 4)])
@@ -326,6 +364,17 @@ def maximum_likelihood(
     scatter[:, unknown] = np.nan
     powers = np.stack([given.psd**m for m in (2, 3, 4)])
     return SelfNoise.of("maximum-likelihood", noise_psd * given.psd, scatter * powers, flags)
+
+
+def _with_matrices(alive: IntArray, factors: IntArray, dims: tuple[int, ...]) -> BoolArray:
+    """Return at which frequencies live channels give the noise of sensors as matrices."""
+    found = np.zeros(len(factors), np.bool_)
+    each = np.column_stack([alive, factors])
+    for case in np.unique(each, axis=0):
+        *live, q = case.tolist()
+        if q <= max(dims):
+            found[(each == case).all(axis=1)] = sensors(tuple(live), q) is not None
+    return found
 
 
 def _remarks(maximum: Maximum, error: FloatArray, good: BoolArray, shared: IntArray) -> IntArray:
@@ -343,16 +392,13 @@ def _remarks(maximum: Maximum, error: FloatArray, good: BoolArray, shared: IntAr
     return flags
 
 
-_Fit: TypeAlias = (
-    "Callable[[ComplexArray, IntArray], Iterator[tuple[IntArray, Maximum, FloatArray, FloatArray]]]"
-)
+_Found: TypeAlias = "Iterator[tuple[IntArray, Maximum, FloatArray, fisher.Covariance]]"
+_Fit: TypeAlias = "Callable[[ComplexArray, IntArray], _Found]"
 
 
-def _in_blocks(
-    fit: _Fit, matrix: ComplexArray, rows: IntArray
-) -> Iterator[tuple[IntArray, Maximum, FloatArray, FloatArray]]:
+def _in_blocks(fit: _Fit, matrix: ComplexArray, rows: IntArray, n_values: int) -> _Found:
     """Yield the fits at some frequencies, a few at a time: several times their matrices exist."""
-    for block in blocks(len(rows), matrix.shape[1]):
+    for block in blocks(len(rows), n_values):
         here = rows[block]
         for some, maximum, error, covariance in fit(matrix[here], here):
             yield here[some], maximum, error, covariance
@@ -363,16 +409,17 @@ def _usual(
     _: IntArray,
     *,
     q: int,
+    dims: tuple[int, ...] | None,
     n_effective: float,
     correct: bool,
     maxima: Maxima,
-) -> Iterator[tuple[IntArray, Maximum, FloatArray, FloatArray]]:
+) -> _Found:
     """Fit q factors or, with `correct`, those that the averages resolve.
 
     Yields frequencies, their fit, the standard error of psi, which includes the effect of excluded
     factors, and `fisher.spread`.
     """
-    maximum = maxima.maximise(matrix, q)
+    maximum = maxima.maximise(matrix, q, dims=dims)
     if not correct:
         covariance = fisher.spread(maximum)
         error = standard_error(maximum, covariance, n_effective=n_effective)
@@ -395,7 +442,7 @@ def _expecting(
     kind: IntArray,
     n_effective: float,
     spread: float,
-) -> Iterator[tuple[IntArray, Maximum, FloatArray, FloatArray]]:
+) -> _Found:
     """Fit more factors than usual; the standard error allows for some additional factors.
 
     Factors at the limit of detection are easily missed. Their motion is then attributed to the
@@ -436,7 +483,7 @@ def _without_dead_and_copies(given: Coherency) -> tuple[ComplexArray, BoolArray]
 
 
 def small_sample_correction(
-    maximum: Maximum, covariance: FloatArray, *, n_effective: float
+    maximum: Maximum, covariance: fisher.Covariance, *, n_effective: float
 ) -> FloatArray:
     """Return the factors that correct the bias of psi, shape (n_freqs, n_channels)."""
     lost = maximum.n_factors / n_effective
@@ -445,13 +492,14 @@ def small_sample_correction(
 
 
 def standard_error(
-    maximum: Maximum, covariance: FloatArray | None = None, *, n_effective: float
+    maximum: Maximum, covariance: fisher.Covariance | None = None, *, n_effective: float
 ) -> FloatArray:
     """Return the standard error of psi, unit**2/Hz, shape (n_freqs, n_channels), by `fisher`."""
     if covariance is None:
         variance = np.empty_like(maximum.psi)
-        for some in blocks(*maximum.psi.shape):
-            variance[some] = np.einsum("fii->fi", fisher.spread(maximum.take(some)))
+        for some in blocks(*maximum.root.shape):
+            part = maximum.take(some)
+            variance[some] = fisher.variance(part, fisher.spread(part))
     else:
-        variance = np.einsum("fii->fi", covariance)
+        variance = fisher.variance(maximum, covariance)
     return np.asarray(maximum.psi * np.sqrt(variance / (n_effective - maximum.n_factors)))

@@ -23,6 +23,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimator.levels.noise_matrices import coupling_beside
+from estimator.levels.noise_matrices import pairs as elements
 from estimator.likelihood import fisher
 
 if TYPE_CHECKING:
@@ -203,27 +205,41 @@ def pair_scores(
     )
 
 
-def shift(maximum: Maximum, rows: IntArray, scores: Scores, amounts: FloatArray) -> FloatArray:
+def shift(
+    maximum: Maximum,
+    rows: IntArray,
+    scores: Scores,
+    amounts: FloatArray,
+    *,
+    dims: tuple[int, ...],
+) -> FloatArray:
     """Return the bias of the maximum likelihood ln psi by shared noise, to first order.
 
     Parameters
     ----------
     maximum : Maximum
+        With independent noise.
     rows : int64, shape (n,)
         Frequencies.
     scores : Scores
     amounts : float64, shape (n_pairs,)
         Coherency of the noise of every pair.
+    dims : tuple of int
+        Channels of each sensor, whose noise is a matrix in the estimate.
 
     Returns
     -------
     float64, shape (n, n_channels)
     """
+    noise = np.zeros(maximum.rest.shape[1:])
     i, j = scores.pairs.T
-    projector = maximum.take(rows).projector
-    with_noise = 2 * (projector[:, :, i].conj() * projector[:, :, j]).real
-    left = fisher.covariance(np.abs(projector) ** 2)
-    return np.asarray(np.einsum("fkl,fla,a->fk", left, with_noise, amounts))
+    noise[i, j] = noise[j, i] = amounts
+    sensor = np.repeat(np.arange(len(dims)), dims)
+    a, b = elements(sensor)
+    at = maximum.take(rows)
+    seen = (at.projector @ noise @ at.projector)[:, a, b]
+    inverse = fisher.covariance(coupling_beside(at.eigenvectors, sensor))
+    return np.asarray((inverse[:, a == b] @ seen[:, :, None])[:, :, 0].real)
 
 
 def _power(projector: ComplexArray, left: FloatArray, i: IntArray, j: IntArray) -> FloatArray:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from estimator.errors import InsufficientDataError, InvalidMatrixError
-from estimator.levels.noise_matrices import discrepancy
 from estimator.likelihood.dimension import bands, choose_dimension
-from estimator.likelihood.goodness_of_fit import likelihood_ratio
+from estimator.likelihood.factor_analysis import maximise
+from estimator.likelihood.goodness_of_fit import model_test
 from estimator.likelihood.maximum_likelihood import maximum_likelihood
 from estimator.likelihood.prior import expected_noise
 from estimator.self_noise.three_sensor import three_sensor
@@ -186,7 +186,8 @@ def test_a_missing_dimension_is_excluded_and_improves_precision() -> None:
     usual = maximum_likelihood(averages, dims=THREE, n_effective=1080)
     scatter = chosen.noise_psd.std(axis=0).mean()
     assert scatter < 0.8 * usual.noise_psd.std(axis=0).mean()
-    assert scatter == pytest.approx(choice.cov, rel=0.1)
+    # of noise that is known to be independent; matrices of the sensors cost a tenth
+    assert scatter == pytest.approx(choice.cov, rel=0.15)
     assert chosen.noise_psd.mean() == pytest.approx(1, abs=0.005)
 
 
@@ -311,13 +312,7 @@ def test_the_ratio_with_a_matrix_for_each_sensor_is_chi_squared(snr: float) -> N
     rng, draws = np.random.default_rng(3), 60
     n = 189 if snr >= 1 else 20000  # it is conservative where motion is not resolved
     sample = wishart(_sharing(snr, 4, rng), n, rng, n_draws=draws)
-    test = likelihood_ratio(
-        discrepancy(sample, 3, np.repeat(np.arange(4), 3)),
-        np.full(draws, 36.0),
-        n_channels=12,
-        n_factors=3,
-        n_effective=n,
-    )
+    test = model_test(maximise(sample, 3, dims=(3,) * 4), n_effective=n)
     assert test.degrees[0] == 12**2 - 4 * 9 - (2 * 12 * 3 - 9)
     error = np.sqrt(2 * 45 / draws)
     assert test.statistic.mean() == pytest.approx(45, abs=4 * error)
