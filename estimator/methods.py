@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -11,7 +10,7 @@ import numpy as np
 from estimator.errors import EstimatorError, UnknownMethodError
 from estimator.levels.interval import unpredicted
 from estimator.levels.noise_matrices import together
-from estimator.levels.pooled import pooled_noise
+from estimator.levels.pooled import EQUATIONS, most_pooled, pooled_noise
 from estimator.likelihood.maximum_likelihood import maximum_likelihood
 from estimator.self_noise.coherency import coherency
 from estimator.self_noise.result import Flag, SelfNoise
@@ -29,12 +28,6 @@ __all__ = ["METHODS", "Flag", "Method", "SelfNoise", "self_noise"]
 
 SMOOTH = 400.0
 """Averages on which the course of the noise in a block rests."""
-
-EQUATIONS = 2
-"""Equations of like channels over their number, from which pooled directions of further dimensions
-give every noise: with six sensors of one channel and three dimensions the tails are heavy."""
-
-DIMENSIONS_OF_MOTION = 3
 
 Method: TypeAlias = "Callable[..., SelfNoise]"
 """``method(csm, *, dims, n_effective, correct, **options)``."""
@@ -152,13 +145,6 @@ def _shared(dims: tuple[int, ...]) -> int:
     return sorted(dims)[-3] if len(dims) > 2 else 0
 
 
-def _most_pooled(dims: tuple[int, ...]) -> int:
-    """Return how many dimensions sensors of one or two channels divide from their noise."""
-    n, d = len(dims), max(dims)
-    alike = n - math.ceil(math.sqrt(2 * EQUATIONS * n))  # of 8 sensors, a fourth takes noise
-    return d * alike if d < DIMENSIONS_OF_MOTION else 0
-
-
 def _scale(psd: FloatArray, rest: FloatArray, block: IntArray, n_effective: float) -> FloatArray:
     """Return the unit of every channel at every bin, shape (n_bins, n_channels).
 
@@ -240,7 +226,7 @@ def _with_neighbours(
         matrix,
         number,
         n_dims[rows],
-        most=_most_pooled(live) if further.any() else 0,
+        most=most_pooled(live) if further.any() else 0,
         dims=live,
         n_effective=n_effective,
         correlation=correlation,

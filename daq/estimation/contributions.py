@@ -46,6 +46,8 @@ MUCH_LEAKS = 0.5
 MUCH_NONLINEAR = 0.05
 """Share of the noise from which squares and cubes of the motion delay a result, and from which
 terms of other forms may be all of the rest."""
+NO_NOISE = 0.1
+"""Share of the frequencies of a band with no noise, from which a channel has none for certain."""
 _THREE = 3  # sensors
 UNCERTAIN = 0.3
 """Share of what squares and cubes explain by which it is uncertain."""
@@ -85,9 +87,10 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
         most = snapshot.rounding * np.nan_to_num(snapshot.data_psd)
         found.append(contribution(Source.ROUNDING, shape, below=most, above=most))
     below = psd * _left_out(snapshot, method)[:, None]
-    if dimensions.any() or below.any():
+    above = _in_a_dimension(snapshot, method)
+    if dimensions.any() or below.any() or above.any():
         share = dimensions[:, None]
-        found.append(contribution(Source.DIMENSIONS, shape, below=below, share=share))
+        found.append(contribution(Source.DIMENSIONS, shape, below=below, above=above, share=share))
     taken = psd * _taken_for_motion(snapshot, method)
     for source, share in _misfits(snapshot, explained).items():
         above = taken if source is Source.SHARED_NOISE else 0.0
@@ -288,6 +291,20 @@ def _dimensions(snapshot: Snapshot, method: str) -> tuple[FloatArray, BoolArray]
             edge = 2 * math.sqrt(n_channels / averages) / (n_channels - choice.n_factors)
             share[inside] = np.where(pooled[inside], edge, NORMAL_95 * error)
     return share, explained
+
+
+def _in_a_dimension(snapshot: Snapshot, method: str) -> FloatArray:
+    """Return infinity where further dimensions leave a channel no noise: one may be its noise.
+
+    Shape (n_freqs, n_channels). The bound without a model then is all that is known.
+    """
+    flags, frequency = snapshot.results[method].flags, snapshot.frequency
+    above, none = np.zeros(flags.shape), (flags & (Flag.NEGATIVE | Flag.BOUNDARY)) != 0
+    for choice in snapshot.diagnostics.dimensions if method == "maximum-likelihood" else ():
+        if choice.n_factors > choice.usual:
+            inside = (frequency >= choice.low) & (frequency <= choice.high)
+            above[np.ix_(inside, none[inside].mean(axis=0) > NO_NOISE)] = math.inf
+    return above
 
 
 def _left_out(snapshot: Snapshot, method: str) -> FloatArray:

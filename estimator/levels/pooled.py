@@ -27,6 +27,7 @@ mean of its bins; so are its cumulants with powers of the weights (`estimator.le
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
@@ -51,6 +52,10 @@ if TYPE_CHECKING:
 
 _Array = TypeVar("_Array", "FloatArray", "ComplexArray")
 
+EQUATIONS = 2
+"""Equations of like channels over their number, from which pooled directions of further dimensions
+give every noise: with six sensors of one channel and three dimensions the tails are heavy."""
+DIMENSIONS_OF_MOTION = 3
 LEAST_BINS = 24
 """Bins of a block at least."""
 ENOUGH = 45.0
@@ -154,6 +159,13 @@ class _Fit:
     resolved: IntArray
     whitener: ComplexArray
     level: FloatArray
+
+
+def most_pooled(dims: tuple[int, ...]) -> int:
+    """Return how many dimensions sensors of one or two channels divide from their noise."""
+    n, d = len(dims), max(dims)
+    alike = n - math.ceil(math.sqrt(2 * EQUATIONS * n))  # of 8 sensors, a fourth takes noise
+    return d * alike if d < DIMENSIONS_OF_MOTION else 0
 
 
 def blocks_of(frequency: FloatArray, *, per_octave: int = 3, least: int = LEAST_BINS) -> IntArray:

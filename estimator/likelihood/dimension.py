@@ -14,7 +14,7 @@ import numpy as np
 
 from estimator.errors import InsufficientDataError, InvalidMatrixError
 from estimator.levels.noise_matrices import together
-from estimator.levels.pooled import blocks_of
+from estimator.levels.pooled import DIMENSIONS_OF_MOTION, blocks_of, most_pooled
 from estimator.likelihood.factor_analysis import Maxima, max_factors, maximise, n_noise
 from estimator.likelihood.goodness_of_fit import (
     HANN_HALF,
@@ -319,11 +319,7 @@ def choose_dimension(
         some = [b for b in open_bands if b not in hopeless]
         if not some and q != usual:
             continue
-        fit = search.fit(q, some if q != usual else list(tried))
-        for b in some:
-            distant = r[stride[b] - 1 :: stride[b]]
-            tried[b].append(pool(fit.test, fit.number == b, neighbours=distant))
-            cov[b, q] = fit.median_cov(b)
+        fit = search.try_in(q, some, tried, cov, r)
         open_bands = [b for b in open_bands if not tried[b][-1].p_value > level]
         if q == usual:
             cov |= {(b, q): fit.median_cov(b) for b in tried}
@@ -342,7 +338,7 @@ def choose_dimension(
         usual=usual,
         level=level,
     )
-    open_bands += _rejected_together([b for b in tried if b not in open_bands], tried, most, usual)
+    open_bands += search.together(tried, open_bands, cov, most=most, neighbours=r)
     shared = sharers.found(tried, open_bands) if len(there.sensors) >= SHARING else {}
     for b, sharing in shared.items():
         tried[b][sharing.n_factors :] = [sharing.test]
@@ -367,20 +363,14 @@ def choose_dimension(
     return np.array([chosen[int(b)] for b in number]), choices
 
 
-def _rejected_together(
-    some: list[int], tried: dict[int, list[BandTest]], most: int, usual: int
-) -> list[int]:
-    """Return the bands of further dimensions, where their tests fail together and none can be more.
+def _are_rejected(tests: list[BandTest]) -> bool:
+    """Whether the tests of bands fail together.
 
     What a band alone hardly shows, such as weak gradients, biases the noise of all.
     """
-    further = [b for b in some if len(tried[b]) - 1 > usual]
-    if all(len(tried[b]) - 1 < most for b in further):
-        return []
-    tests = [tried[b][-1] for b in further]
     statistic = sum(test.statistic / test.spread for test in tests)
     degrees = sum(test.degrees / test.spread for test in tests)
-    return further if upper_tail(degrees, statistic) < MISFIT_LEVEL else []
+    return bool(tests) and upper_tail(degrees, statistic) < MISFIT_LEVEL
 
 
 def most_testable(dims: tuple[int, ...]) -> int:
@@ -466,6 +456,48 @@ class _Search:
             cov=error / maximum.psi,
             test=model_test(maximum, n_effective=self._n_effective),
         )
+
+    def together(
+        self,
+        tried: dict[int, list[BandTest]],
+        rejected: list[int],
+        cov: dict[tuple[int, int], float],
+        *,
+        most: int,
+        neighbours: FloatArray,
+    ) -> list[int]:
+        """Try one more dimension where tests of bands fail together only.
+
+        What a band alone hardly shows, such as weak gradients, biases the noise of all. Not where
+        neighbouring frequencies give it (`estimator.levels.pooled`). Returns the bands that fail
+        together with as many dimensions as can be tested.
+        """
+        found = [b for b in tried if b not in rejected]
+        few = self._usual < DIMENSIONS_OF_MOTION and len(self._dims) >= MIN_DETERMINED_SENSORS
+        for q in range(max(self._usual, most_pooled(self._dims)), most if few else 0):
+            some = [b for b in found if len(tried[b]) == q + 1]
+            if _are_rejected([tried[b][-1] for b in some]):
+                self.try_in(q + 1, some, tried, cov, neighbours)
+        further = [b for b in found if len(tried[b]) - 1 > self._usual]
+        if all(len(tried[b]) <= most for b in further):
+            return []
+        return further if _are_rejected([tried[b][-1] for b in further]) else []
+
+    def try_in(
+        self,
+        q: int,
+        some: list[int],
+        tried: dict[int, list[BandTest]],
+        cov: dict[tuple[int, int], float],
+        neighbours: FloatArray,
+    ) -> _Fit:
+        """Fit q factors, and add tests and c.o.v. of some bands."""
+        fit = self.fit(q, some if q != self._usual else list(tried))
+        for b in some:
+            distant = neighbours[self._stride[b] - 1 :: self._stride[b]]
+            tried[b].append(pool(fit.test, fit.number == b, neighbours=distant))
+            cov[b, q] = fit.median_cov(b)
+        return fit
 
     def hopeless(
         self, q: int, some: list[int], stride: dict[int, int], neighbours: FloatArray

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
@@ -13,13 +14,19 @@ RATE, SECONDS, RATIO = 100.0, 400.0, 1e3
 UNIT = 2 / RATE
 
 
-def test_gradients_of_the_motion_are_not_in_the_noise_of_sensors_off_plumb() -> None:
-    """Twelve sensors, 1 degree, gradients of 1 %: intervals excluded the noise by up to 34 %."""
-    rng, n = np.random.default_rng([46, 5]), round(SECONDS * RATE)
+@pytest.mark.parametrize(("n_sensors", "seed"), [(12, 5), (6, 2)])
+def test_gradients_of_the_motion_are_not_in_the_noise_of_sensors_off_plumb(
+    n_sensors: int, seed: int
+) -> None:
+    """1 degree, gradients of 1 %: intervals excluded the noise by up to 34 and 23 %.
+
+    Of twelve sensors neighbouring frequencies show them together, of six the tests of all bands.
+    """
+    rng, n = np.random.default_rng([46, seed]), round(SECONDS * RATE)
     motion = np.sqrt(RATIO) * rng.standard_normal((n, 3))
     gradients = 0.01 * np.sqrt(RATIO) * rng.standard_normal((n, 2))
     samples = {}
-    for number in range(12):
+    for number in range(n_sensors):
         axis = np.array([*np.radians(1) / np.sqrt(2) * rng.standard_normal(2), 1.0])
         felt = motion @ axis + gradients @ rng.uniform(-1, 1, 2)
         samples[f"s{number:02}"] = felt + rng.standard_normal(n)
