@@ -12,6 +12,7 @@ from daq.estimation.settings import DIMENSIONS
 from estimator.checks.advice import Rank
 from estimator.checks.advice_on_model import ModelMisfit, TooFewDimensions
 from estimator.checks.advice_on_noise import SharedNoise
+from estimator.checks.advice_on_signals import NoSharedMotion
 from estimator.checks.counts import MARGIN
 from estimator.checks.steadied import MARGIN as WITHIN
 from estimator.levels.contributions import (
@@ -359,6 +360,16 @@ def shared_parts(snapshot: Snapshot) -> FloatArray:
     return parts
 
 
+def two_may_share(snapshot: Snapshot) -> BoolArray:
+    """Return where two of three sensors may share noise, which two being unknown, (n_freqs,)."""
+    frequency, found = snapshot.frequency, np.zeros(len(snapshot.frequency), np.bool_)
+    for advice in snapshot.diagnostics.advice if len(snapshot.dims) == _THREE else ():
+        doubts = isinstance(advice, ModelMisfit | NoSharedMotion)
+        if doubts and advice.band is not None and advice.rank is not Rank.TO_KNOW:
+            found |= (frequency >= advice.band[0]) & (frequency <= advice.band[1])
+    return found
+
+
 def _taken_for_motion(snapshot: Snapshot, method: str) -> FloatArray:
     """Return the shared noise that further dimensions may have taken for motion.
 
@@ -406,6 +417,8 @@ def _misfits(snapshot: Snapshot, explained: BoolArray) -> dict[Source, FloatArra
             source, error = Source.SHARED_NOISE, advice.harm
         elif isinstance(advice, TooFewDimensions):
             here &= ~explained
+            error = math.inf
+        elif isinstance(advice, NoSharedMotion) and len(snapshot.dims) == _THREE:
             error = math.inf
         found[source][here] = np.maximum(found[source][here], error)
     return found

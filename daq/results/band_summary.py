@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.estimation.contributions import contributions, shared_parts
+from daq.estimation.contributions import contributions, shared_parts, two_may_share
 from daq.estimation.noise_estimates import ALL_METHODS
 from estimator.checks.advice_on_signals import NoSharedMotion
 from estimator.levels.bands import band_edges, band_levels, bin_correlation, third_octaves
 from estimator.levels.contributions import Source, by_chance, deviation, widened
-from estimator.levels.interval import NORMAL_95, interval, unpredicted
+from estimator.levels.interval import NORMAL_95, interval, unpredicted, unpredicted_by_one
 from estimator.median import median_of_columns
 from estimator.self_noise.result import Flag
 from estimator.spectra.windows import get_window
@@ -256,6 +256,13 @@ class Spectrum:
             rest, scatter = unpredicted(
                 snapshot.csm[inside], dims=snapshot.dims, n_effective=averages
             )
+            doubtful = np.flatnonzero(two_may_share(snapshot)[inside])
+            if len(doubtful):
+                rest[doubtful], scatter[:, doubtful] = unpredicted_by_one(
+                    snapshot.csm[inside][doubtful],
+                    dims=snapshot.dims,
+                    n_effective=averages[doubtful],
+                )
             self._bound = (inside, rest, scatter)
         return inside.start, rest, scatter
 

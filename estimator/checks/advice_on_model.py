@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, ClassVar
 from estimator.checks.advice import Advice, Names, Rank, model
 from estimator.likelihood.dimension import has_room
 from estimator.records import Hertz, Share, record
-from estimator.wording import Words, percent, ratio, several, span
+from estimator.wording import Words, listed, percent, ratio, several, span
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from typing import Self
+
+_THREE = 3  # sensors
 
 
 EFFECT_OF_FEW_DIMENSIONS = (
@@ -267,10 +269,16 @@ def effect_of_misfit(advice: ModelMisfit, names: Names) -> str:
     else:
         channels = several(max(names.dims), "channel")
         at_most = f"by any amount {apart}, which three sensors of {channels} cannot detect"
+    two_share = ""
+    if len(names.dims) == _THREE:
+        two_share = (
+            f" Or two of {listed(names.sensors)} share noise: three sensors do not tell which two; "
+            "the intervals reach up to all of it."
+        )
     verdict = "is wrong" if advice.is_wrong else "may be wrong"
     return (
         f"Up to {percent(advice.unexplained)} of the noise is unexplained. The estimate {verdict} "
-        f"by up to about {percent(advice.error)} of the noise, and {at_most}."
+        f"by up to about {percent(advice.error)} of the noise, and {at_most}." + two_share
     )
 
 

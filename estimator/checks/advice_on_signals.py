@@ -116,7 +116,12 @@ class NoSharedMotion(Advice):
             f"Sensor {names.list_sensors(self.sensors)} records none of the motion that {partners} "
             f"share at {self.where}: at most {percent(self.share)} in common, {partners} "
             f"{percent(self.share_of_partners)} or more. Its noise cannot be separated from motion"
-            + (f", and {partners} have no third sensor." if few else "."),
+            + (
+                f", and {partners} have no third sensor. Or {partners} share noise: the intervals "
+                "reach up to all of it."
+                if few
+                else "."
+            ),
             "Check its input and its place: it must stand beside the others on the same floor.",
         )
 

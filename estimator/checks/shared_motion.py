@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 MIN_SHARED = 0.3
 """Share of common motion from which two sensors agree."""
+MIN_OF_ONE = 0.2
+"""The same where a third sensor shares none: one of three dimensions has a third of them."""
 NONE = 0.1
 """Share of common motion, relative to that of the other sensors, below which a sensor has none."""
 ERRORS = 3.0
@@ -217,14 +219,14 @@ def outsiders(
         Number of frequencies of the band.
     """
     n_sensors = len(share)
-    agree = share >= MIN_SHARED
+    agree = share >= MIN_OF_ONE
     groups = [tuple(np.flatnonzero(row).tolist()) for row in agree | np.eye(n_sensors, dtype=bool)]
     group = max(groups, key=len, default=())
     if len(group) < 2 or 2 * len(group) <= n_sensors:  # no majority
         return
     least = min(share[j, k] for j, k in combinations(group, 2))
     error = ERRORS / (n_effective * np.sqrt(n_frequencies))
-    if least < MIN_SHARED:
+    if least < MIN_OF_ONE:
         return
     for i in range(n_sensors):
         if i not in group and max(share[i, j] for j in group) < NONE * least + error:

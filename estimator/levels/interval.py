@@ -33,6 +33,7 @@ sensors share is predicted too: for their channels it is no bound.
 
 from __future__ import annotations
 
+from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -249,6 +250,27 @@ def unpredicted(
         some = slice(low, low + step)
         level[some], averages[some] = _unpredicted(csm[some], psd[some], dims, n_effective[some])
     return level, np.stack([level**k / averages ** (k - 1) for k in (2, 3, 4)])
+
+
+def unpredicted_by_one(
+    csm: ComplexArray, *, dims: tuple[int, ...], n_effective: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return `unpredicted` by one other sensor, that which predicts least.
+
+    It bounds the noise also where two sensors share noise, whichever they are.
+    """
+    own = np.split(np.arange(sum(dims)), np.cumsum(dims)[:-1])
+    level = np.zeros(csm.shape[:2])
+    scatter = np.zeros((3, *level.shape))
+    for i, j in combinations(range(len(dims)), 2):
+        at = np.concatenate([own[i], own[j]])
+        its, its_scatter = unpredicted(
+            csm[:, at[:, None], at], dims=(dims[i], dims[j]), n_effective=n_effective
+        )
+        less = its <= level[:, at]
+        level[:, at] = np.where(less, level[:, at], its)
+        scatter[:, :, at] = np.where(less, scatter[:, :, at], its_scatter)
+    return level, scatter
 
 
 def _unpredicted(

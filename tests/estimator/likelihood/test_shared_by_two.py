@@ -55,6 +55,20 @@ def test_noise_of_two_sensors_is_left_in_both_and_in_their_intervals(
             assert noise.low[0] < 0.5 * true  # it may be a motion that only they feel
 
 
+@pytest.mark.parametrize(("ratio", "said"), [(0.1, "A and B share"), (10.0, "two of A, B and C")])
+def test_noise_of_two_of_three_sensors_is_in_the_intervals_of_all(ratio: float, said: str) -> None:
+    """Three quarters of these intervals excluded the noise: the others predict what they share."""
+    settings = Settings(segment=2.0)
+    samples = recorded(3, 3, ratio, np.random.default_rng([46, 3]))
+    result = Result(estimate([recording_of_arrays(samples, RATE)], settings), settings)
+    assert said in " ".join(str(each.words) for each in result.facts)
+    truth = UNIT * (1 + np.square([*AMPLITUDES, np.zeros(3)])).ravel()
+    for band in ((2.0, 10.0), (10.0, 30.0)):
+        means = result.means(result.method, band)
+        for noise, true in zip(means, truth, strict=True):
+            assert noise.low[0] <= true <= noise.high[0]
+
+
 @pytest.mark.parametrize(("n_sensors", "d"), [(4, 3), (6, 1), (8, 3)])
 def test_motion_of_all_sensors_is_no_noise_of_two(n_sensors: int, d: int) -> None:
     settings = Settings(segment=2.0)

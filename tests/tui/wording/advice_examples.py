@@ -239,7 +239,7 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
         (
             "Sensor a records none of the motion that b and c share at 2–8 Hz",
             "at most 1.2 % in common, b and c 98 % or more",
-            "and b and c have no third sensor",
+            "and b and c have no third sensor. Or b and c share noise: the intervals",
             "Check its input and its place",
         ),
     ),
@@ -284,6 +284,7 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
             "The model test fails at 2–8 Hz: one common motion does not explain",
             "(test statistic 2.5 times its expectation, 4 at 4–5 Hz). Up to 6 % of the noise",
             "The estimate is wrong by up to about 60 % of the noise, and by up to 600 % where",
+            "Or two of a, b and c share noise: three sensors do not tell which two; the intervals",
             "Put the sensors closer together",
         ),
     ),
