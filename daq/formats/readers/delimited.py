@@ -78,6 +78,7 @@ _UNIT = re.compile(
 )
 _EXAMPLE = ("time [s]", "X [m/s²]", "Y [m/s²]", "Z [m/s²]")
 LEFT_OUT = "-"
+LABVIEW = "LabVIEW Measurement"
 WHITESPACE = " "
 
 
@@ -104,6 +105,8 @@ class Dialect:
         Of LabVIEW: date and time from which its times count, and seconds between samples.
     is_given : bool
         Whether a person named the columns.
+    has_comments : bool
+        Whether the last column is LabVIEW's of comments, whose cell many rows lack.
     """
 
     delimiter: str
@@ -117,10 +120,12 @@ class Dialect:
     start: str = ""
     interval: str = ""
     is_given: bool = False
+    has_comments: bool = False
 
     def cells(self, lines: Iterable[str]) -> Iterator[list[str]]:
         """Yield the cells of each line."""
-        return split(lines, self.delimiter, quoted=self.quoted)
+        rows = split(lines, self.delimiter, quoted=self.quoted)
+        return (_with_comment(row, len(self.names)) for row in rows) if self.has_comments else rows
 
 
 def open_text(path: Path) -> TextIO:
@@ -187,6 +192,10 @@ def find_dialect(path: Path, columns: str = "") -> Dialect:
         )
     comma = delimiter != "," or quoted
     first = _first_data_row(cells, decimal_comma=comma)
+    title = None if columns else _row_with_comment(cells)
+    if title is not None:  # a first row of samples may have one
+        cells = {number: _with_comment(row, len(cells[title])) for number, row in cells.items()}
+        first = next((number for number in cells if number > title), None)
     before = [row for number, row in cells.items() if first is None or number < first]
     labview = _labview(before)
     if columns and first is not None:
@@ -207,7 +216,11 @@ def find_dialect(path: Path, columns: str = "") -> Dialect:
             f"{path}: expected rows of {len(names)} cells as in its header, found none"
         )
     samples = [row for number, row in cells.items() if number >= first]
-    used = [k for k in range(len(names)) if any(k < len(row) and row[k] for row in samples)]
+    used = [
+        k
+        for k in range(len(names) - (title is not None))
+        if any(k < len(row) and row[k] for row in samples)
+    ]
     return Dialect(
         delimiter=delimiter,
         decimal_comma=comma and any(_DECIMAL_COMMA.match(c) for row in samples for c in row),
@@ -220,6 +233,7 @@ def find_dialect(path: Path, columns: str = "") -> Dialect:
         start=" ".join(labview[key][0] for key in ("Date", "Time") if labview.get(key)),
         interval=next(iter(labview.get("Delta_X", [])), ""),
         is_given=bool(columns),
+        has_comments=title is not None,
     )
 
 
@@ -231,9 +245,20 @@ def columns_example(n: int) -> str:
 
 def _labview(before: Sequence[Sequence[str]]) -> dict[str, Sequence[str]]:
     """Return the header of a LabVIEW measurement file: values by key, a cell a channel."""
-    if not before or before[0][0] != "LabVIEW Measurement":
+    if not before or before[0][0] != LABVIEW:
         return {}
     return {row[0]: row[1:] for row in before}
+
+
+def _row_with_comment(cells: dict[int, list[str]]) -> int | None:
+    """Return the number of the row in which LabVIEW names its channels and a column of comments."""
+    if next(iter(cells.values()), [""])[0] == LABVIEW:
+        return next((number for number, row in cells.items() if row[-1] == "Comment"), None)
+    return None
+
+
+def _with_comment(row: list[str], width: int) -> list[str]:
+    return [*row, ""] if len(row) == width - 1 else row
 
 
 def _names_and_units(titles: Iterable[str]) -> tuple[list[str], list[str]]:

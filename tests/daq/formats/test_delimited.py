@@ -67,6 +67,9 @@ LABVIEW_TIMELESS = LABVIEW_DATED.replace("X_Columns\tOne", "X_Columns\tNo").repl
 )
 for _time in ("0.010000", "0.020000"):
     LABVIEW_TIMELESS = LABVIEW_TIMELESS.replace(f"\n{_time}\t", "\n\t")
+LABVIEW_COMMENTED = LABVIEW_DATED.replace("1.25\t\n", "1.25\tstart\n")
+for _cell in ("2.0", "2.5"):  # rows without a comment lack its cell
+    LABVIEW_COMMENTED = LABVIEW_COMMENTED.replace(f"{_cell}\t\n", f"{_cell}\n")
 PREAMBLE = """Device,ADXL355
 Serial,12345
 Sample Rate (Hz),100
@@ -120,6 +123,7 @@ BLANKS = """# a recorder of our own
         (LABVIEW, "counts", 0),
         (LABVIEW_DATED, "m/s^2", NOON),
         (LABVIEW_TIMELESS, "m/s^2", NOON),
+        (LABVIEW_COMMENTED, "m/s^2", NOON),
         (PREAMBLE, "g", 0),
         (GEOCSV, "m/s**2", NOON),
         (CAMPBELL, "mV", NOON),
@@ -128,8 +132,8 @@ BLANKS = """# a recorder of our own
         (BLANKS, "counts", NOON),
     ],
     ids=[
-        *("german", "labview", "labview dated", "labview timeless", "preamble", "geocsv"),
-        *("campbell", "american", "quoted", "blanks"),
+        *("german", "labview", "labview dated", "labview timeless", "labview commented"),
+        *("preamble", "geocsv", "campbell", "american", "quoted", "blanks"),
     ],
 )
 def test_dialects_give_the_same_samples(tmp_path: Path, text: str, unit: str, date: int) -> None:
