@@ -252,7 +252,7 @@ class Stability:
             runs=Scatter.joined(runs) if len(runs) == len(found) else None,
             inflations=np.concatenate([each.inflations for each in found]),
             changes=tuple(clearest.values()),
-            added=np.max([each.added for each in found], axis=0) * is_added,
+            added=np.max([each.added for each in found], axis=0) * float(is_added),
             explained=np.concatenate([each.explained for each in found]),
             within=np.concatenate([each.within for each in found]),
             steadied=tuple(
@@ -345,7 +345,7 @@ def stability(
         None with too few parts or frequencies.
     """
     good, places = usable(maximum, n_effective), np.flatnonzero(parts.bins < len(frequency))
-    doubtful = good[parts.bins[places]].sum() < FREQUENCIES
+    doubtful = bool(good[parts.bins[places]].sum() < FREQUENCIES)
     if doubtful:  # the noise of a sensor may seem to be zero where all others change
         good = maximum.converged & ~maximum.singular
         good &= maximum.eigenvalues[:, maximum.n_factors - 1] > STRONG
