@@ -8,8 +8,8 @@ host that is only busy makes up: its blocks arrive late, then on time again.
 
 So when blocks are suddenly late against the earliest before (:mod:`daq.protocols.pace`), they are
 held back until arrivals settle. If they are on time again, nothing is missing. If they remain late,
-the stored rows come first, and samples are missing behind them. The number is an estimate. The
-stored rows begin an epoch of their own, for the place of the loss is known to a block only.
+the stored rows come first, and samples are missing behind them. Number and place are estimates. The
+stored rows begin an epoch of their own.
 
 A rate that is a little off makes no sudden step. An early block makes none either: see
 :class:`daq.clocks.arrival_times.HostSleep`.
@@ -99,12 +99,23 @@ class LateBlocks:
         return abs(before - after) < max(2 * self._pace.scatter, MIN_LATE / 4 * self._speed)
 
     def _with_gap(self) -> list[Block]:
-        """Return the blocks that are held back, with a gap behind the stored ones."""
-        lateness = [late for _, late in self._held]
+        """Return the blocks that are held back, with a gap behind the stored rows.
+
+        The last block with stored rows also has those that were sent since the host reads again.
+        """
+        held, lateness = self._held, [late for _, late in self._held]
         least = min(lateness[len(lateness) // 2 :])
         near = least + MIN_LATE / 2 * self._speed
-        n_stored = next(n for n, late in enumerate(lateness) if late <= near) + 1
-        return self._released(n_stored, round(least * self._rate))
+        last = next(n for n, late in enumerate(lateness) if late <= near)
+        block, late = held[last]
+        since_ns = block.received.monotonic_ns - held[0][0].received.monotonic_ns
+        n = max(0, block.n_samples - round(since_ns * 1e-9 * self._rate))
+        parts = [
+            replace(block, counts=block.counts[:n]),
+            replace(block, first_sample=block.first_sample + n, counts=block.counts[n:]),
+        ]
+        held[last : last + 1] = [(part, late) for part in parts if part.n_samples]
+        return self._released(last + (n > 0), round(least * self._rate))
 
     def _released(self, n_stored: int, missing: int) -> list[Block]:
         """Return the blocks that are held back; ``missing`` samples lack behind ``n_stored``."""

@@ -89,6 +89,22 @@ def test_what_a_stopped_host_loses_is_a_gap_of_estimated_length(
     assert np.array_equal(index[before], true[before])
 
 
+def test_rows_that_come_with_the_last_stored_ones_are_behind_the_gap(tmp_path: Path) -> None:
+    logger = TextLogger(seconds=60.0)
+    reads = logger.stopped(20.0, 30.0, 4096)
+    begin = next(n for n, (_, now) in enumerate(reads) if now >= 30)
+    stored, new = reads[begin], reads[begin + 1 : begin + 11]
+    end = stored[0].index(b"\n", 2000) + 1
+    together = stored[0][end:] + b"".join(data for data, _ in new), new[-1][1]
+    reads[begin : begin + 11] = [(stored[0][:end], stored[1]), together]
+    true, index, gaps, _ = recorded(tmp_path / "r.h5", logger, reads)
+    n_lost = len(logger.samples) - sum(data.count(b"\n") for data, _ in reads)
+    ((missing, is_estimated),) = gaps
+    assert is_estimated
+    assert abs(missing - n_lost) <= 4
+    assert np.count_nonzero(np.abs(index - true)[true >= 0] > 4) <= 8
+
+
 @pytest.mark.parametrize(("stop", "speed"), [(10.0, 1.3), (2.0, 20.0)])
 def test_stored_rows_that_a_server_drains_are_no_gap(
     tmp_path: Path, stop: float, speed: float

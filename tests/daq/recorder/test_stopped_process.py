@@ -112,6 +112,6 @@ def test_a_stopped_recorder_keeps_every_row_that_arrived(
     lost = int(numbers[-1] - numbers[0] + 1 - len(numbers))
     assert gaps["estimated"].all()
     assert len(gaps) == len(overflows) == (lost > 0)
-    assert (stop < 10) == (lost == 0)
+    assert (lost > 0) == (stop > 10)
     off = (index - index[0]) - (numbers - numbers[0])
-    assert np.abs(off).max() <= 0.3 * RATE * (lost > 0)
+    assert np.count_nonzero(np.abs(off) > 0.3 * RATE) <= RATE * (lost > 0)  # near the gap
