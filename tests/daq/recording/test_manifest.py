@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import re
+import runpy
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
@@ -20,7 +20,7 @@ from tests.torture.damaged_files import make_recording
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-FORMAT = Path(__file__).parents[3] / "docs/recording-format.md"
+PROGRAM = Path(__file__).parents[3] / "docs" / "manifest_root.py"
 
 
 @pytest.fixture
@@ -32,11 +32,7 @@ def closed(tmp_path: Path) -> Path:
 
 def documented_root(path: Path) -> str:
     """Run the program that the documentation gives; it imports nothing of huddle."""
-    program = re.search(r"```python\n(import hashlib.*?)```", FORMAT.read_text(), re.DOTALL)
-    assert program is not None
-    names: dict[str, Any] = {}
-    exec(program[1], names)  # noqa: S102 - a program of our documentation
-    return str(names["root"](path))
+    return str(runpy.run_path(str(PROGRAM))["root"](path))
 
 
 def rename_a_unit(file: h5py.File) -> None:
