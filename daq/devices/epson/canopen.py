@@ -66,16 +66,6 @@ _SAMPLE = np.dtype(
 Message = tuple[int, bytes]
 """COB-ID and content."""
 
-
-def encode_sample(node: int, counts: NDArray[np.int32], counter: int) -> list[Message]:
-    """Return both messages of a sample; the simulator sends them."""
-    ax, ay, az = (int(count).to_bytes(4, "little", signed=True) for count in counts)
-    return [
-        (TPDO_COB_IDS[0] + node, ax + ay),
-        (TPDO_COB_IDS[1] + node, az + (counter % COUNTER_MODULUS).to_bytes(2, "little")),
-    ]
-
-
 TPDO_COB_IDS = (0x180, 0x280)
 """Of TPDO1 and TPDO2 of node 0."""
 

@@ -451,23 +451,9 @@ async def _listen(link: _Link) -> None:
 def _information(
     planned: _Planned, sensors: Sequence[Sensor], link: _Link
 ) -> tuple[DeviceInformation, ...]:
-    found, decoder, server, label = [], link.decoder, link.server, link.label
+    found, decoder, server = [], link.decoder, link.server
     for sensor in sensors:
-        if trouble := link.refused.get(sensor.name):
-            found.append(DeviceInformation(sensor=sensor.name, trouble=trouble))
-            continue
-        if why := decoder.refused.get(sensor.name):
-            unusable = f"{label}: {sensor.name!r}: {why}"
-            found.append(DeviceInformation(sensor=sensor.name, trouble=unusable))
-            continue
-        if sensor.name in decoder.silent:
-            there = ", ".join(decoder.heard(sensor.name)) or "none"
-            settings = planned.settings[sensor.name]
-            trouble = (
-                f"{label}: the {len(sensor.channels)} streams of {sensor.name!r} not received in"
-                f" {settings.patience:g} s; of {settings.network}.{settings.station} that match:"
-                f" {there}"
-            )
+        if trouble := _trouble(planned, sensor, link):
             found.append(DeviceInformation(sensor=sensor.name, trouble=trouble))
             continue
         details = {
@@ -488,6 +474,20 @@ def _information(
         error = WrongDeviceError if decoder.refused else NoAnswerError
         raise error(found[0].trouble)
     return tuple(found)
+
+
+def _trouble(planned: _Planned, sensor: Sensor, link: _Link) -> str:
+    """Return why a sensor is not read; empty if it is."""
+    decoder, name = link.decoder, sensor.name
+    if name not in decoder.silent or name in link.refused:
+        return link.refused.get(name, "")
+    if why := decoder.refused.get(name):
+        return f"{link.label}: {name!r}: {why}"
+    settings, there = planned.settings[name], ", ".join(decoder.heard(name)) or "none"
+    return (
+        f"{link.label}: the {len(sensor.channels)} streams of {name!r} not received in"
+        f" {settings.patience:g} s; of {settings.network}.{settings.station} that match: {there}"
+    )
 
 
 DRIVER = SeedLinkDriver()

@@ -1,8 +1,7 @@
 """M-A552 accelerometers on a CAN bus, simulated by canopen's own nodes, on any python-can bus.
 
 This simulator runs in a thread of whoever needs it. The device that is told to produces SYNC; at
-each SYNC every operational device sends its next sample. The codec of samples is the driver's; the
-rest is canopen's.
+each SYNC every operational device sends its next sample. The rest is canopen's.
 """
 
 from __future__ import annotations
@@ -36,6 +35,13 @@ UNSIGNED, VISIBLE_STRING = {1: 0x5, 2: 0x6, 4: 0x7}, 0x9
 """Data types of CiA 301, numbers by their bytes."""
 IDLE = 0.005
 """Interval at which the bus looks whether it is to start, in s."""
+
+
+def encode_sample(node: int, counts: NDArray[np.int32], counter: int) -> list[protocol.Message]:
+    """Return both messages of a sample."""
+    ax, ay, az = (int(count).to_bytes(4, "little", signed=True) for count in counts)
+    last = az + (counter % protocol.COUNTER_MODULUS).to_bytes(2, "little")
+    return list(zip((0x180 + node, 0x280 + node), (ax + ay, last), strict=True))
 
 
 BUS_CELSIUS = 26.5
@@ -146,7 +152,7 @@ class SimulatedBus:
                 continue
             counter = self._value(node, protocol.SAMPLE_COUNTER)
             counts = self._samples[node_id](number)
-            messages = protocol.encode_sample(node_id, np.asarray(counts, np.int32), counter)
+            messages = encode_sample(node_id, np.asarray(counts, np.int32), counter)
             for k, (cob_id, data) in enumerate(messages):
                 is_on = not self._value(node, (protocol.TPDO1, protocol.TPDO2)[k], 1) >> 31
                 if is_on and (node_id, k, number) not in self.lost:

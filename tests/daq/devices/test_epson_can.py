@@ -25,7 +25,7 @@ from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.host_clock import SystemClock
 from daq.protocols import block
 from daq.protocols.block import Block, BlockFlag, HostTime, Quantity, Reading
-from tests.daq.devices.simulated_can_bus import BUS_CELSIUS, SimulatedBus
+from tests.daq.devices.simulated_can_bus import BUS_CELSIUS, SimulatedBus, encode_sample
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -107,7 +107,7 @@ def test_networks_that_are_can_buses_are_listed(tmp_path: Path) -> None:
 
 def test_messages_of_the_data_sheet() -> None:
     """TPDO1: Ax, Ay; TPDO2: Az, sample counter; little-endian."""
-    made = protocol.encode_sample(3, np.array([1, -2, 0x123456], np.int32), 0xABCD)
+    made = encode_sample(3, np.array([1, -2, 0x123456], np.int32), 0xABCD)
     assert made == [
         (0x183, bytes.fromhex("01000000feffffff")),
         (0x283, bytes.fromhex("56341200cdab")),
@@ -227,7 +227,7 @@ def test_messages_cut_anywhere_are_decoded() -> None:
     for n in range(50):
         line.append((protocol.SYNC, b""))
         for node in (1, 2):
-            line += protocol.encode_sample(node, counts(node, n, 1)[0], n + 65500)
+            line += encode_sample(node, counts(node, n, 1)[0], n + 65500)
     for step in (1, 2, 3, 5, 7, 250):
         decoder = protocol.CanDecoder({"A": 1, "B": 2}, RATE, full_scale_counts=2**24)
         found = [
