@@ -11,13 +11,9 @@ import signal
 import sys
 import time
 import traceback
-from typing import TYPE_CHECKING
 
 import benchmarks
-
-if TYPE_CHECKING:
-    from benchmarks.row import Row
-
+from benchmarks.row import Row
 
 LONGEST = 1800.0
 """Seconds after which a benchmark is ended, and the next begins."""

@@ -18,8 +18,8 @@ import tempfile
 import termios
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,9 +27,6 @@ from benchmarks.recorder import _work_of, played
 from benchmarks.row import Row
 from daq.python_process import python_command
 from tui.application.terminal.changes import ScreenChanges
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 WIDE, USUAL = (160, 45), (80, 24)
 SETTLED = 25.0

@@ -10,13 +10,10 @@ import os
 import statistics
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 from benchmarks.row import Row
 from daq.python_process import python_command
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 REPEATS = 7
 RECORD = "rich.live, daq.recorder.recorder, daq.devices.bench_file, tui.simulation.host_time"

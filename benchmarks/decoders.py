@@ -5,10 +5,11 @@ from __future__ import annotations
 import itertools
 import struct
 import time
+from collections.abc import Callable
 from fractions import Fraction
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.row import Row
 from daq.devices.epson import commands
@@ -25,11 +26,6 @@ from daq.devices.modbus.registers_protocol import RegisterDecoder, RegisterMap
 from daq.devices.text.decoder import TextDecoder
 from daq.devices.text.format import RASPBERRY_SHAKE
 from daq.protocols.block import HostTime
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
 
 READ = 4096
 """Bytes a read: what a serial port's buffer in the kernel holds."""

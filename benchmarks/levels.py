@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,10 +10,8 @@ from benchmarks.row import Row, least_work
 from estimator.levels.bands import band_levels, log_edges
 from estimator.levels.pooled import blocks_of
 from estimator.methods import self_noise
+from estimator.types import ComplexArray, FloatArray
 from tests.estimator.csm_models import wishart
-
-if TYPE_CHECKING:
-    from estimator.types import ComplexArray, FloatArray
 
 N_BANDS, N_AVERAGES, DIMS = 30, 190, (3, 3, 3)
 SCENES = {

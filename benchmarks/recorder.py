@@ -19,10 +19,12 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.row import Row, peak_memory
 from daq.bench.channel import Channel
@@ -31,17 +33,11 @@ from daq.bench.model import Bench, Sensor
 from daq.devices.epson import commands
 from daq.estimation.follow import SHORTEST_INTERVAL, follow
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.python_process import python_command
 from daq.recorder.recorder import run as record
+from daq.recording.monitor import RecordingStatus
 from daq.recording.repair import verify
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    from daq.estimation.snapshot import Snapshot
-    from daq.recording.monitor import RecordingStatus
 
 SEND_INTERVAL = 0.05
 AXES = tuple(Channel(name=axis, sensitivity=commands.COUNTS_PER_UNIT) for axis in "xyz")

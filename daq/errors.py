@@ -6,10 +6,7 @@ Each is a `HuddleError`, and also an instance of the matching standard exception
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from pathlib import Path
 
 ABSENT: object = object()
 """Stands for a value that is missing in a file."""

@@ -7,13 +7,11 @@ faster by the same factor, so that all later processing sees the times of a benc
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 from daq.protocols.block import HostTime
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 # Continues while the computer is suspended, unlike time.monotonic_ns.
 _always: Callable[[], int] = (

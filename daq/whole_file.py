@@ -19,11 +19,9 @@ import stat
 import sys
 import time
 import uuid
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 PRIVATE = 0o600
 """Permissions of what only its owner may read, such as recordings and keys."""

@@ -9,12 +9,14 @@ import inspect
 import json
 import re
 import textwrap
+from collections.abc import Iterator
 from dataclasses import fields
+from enum import StrEnum
 from importlib import resources
 from itertools import chain
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel, BeforeValidator
 from pydantic_core import PydanticUndefined
@@ -34,10 +36,6 @@ from tests.tui.wording.fact_examples import kinds
 from tui.commands.help import PANELS, subcommand
 from tui.service.records.run_state import RunState
 from tui.wording.facts import RANKS
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from enum import StrEnum
 
 _WRITTEN = {"[[schedule.runs]]": "[[schedule]]"}
 """Tables that a person writes by another name than that of their model."""

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from estimator.types import FloatArray
+from estimator.types import FloatArray
 
 
 def median(values: FloatArray) -> FloatArray:

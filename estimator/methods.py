@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -17,11 +18,7 @@ from estimator.self_noise.result import Flag, SelfNoise
 from estimator.self_noise.three_channel import three_channel
 from estimator.self_noise.three_sensor import three_sensor
 from estimator.self_noise.two_channel import two_channel
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 __all__ = ["METHODS", "Flag", "Method", "SelfNoise", "self_noise"]
 

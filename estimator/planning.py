@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import ndtri
@@ -22,11 +21,9 @@ from estimator.likelihood.fisher import covariance, cramer_rao_cov, efficiency
 from estimator.likelihood.maximum_likelihood import sensors
 from estimator.methods import METHODS, self_noise
 from estimator.self_noise.coherency import check_dims, own_channels
+from estimator.spectra.welch import WelchSettings
 from estimator.spectra.windows import effective_averages, get_window
-
-if TYPE_CHECKING:
-    from estimator.spectra.welch import WelchSettings
-    from estimator.types import BoolArray, ComplexArray, FloatArray
+from estimator.types import BoolArray, ComplexArray, FloatArray
 
 BOUND = "cramer-rao-bound"
 REFERENCE = 1e6  # number of averages at which the scatter of a method is evaluated

@@ -9,12 +9,9 @@ Instances take longer to make than those of a frozen dataclass: it is for classe
 from __future__ import annotations
 
 import re
-from dataclasses import MISSING, FrozenInstanceError, dataclass, fields
-from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar, dataclass_transform
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from dataclasses import Field
+from collections.abc import Mapping
+from dataclasses import MISSING, Field, FrozenInstanceError, dataclass, fields
+from typing import Any, NoReturn, TypeAlias, TypeVar, dataclass_transform
 
 Seconds: TypeAlias = float
 Hertz: TypeAlias = float

@@ -11,8 +11,9 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Awaitable, Callable, Generator, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -23,9 +24,6 @@ from tests import devices
 from tests.devices import device_loop
 from tests.virtual_time import VirtualTimeLoop
 from tests.waiting import limit
-
-if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Generator, Iterator, Sequence
 
 USGS_RECORDING = "usgs-tst-huddle"
 FIRST = (

@@ -10,17 +10,15 @@ from __future__ import annotations
 import asyncio
 import functools
 import tempfile
+from collections.abc import Coroutine, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from daq.host_clock import SystemClock
 from sim_devices.server.launch import DeviceServer, RunningDevice
 from sim_devices.server.paced_clock import PacedClock, PacedLoop
 from tests.virtual_time import VirtualTimeLoop
-
-if TYPE_CHECKING:
-    from collections.abc import Coroutine, Iterator, Mapping
 
 RATE = 3.0
 """How fast the clock runs while nobody is behind: no test waits for long, and the limits of what

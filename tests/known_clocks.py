@@ -7,29 +7,24 @@ the fastest sensor, and read from there by splines of the fifth degree (error be
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline, make_interp_spline
 
 from daq.bench.channel import Channel
+from daq.estimation.snapshot import Snapshot
 from daq.protocols.block import Block, BlockFlag, HostTime
 from daq.recording.file_format import SensorLayout
 from daq.recording.writer import RecordingWriter
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-    from scipy.interpolate import BSpline
-
-    from daq.estimation.snapshot import Snapshot
-
-    FloatArray = NDArray[np.float64]
-    IntArray = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 Motion: TypeAlias = Literal["white", "red", "coloured", "hum"]
 

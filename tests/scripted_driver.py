@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import AsyncIterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,13 +19,8 @@ from daq.devices.interface import (
     DriverSettings,
     Session,
 )
-from daq.protocols.block import Block, HostTime
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Sequence
-
-    from daq.host_clock import HostClock
-    from daq.protocols.block import DeviceItem
+from daq.host_clock import HostClock
+from daq.protocols.block import Block, DeviceItem, HostTime
 
 RATE = 100.0
 

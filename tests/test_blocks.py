@@ -13,18 +13,16 @@ import re
 import shlex
 import textwrap
 import tomllib
+from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 import tomlkit
 from typer.testing import CliRunner
 
 from tui.commands.main import app
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 ROOT = Path(__file__).parents[1]
 HOW_TOS = ROOT / "docs" / "examples"

@@ -11,7 +11,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import ModuleType
 
 import pytest
 
@@ -21,9 +21,6 @@ from daq.python_process import python_command
 from tests.test_architecture import modules_after
 from tui.notebook import estimates, planning, recording, simulation, verbs
 from tui.notebook.options import EstimateOptions
-
-if TYPE_CHECKING:
-    from types import ModuleType
 
 ROOT = Path(__file__).parents[1]
 

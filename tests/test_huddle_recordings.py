@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,13 +13,9 @@ import huddle
 from daq.errors import ArrayError, WrongSettingError
 from tests.daq.archive.day_files import write_station
 from tests.test_huddle import RATE, command, imported, triaxial
+from tui.notebook.options import EstimateOptions
 from tui.output.json_document import calibration_document
 from tui.output.json_values import json_text
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from tui.notebook.options import EstimateOptions
 
 
 def test_a_recording_is_opened_read_and_estimated(tmp_path: Path) -> None:

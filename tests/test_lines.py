@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from tests.lines import code_lines, lines_by_room
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 MODULE = '''"""What it is.
 

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pytest
 
 import huddle
 from daq.estimation.settings import Settings
-
-if TYPE_CHECKING:
-    from tui.notebook.result import Result
-    from tui.notebook.simulation import Simulation
+from tui.notebook.result import Result
+from tui.notebook.simulation import Simulation
 
 BANDS = ((10.0, 12.0), (48.0, 52.0))
 METHODS = ("auto", "three-sensor")

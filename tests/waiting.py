@@ -9,10 +9,7 @@ from __future__ import annotations
 import os
 import subprocess
 import time
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
+from collections.abc import Callable
 
 PATIENCE = float(os.environ.get("HUDDLE_TEST_PATIENCE", "1"))
 USUAL = 300.0

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import typer
 
@@ -22,11 +22,7 @@ from benchmarks.studies.verdicts import verdicts
 from daq.errors import HuddleError
 from sim_devices.errors import ScenarioError
 from tui.studies.reproduce import DEFAULT_FOLDER, run
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from tui.studies.study import ProgressCallback, Study
+from tui.studies.study import ProgressCallback, Study
 
 STUDIES: dict[str, Callable[[ProgressCallback, float], Study]] = {
     "clocks": clocks,

@@ -6,24 +6,20 @@ import itertools
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.studies.synthesis import ORIGIN, Latency, synthesise
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
-from tui.studies.study import Curve, Panel, Point, Series, Study
+from tui.studies.study import Curve, Panel, Point, ProgressCallback, Series, Study
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from daq.estimation.snapshot import Snapshot
-    from tui.studies.study import ProgressCallback
-
-    FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 
 def free_running(

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
 from benchmarks.studies.estimates import share
-from benchmarks.studies.hours import days_of, drawn
+from benchmarks.studies.hours import FloatArray, days_of, drawn
 from daq.archive.changes import courses
-from tui.studies.study import Panel, Series, Study
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from benchmarks.studies.hours import FloatArray
-    from tui.studies.study import ProgressCallback
+from tui.studies.study import Panel, ProgressCallback, Series, Study
 
 CONTRASTS = "contrasts"
 N_DAYS = 60

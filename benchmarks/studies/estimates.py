@@ -5,25 +5,20 @@ Every point has averages of its own, drawn from known matrices of sensors that p
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from collections.abc import Callable, Mapping
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.studies.draws import averaged, bench
 from estimator.levels.bands import band_levels
 from estimator.likelihood.fisher import cramer_rao_cov
 from estimator.methods import self_noise
 from estimator.noise_parameters.fit import fit, terms_at
-from tui.studies.study import Panel, Point, Series, Study
+from tui.studies.study import Panel, Point, ProgressCallback, Series, Study
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from numpy.typing import NDArray
-
-    from tui.studies.study import ProgressCallback
-
-    FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 METHODS = ("three-sensor", "maximum-likelihood")
 NOMINAL = 0.95

@@ -7,9 +7,8 @@ averages.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.studies.draws import averaged
 from estimator.likelihood.dimension import choose_dimension
@@ -18,15 +17,10 @@ from estimator.likelihood.maximum_likelihood import maximum_likelihood
 from sim_devices.world.plane_waves import field
 from sim_devices.world.spectrum import White
 from sim_devices.world.tables import PlaneWaves
-from tui.studies.study import Panel, Point, Series, Study
+from tui.studies.study import Panel, Point, ProgressCallback, Series, Study
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from tui.studies.study import ProgressCallback
-
-    FloatArray = NDArray[np.float64]
-    ComplexArray = NDArray[np.complex128]
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 SNR, SPEED, RADIUS, NEAREST = 1e3, 150.0, 0.12, 0.08
 CENTRES = (1.0, 3.5, 7.0, 14.0, 20.0, 30.0, 50.0)

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Collection
 
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from collections.abc import Collection
-
-    from numpy.typing import NDArray
-
-    FloatArray = NDArray[np.float64]
-    Parts = dict[int, tuple[FloatArray, FloatArray]]
+FloatArray = NDArray[np.float64]
+Parts = dict[int, tuple[FloatArray, FloatArray]]
 
 MONDAY = 20696
 """2026-08-31, in days since 1970."""

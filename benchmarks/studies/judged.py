@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.results.result import Result
+from estimator.checks.advice import Advice
 from estimator.levels.bands import band_edges
+from estimator.types import FloatArray
 from tui.studies.study import Panel, Point, Series, Study
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
-    from estimator.checks.advice import Advice
-    from estimator.types import FloatArray
 
 METHODS = ("three-sensor", "maximum-likelihood")
 DECADES = (-2, -1, 0, 1, 2, 4, 6)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.signal import lfilter
@@ -21,9 +20,7 @@ from estimator.likelihood.fisher import cramer_rao_cov
 from estimator.methods import self_noise
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import effective_averages, get_window
-
-if TYPE_CHECKING:
-    from estimator.types import FloatArray
+from estimator.types import FloatArray
 
 LENGTH = 256
 """Samples of a segment."""

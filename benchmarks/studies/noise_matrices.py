@@ -9,20 +9,17 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.studies.draws import averaged
 from estimator.levels.bands import band_levels
 from estimator.levels.interval import NORMAL_95
 from estimator.methods import self_noise
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    FloatArray = NDArray[np.float64]
-    ComplexArray = NDArray[np.complex128]
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 RATIOS = (0.05, 0.1, 0.3, 1.0, 10.0, 100.0, 1e4)
 AVERAGES = (20, 60, 200)

@@ -7,8 +7,8 @@ another response, or one that lags. So combinations are seen that nobody thought
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.signal import lfilter
@@ -18,17 +18,13 @@ from benchmarks.studies.judged import METHODS, Judged
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
+from estimator.checks.advice import Advice
 from estimator.checks.advice_on_model import ModelMisfit
 from estimator.checks.advice_on_noise import SharedNoise
 from estimator.checks.advice_on_sensors import Delay, Gain, Rotated, UnequalResponses
 from estimator.checks.advice_on_signals import NoSharedMotion
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from estimator.checks.advice import Advice
-    from estimator.types import FloatArray
-    from tui.studies.study import ProgressCallback, Study
+from estimator.types import FloatArray
+from tui.studies.study import ProgressCallback, Study
 
 RANDOM_TESTS = "random-tests"
 N_TESTS = 400

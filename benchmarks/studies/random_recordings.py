@@ -8,7 +8,7 @@ from __future__ import annotations
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,9 +22,7 @@ from estimator.checks.advice_on_noise import NoiseChanges, SharedNoise
 from estimator.checks.advice_on_sensors import Delay, Gain, Rotated, UnequalResponses
 from estimator.checks.advice_on_signals import NoSharedMotion
 from sim_devices.world.scenario import Scenario
-
-if TYPE_CHECKING:
-    from tui.studies.study import ProgressCallback, Study
+from tui.studies.study import ProgressCallback, Study
 
 RANDOM_RECORDINGS = "random-recordings"
 N_RECORDINGS = 160

@@ -7,25 +7,21 @@ three sensors another response: what leaks into its noise is predicted, and is g
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daq.bench.response import PolesZeros
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.formats.arrays import recording_of_arrays
 from estimator.levels.bands import bin_correlation
 from estimator.responses.calibration import calibrate_sensor
 from estimator.responses.derived_quantities import derived
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window
-from tui.studies.study import Panel, Point, Series, Study
-
-if TYPE_CHECKING:
-    from daq.estimation.snapshot import Snapshot
-    from estimator.types import FloatArray
-    from tui.studies.study import ProgressCallback
+from estimator.types import FloatArray
+from tui.studies.study import Panel, Point, ProgressCallback, Series, Study
 
 SEED = 20261123
 N_DRAWS = 800

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from statistics import NormalDist
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,11 +12,8 @@ from estimator.checks.shared_noise import LEVEL, shared_noise
 from estimator.likelihood.dimension import bands
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.score_test import pair_scores
-from tui.studies.study import Panel, Point, Series, Study
-
-if TYPE_CHECKING:
-    from estimator.types import ComplexArray
-    from tui.studies.study import ProgressCallback
+from estimator.types import ComplexArray
+from tui.studies.study import Panel, Point, ProgressCallback, Series, Study
 
 SHARED_NOISE = "shared-noise"
 CASES = (

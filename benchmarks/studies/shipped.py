@@ -12,11 +12,13 @@ import tempfile
 import traceback
 import warnings
 from collections import Counter, defaultdict
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.errors import HuddleError
 from daq.formats.importer import import_files
@@ -26,12 +28,7 @@ from daq.formats.response import Responses, whole_response
 from daq.formats.sources import Selection
 from daq.recording.reader import Recording
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    Samples = dict[str, NDArray[Any]]
+Samples = dict[str, NDArray[Any]]
 
 MAX_DB, MAX_DEGREES, USED, LOWEST, LEAST_KNOWN = 0.01, 0.1, 0.4, 1e-3, 0.7
 SAME, ROWS, NOT_COMPARED, OURS_ALONE, REFUSED, DIFFERENT, FAILED = (

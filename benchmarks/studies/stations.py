@@ -20,10 +20,10 @@ import resource
 import signal
 import subprocess
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
@@ -33,9 +33,6 @@ import pymseed
 from daq.archive.stations import archives_in
 from daq.archive.store import Store
 from daq.python_process import python_command
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
 
 FIRST_S = 20_454 * 86_400  # 2026-01-01
 RATE = 0.1

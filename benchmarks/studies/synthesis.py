@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.bench.channel import Channel
 from daq.protocols.block import HostTime
 from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
+from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from sim_devices.world.scenario import Scenario
-
-    FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 ORIGIN = HostTime(5_000_000_000_000, 1_790_000_000_000_000_000)
 SENSITIVITY = 1e8  # counts per m/s²: quantisation 60 dB under the noise

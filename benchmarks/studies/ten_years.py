@@ -17,10 +17,11 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.archive.averages import Estimator
 from daq.archive.plan import Plan
@@ -41,12 +42,7 @@ from daq.archive.store import Store
 from daq.bench.channel import Channel
 from daq.estimation.settings import Settings
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 FIRST_NS = 16_801 * DAY_NS  # 2016-01-01
 N_DAYS = 3653

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,12 +20,10 @@ from daq.bench.model import Bench, Limit
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import ChannelLabel, Snapshot
 from daq.results.result import Result
+from estimator.decision.verdict import Prediction
 from estimator.methods import self_noise
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import effective_averages, get_window
-
-if TYPE_CHECKING:
-    from estimator.decision.verdict import Prediction
 
 RATE, LONGEST, GROWTH = 20.0, 4 * 3600.0, 1.1
 FIRST = 200.0

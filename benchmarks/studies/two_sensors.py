@@ -7,18 +7,13 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.levels.interval import interval
-from estimator.likelihood.changing_motion import band_noise
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from estimator.likelihood.changing_motion import BandNoise
+from estimator.likelihood.changing_motion import BandNoise, band_noise
 
 N_PARTS = 12
 KINDS = {"two": (1, 2), "triaxial": (3, 2), "pair": (1, 3)}

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import itertools
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.signal import lfilter
@@ -21,9 +21,6 @@ from estimator.levels.interval import interval
 from estimator.likelihood.changing_motion import bound_of_parts
 from estimator.likelihood.multi_part import multi_part
 from estimator.spectra.windows import effective_averages, get_window
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 SEGMENT, HOP, RATE = 128, 64, 128.0
 BINS = {1: slice(30, 31), 20: slice(26, 46)}

@@ -7,8 +7,8 @@ One that is not decided goes on for as long as was predicted, and is judged agai
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,20 +16,15 @@ from daq.bench.channel import Channel
 from daq.bench.model import Bench, Limit, Sensor
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import ChannelLabel, Snapshot
+from daq.results.decision.verdict import TestVerdict
 from daq.results.result import Result
 from estimator.decision.verdict import Verdict
 from estimator.errors import InsufficientDataError
 from estimator.methods import self_noise
+from estimator.self_noise.result import SelfNoise
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import effective_averages, get_window
-from tui.studies.study import Panel, Point, Series, Study
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from daq.results.decision.verdict import TestVerdict
-    from estimator.self_noise.result import SelfNoise
-    from tui.studies.study import ProgressCallback
+from tui.studies.study import Panel, Point, ProgressCallback, Series, Study
 
 RATE, SEGMENT = 20.0, 2.0
 METHOD = "three-sensor"

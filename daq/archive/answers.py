@@ -16,14 +16,17 @@ import hashlib
 import json
 import logging
 from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from datetime import UTC, tzinfo
 from functools import reduce
 from operator import add
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.archive.averages import Average, Estimator, converted
 from daq.archive.changes import Course, courses
@@ -48,26 +51,19 @@ from daq.archive.spectra_file import (
     packed,
     unpacked,
 )
+from daq.archive.store import Store
 from daq.errors import ArchiveError, HuddleError
 from daq.estimation.blas_threads import one_blas_thread
+from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.recording.storage.refusals import check_all
 from daq.recording.storage.whole_hdf5 import WholeHdf5
 from daq.results.band_summary import band_within, judged_method
 from daq.results.result import Result
 from daq.whole_file import hidden, put_in_place, remove
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from daq.archive.store import Store
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
-
-    FloatArray = NDArray[np.float64]
-    IntArray = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 
 _LOGGER = logging.getLogger(__name__)

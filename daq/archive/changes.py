@@ -7,12 +7,13 @@ one: each segment has its own mean, drift, and difference of working hours and n
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import date
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtri, stdtrit
 
 from daq.archive.rollup import EARLY, LATE, WORK
@@ -20,14 +21,9 @@ from daq.archive.spectra_file import DAY_NS
 from daq.results.change_test import changes
 from estimator.levels.interval import CERTAIN
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from numpy.typing import NDArray
-
-    FloatArray = NDArray[np.float64]
-    IntArray = NDArray[np.int64]
-    BoolArray = NDArray[np.bool_]
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
 MIN_DAYS = 8
 """With fewer, neither drift nor change is decided."""

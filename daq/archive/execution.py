@@ -9,10 +9,14 @@ import logging
 import queue
 import subprocess
 import threading
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import asdict
+from datetime import datetime
 from ipaddress import ip_address
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from types import ModuleType
+from typing import Any
 from urllib.parse import urlsplit
 
 from daq.archive.plan import Plan
@@ -20,16 +24,9 @@ from daq.archive.store import Store
 from daq.archive.task import Outcome, Task, run, software_version
 from daq.errors import ArchiveError, HuddleError
 from daq.estimation.segments.segment_pass import Pass
+from daq.estimation.settings import Settings
 from daq.python_process import python_command
 from daq.recording.reader import Recording
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-    from datetime import datetime
-    from pathlib import Path
-    from types import ModuleType
-
-    from daq.estimation.settings import Settings
 
 _LOGGER = logging.getLogger(__name__)
 CONNECT_SECONDS = 10.0

@@ -10,22 +10,19 @@ import hashlib
 import json
 import os
 import sqlite3
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import TYPE_CHECKING, Any, Self
+from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 
 from daq.archive.rollup import month_of
 from daq.archive.spectra_file import Described, Origin, SpectraFile
+from daq.bench.channel import Channel
 from daq.recording.file_format import channel_attributes, channels_of, texts
 from estimator.checks.count_limits import CountLimits
 from estimator.spectra.segment_rejection import Reason
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from daq.bench.channel import Channel
 
 FILE = "index.sqlite"
 ROLLUP = "rollup-"

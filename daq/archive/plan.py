@@ -7,18 +7,15 @@ Settings that shape spectra are the same for all of a store. Those that only sha
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 from daq.bench.estimate_settings import OPTIONS, EstimateSettings
 from daq.bench.units import canonical
 from daq.errors import WrongArchiveError, WrongSettingError
+from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from daq.estimation.segments.segment_pass import Pass
 
 FORMAT = "huddle-archive"
 FORMAT_VERSION = 1

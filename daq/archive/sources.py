@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from daq.archive.index import Entry
 from daq.archive.store import FOLDER, PLAN_FILE
 from daq.archive.task import origin_of
 from daq.errors import HuddleError, RecordingError, WrongArchiveError
 from daq.formats.readers.miniseed import is_miniseed
 from daq.formats.sources import SCHEME
 from daq.recording.reader import Recording
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from daq.archive.index import Entry
 
 
 @dataclass(slots=True)

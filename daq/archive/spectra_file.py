@@ -13,11 +13,17 @@ import contextlib
 import hashlib
 import itertools
 import json
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, Self
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
 
+import h5py
 import numpy as np
+from numpy.typing import NDArray
 
+from daq.bench.channel import Channel
 from daq.errors import ArchiveError, RecordingError, WrongArchiveError
 from daq.recording.file_format import channel_attributes, channels_of
 from daq.recording.storage.opening import open_file
@@ -28,19 +34,9 @@ from daq.whole_file import replaced
 from estimator.checks.count_limits import CountLimits
 from estimator.spectra.segment_rejection import Reason
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
-    from pathlib import Path
-    from types import TracebackType
-
-    import h5py
-    from numpy.typing import NDArray
-
-    from daq.bench.channel import Channel
-
-    ComplexArray = NDArray[np.complex128]
-    IntArray = NDArray[np.int64]
-    SmallArray = NDArray[np.float32]
+ComplexArray = NDArray[np.complex128]
+IntArray = NDArray[np.int64]
+SmallArray = NDArray[np.float32]
 
 FORMAT = "huddle-archive-spectra"
 FORMAT_VERSION = 2

@@ -15,8 +15,9 @@ from __future__ import annotations
 
 import itertools
 import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from daq.archive.execution import failure_of
 from daq.archive.plan import Plan, settings_document
@@ -25,14 +26,9 @@ from daq.archive.store import PLAN_FILE, Store
 from daq.archive.task import Outcome, Task, software_version
 from daq.archive.waveforms import Day, Reading, States, Station, responses_on, without_channels
 from daq.errors import ImportFormatError, WrongArchiveError, WrongSettingError
+from daq.estimation.settings import Settings
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-    from pathlib import Path
-
-    from daq.estimation.settings import Settings
-
-    Run = Callable[[Iterable[Task]], Iterator[Outcome]]
+Run = Callable[[Iterable[Task]], Iterator[Outcome]]
 
 _TRIES = 3
 """Days of a station that are tried for its plan."""

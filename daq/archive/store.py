@@ -21,8 +21,10 @@ import hashlib
 import os
 import re
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from datetime import datetime
+from pathlib import Path
 
 from daq.archive.index import ROLLUP, Entry, Index
 from daq.archive.plan import Plan
@@ -33,10 +35,6 @@ from daq.whole_file import write_whole
 if sys.platform != "win32":
     import fcntl
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from datetime import datetime
-    from pathlib import Path
 
 PLAN_FILE = "archive.json"
 FOLDER = "huddle-archive"

@@ -12,14 +12,16 @@ days, and the station is summed up: so the reduction is a tree, whose branches a
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 from zoneinfo import ZoneInfo
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.archive.answers import answer
 from daq.archive.averages import Estimator
@@ -37,19 +39,13 @@ from daq.estimation.noise_estimates import responses
 from daq.estimation.segments.clipping import limits_by_column
 from daq.estimation.segments.segment_pass import Pass, still_for_a_while
 from daq.estimation.settings import check_fit
+from daq.recording.interface import ReadableRecording
 from daq.recording.reader import Recording
 from estimator.errors import EstimatorError
 from estimator.spectra.segment_rejection import Reason
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    from daq.recording.interface import ReadableRecording
-
-    FloatArray = NDArray[np.float64]
-    ComplexArray = NDArray[np.complex128]
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import tomlkit
 from tomlkit.items import Array, InlineTable, Table
 
 from daq.whole_file import write_whole
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 
 def set_sensor_values(path: str | Path, values: Mapping[str, Mapping[str, str]]) -> None:

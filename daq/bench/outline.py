@@ -8,15 +8,13 @@ limits or data sheets.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from daq.bench.estimate_settings import OPTIONS, EstimateSettings, table_keys
 from daq.bench.sensitivity import Sensitivities, known_sensitivities
 from daq.bench.tables.toml_text import checked_table
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 
 @dataclass(frozen=True, slots=True)

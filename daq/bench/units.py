@@ -5,14 +5,11 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.errors import WrongSettingError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 STANDARD_GRAVITY = 9.80665
 """In m/s²."""

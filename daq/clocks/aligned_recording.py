@@ -22,11 +22,14 @@ sensors only arrival times can say which of them slipped; where they do not, it 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from daq.bench.channel import Channel
 from daq.clocks.clock_model import ClockSource, ClockState, nominal
 from daq.clocks.device_utc import UtcRate
 from daq.clocks.grid import SNAP, Grid, OwnSamples, grid_rate, joint_start, late_by, start_of
@@ -35,19 +38,11 @@ from daq.clocks.resampling import USABLE
 from daq.clocks.sensor_reader import SensorSource, main_columns
 from daq.clocks.slips import Slip, Step, arrive_otherwise, lost_by_delays, steps
 from daq.errors import CannotAlignError
+from daq.recording.interface import ReadableRecording
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from daq.bench.channel import Channel
-    from daq.recording.interface import ReadableRecording
-
-    FloatArray = NDArray[np.float64]
-    BoolArray = NDArray[np.bool_]
-    FrameDelays = Callable[[], FloatArray]
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+FrameDelays = Callable[[], FloatArray]
 
 
 _NODE = 10.0  # seconds of arrivals, the earliest of which counts, and

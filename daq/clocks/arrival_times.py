@@ -33,10 +33,12 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.clocks.clock_model import (
     Clock,
@@ -50,19 +52,13 @@ from daq.clocks.departures import agreement
 from daq.clocks.device_utc import corrected, from_device_utc
 from daq.clocks.lower_envelope import least_of_each, levelled, scatter_of_least, supporting_line
 from daq.clocks.quantiles import median
+from daq.clocks.slips import Slips
 from daq.clocks.usb_polling import BEATS_PER_WINDOW, Polls, shows
 from daq.protocols.block import BlockFlag
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    from daq.clocks.slips import Slips
-
-    FloatArray = NDArray[np.float64]
-    BoolArray = NDArray[np.bool_]
-    IntArray = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
 
 _EARLY = 0.05  # seconds that a block comes too early at least
 _RATE_OFF = 0.02  # share by which a rate may be off

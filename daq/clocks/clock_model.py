@@ -10,23 +10,19 @@ the timeline itself where all sensors share one.
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from math import inf, isnan
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+from daq.clocks.slips import Slips
+from daq.protocols.block import Uncounted
 
-    from numpy.typing import NDArray
-
-    from daq.clocks.slips import Slips
-    from daq.protocols.block import Uncounted
-
-    FloatArray = NDArray[np.float64]
-    IntArray = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 _NEVER = 1 << 62  # a sample index beyond all others
 _BETWEEN = 3  # nodes of a cubic's straight pieces, in each interval: 1/16 of its bend is left

@@ -8,19 +8,15 @@ does a digitizer without GPS. The arrivals of what states UTC tell by how much.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.clocks.clock_model import Clock, ClockSource, ClockState, Epoch, MeasuredDelays
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from numpy.typing import NDArray
-
-    FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 _UTC_TOLERANCE = 2e-6  # seconds; how well device UTC must agree with the nominal rate
 _NODES = 33  # of an epoch, at which clocks are compared

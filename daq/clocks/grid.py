@@ -9,27 +9,19 @@ grid is interpolated.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.clocks.resampling import SPAN, all_present, reach, resample
+from daq.clocks.sensor_reader import SensorSource
 from daq.errors import CannotAlignError
+from daq.recording.interface import ReadableSensor
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from daq.clocks.sensor_reader import SensorSource
-
-    FloatArray = NDArray[np.float64]
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from daq.recording.interface import ReadableSensor
-
-    BoolArray = NDArray[np.bool_]
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 _TOGETHER = 60.0  # s
 _FEWEST = 3  # sensors that have an estimate without the others

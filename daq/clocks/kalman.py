@@ -27,15 +27,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    FloatArray = NDArray[np.float64]
-    BoolArray = NDArray[np.bool_]
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 _WALKS = 10.0 ** np.arange(-10.0, -4.4, 0.5)  # random walk of the rate, s/s per √s
 _NOISES = 10.0 ** np.arange(-6.0, -2.4, 0.5)  # of arrival observations, s

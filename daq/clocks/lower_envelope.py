@@ -5,18 +5,14 @@ The lateness of a block is when it arrived less its last sample's index over the
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.clocks.quantiles import median
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    FloatArray = NDArray[np.float64]
-    BoolArray = NDArray[np.bool_]
-    IntArray = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
 
 _STEEP = 2e-4  # seconds of lateness over a second that hide which one is the earliest
 _LEVEL = 10  # seconds over which a slope can be told from jitter

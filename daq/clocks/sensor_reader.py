@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import bisect
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.clocks.arrival_times import ArrivalTimes
 from daq.clocks.clock_model import (
@@ -26,14 +28,9 @@ from daq.errors import CannotAlignError
 from daq.protocols.block import BlockFlag, Uncounted
 from daq.recording.interface import ReadableSensor, absences
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
-    from numpy.typing import NDArray
-
-    FloatArray = NDArray[np.float64]
-    BoolArray = NDArray[np.bool_]
-    IntArray = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
 
 
 _Number = TypeVar("_Number", bound=np.generic)

@@ -16,17 +16,14 @@ consecutive blocks are looked at, spread over the recording.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.clocks.quantiles import median, quantile
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    FloatArray = NDArray[np.float64]
-    IntArray = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 _BLOCKS = 64  # in a window: few enough for little drift, many enough for clusters to show
 _MIN_BLOCKS = 24  # while there is no whole window yet

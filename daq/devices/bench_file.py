@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from daq.bench import loading
+from daq.bench.model import Bench
 from daq.devices.interface import AnyDriver
 from daq.devices.registry import driver_names, driver_type
 from daq.transport.ports import is_simulated as is_simulated_port
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from daq.bench.model import Bench
 
 
 class InstalledDrivers(Mapping[str, AnyDriver]):

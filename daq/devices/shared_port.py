@@ -8,17 +8,13 @@ ever, and is configured again before it is read: it may have lost its settings.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Awaitable, Callable, Mapping
 
 from daq.devices.interface import DeviceInformation
 from daq.errors import DeviceError, NoAnswerError, NotConnectedError, WrongDeviceError
+from daq.host_clock import HostClock
 from daq.protocols.block import Event, EventKind
 from daq.protocols.errors import shortened
-
-if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping
-
-    from daq.host_clock import HostClock
 
 FIRST_RETRY, MAX_RETRY = 1.0, 30.0
 """Delay in s of the next attempt; doubled after each one, because the others wait meanwhile."""

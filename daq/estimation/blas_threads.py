@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import sys
 import threading
+from collections.abc import Generator
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from threadpoolctl import ThreadpoolController
-
-if TYPE_CHECKING:
-    from collections.abc import Generator
 
 _lock = threading.Lock()
 _limits: list[Any] = []  # of the estimates that run: the process has one number of threads for all

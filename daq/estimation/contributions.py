@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.bench.sensitivity import Sensitivities
 from daq.estimation.settings import DIMENSIONS
+from daq.estimation.snapshot import Snapshot
 from estimator.checks.advice import Rank
 from estimator.checks.advice_on_model import ModelMisfit, TooFewDimensions
 from estimator.checks.advice_on_noise import SharedNoise
@@ -27,13 +29,7 @@ from estimator.levels.interval import NORMAL_95, interval
 from estimator.levels.pooled import blocks_of
 from estimator.likelihood.dimension import most_testable
 from estimator.self_noise.result import Flag, SelfNoise
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from daq.bench.sensitivity import Sensitivities
-    from daq.estimation.snapshot import Snapshot
-    from estimator.types import BoolArray, FloatArray
+from estimator.types import BoolArray, FloatArray
 
 SECOND_ORDER = 2.5
 """Bias by further dimensions over the squared c.o.v. of one frequency, one standard deviation

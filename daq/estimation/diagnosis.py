@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from daq.clocks.clock_model import RelativeTime
-from daq.estimation.noise_estimates import neighbours
+from daq.bench.channel import Channel
+from daq.clocks.clock_model import ClockState, RelativeTime
+from daq.estimation.noise_estimates import Dimensions, neighbours
+from daq.estimation.segments.segment_pass import Pass
+from daq.estimation.snapshot import NonlinearChannel
 from daq.estimation.snapshot_diagnostics import (
     CLOCK_FACTOR,
     Diagnosis,
@@ -23,31 +27,19 @@ from estimator.checks.advice import Advice, Rank, Untested
 from estimator.checks.advice_on_model import ModelMisfit
 from estimator.checks.advice_on_noise import NoiseChanges, ResponseChanges, SharedNoise
 from estimator.checks.advice_on_sensors import Delay, Gain
+from estimator.checks.band import BandDiagnosis
 from estimator.checks.count_limits import CountLimits
 from estimator.checks.diagnose import Diagnostics, diagnose
-from estimator.checks.stability import Stability
+from estimator.checks.stability import SegmentCourse, Stability
 from estimator.errors import InsufficientDataError
+from estimator.likelihood.factor_analysis import Maxima
 from estimator.median import median
 from estimator.responses.equalisation import leakage_advice
+from estimator.self_noise.result import SelfNoise
+from estimator.spectra.multiresolution import Band
 
-if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from daq.bench.channel import Channel
-    from daq.clocks.clock_model import ClockState
-    from daq.estimation.noise_estimates import Dimensions
-    from daq.estimation.segments.segment_pass import Pass
-    from daq.estimation.snapshot import NonlinearChannel
-    from estimator.checks.band import BandDiagnosis
-    from estimator.checks.stability import SegmentCourse
-    from estimator.likelihood.factor_analysis import Maxima
-    from estimator.self_noise.result import SelfNoise
-    from estimator.spectra.multiresolution import Band
-
-    FloatArray = NDArray[np.float64]
-    ComplexArray = NDArray[np.complex128]
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 MIN_AVERAGES = 2.0
 """Without which nothing is diagnosed: in one average all channels are coherent, as copies are."""

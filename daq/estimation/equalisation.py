@@ -15,12 +15,15 @@ by more than chance.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
+from daq.bench.channel import Channel
 from daq.estimation.noise_estimates import known_part, responses
+from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.snapshot_diagnostics import (
     EdgeLeakage,
 )
@@ -38,6 +41,7 @@ from estimator.responses.equalisation import (
     lowers_noise,
     significant_minimum,
 )
+from estimator.self_noise.result import SelfNoise
 from estimator.spectra.equaliser import (
     USABLE,
     Equaliser,
@@ -47,20 +51,11 @@ from estimator.spectra.equaliser import (
     with_short_tails,
 )
 from estimator.spectra.multiresolution import Band
+from estimator.spectra.welch import WelchSettings
 from estimator.spectra.windows import effective_averages, get_window
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from daq.bench.channel import Channel
-    from daq.estimation.segments.segment_pass import Pass
-    from estimator.self_noise.result import SelfNoise
-    from estimator.spectra.welch import WelchSettings
-
-    FloatArray = NDArray[np.float64]
-    ComplexArray = NDArray[np.complex128]
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 FILTER_SEGMENTS = 240
 """Segments of each recording, from its start, that filters are found from at most."""

@@ -19,9 +19,10 @@ from __future__ import annotations
 import logging
 import math
 from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from itertools import accumulate
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
@@ -38,7 +39,7 @@ from daq.estimation.equalisation import (
     Equalisation,
 )
 from daq.estimation.freed_memory import FREED_FROM, give_back
-from daq.estimation.noise_estimates import averages
+from daq.estimation.noise_estimates import Dimensions, averages
 from daq.estimation.recording_set import (
     check_same,
     check_span,
@@ -51,17 +52,9 @@ from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError, Snapshot
 from daq.estimation.snapshot_builder import DIAGNOSIS_SHARE, SnapshotBuilder, keep_few, why_nothing
-from daq.recording.interface import created_at
+from daq.recording.interface import ReadableRecording, created_at
 from estimator.checks.shared_noise import MAX_CHANNELS
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from concurrent.futures import Future
-    from pathlib import Path
-
-    from daq.estimation.noise_estimates import Dimensions
-    from daq.recording.interface import ReadableRecording
-    from estimator.spectra.welch import WelchSettings
+from estimator.spectra.welch import WelchSettings
 
 _LOGGER = logging.getLogger(__name__)
 MATRICES = 7

@@ -16,28 +16,23 @@ import contextlib
 import ctypes
 import threading
 import time
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Protocol
+from pathlib import Path
+from typing import Protocol
 
 from daq.errors import HuddleError, NotConnectedError, RecordingError
 from daq.estimation.estimation import Estimation
 from daq.estimation.freed_memory import c_function, give_back
 from daq.estimation.recording_set import is_continued, is_left
 from daq.estimation.settings import Settings
-from daq.estimation.snapshot import NoResultError
+from daq.estimation.snapshot import NoResultError, Snapshot
 from daq.estimation.throttle import Throttle
+from daq.protocols.block import Uncounted
 from daq.recording.control import ask
-from daq.recording.monitor import RecordingMonitor
+from daq.recording.monitor import RecordingMonitor, RecordingStatus
 from daq.recording.reader import Recording, control_address
 from daq.recording.storage import locking
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterable
-    from pathlib import Path
-
-    from daq.estimation.snapshot import Snapshot
-    from daq.protocols.block import Uncounted
-    from daq.recording.monitor import RecordingStatus
 
 INTERVAL = 20.0
 """Seconds between returns, at least."""

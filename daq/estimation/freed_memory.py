@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import sys
+from collections.abc import Callable
 from functools import cache
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
 
 FREED_FROM = 1 << 25
 """Bytes of the matrices of all frequencies from which an estimate returns memory between stages."""

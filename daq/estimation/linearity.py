@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from daq.estimation.noise_estimates import responses
+from daq.estimation.noise_estimates import Channels, responses
+from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.snapshot import NonlinearChannel
 from estimator.checks.linearity import MOST_SEGMENTS, SquaresAndCubes
 from estimator.self_noise.result import Flag, SelfNoise
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from daq.estimation.noise_estimates import Channels
-    from daq.estimation.segments.segment_pass import Pass
-    from estimator.types import FloatArray
+from estimator.types import FloatArray
 
 
 def nonlinear_channels(

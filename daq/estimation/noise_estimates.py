@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daq.bench.channel import Channel
 from daq.bench.units import conversion
 from daq.errors import WrongSettingError
+from daq.estimation.segments.segment_pass import Pass
+from daq.estimation.settings import Settings
 from daq.estimation.snapshot import RoundedAlike
+from daq.recording.interface import ReadableRecording
 from estimator.checks.counts import shared_rounding
 from estimator.errors import InsufficientDataError
 from estimator.levels.bands import bin_correlation
 from estimator.levels.pooled import blocks_of
 from estimator.likelihood.dimension import BandDimension, choose_dimension, noise_groups
+from estimator.likelihood.factor_analysis import Maxima
 from estimator.likelihood.goodness_of_fit import neighbour_correlation
 from estimator.median import median
 from estimator.methods import METHODS, self_noise
@@ -23,24 +29,13 @@ from estimator.spectra.multiresolution import Band, MultiResolution
 from estimator.spectra.parts import Parts
 from estimator.spectra.welch import CrossSpectra, scale
 from estimator.spectra.windows import effective_averages, get_window
+from estimator.types import ComplexArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from daq.bench.channel import Channel
-    from daq.estimation.segments.segment_pass import Pass
-    from daq.estimation.settings import Settings
-    from daq.recording.interface import ReadableRecording
-    from estimator.likelihood.factor_analysis import Maxima
     from estimator.likelihood.gradients import Gradients
     from estimator.likelihood.multi_part import Beside, MultiPart
 
-    FloatArray = NDArray[np.float64]
-    IntArray = NDArray[np.int64]
-    ComplexArray = NDArray[np.complex128]
-    Channels = Sequence[tuple[str, Channel]]
+Channels = Sequence[tuple[str, Channel]]
 
 ALL_METHODS = (*sorted(METHODS, key=lambda name: name != "three-sensor"), "multi-part")
 """The first is what limits, c.o.v. and clocks are judged by: one that needs no alignment."""

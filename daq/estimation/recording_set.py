@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from daq.bench.durations import format_duration
 from daq.clocks.aligned_recording import AlignedRecording
 from daq.errors import CannotAlignError, RecordingError, WrongSettingError
+from daq.estimation.segments.segment_pass import Pass
+from daq.estimation.settings import Settings
+from daq.recording.interface import ReadableRecording
 from daq.recording.reader import Recording
 from daq.recording.storage.locking import is_being_written
 from daq.recording.storage.names import continuation_names
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from daq.estimation.segments.segment_pass import Pass
-    from daq.estimation.settings import Settings
-    from daq.recording.interface import ReadableRecording
 
 
 def open_another(

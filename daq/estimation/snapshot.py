@@ -2,36 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
+from daq.bench.sensitivity import Sensitivities
+from daq.clocks.clock_model import ClockState
 from daq.estimation.snapshot_diagnostics import (
     SnapshotDiagnostics,
     added_by_clocks,
 )
+from daq.protocols.block import Event
+from daq.recording.interface import ReadableSensor
 from daq.recording.sensor_state import STATE_AFTER
 from estimator.checks.advice import Names
 from estimator.errors import InsufficientDataError
+from estimator.records import Hertz, Seconds, Share
+from estimator.self_noise.result import SelfNoise
+from estimator.spectra.multiresolution import Band
+from estimator.spectra.parts import Parts
+from estimator.spectra.segment_rejection import Reason
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
-    from numpy.typing import NDArray
-
-    from daq.bench.sensitivity import Sensitivities
-    from daq.clocks.clock_model import ClockState
-    from daq.protocols.block import Event
-    from daq.recording.interface import ReadableSensor
-    from estimator.records import Hertz, Seconds, Share
-    from estimator.self_noise.result import SelfNoise
-    from estimator.spectra.multiresolution import Band
-    from estimator.spectra.parts import Parts
-    from estimator.spectra.segment_rejection import Reason
-
-    FloatArray = NDArray[np.float64]
-    ComplexArray = NDArray[np.complex128]
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,13 +9,15 @@ import math
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
+from daq.bench.sensitivity import Sensitivities
 from daq.clocks.sensor_reader import main_columns
 from daq.estimation.blas_threads import one_blas_thread
 from daq.estimation.contributions import with_contributions
@@ -28,10 +30,12 @@ from daq.estimation.diagnosis import (
     last_aligned,
     synchronisation,
 )
-from daq.estimation.equalisation import METHOD
+from daq.estimation.equalisation import METHOD, Equalisation
 from daq.estimation.freed_memory import FREED_FROM, give_back
 from daq.estimation.linearity import linearised, nonlinear_channels
 from daq.estimation.noise_estimates import (
+    Channels,
+    ChannelSet,
     Dimensions,
     Estimates,
     averages,
@@ -50,7 +54,8 @@ from daq.estimation.noise_estimates import (
 )
 from daq.estimation.recording_set import is_complete
 from daq.estimation.segments.clipping import limits_by_column
-from daq.estimation.segments.segment_pass import still_for_a_while
+from daq.estimation.segments.segment_pass import Pass, still_for_a_while
+from daq.estimation.settings import Settings
 from daq.estimation.snapshot import (
     Bridged,
     ChannelLabel,
@@ -62,29 +67,17 @@ from daq.estimation.snapshot import (
 )
 from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics
 from daq.estimation.throttle import Throttle
-from daq.protocols.block import Quantity
+from daq.protocols.block import Event, Quantity, Reading
+from daq.recording.interface import ReadableRecording
 from estimator.checks.advice import Untested
 from estimator.checks.stability import SegmentCourse
+from estimator.checks.steadied import Steadied
 from estimator.errors import InsufficientDataError
 from estimator.likelihood.factor_analysis import Maxima
+from estimator.self_noise.result import SelfNoise
+from estimator.spectra.multiresolution import Band
 from estimator.spectra.segment_rejection import Reason
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from daq.bench.sensitivity import Sensitivities
-    from daq.estimation.equalisation import Equalisation
-    from daq.estimation.noise_estimates import Channels, ChannelSet
-    from daq.estimation.segments.segment_pass import Pass
-    from daq.estimation.settings import Settings
-    from daq.protocols.block import Event, Reading
-    from daq.recording.interface import ReadableRecording
-    from estimator.checks.steadied import Steadied
-    from estimator.self_noise.result import SelfNoise
-    from estimator.spectra.multiresolution import Band
-    from estimator.spectra.welch import SegmentSpectra
+from estimator.spectra.welch import SegmentSpectra
 
 
 def keep_few(spectra: Sequence[SegmentSpectra | None]) -> None:

@@ -16,12 +16,14 @@ from __future__ import annotations
 import heapq
 import math
 from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain, count
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.clocks.resampling import reach, resample
 from daq.errors import ImportFormatError
@@ -32,14 +34,7 @@ from daq.formats.foreign_sensor import (
     Stretch,
     piecewise_linear,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from daq.formats.traces import PartCache, Piece
-
+from daq.formats.traces import PartCache, Piece
 
 Overlap: TypeAlias = Literal["refuse", "first", "last"]
 

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.bench.channel import check_name
 from daq.errors import ImportFormatError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from daq.protocols.block import CountsArray
+from daq.protocols.block import CountsArray
 
 NS_PER_S = 1_000_000_000
 MAX_CHANNELS = 1000

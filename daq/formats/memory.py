@@ -6,24 +6,20 @@ is that from the imported file, bit for bit.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from daq.bench.channel import Channel
 from daq.errors import RecordingError
+from daq.formats.foreign_sensor import ForeignSensor, Stretch
 from daq.protocols.block import BlockFlag, Event, HostTime, Reading
 from daq.recording.array_writer import BLOCK_ROWS
 from daq.recording.file_format import BLOCK_DTYPE, GAP_DTYPE
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from daq.bench.channel import Channel
-    from daq.formats.foreign_sensor import ForeignSensor, Stretch
 
 
 class BlocksInMemory:

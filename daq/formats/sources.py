@@ -7,12 +7,13 @@ hold the state of the instrument, and those that were not asked for, are left as
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, TypeAlias
+from typing import Protocol, TypeAlias
 
 from daq.errors import ImportFormatError
 from daq.formats.assembly import SAME_RATE, Overlap, assembled
@@ -24,13 +25,8 @@ from daq.formats.readers.vibration import read_uff, read_wav, tdms_parts
 from daq.formats.readers.waveforms import waveform_parts
 from daq.formats.traces import FilePart, Part, PartCache, Piece, Trace, pieces_of, traces_of
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
-
-    Progress: TypeAlias = Callable[[str], None]
-    from collections.abc import Callable
-
-    WholeFile: TypeAlias = Callable[[Path, float | None], Sequence[ForeignSensor]]
+Progress: TypeAlias = Callable[[str], None]
+WholeFile: TypeAlias = Callable[[Path, float | None], Sequence[ForeignSensor]]
 
 SCHEME = "sds://"
 _N_FIELDS = 7

@@ -14,21 +14,18 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from pathlib import Path
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.errors import ImportFormatError
 from daq.formats.foreign_sensor import NS_PER_S, Calibration, ForeignSensor
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    Samples: TypeAlias = NDArray[Any]
+Samples: TypeAlias = NDArray[Any]
 
 CACHE_BYTES = 48 << 20
 MOST_CACHE_BYTES = 256 << 20

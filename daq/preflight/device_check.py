@@ -5,18 +5,23 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ipaddress
+from collections.abc import AsyncGenerator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
+from daq.bench.model import Bench, Sensor
 from daq.devices.epson import commands
 from daq.devices.epson.driver import identify
+from daq.devices.interface import DeviceInformation
 from daq.devices.modbus.bus import TCP, RefusedError, open_bus
 from daq.devices.registry import driver_type
 from daq.devices.text.format import MessageFinder
 from daq.devices.text.guess import guess_settings
 from daq.errors import DeviceError, NoAnswerError, NotConnectedError, WrongDeviceError
+from daq.host_clock import HostClock
 from daq.preflight.findings import CheckRow, Outcome
 from daq.preflight.preflight import check_list
 from daq.preflight.preview import LENGTH, SensorPreview, arrivals
@@ -25,15 +30,6 @@ from daq.protocols.errors import RemoteProtocolError
 from daq.recorder.device_identity import check_identity, with_owner
 from daq.transport.address import USUAL_NUMBERS
 from daq.transport.ports import open_port
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Iterator, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from daq.bench.model import Bench, Sensor
-    from daq.devices.interface import DeviceInformation
-    from daq.host_clock import HostClock
 
 MIN_SAMPLES = 4
 TEXT_BAUD_RATES = (115200, 9600, 57600, 38400, 19200, 230400)

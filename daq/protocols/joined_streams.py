@@ -29,19 +29,16 @@ A step of the clock is found in one stream, and then expected in the others.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
 from daq.protocols.pace import Pace
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
 
 _NS = 1_000_000_000
 _RATE_OFF = 5e-4  # share by which the rate may be off that a record states

@@ -23,16 +23,13 @@ A device may continue to sample while its connection is interrupted.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from daq.protocols.block import HostTime
 from daq.protocols.pace import Pace
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from daq.protocols.block import HostTime
 
 CLOCK_TOLERANCE = 200e-6
 """Relative error of the rate of a device's clock, as measured or nominal."""

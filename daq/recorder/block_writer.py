@@ -15,11 +15,13 @@ import logging
 import math
 import re
 from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.protocols.block import Block, Event, EventKind, HostTime, Quantity, Reading, ReadingTimes
 from daq.protocols.pace import Pace
@@ -29,12 +31,6 @@ from daq.recorder.late_blocks import LateBlocks
 from daq.recorder.sample_index import Gap, SampleIndexer
 from daq.recording.sensor_state import SensorState
 from daq.recording.writer import Committed, RecordingWriter, SensorCounts
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
-
-    from numpy.typing import NDArray
-
 
 ShareOfRepeats: TypeAlias = "Callable[[NDArray[Any]], float]"
 

@@ -5,16 +5,12 @@ from __future__ import annotations
 import ctypes
 import math
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING
 
+from daq.host_clock import HostClock
 from daq.protocols.block import Event, EventKind
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from daq.host_clock import HostClock
 
 RELEASED = datetime(2026, 11, 1, tzinfo=UTC)
 """Release of this software; a correct clock shows no earlier time."""

@@ -18,15 +18,18 @@ import logging
 import math
 import shutil
 import signal
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 from daq.bench.durations import format_duration
+from daq.bench.model import Bench, Sensor
 from daq.devices.bench_file import is_simulated
+from daq.devices.interface import AnyDriver
 from daq.devices.registry import driver_type
 from daq.errors import DeviceError, DiskError, RecordingError
 from daq.host_clock import HostClock, SystemClock
@@ -41,12 +44,6 @@ from daq.recording.control import Command
 from daq.recording.file_format import SIMULATED, SensorLayout
 from daq.recording.storage.names import CONTINUES, continuation_names
 from daq.recording.writer import Committed, RecordingWriter
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from daq.bench.model import Bench, Sensor
-    from daq.devices.interface import AnyDriver
 
 
 class WritingThread:

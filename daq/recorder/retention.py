@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from daq.recording.storage.journal import journal_path
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 RUN_SUFFIXES = (".json", ".csv", ".csv-metadata.json", ".html", ".pdf", ".sig", ".extremes")
 """Suffixes of the other files of a recording, which are also removed."""

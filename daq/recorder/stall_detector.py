@@ -24,16 +24,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from typing import TYPE_CHECKING, Literal, Self, TypeAlias
+from collections.abc import Callable, Iterator, Mapping
+from types import TracebackType
+from typing import Literal, Self, TypeAlias
 
 from daq.devices.interface import DEFAULT_PATIENCE
+from daq.protocols.block import Block
 from daq.recording.sensor_state import SensorState
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-    from types import TracebackType
-
-    from daq.protocols.block import Block
 
 FIRST_BLOCK_TIMEOUT = 10.0
 """Seconds to wait for a short first block of a session; drivers have tighter limits."""

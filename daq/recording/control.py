@@ -27,15 +27,13 @@ import secrets
 import socket
 import sys
 import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from daq.errors import HuddleError, NoAnswerError, NotConnectedError
 from daq.recording.reader import control_address
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 
 HOST = "127.0.0.1"
 MAX_CONNECTIONS = 16

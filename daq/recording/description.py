@@ -10,21 +10,17 @@ from __future__ import annotations
 
 import json
 import zlib
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
+import h5py
 import numpy as np
 
 from daq.errors import NotARecordingError
 from daq.recording.file_format import fixed, texts
+from daq.recording.sensor_record import CommittedRows
 from daq.recording.storage.refusals import dataset
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
-
-    import h5py
-
-    from daq.recording.sensor_record import CommittedRows
 
 CHECKSUMS = "checksums"
 _DESCRIPTION, _TABLE, _COUNTS = range(3)

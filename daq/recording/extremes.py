@@ -19,20 +19,17 @@ import json
 import stat
 import zipfile
 import zlib
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.recording.interface import ReadableRecording, ReadableSensor, absences
 from daq.whole_file import write_whole
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    IntArray = NDArray[np.int64]
+IntArray = NDArray[np.int64]
 
 BUCKET, FACTOR = 256, 16
 """Rows of a bucket of the lowest level, and buckets that one of the next level joins."""

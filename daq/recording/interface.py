@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from pathlib import Path
+from typing import Any, Protocol, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from daq.bench.channel import Channel
-    from daq.bench.outline import BenchOutline
-    from daq.protocols.block import Event, HostTime, Reading
+from daq.bench.channel import Channel
+from daq.bench.outline import BenchOutline
+from daq.protocols.block import Event, HostTime, Reading
 
 
 class ReadableBlocks(Protocol):

@@ -18,13 +18,15 @@ import json
 import logging
 import shutil
 import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.errors import HuddleError, RecordingError
 from daq.host_clock import SystemClock
@@ -41,6 +43,7 @@ from daq.recording.chunks.manifest import (
 from daq.recording.description import result_crc32, write_checksums
 from daq.recording.file_format import LIBVER, fixed
 from daq.recording.reader import Recording
+from daq.recording.sensor_record import SensorRecord
 from daq.recording.storage.journal import JournalContents, journal_path, read_journal, rebuild
 from daq.recording.storage.locking import is_being_written
 from daq.recording.storage.opening import open_file
@@ -49,13 +52,6 @@ from daq.recording.storage.superblock import Superblock
 from daq.recording.storage.trial import remember
 from daq.recording.storage.whole_hdf5 import WholeHdf5
 from daq.whole_file import create_private, replaced
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from daq.recording.sensor_record import SensorRecord
 
 _ROWS_PER_READ = 1 << 17
 _SUPERBLOCK = "the superblock: the recorder was killed while it closed the file"

@@ -16,10 +16,14 @@ import bisect
 import contextlib
 import os
 import threading
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import Any
 
+import h5py
 import numpy as np
+from numpy.typing import NDArray
 
+from daq.bench.channel import Channel
 from daq.errors import NotARecordingError, RecordingError
 from daq.protocols.block import BlockFlag
 from daq.recording import file_format
@@ -28,15 +32,7 @@ from daq.recording.storage.opening import refresh
 from daq.recording.storage.packing import PIPELINE, RAW, InflationError, check_chunks, unpacked
 from daq.recording.storage.refusals import check_length, dataset, number, text
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    import h5py
-    from numpy.typing import NDArray
-
-    from daq.bench.channel import Channel
-
-    IntArray = NDArray[np.int64]
+IntArray = NDArray[np.int64]
 
 
 _ROWS_PER_READ = 1 << 14  # 900 kB

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import StrEnum
-from typing import TYPE_CHECKING
 
 from daq.protocols.block import EventKind
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 
 class SensorState(StrEnum):

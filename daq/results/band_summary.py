@@ -8,33 +8,31 @@ from __future__ import annotations
 
 import enum
 import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.estimation.contributions import contributions, shared_parts, two_may_share
 from daq.estimation.noise_estimates import ALL_METHODS
+from daq.estimation.settings import Settings
+from daq.estimation.snapshot import ChannelLabel, Snapshot
 from estimator.checks.advice_on_signals import NoSharedMotion
-from estimator.levels.bands import band_edges, band_levels, bin_correlation, third_octaves
-from estimator.levels.contributions import Source, by_chance, deviation, widened
+from estimator.levels.bands import (
+    BandLevels,
+    band_edges,
+    band_levels,
+    bin_correlation,
+    third_octaves,
+)
+from estimator.levels.contributions import Contribution, Source, by_chance, deviation, widened
 from estimator.levels.interval import NORMAL_95, interval, unpredicted, unpredicted_by_one
 from estimator.median import median_of_columns
-from estimator.self_noise.result import Flag
+from estimator.self_noise.result import Flag, SelfNoise
 from estimator.spectra.windows import get_window
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
-
-    from numpy.typing import NDArray
-
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import ChannelLabel, Snapshot
-    from estimator.levels.bands import BandLevels
-    from estimator.levels.contributions import Contribution
-    from estimator.self_noise.result import SelfNoise
-    from estimator.types import BoolArray, FloatArray
+from estimator.types import BoolArray, FloatArray
 
 CONSTANT = frozenset({Source.SENSITIVITY})
 """What is the same in all tests of a sensor, and no part of the difference of two."""

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from daq.clocks.clock_model import RelativeTime
-
-if TYPE_CHECKING:
-    from daq.estimation.snapshot import Snapshot
-    from daq.results.band_summary import Estimate
-    from estimator.types import FloatArray
+from daq.estimation.snapshot import Snapshot
+from daq.results.band_summary import Estimate
+from estimator.types import FloatArray
 
 NO_EFFECT, NEGLIGIBLE_EFFECT, SMALL_EFFECT = 0.001, 0.01, 0.05
 """Share of the noise that comes from the clocks: below it nothing, negligible, small."""

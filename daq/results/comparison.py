@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from daq.bench.units import decibels
-from daq.results.band_summary import CONSTANT
-
-if TYPE_CHECKING:
-    from daq.results.band_summary import BandMeans, Estimate
+from daq.results.band_summary import CONSTANT, BandMeans, Estimate
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,37 +12,32 @@ takes to arrive.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import groupby, pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
+from daq.bench.channel import Channel
 from daq.bench.units import levels_db
+from daq.clocks.arrival_times import ArrivalTimes
+from daq.clocks.clock_model import Clock
 from daq.clocks.sensor_reader import SensorSource
 from daq.estimation.noise_estimates import responses
+from daq.estimation.snapshot import Snapshot
 from daq.protocols.block import EventKind
 from daq.recording.extremes import Extremes, extremes_of
+from daq.recording.interface import ReadableRecording, ReadableSensor
 from estimator.errors import EstimatorError
 from estimator.levels.bands import log_edges
 from estimator.methods import self_noise
 from estimator.spectra.parts import grouped
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
-    from numpy.typing import NDArray
-
-    from daq.bench.channel import Channel
-    from daq.clocks.arrival_times import ArrivalTimes
-    from daq.clocks.clock_model import Clock
-    from daq.estimation.snapshot import Snapshot
-    from daq.recording.interface import ReadableRecording, ReadableSensor
-
-    FloatArray = NDArray[np.float64]
-    IntArray = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 GAP, CLIPPED, EXCLUDED = "gap", "clipped", "excluded"
 """Kinds of marks beside those of events."""

@@ -5,21 +5,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import combinations, pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daq.bench.channel import Channel
 from daq.estimation.diagnosis import vertical_channel
+from daq.estimation.snapshot import Snapshot
+from daq.results.result import Result
 from estimator.checks.shared_motion import CanonicalCoherence
 from estimator.errors import EstimatorError
 from estimator.levels.bands import log_edges
 from estimator.self_noise.coherency import coherency, own_channels
-
-if TYPE_CHECKING:
-    from daq.estimation.snapshot import Snapshot
-    from daq.results.result import Result
-    from estimator.types import FloatArray
+from estimator.types import FloatArray
 
 POINTS = 40
 """Points of a coherence against frequency."""

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
+from daq.estimation.snapshot import Snapshot
+from daq.recording.reader import Recording
 from daq.recording.repair import write_results
+from daq.results.decision.verdict import TestVerdict
 from estimator.decision.verdict import Verdict
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from daq.estimation.snapshot import Snapshot
-    from daq.recording.reader import Recording
-    from daq.results.decision.verdict import TestVerdict
-    from estimator.types import FloatArray
+from estimator.types import FloatArray
 
 
 def store_results(

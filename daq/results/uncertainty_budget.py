@@ -14,26 +14,20 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from statistics import NormalDist
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.bench.sensitivity import KnownSensitivity
-from daq.results.band_summary import Estimate
+from daq.estimation.snapshot import ChannelLabel
+from daq.results.band_summary import Estimate, Levels
 from estimator.levels.bands import band_edges, third_octaves
 from estimator.levels.interval import NORMAL_95
 from estimator.records import NOT_IN_JSON
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from numpy.typing import NDArray
-
-    from daq.estimation.snapshot import ChannelLabel
-    from daq.results.band_summary import Levels
-    from estimator.types import FloatArray
+from estimator.types import FloatArray
 
 STATED = 1e6
 """Degrees of freedom of an uncertainty that is stated."""

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from daq.clocks.clock_model import ClockSource
+from daq.clocks.clock_model import ClockSource, ClockState
 from daq.recording.sensor_state import SensorState
 from daq.results.band_summary import WithoutPartner
 from estimator.checks.sensitivities import Cause
 from estimator.levels.contributions import Source
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from daq.clocks.clock_model import ClockState
 
 STATE_MEANINGS: Mapping[SensorState, str] = {
     SensorState.LIVE: "samples arrive",

@@ -23,25 +23,21 @@ import errno
 import json
 import os
 import socket
+import ssl
 import sys
 import tempfile
 import threading
+from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import serial
 
 from daq.errors import NotConnectedError
+from daq.host_clock import HostClock
 from daq.transport import wire_log
 from daq.transport.address import check_serial, host_and_port, is_same_port, is_virtual
 from daq.transport.byte_stream import ByteStream, Transport, why
-
-if TYPE_CHECKING:
-    import ssl
-    from collections.abc import AsyncIterator
-
-    from daq.host_clock import HostClock
-
 
 if sys.platform != "win32":
     import fcntl

@@ -9,18 +9,15 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections import deque
-from typing import TYPE_CHECKING, cast
+from collections.abc import AsyncIterator
+from typing import cast
 
 from daq.errors import NotConnectedError
+from daq.host_clock import HostClock
+from daq.protocols.block import HostTime
 from daq.transport import wire_log
 from daq.transport.address import host_and_port
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from daq.host_clock import HostClock
-    from daq.protocols.block import HostTime
-    from daq.transport.byte_stream import StreamLog
+from daq.transport.byte_stream import StreamLog
 
 MAX_UNREAD = 8192
 """Maximum number of unread datagrams; beyond, the oldest are dropped."""

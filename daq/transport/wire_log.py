@@ -23,19 +23,16 @@ import contextlib
 import itertools
 import json
 from collections import deque
+from collections.abc import Iterator
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
 from daq.errors import NotConnectedError, ReplayError
+from daq.host_clock import HostClock
 from daq.protocols.block import HostTime
 from daq.transport.byte_stream import ByteStream
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from daq.host_clock import HostClock
 
 
 class PortLog:

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import html
 import re
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
 from tui.application.app import HuddleApp
 from tui.commands.tui_controls import RecordingControls
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 BRAILLE = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (0, 3), (1, 3))
 METHODS = ("three-sensor", "three-channel")

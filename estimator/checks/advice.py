@@ -8,15 +8,12 @@ advice of their own.
 from __future__ import annotations
 
 import enum
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar, Self
 
 from estimator.records import Record, record
 from estimator.wording import Words, listed, several, span
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from typing import Self
 
 
 class Rank(enum.StrEnum):

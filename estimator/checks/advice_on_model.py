@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Sequence
+from typing import ClassVar, Self
 
 from estimator.checks.advice import Advice, Names, Rank, model
 from estimator.likelihood.dimension import has_room
 from estimator.records import Hertz, Share, record
 from estimator.wording import Words, listed, percent, ratio, several, span
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from typing import Self
 
 _THREE = 3  # sensors
 

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Callable, Sequence
+from typing import ClassVar, Self, TypeVar
 
 from estimator.checks.advice import Advice, Names, Rank
 from estimator.records import Seconds, record
 from estimator.wording import Words, degrees, listed, percent, ratio, signed
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from typing import Self, TypeVar
-
-    Pairwise = TypeVar("Pairwise", bound=Advice)
+Pairwise = TypeVar("Pairwise", bound=Advice)
 
 
 ANY_AXES = "three-sensor, maximum likelihood or multi-part"

@@ -13,14 +13,11 @@ rounding only, where its variance is ``v + 1/6 - 2 rho(v)``.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from estimator.types import ComplexArray, FloatArray, IntArray
+from estimator.types import ComplexArray, FloatArray, IntArray
 
 NEAR = 1.0
 """Variance of the difference in counts**2 from which nothing is shared: 1e-9 of the rounding."""

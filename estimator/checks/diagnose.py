@@ -6,14 +6,14 @@ orientation of the sensors, and the recommendations of section 5 of the paper.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.checks.advice import Rank, Untested
+from estimator.checks.advice import Advice, Rank, Untested
 from estimator.checks.advice_on_noise import DisturbedSegments, NoiseChanges, ResponseChanges
 from estimator.checks.band import BandDiagnosis
 from estimator.checks.relative_response import (
@@ -31,13 +31,14 @@ from estimator.checks.shared_motion import (
     significant_dimensions,
 )
 from estimator.checks.shared_noise import shared_noise
-from estimator.checks.stability import Stability, stability
+from estimator.checks.stability import SegmentCourse, Stability, stability
 from estimator.errors import InsufficientDataError
 from estimator.likelihood import fisher
 from estimator.likelihood.dimension import bands
 from estimator.likelihood.factor_analysis import Maxima, Maximum, joined
 from estimator.likelihood.goodness_of_fit import (
     HANN_HALF,
+    BandTest,
     ModelTest,
     critical_value,
     deflated,
@@ -48,6 +49,7 @@ from estimator.likelihood.goodness_of_fit import (
 from estimator.likelihood.maximum_likelihood import standard_error
 from estimator.median import median_of_columns
 from estimator.self_noise.coherency import (
+    Coherency,
     Presence,
     blocks,
     check_averages,
@@ -57,16 +59,8 @@ from estimator.self_noise.coherency import (
     presence,
     testable,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from estimator.checks.advice import Advice
-    from estimator.checks.stability import SegmentCourse, Stability
-    from estimator.likelihood.goodness_of_fit import BandTest
-    from estimator.self_noise.coherency import Coherency
-    from estimator.spectra.parts import Parts
-    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+from estimator.spectra.parts import Parts
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 NAMED = 5
 """Maximum number of disturbed segments with reported times."""

@@ -15,18 +15,14 @@ frequencies, and however loud the segments are.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimator.levels.pooled import blocks_of
+from estimator.spectra.welch import WelchSettings
 from estimator.spectra.windows import get_window
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from estimator.spectra.welch import WelchSettings
-    from estimator.types import ComplexArray, FloatArray, IntArray
+from estimator.types import ComplexArray, FloatArray, IntArray
 
 MOST_SEGMENTS = 48
 MOST_BINS = 200

@@ -12,8 +12,9 @@ the difference.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -25,7 +26,9 @@ from estimator.checks.shared_motion import (
 )
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.levels.interval import worth
+from estimator.records import Hertz, Seconds
 from estimator.self_noise.coherency import (
+    Coherency,
     blocks,
     check_dims,
     check_frequency,
@@ -33,13 +36,7 @@ from estimator.self_noise.coherency import (
     other_channels,
     own_channels,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from estimator.records import Hertz, Seconds
-    from estimator.self_noise.coherency import Coherency
-    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 _Numbers = TypeVar("_Numbers", "ComplexArray", "FloatArray")
 

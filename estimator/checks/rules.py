@@ -14,9 +14,9 @@ Advice on two sensors is on rotation, orthogonality, swapped or reversed channel
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import groupby
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -45,19 +45,14 @@ from estimator.checks.advice_on_signals import (
     NoSignal,
     TooFewSensors,
 )
+from estimator.checks.band import BandDiagnosis
+from estimator.checks.relative_response import RelativeResponse
 from estimator.checks.shared_motion import outsiders
+from estimator.checks.shared_noise import SharedPairs
 from estimator.likelihood.goodness_of_fit import less, rejected_below
-from estimator.self_noise.coherency import presence
+from estimator.self_noise.coherency import Coherency, presence
 from estimator.self_noise.result import Flag
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
-
-    from estimator.checks.band import BandDiagnosis
-    from estimator.checks.relative_response import RelativeResponse
-    from estimator.checks.shared_noise import SharedPairs
-    from estimator.self_noise.coherency import Coherency
-    from estimator.types import FloatArray
+from estimator.types import FloatArray
 
 ROTATED_DEG = 0.5
 SKEWED_DEG = 2.0

@@ -8,16 +8,13 @@ from __future__ import annotations
 
 import enum
 import math
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
-
-    from estimator.checks.relative_response import RelativeResponse
-    from estimator.types import FloatArray
+from estimator.checks.relative_response import RelativeResponse
+from estimator.types import FloatArray
 
 TOLERANCE = 0.05
 """Difference of a gain from 1 from which on a sensitivity is wrong."""

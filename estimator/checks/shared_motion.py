@@ -11,21 +11,16 @@ motion that fades shares less as well, but its noise is as before.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimator.likelihood.goodness_of_fit import critical_value
 from estimator.median import median
 from estimator.self_noise.coherency import blocks, own_channels
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 MIN_SHARED = 0.3
 """Share of common motion from which two sensors agree."""

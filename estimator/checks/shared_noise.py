@@ -8,25 +8,21 @@ the averages, as for waves across the bench, none is reported.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import combinations
 from operator import add
 from statistics import NormalDist
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimator.likelihood.factor_analysis import Maximum
 from estimator.likelihood.goodness_of_fit import REJECT, upper_tail
 from estimator.likelihood.score_test import Scores, pair_scores, shift, usable
 from estimator.median import median
 from estimator.self_noise.three_sensor import three_sensor
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from estimator.likelihood.factor_analysis import Maximum
-    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 UNEXPLAINED = 1e-3
 """Smallest p value of the residual after removal of the found pairs; below it none is reported."""

@@ -12,11 +12,12 @@ import functools
 import math
 import operator
 from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimator.checks.steadied import Steadied, steadied
 from estimator.checks.steadiness import (
@@ -34,20 +35,13 @@ from estimator.checks.steadiness import (
     variance_of_changes,
 )
 from estimator.likelihood import fisher
+from estimator.likelihood.factor_analysis import Maximum
 from estimator.likelihood.goodness_of_fit import critical_value
 from estimator.likelihood.score_test import usable
 from estimator.median import median
 from estimator.records import NOT_IN_JSON
-from estimator.spectra.parts import grouped
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from estimator.likelihood.factor_analysis import Maximum
-    from estimator.spectra.parts import Parts
-    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+from estimator.spectra.parts import Parts, grouped
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 MIN_SEGMENTS = 4
 """Minimum number of segments per part."""

@@ -23,23 +23,17 @@ frequency, by the coefficients of the regression less what their scatter adds.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.checks.steadiness import VALUES_AT_ONCE, regression
+from estimator.checks.steadiness import VALUES_AT_ONCE, Regression, regression
 from estimator.likelihood import fisher
+from estimator.likelihood.factor_analysis import Maximum
 from estimator.median import median
-from estimator.spectra.parts import grouped
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from estimator.checks.steadiness import Regression
-    from estimator.likelihood.factor_analysis import Maximum
-    from estimator.spectra.parts import Parts
-    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+from estimator.spectra.parts import Parts, grouped
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 LEAST = 4
 """Averages of a part, per dimension of the motion: a quarter of them is spent."""

@@ -21,19 +21,15 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.likelihood import fisher
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from estimator.likelihood.factor_analysis import Maximum
-    from estimator.spectra.parts import Divided
-    from estimator.types import ComplexArray, FloatArray
+from estimator.likelihood.factor_analysis import Maximum
+from estimator.spectra.parts import Divided
+from estimator.types import ComplexArray, FloatArray
 
 MIN_PARTS = 3
 MIN_DEGREES = 2.0

@@ -14,23 +14,17 @@ A mask is judged in bands, which follow from it and from the spectrum.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimator.decision.decision_time import Margins, predict
-from estimator.decision.verdict import MIN_AVERAGES, REMOVED_BY_TIME, Obstacle, Verdict
+from estimator.decision.verdict import MIN_AVERAGES, REMOVED_BY_TIME, Obstacle, Prediction, Verdict
 from estimator.levels.bands import third_octaves
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
-
-    from numpy.typing import NDArray
-
-    from estimator.decision.verdict import Prediction
-    from estimator.types import BoolArray, FloatArray
+from estimator.types import BoolArray, FloatArray
 
 
 def joint_quantile(n_bands: int) -> float:

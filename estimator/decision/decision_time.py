@@ -16,15 +16,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.decision.verdict import Prediction
 from estimator.levels.interval import interval
-
-if TYPE_CHECKING:
-    from estimator.types import BoolArray, FloatArray
+from estimator.types import BoolArray, FloatArray
 
 LIKELY = 0.4
 """Probability with which a look at the predicted length decides.

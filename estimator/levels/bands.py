@@ -13,17 +13,13 @@ the same correlation.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimator.errors import BandError
 from estimator.levels.interval import NORMAL_95, interval
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from estimator.types import FloatArray
+from estimator.types import FloatArray
 
 BANDS_PER_OCTAVE = 3
 N_LAGS = 8

@@ -15,19 +15,14 @@ too high or too low. The model test of three sensors cannot see it. For leans of
 from __future__ import annotations
 
 import enum
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimator.levels.interval import NORMAL_95
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable
-
-    from numpy.typing import NDArray
-
-    from estimator.types import FloatArray
+from estimator.types import FloatArray
 
 
 class Source(enum.StrEnum):

@@ -34,12 +34,10 @@ sensors share is predicted too: for their channels it is no bound.
 from __future__ import annotations
 
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from estimator.types import BoolArray, ComplexArray, FloatArray
+from estimator.types import BoolArray, ComplexArray, FloatArray
 
 NORMAL_95 = 1.959963984540054
 """Standard normal quantile of 97.5 %."""

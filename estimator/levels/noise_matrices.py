@@ -6,12 +6,9 @@ the motion; `estimator.likelihood.factor_analysis` and `estimator.levels.pooled`
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from estimator.types import ComplexArray, FloatArray, IntArray
+from estimator.types import ComplexArray, FloatArray, IntArray
 
 MANY = 8
 """Sensors with equal numbers of channels from which information is inverted sensor by sensor."""

@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -46,9 +46,7 @@ from estimator.levels.noise_matrices import (
     white,
 )
 from estimator.median import median
-
-if TYPE_CHECKING:
-    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 _Array = TypeVar("_Array", "FloatArray", "ComplexArray")
 

@@ -36,8 +36,8 @@ Method item 27a of the design; K = 1 is the ordinary likelihood with a block of 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -45,11 +45,7 @@ from estimator.errors import InsufficientDataError
 from estimator.levels.interval import NORMAL_95
 from estimator.likelihood.goodness_of_fit import digamma, trigamma, upper_tail
 from estimator.self_noise.result import Refusal
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 STEADINESS = 1e-3
 """Relative change of a gain a decade of loudness (power of the motion), by default."""

@@ -7,8 +7,8 @@ then further factors of the same model.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,7 +29,9 @@ from estimator.likelihood.maximum_likelihood import standard_error
 from estimator.likelihood.prior import expected_noise, kinds, maximise_expecting
 from estimator.likelihood.shared_by_two import SHARING, SharedByTwo, local_shares
 from estimator.median import median
+from estimator.records import Hertz
 from estimator.self_noise.coherency import (
+    Presence,
     check_averages,
     check_dims,
     check_frequency,
@@ -37,13 +39,7 @@ from estimator.self_noise.coherency import (
     presence,
     testable,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from estimator.records import Hertz
-    from estimator.self_noise.coherency import Presence
-    from estimator.types import ComplexArray, FloatArray, IntArray
+from estimator.types import ComplexArray, FloatArray, IntArray
 
 ROOM, ROOM_OF_ONE_CHANNEL = 4, 6
 """Sensors from which ``auto`` looks for more dimensions of motion than a sensor has channels."""

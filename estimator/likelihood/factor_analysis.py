@@ -18,21 +18,18 @@ direction whose noise tends to zero is held at a bound while the others are solv
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from hashlib import sha256
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from estimator.errors import EstimatorError, InsufficientDataError, InvalidMatrixError
 from estimator.levels.noise_matrices import axes_of, coupling_beside, pairs
 from estimator.self_noise.coherency import TOLERANCE, blocks
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 _FEW = 16  # channels whose matrices are diagonalised whole
 _NEARLY_ONE = 1e-4  # share of a channel beside the factors, near zero noise

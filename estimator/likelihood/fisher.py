@@ -12,19 +12,16 @@ sensors of one channel these are ``|P_ij|**2``, the information on ``ln psi``.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias, overload
+from collections.abc import Sequence
+from typing import TypeAlias, overload
 
 import numpy as np
 
 from estimator.errors import InvalidMatrixError
 from estimator.levels.noise_matrices import coupling_beside, pairs, traces
+from estimator.likelihood.factor_analysis import Maximum
 from estimator.self_noise.coherency import blocks, check_averages
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from estimator.likelihood.factor_analysis import Maximum
-    from estimator.types import ComplexArray, FloatArray
+from estimator.types import ComplexArray, FloatArray
 
 Covariance: TypeAlias = "ComplexArray | FloatArray"
 """Of the noise: of elements within sensors, real where each has one channel."""

@@ -11,22 +11,18 @@ that of ``huddle estimate`` for a recording of four minutes. The tests compare t
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.errors import InsufficientDataError
 from estimator.likelihood import fisher
+from estimator.likelihood.factor_analysis import Maximum
 from estimator.self_noise.coherency import check_averages
 from estimator.spectra.windows import get_window
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from estimator.likelihood.factor_analysis import Maximum
-    from estimator.types import BoolArray, FloatArray
+from estimator.types import BoolArray, FloatArray
 
 _EPS = 2.0**-52
 _TINY = 1e-300  # replaces zero in the continued fraction

@@ -18,15 +18,21 @@ and weak motion along them nearly nothing.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.levels.interval import like_psd
 from estimator.likelihood import fisher
-from estimator.likelihood.dimension import MAX_BINS, MIN_BINS, MIN_DETERMINED_SENSORS, MISFIT_LEVEL
-from estimator.likelihood.factor_analysis import Maxima
+from estimator.likelihood.dimension import (
+    MAX_BINS,
+    MIN_BINS,
+    MIN_DETERMINED_SENSORS,
+    MISFIT_LEVEL,
+    BandDimension,
+)
+from estimator.likelihood.factor_analysis import Maxima, Maximum
 from estimator.likelihood.goodness_of_fit import (
     HANN_HALF,
     BandTest,
@@ -40,13 +46,7 @@ from estimator.likelihood.prior import NOISE_SPREAD, alike, expected_noise, kind
 from estimator.median import median
 from estimator.self_noise.coherency import coherency
 from estimator.self_noise.result import Flag, SelfNoise
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from estimator.likelihood.dimension import BandDimension
-    from estimator.likelihood.factor_analysis import Maximum
-    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 DIMENSIONS = 3
 """Of motion at one point: axes of fewer channels that lean feel all of them."""

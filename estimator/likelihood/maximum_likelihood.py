@@ -12,8 +12,9 @@ indistinguishable from its noise: `alone` finds these channels (`docs/decisions/
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from functools import partial
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from estimator.likelihood.factor_analysis import (
 from estimator.likelihood.goodness_of_fit import model_test
 from estimator.likelihood.prior import NOISE_SPREAD, expected_noise, kinds, maximise_expecting
 from estimator.self_noise.coherency import (
+    Coherency,
     blocks,
     check_averages,
     check_dims,
@@ -37,12 +39,7 @@ from estimator.self_noise.coherency import (
     inverse,
 )
 from estimator.self_noise.result import Flag, SelfNoise
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from estimator.self_noise.coherency import Coherency
-    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 SCATTER = 1.2
 """Standard deviations by which a factor must lower the test statistic beyond its number of

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import functools
 import itertools
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,13 +21,8 @@ from estimator.levels.interval import CERTAIN, NORMAL_95, interval, unpredicted,
 from estimator.levels.pooled import blocks_of
 from estimator.likelihood.changing_motion import STEADINESS, BandNoise, band_noise
 from estimator.self_noise.result import Flag, Refusal, SelfNoise, joined
-from estimator.spectra.parts import grouped, joined_parts
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from estimator.spectra.parts import Parts
-    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+from estimator.spectra.parts import Parts, grouped, joined_parts
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 REJECTED = 1e-3
 """p-value of the model's fit in a block, from which the block has no levels."""

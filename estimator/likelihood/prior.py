@@ -12,16 +12,12 @@ Averages with more information outweigh the prior: a spread of 0.5 has the weigh
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.likelihood.factor_analysis import Maximum, maximise
-from estimator.self_noise.coherency import presence
-
-if TYPE_CHECKING:
-    from estimator.self_noise.coherency import Coherency
-    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+from estimator.self_noise.coherency import Coherency, presence
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 NOISE_SPREAD = 0.5
 NEAREST = 32

@@ -16,22 +16,18 @@ separates the pairs.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.levels.noise_matrices import coupling_beside
 from estimator.levels.noise_matrices import pairs as elements
 from estimator.likelihood import fisher
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from estimator.likelihood.factor_analysis import Maximum
-    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+from estimator.likelihood.factor_analysis import Maximum
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 MAX_BINS = 4
 """Number of frequencies of a band for the information, which changes little between them."""

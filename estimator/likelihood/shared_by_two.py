@@ -7,26 +7,23 @@ The pairs are those with which, one noise matrix for both, a dimension less expl
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from estimator.levels.noise_matrices import apart
+from estimator.likelihood.goodness_of_fit import BandTest
 from estimator.median import median
+from estimator.types import ComplexArray, FloatArray, IntArray
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-
-    from estimator.likelihood.goodness_of_fit import BandTest
-    from estimator.types import ComplexArray, FloatArray, IntArray
-
-    Pair: TypeAlias = tuple[int, int]
-    Tested: TypeAlias = tuple[BandTest, ComplexArray]
-    Test: TypeAlias = Callable[[int, int, IntArray], Tested | None]
-    """Of a number of dimensions, a band, groups of sensors; with the noise at its frequencies."""
+Pair: TypeAlias = tuple[int, int]
+Tested: TypeAlias = tuple[BandTest, ComplexArray]
+Test: TypeAlias = Callable[[int, int, IntArray], Tested | None]
+"""Of a number of dimensions, a band, groups of sensors; with the noise at its frequencies."""
 
 SHARING = 4
 """Sensors from which noise that two of them share is told from motion."""

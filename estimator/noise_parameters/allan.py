@@ -9,16 +9,12 @@ terms replace the estimate.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.levels.interval import CERTAIN, NORMAL_95
-from estimator.noise_parameters.fit import resolution, scatter, terms_at, usable
-
-if TYPE_CHECKING:
-    from estimator.noise_parameters.fit import NoiseParameters
-    from estimator.types import FloatArray
+from estimator.noise_parameters.fit import NoiseParameters, resolution, scatter, terms_at, usable
+from estimator.types import FloatArray
 
 LONGEST = 0.3
 """Maximum averaging time times the lowest frequency, for which the estimate has most of the

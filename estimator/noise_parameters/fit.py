@@ -15,16 +15,13 @@ from __future__ import annotations
 import enum
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.median import median
 from estimator.records import NOT_IN_JSON
-
-if TYPE_CHECKING:
-    from estimator.types import BoolArray, FloatArray, IntArray
+from estimator.types import BoolArray, FloatArray, IntArray
 
 MIN_BINS = 24
 """Minimum number of frequencies for a fit of four terms."""

@@ -15,19 +15,16 @@ common.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.checks.relative_response import relative_response
+from estimator.checks.shared_motion import CanonicalCoherence
 from estimator.errors import InsufficientDataError
 from estimator.records import NOT_IN_JSON
 from estimator.responses.derived_quantities import Value, with_errors
 from estimator.self_noise.coherency import other_channels, own_channels
-
-if TYPE_CHECKING:
-    from estimator.checks.shared_motion import CanonicalCoherence
-    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 _STEPS = 3  # alternating estimates of delays and matrix
 _PER_INSTRUMENT = 2  # averages for each channel of the other sensors

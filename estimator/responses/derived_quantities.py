@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from estimator.types import FloatArray
+from estimator.types import FloatArray
 
 _STEP = 1e-6  # step of numerical derivatives, relative to the largest element
 

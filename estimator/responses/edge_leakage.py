@@ -16,18 +16,14 @@ mean is taken, with weights ``|S_yz|² / S_zz``: their predictions may have any 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.likelihood.dimension import bands
 from estimator.self_noise.coherency import BLOCK_BYTES, blocks, check_dims, own_channels
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from estimator.types import BoolArray, ComplexArray, FloatArray
+from estimator.types import BoolArray, ComplexArray, FloatArray
 
 MIN_COHERENCE = 0.3
 """Minimum coherence between a channel and its prediction at a used frequency."""

@@ -11,14 +11,14 @@ from data is used only where other segments prove it (`lowers_noise`).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import numpy as np
 
 from estimator.checks.advice import Rank
 from estimator.checks.advice_on_sensors import UnequalResponses
 from estimator.likelihood.dimension import bands
-from estimator.responses.edge_leakage import band_shares
+from estimator.responses.edge_leakage import ChannelResponses, band_shares
 from estimator.self_noise.coherency import own_channels
 from estimator.spectra.equaliser import (
     USABLE,
@@ -27,12 +27,7 @@ from estimator.spectra.equaliser import (
     tail_leakage,
     with_short_tails,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from estimator.responses.edge_leakage import ChannelResponses
-    from estimator.types import BoolArray, ComplexArray, FloatArray
+from estimator.types import BoolArray, ComplexArray, FloatArray
 
 THRESHOLD = 0.01
 """Leakage from which channels are filtered, as a share of the noise in a third of an octave."""

@@ -12,15 +12,12 @@ References
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.errors import EstimatorError
 from estimator.self_noise.coherency import check_dims
-
-if TYPE_CHECKING:
-    from estimator.types import ComplexArray, FloatArray
+from estimator.types import ComplexArray, FloatArray
 
 SINGULAR = 1e-12  # fraction of the largest singular value that is zero within rounding
 

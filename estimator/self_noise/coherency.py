@@ -9,18 +9,14 @@ channels did not exist.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.errors import InsufficientDataError, InvalidMatrixError
 from estimator.self_noise.result import Flag, SelfNoise
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 TOLERANCE = 1e-8  # of Hermitian symmetry, and of coherence above 1
 DEAD = 1e-28  # fraction of a channel's largest PSD that is rounding of a constant

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.levels.interval import interval
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from estimator.types import FloatArray, IntArray
+from estimator.types import FloatArray, IntArray
 
 
 class Flag(enum.IntFlag):

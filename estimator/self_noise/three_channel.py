@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from estimator.errors import InsufficientDataError
 from estimator.self_noise.coherency import check_dims, coherency
 from estimator.self_noise.result import Flag, SelfNoise
 from estimator.self_noise.three_sensor import estimate
-
-if TYPE_CHECKING:
-    from estimator.types import ComplexArray
+from estimator.types import ComplexArray
 
 
 def three_channel(

@@ -33,31 +33,26 @@ spite of scatter.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimator.levels.interval import cumulants, moments
 from estimator.self_noise.coherency import (
+    Coherency,
     check_averages,
     check_dims,
     coherency,
     from_parts,
     inverse,
 )
-from estimator.self_noise.result import Flag
+from estimator.self_noise.result import Flag, SelfNoise
 from estimator.spectra.welch import THREADS
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from numpy.typing import NDArray
-
-    from estimator.self_noise.coherency import Coherency
-    from estimator.self_noise.result import SelfNoise
-    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 NEIGHBOURS = 16
 """Number of sampled frequencies on either side whose variances are averaged."""

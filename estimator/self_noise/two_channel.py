@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from estimator.errors import EstimatorError
 from estimator.levels.interval import cumulants, moments
 from estimator.self_noise.coherency import check_averages, check_dims, coherency, from_parts
-from estimator.self_noise.result import Flag
-
-if TYPE_CHECKING:
-    from estimator.self_noise.result import SelfNoise
-    from estimator.types import ComplexArray
+from estimator.self_noise.result import Flag, SelfNoise
+from estimator.types import ComplexArray
 
 
 def two_channel(

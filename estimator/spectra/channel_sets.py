@@ -8,16 +8,11 @@ channel's noise is estimated in every set that holds it, and the estimates are c
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from estimator.spectra.segment_rejection import SelectedSpectra
+from estimator.spectra.segment_rejection import RejectionSettings, SelectedSpectra
 from estimator.spectra.welch import CrossSpectra, WelchSettings
-
-if TYPE_CHECKING:
-    from estimator.spectra.segment_rejection import RejectionSettings
-    from estimator.types import BoolArray, FloatArray, IntArray
+from estimator.types import BoolArray, FloatArray, IntArray
 
 MOST_SETS = 16
 

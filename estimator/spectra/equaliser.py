@@ -11,15 +11,12 @@ divided by it, so that the truncation causes no bias.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.errors import EstimatorError
 from estimator.median import median
-
-if TYPE_CHECKING:
-    from estimator.types import ComplexArray, FloatArray
+from estimator.types import ComplexArray, FloatArray
 
 MAX_AMPLIFICATION = 100.0
 """Maximum amplification over the median amplification: limits the amplification of noise."""

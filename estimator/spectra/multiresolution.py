@@ -19,7 +19,6 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import takewhile
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,11 +27,9 @@ from estimator.spectra.channel_sets import ChannelSets
 from estimator.spectra.parts import Part, PartEnds, Parts, by_part
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
 from estimator.spectra.welch import CrossSpectra, WelchSettings
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
-if TYPE_CHECKING:
-    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
-
-    Columns = tuple[int, ...]
+Columns = tuple[int, ...]
 
 LOW, HIGH = 0.2, 0.4  # octave of a stage, as fractions of its rate
 TAPS = 89  # odd; stop-band from 0.3 of the rate above, 120 dB down

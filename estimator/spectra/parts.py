@@ -11,15 +11,13 @@ costs a pass no product. In float64 the difference is as exact as the sum.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 MOST = 24
 """Parts at most; half as many after neighbours are merged."""

@@ -20,21 +20,17 @@ from __future__ import annotations
 
 import enum
 from collections import Counter, deque
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.errors import EstimatorError
 from estimator.median import median
+from estimator.spectra.parts import PartEnds
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from estimator.spectra.parts import PartEnds
-    from estimator.types import BoolArray, FloatArray, IntArray
+from estimator.types import BoolArray, FloatArray, IntArray
 
 FIRST_BAND = 8  # frequencies in the lowest band; every other band is an octave
 FLATLINE_SAMPLES = 32  # consecutive equal samples of a dead channel

@@ -20,12 +20,10 @@ these nine rows.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from estimator.types import ComplexArray, FloatArray, IntArray
+from estimator.types import ComplexArray, FloatArray, IntArray
 
 PRECISION = 1e-5
 """Error of the series relative to the motion, as an amplitude: -100 dB, as interpolation has."""

@@ -13,23 +13,18 @@ from __future__ import annotations
 import functools
 import io
 import json
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimator.errors import EstimatorError, InsufficientDataError
-from estimator.spectra.parts import Part
+from estimator.spectra.parts import Part, PartEnds
 from estimator.spectra.windows import effective_averages, get_window
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    from estimator.spectra.parts import PartEnds
-    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 SEGMENTS_PER_BLOCK = 32
 BLOCK_VALUES = 2**20  # maximum number of values per group: 8 MB

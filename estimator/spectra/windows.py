@@ -10,14 +10,12 @@ much lower noise than elsewhere, the side lobes of the window add noise from oth
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
 from estimator.errors import EstimatorError
-
-if TYPE_CHECKING:
-    from estimator.types import BoolArray, FloatArray
+from estimator.types import BoolArray, FloatArray
 
 Window: TypeAlias = "str | tuple[str | float, ...] | FloatArray"
 

@@ -19,19 +19,15 @@ from __future__ import annotations
 
 import math
 import zlib
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.devices.epson import commands
 from daq.devices.epson.commands import BurstFormat, CommandDecoder, Read, Register, Write
 from sim_devices.devices.interface import NEVER, DeviceSpec, Endpoint, Line, Source
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from numpy.typing import NDArray
-
 
 FULL_SCALE = 15 * commands.COUNTS_PER_G
 RESET_TIME, FLASH_TIME, FILTER_TIME, TEST_TIME = 0.97, 0.31, 0.005, 0.2

@@ -10,7 +10,7 @@ been transmitted at the line's rate, after a turnaround of 1 ms.
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -18,10 +18,6 @@ from daq.devices.modbus import rtu
 from daq.devices.modbus.fifo_protocol import FIFO_REGISTER, MAX_WORDS, RATE_REGISTER
 from daq.devices.modbus.rtu import Request, RequestFinder
 from sim_devices.devices.interface import NEVER, DeviceSpec, Endpoint, Line, Samples, Source, whole
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
 
 TURNAROUND = 0.001
 CAPACITY = 24_576

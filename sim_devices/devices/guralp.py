@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import zlib
 from collections import deque
+from collections.abc import Sequence
 from fractions import Fraction
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,10 +26,6 @@ from daq.devices.guralp.gcf import SampleBlock, StatusBlock, SystemId, Width
 from daq.devices.guralp.scream import Packet
 from sim_devices.devices.interface import NEVER, DeviceSpec, Endpoint, Line, Samples, Source, whole
 from sim_devices.errors import ScenarioError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
 
 FULL_SCALE = (1 << 23) - 1
 MAX_SAMPLES = 248

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -16,10 +16,6 @@ from daq.devices.iio.protocol import (
     mask_of,
 )
 from sim_devices.devices.interface import NEVER, DeviceSpec, Endpoint, Line, Samples, Source, whole
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
 
 FORMAT, TIME_FORMAT = "be:s32/32>>0", "le:s64/64>>0"
 VERSION = "0.25.v0.25  "

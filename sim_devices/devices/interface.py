@@ -10,22 +10,18 @@ can affect exactly one. The samples of its sensors are simulated in stretches.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sim_devices.arrays import FloatArray
+from sim_devices.faults import SampleFaults
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from sim_devices.arrays import FloatArray
-    from sim_devices.faults import SampleFaults
 
 Kind: TypeAlias = Literal["pty", "tcp", "udp", "udp-server"]
 """Kind of a line; "udp" only sends, "udp-server" sends to the last client."""

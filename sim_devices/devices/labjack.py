@@ -19,10 +19,11 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.devices.labjack import registers as reg
 from daq.devices.labjack.packets import MAX_SAMPLES, Packet, encode_packet, encode_response
@@ -37,12 +38,6 @@ from daq.devices.labjack.stream import (
 )
 from daq.protocols.errors import RemoteProtocolError
 from sim_devices.devices.interface import NEVER, DeviceSpec, Endpoint, Line, Samples, Source, whole
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
-
 
 CENTER = 33523
 

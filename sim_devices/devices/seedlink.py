@@ -11,9 +11,9 @@ get stations. The fault ``reset`` restarts the server with an empty ring and seq
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,10 +26,6 @@ from daq.devices.seedlink.packets import (
     encode_packet,
 )
 from sim_devices.devices.interface import NEVER, DeviceSpec, Endpoint, Line, Samples, Source, whole
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
 
 RECORD_SAMPLES = 100
 KEEP = 600.0

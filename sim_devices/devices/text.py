@@ -8,8 +8,8 @@ Shake. With the settings ``start`` and ``stop``, the device sends only between t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING
 
 from daq.devices.text.format import (
     PRESETS,
@@ -20,10 +20,6 @@ from daq.devices.text.format import (
     encode_time,
 )
 from sim_devices.devices.interface import NEVER, DeviceSpec, Endpoint, Line, Samples, Source, whole
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
 
 PACKET_SAMPLES = 25
 LILY_TAIL = ("194.25", "", "", "N9655")

@@ -23,17 +23,15 @@ import sys
 import tempfile
 import time
 import traceback
+from collections.abc import Mapping
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 from sim_devices.errors import ServeError, SimulationError
 from sim_devices.server.paced_clock import PacedClock, PacedLoop
 from sim_devices.server.serve import FAMILIES, serve
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 STOP_TIMEOUT = 5.0
 """Seconds after which a device that does not end is killed."""

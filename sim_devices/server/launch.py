@@ -8,17 +8,15 @@ import signal
 import subprocess
 import tempfile
 import threading
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 from daq.python_process import python_command
 from sim_devices.errors import ServeError
 from sim_devices.server.paced_clock import PacedClock
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
 
 HEAD_START_NS = 200_000_000
 """Delay of world time 0, in ns, so that every device has started by then."""

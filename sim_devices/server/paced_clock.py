@@ -29,12 +29,10 @@ import mmap
 import os
 import selectors
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+from typing import Self
 
 NS = 1_000_000_000
 SHORTEST, LONGEST = 2_000_000, 40_000_000

@@ -6,7 +6,7 @@ with 1.5 times the PSD along y as along x.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -14,10 +14,6 @@ from sim_devices.errors import ScenarioError
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.spectrum import Mixed, Resonance, Spectrum, Sum, Tabulated, White
 from sim_devices.world.tables import ChangingLevel, CommonMotion, PlaneWaves, SensorModel
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
 
 STANDARD_GRAVITY = 9.80665
 NOISE = 1e-15 * STANDARD_GRAVITY**2

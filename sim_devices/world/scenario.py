@@ -46,19 +46,16 @@ A field of plane waves instead of one common motion; distant sensors are not coh
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, Self
+from collections.abc import Mapping
+from typing import Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, NonNegativeInt, ValidationError, model_validator
 
+from sim_devices.arrays import FloatArray
 from sim_devices.errors import ScenarioError
+from sim_devices.world.spectrum import Spectrum
 from sim_devices.world.tables import MAX_BLOCK, USABLE, MotionModel, SensorModel, Table
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from sim_devices.arrays import FloatArray
-    from sim_devices.world.spectrum import Spectrum
 
 OTHER_KEYS = frozenset({"speed", "clock", "devices", "faults"})
 """Keys of the `[simulation]` table that other modules read."""

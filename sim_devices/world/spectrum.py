@@ -10,13 +10,12 @@ Each shape is a frozen table, written in a bench file as::
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import TYPE_CHECKING, Annotated, Literal, Self, TypeAlias
+from typing import Annotated, Literal, Self, TypeAlias
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFloat, model_validator
 
-if TYPE_CHECKING:
-    from sim_devices.arrays import FloatArray
+from sim_devices.arrays import FloatArray
 
 
 class Shape(BaseModel):

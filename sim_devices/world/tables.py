@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Final, Literal, Self, TypeAlias
+from typing import Annotated, Final, Literal, Self, TypeAlias
 
 import numpy as np
 from pydantic import (
@@ -16,10 +16,8 @@ from pydantic import (
     model_validator,
 )
 
+from sim_devices.arrays import FloatArray
 from sim_devices.world.spectrum import Spectrum, White
-
-if TYPE_CHECKING:
-    from sim_devices.arrays import FloatArray
 
 USABLE = 0.9
 """The motion ends at this fraction of the lowest Nyquist frequency."""

@@ -21,9 +21,11 @@ import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 from scipy import signal
@@ -31,17 +33,13 @@ from scipy import signal
 from daq.errors import HuddleError
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.formats.arrays import recording_of_arrays
 from daq.results.facts.fact import Finding
 from daq.results.result import Result
 from estimator.checks.advice import Rank
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-
-    from daq.estimation.snapshot import Snapshot
-
-    FloatArray: TypeAlias = np.ndarray
+FloatArray: TypeAlias = np.ndarray
 
 RATE, N_SAMPLES = 100.0, 90_000
 EDGES = np.array([0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0])

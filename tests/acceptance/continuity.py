@@ -10,10 +10,12 @@ from __future__ import annotations
 import itertools
 import tempfile
 from collections import Counter
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
@@ -30,11 +32,6 @@ from tests.daq.devices.test_stated_steps import (
 from tests.daq.devices.text.test_stated_steps import by_packets, by_rows
 from tests.peers.digitizer import Digitizer
 from tests.peers.text_logger import TextLogger
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from numpy.typing import NDArray
 
 KINDS: dict[str, Callable[[Digitizer], list[Any]]] = {
     "SeedLink, numbers of a station": by_seedlink,

@@ -7,12 +7,10 @@ changes the LabJack's on the way; and only the LabJack has a buffer to overflow,
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from daq.bench.tables.toml_text import to_toml
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 FULL_SCALE_E = 83886.0
 """Of the Epson as the bench file says, in counts; the others' lies at the ends of their words."""

@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import sys
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,17 +24,13 @@ from daq.protocols.block import Block, BlockFlag, HostTime
 from daq.recording.monitor import RecordingMonitor
 from daq.recording.reader import Recording
 from daq.results.result import Result
+from estimator.types import FloatArray
 from sim_devices.world.world import World
 from tests.tui.example_snapshot import demo_bench, growing
 from tui.application.following import CURVE_GROWTH
 from tui.application.test_view.panels import alerts, findings
 from tui.application.test_view.recent_motion import RecentMotion, with_advice
 from tui.simulation.devices import scenario_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from estimator.types import FloatArray
 
 RATE, COUNTS = 200, 1710799.9
 LONGEST = 150

@@ -23,11 +23,13 @@ import json
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
@@ -37,19 +39,13 @@ from daq.bench.loading import dump
 from daq.devices.bench_file import parse
 from daq.python_process import python_command
 from daq.recording.reader import Recording
+from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
 from tests.acceptance.true_instants import Truth, truth_of, write_oracle
 from tui.simulation.devices import scenario_of
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    from sim_devices.world.scenario import Scenario
-
-    FloatArray = NDArray[np.float64]
-    IntArray = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 LATENCIES = {"exponential": ("latency", 1e-3), "batching": ("batching", 16e-3)}
 TOLERANCE = 0.02

@@ -17,11 +17,12 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.bench.channel import Channel
 from daq.bench.model import Bench, Sensor
@@ -33,11 +34,6 @@ from tests.acceptance.continuity import compared
 from tests.daq.devices.can_peer import Peer
 from tests.daq.devices.seedlink_peer import PER_RECORD, RATE, Server, value
 from tests.waiting import wait_until
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from numpy.typing import NDArray
 
 LIVES = ("", "c", "l", "lc")
 """A device stays; comes later; leaves; leaves and comes back."""

@@ -5,19 +5,17 @@ from __future__ import annotations
 import contextlib
 import signal
 import subprocess
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from daq.devices.bench_file import load
 from daq.python_process import python_command
 from tests.acceptance import fault_script
 from tests.waiting import limit
 from tui.simulation.devices import specification, with_faults
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,13 +9,16 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.protocols.block import BlockFlag
-from daq.recording.reader import Recording
+from daq.recording.reader import Recording, SensorRecord
 from sim_devices.devices.epson import FULL_SCALE
 from sim_devices.devices.interface import Source
 from sim_devices.devices.labjack import CENTER
@@ -23,16 +26,8 @@ from sim_devices.faults import SampleFaults, parse
 from sim_devices.server.serve import device_spec
 from sim_devices.world.scenario import Scenario
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from daq.recording.reader import SensorRecord
-
-    Counts = NDArray[np.int64]
-    Indices = NDArray[np.int64]
+Counts = NDArray[np.int64]
+Indices = NDArray[np.int64]
 
 GCF_EPOCH = 627264000
 LOST = {b"disconnected", b"stalled", b"refused"}

@@ -12,11 +12,12 @@ import sys
 import tempfile
 from dataclasses import astuple, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
+from daq.bench.model import Bench
 from daq.devices.bench_file import load
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
@@ -28,9 +29,6 @@ from tests.acceptance.sample_accounting import Account, Log, accounts
 from tui.commands.demo import compare
 from tui.simulation.devices import scenario_of
 from tui.wording.formatting import interval, level
-
-if TYPE_CHECKING:
-    from daq.bench.model import Bench
 
 BEGIN = 30.0
 """World time of the first fault, s."""

@@ -9,7 +9,7 @@ import contextlib
 import math
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -18,9 +18,6 @@ from tests.acceptance import fault_script
 from tests.acceptance.run_bench import command, served
 from tests.acceptance.sample_accounting import Log, accounts
 from tests.waiting import limit
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 pytestmark = [
     pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals"),

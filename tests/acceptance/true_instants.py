@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from daq.bench.model import Bench
 from daq.protocols.block import BlockFlag
 from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
+from daq.recording.reader import Recording, SensorRecord
 from sim_devices.devices.interface import Source
 from sim_devices.server.serve import device_spec
 from tui.simulation.devices import scenario_of, specification
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from daq.bench.model import Bench
-    from daq.recording.reader import Recording, SensorRecord
-
-    FloatArray = NDArray[np.float64]
-    IntArray = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 
 MARGIN = 600.0

@@ -11,10 +11,10 @@ from __future__ import annotations
 import itertools
 import sys
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from multiprocessing import Pool
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,9 +22,6 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.results.result import Result
 from tests.known_clocks import NOISE, Motion, Oscillator, Scene, record
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 EDGES = np.array([0.02, 0.05, 0.1, 0.2, 0.3, 0.43])
 """Of bands, as fractions of the lowest sampling rate."""

@@ -5,17 +5,13 @@ from __future__ import annotations
 import importlib
 import math
 import pkgutil
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 import benchmarks
 from benchmarks.__main__ import main, table
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from benchmarks.row import Row
+from benchmarks.row import Row
 
 STUDIES = {"application", "command_start", "estimate_file", "following", "reach", "recorder"}
 """Benchmarks that run whole processes, for most of a minute."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.results.facts.clocks import (
     ClockNotUnderstood,
     ClockSet,
@@ -14,11 +15,6 @@ from daq.results.facts.clocks import (
     StatedTimesUnchecked,
 )
 from daq.results.result import Result
-
-if TYPE_CHECKING:
-    from typing import Any
-
-    from daq.estimation.snapshot import Snapshot
 
 _WRONG = (
     ClockNotUnderstood

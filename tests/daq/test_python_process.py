@@ -5,14 +5,11 @@ from __future__ import annotations
 import shlex
 import sys
 from importlib import metadata
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from daq.python_process import install_command
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 METADATA = """Metadata-Version: 2.4
 Name: huddle-bench

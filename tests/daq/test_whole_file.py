@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import stat
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -16,10 +16,6 @@ from daq.bench.channel import Channel
 from daq.recording.storage.whole_hdf5 import WholeHdf5
 from daq.whole_file import RememberingFile, replaced, write_whole, written
 from tests.full_disk import files_limited_to
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
 
 CHANNELS = tuple(("A", Channel(name=name, sensitivity=1.0)) for name in "abcdef")
 

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from estimator.types import ComplexArray, FloatArray
+from estimator.types import ComplexArray, FloatArray
 
 MOTION_PSD = {1: (1.0,), 2: (1.0, 1.5), 3: (1.0, 1.5, 0.8)}
 """White motion by dimension, along x, y, z; two dimensions as in section 2.3 of the paper."""

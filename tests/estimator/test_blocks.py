@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -15,10 +14,8 @@ from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.maximum_likelihood import standard_error
 from estimator.self_noise import coherency
 from estimator.spectra.welch import CrossSpectra, WelchSettings
+from estimator.types import ComplexArray, FloatArray
 from tests.traced_memory import peak_of
-
-if TYPE_CHECKING:
-    from estimator.types import ComplexArray, FloatArray
 
 N_FREQS, N_AVERAGES = 60, 200
 

@@ -10,23 +10,19 @@ import re
 import socket
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
+from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, EventKind, HostTime
 from daq.recording.reader import Recording
 from tests.devices import paced_clock
 from tests.waiting import limit
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from daq.protocols.block import DeviceItem
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "driver"
 RATE = 100.0

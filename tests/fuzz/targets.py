@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import struct
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from fractions import Fraction
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -32,9 +32,6 @@ from daq.devices.text.decoder import TextDecoder
 from daq.devices.text.format import RASPBERRY_SHAKE, TextFormat
 from daq.protocols.block import Block, Event, HostTime
 from daq.protocols.errors import RemoteProtocolError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
 
 LATER = 10**6
 """Host seconds after which the valid frames come: whatever came before is long past."""

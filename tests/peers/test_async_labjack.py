@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import os
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
 
+from sim_devices.server.launch import RunningDevice
 from sim_devices.world.world import World
 from tests.devices import serving
 from tests.sim_devices.simulated_bench import scenario, spec
 from tests.waiting import limit
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from sim_devices.server.launch import RunningDevice
 
 pytestmark = pytest.mark.peer
 

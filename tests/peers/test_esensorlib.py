@@ -6,16 +6,14 @@ import contextlib
 import importlib
 import io
 import itertools
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
 from daq.devices.epson.commands import COUNTS_PER_G, FILTERS, NOT_ON_A370
 from tests.devices import serving
 from tests.sim_devices.simulated_bench import device, spec
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 sensor_device = pytest.importorskip(
     "esensorlib.sensor_device", reason="esensorlib, Epson's own client, is not installed"

@@ -5,8 +5,9 @@ from __future__ import annotations
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,9 +17,6 @@ from daq.recording.reader import Recording
 from tests.daq.formats.test_sources import counts
 from tui.commands.main import app
 from tui.output.exit_codes import ExitCode
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 obspy: Any = pytest.importorskip("obspy", reason="ObsPy is an extra")
 START = obspy.UTCDateTime("2026-11-01T23:59:00") if obspy else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,9 +13,6 @@ from daq.devices.registry import driver_type
 from daq.protocols.block import BlockFlag
 from tests.daq.devices.reading import record
 from tests.peers.libmodbus import build, ready, serial_cable
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 pytestmark = pytest.mark.peer
 

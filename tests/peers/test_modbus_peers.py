@@ -6,7 +6,9 @@ import itertools
 import re
 import shutil
 import subprocess
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,16 +17,11 @@ from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.devices.registry import driver_type
 from daq.protocols.block import Block, Event, EventKind
+from sim_devices.server.launch import RunningDevice
 from sim_devices.world.world import World
 from tests.devices import host_clock, serving
 from tests.peers.libmodbus import build, ready, running, serial_cable
 from tests.sim_devices.simulated_bench import device, scenario, spec
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from sim_devices.server.launch import RunningDevice
 
 pytestmark = [pytest.mark.devices, pytest.mark.peer]
 

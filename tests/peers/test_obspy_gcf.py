@@ -6,10 +6,11 @@ import asyncio
 import io
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.bench.channel import Channel
 from daq.bench.model import Sensor
@@ -23,9 +24,6 @@ from sim_devices.devices.interface import ChannelSpec, DeviceSpec, Source
 from sim_devices.world.world import World
 from tests.daq.devices.reading import record
 from tests.sim_devices.simulated_bench import scenario
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 pytestmark = pytest.mark.peer
 

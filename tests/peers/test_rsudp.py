@@ -7,7 +7,7 @@ import os
 import socket
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,9 +16,6 @@ from sim_devices.world.world import World
 from tests.devices import paced_clock, serving
 from tests.sim_devices.simulated_bench import device, scenario, spec
 from tests.waiting import limit
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 pytestmark = pytest.mark.peer
 

@@ -14,8 +14,9 @@ import socket
 import subprocess
 import threading
 import time
+from collections.abc import Iterator
 from fractions import Fraction
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,10 +33,6 @@ from tests.acceptance.ringserver import Feeder
 from tests.devices import serving
 from tests.sim_devices.simulated_bench import device, spec
 from tests.waiting import limit, wait_until
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 pytestmark = pytest.mark.peer
 RATE = 100

@@ -7,12 +7,9 @@ Shake's datacast). Its clock may be set, its oscillator be off, and its lines be
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from numpy.typing import NDArray
 
 CHANNELS = ("ENZ", "ENN", "ENE")
 UNIX = 1_795_849_200.0

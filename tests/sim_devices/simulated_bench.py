@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 from daq.bench.channel import Channel
 from daq.bench.model import Bench, Sensor
 from daq.devices.epson import commands
+from sim_devices.server.launch import RunningDevice
 from sim_devices.world.scenario import Scenario
 from tests.devices import paced_clock
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from sim_devices.server.launch import RunningDevice
 
 RATE = 200.0
 AXES = tuple({"name": axis, "sensitivity": commands.COUNTS_PER_UNIT} for axis in "xyz")

@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from daq.bench.model import Sensor
 from daq.devices.epson import commands
 from daq.devices.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.transport.ports import open_port
 from sim_devices.devices.interface import Source
+from sim_devices.server.launch import RunningDevice
 from sim_devices.server.serve import device_spec
 from sim_devices.world.scenario import Scenario
 from tests.daq.devices.reading import record
 from tests.devices import host_clock, paced_clock, serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from daq.bench.model import Sensor
-    from sim_devices.server.launch import RunningDevice
 
 pytestmark = pytest.mark.devices
 

@@ -4,27 +4,23 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
+from daq.bench.model import Sensor
 from daq.devices.epson import commands
 from daq.devices.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.protocols.block import Block, BlockFlag, Reading
 from daq.transport.ports import open_port
 from sim_devices.errors import ServeError
+from sim_devices.server.launch import RunningDevice
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
 from tests.devices import device_at, host_clock, paced_clock, serving
 from tests.sim_devices.simulated_bench import AXES, device, scenario, sensors, spec
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from daq.bench.model import Sensor
-    from sim_devices.server.launch import RunningDevice
 
 pytestmark = pytest.mark.devices
 

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from daq.bench.model import Sensor
 from daq.devices.bench_file import parse as parse_bench
 from daq.devices.epson import commands
+from daq.devices.interface import Session
 from daq.devices.registry import driver_type
 from daq.errors import BenchFileError, DeviceError, NoAnswerError, NotConnectedError
+from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, Event
 from sim_devices.devices.interface import ChannelSpec, DeviceSpec, Source
 from sim_devices.errors import ScenarioError
@@ -23,14 +28,6 @@ from sim_devices.world.world import World
 from tests.devices import host_clock, serving
 from tests.sim_devices.simulated_bench import device, scenario, sensors, spec
 from tui.simulation.devices import specification, with_faults
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-    from pathlib import Path
-
-    from daq.bench.model import Sensor
-    from daq.devices.interface import Session
-    from daq.host_clock import SystemClock
 
 pytestmark = pytest.mark.devices
 

@@ -7,17 +7,13 @@ import select
 import signal
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
 from sim_devices.errors import ServeError
-from sim_devices.server.launch import DeviceServer
+from sim_devices.server.launch import DeviceServer, RunningDevice
 from tests.devices import server_pids, serving
 from tests.sim_devices.simulated_bench import device, spec
-
-if TYPE_CHECKING:
-    from sim_devices.server.launch import RunningDevice
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="pidfd_open")
 

@@ -13,10 +13,12 @@ import contextlib
 import ctypes.util
 import shutil
 import socket
-from typing import TYPE_CHECKING, Any
+from collections.abc import AsyncIterator
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.bench.channel import Channel
 from daq.bench.model import Sensor
@@ -28,11 +30,6 @@ from sim_devices.devices.interface import Source
 from sim_devices.server.serve import device_spec
 from tests.sim_devices.simulated_bench import device, scenario
 from tests.waiting import limit, wait_until
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from numpy.typing import NDArray
 
 pytestmark = pytest.mark.peer
 

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
 
 from daq.devices.registry import driver_type
 from daq.protocols.block import Block, BlockFlag, Event
+from sim_devices.server.launch import RunningDevice
 from tests.daq.devices.reading import reading, record
 from tests.devices import serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from sim_devices.server.launch import RunningDevice
 
 pytestmark = pytest.mark.devices
 

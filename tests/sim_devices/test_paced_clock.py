@@ -7,17 +7,14 @@ import os
 import signal
 import sys
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from daq.host_clock import SystemClock
 from daq.recorder.clock_trust import ClockWatch
 from sim_devices.server.paced_clock import LONGEST, NS, PacedClock, PacedLoop
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="locks of files")
 

@@ -7,16 +7,13 @@ import contextlib
 import os
 import sys
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import pytest
 
 from sim_devices.devices.interface import NEVER, Endpoint, Line
 from sim_devices.faults import LineFaults, parse
 from sim_devices.server.serve import PseudoTerminal, Served, TcpPort, WorldClock
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals")
 

@@ -6,26 +6,23 @@ import asyncio
 import contextlib
 import json
 import re
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from daq.bench.model import Sensor
 from daq.devices.modbus import rtu
 from daq.devices.modbus.bus import open_bus
 from daq.devices.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, NotConnectedError, WrongDeviceError
+from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, Event
+from sim_devices.server.launch import RunningDevice
 from tests.devices import device_at, host_clock, serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
-    from daq.bench.model import Sensor
-    from daq.host_clock import SystemClock
-    from sim_devices.server.launch import RunningDevice
 
 pytestmark = pytest.mark.devices
 

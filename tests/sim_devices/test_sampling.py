@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pytest
+from numpy.typing import NDArray
 
 from daq.devices.modbus import rtu
 from sim_devices.devices.fifo import FifoDevice
@@ -13,10 +14,6 @@ from sim_devices.devices.guralp import create as create_guralp
 from sim_devices.devices.interface import Samples, Source
 from sim_devices.server.serve import device_spec
 from tests.sim_devices.simulated_bench import device, scenario
-
-if TYPE_CHECKING:
-    import pytest
-    from numpy.typing import NDArray
 
 RATE = 200.0
 

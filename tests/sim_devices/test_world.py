@@ -5,17 +5,15 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy import signal
 
+from sim_devices.arrays import ComplexArray, FloatArray
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import GaussianSeries, Motion, WhiteSources, World
-
-if TYPE_CHECKING:
-    from sim_devices.arrays import ComplexArray, FloatArray
 
 RATE = 200.0
 

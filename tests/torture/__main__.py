@@ -9,10 +9,10 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from tests.torture import fault_commands
 from tests.torture.bench_files import bench_faults
@@ -30,9 +30,6 @@ from tests.torture.power_cuts import MODELS, faults, recorded, shim
 from tests.torture.service_database import database_faults
 from tests.torture.service_kills import RATE, soak
 from tests.torture.starved_recorder import starved_faults
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 PAGE = Path(__file__).parents[2] / "docs" / "validation" / "torture.md"
 KILLS, CUTS, DISK_ERRORS = 300, 100, 50

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 
 from daq.recording.reader import Recording
 from daq.recording.repair import repair, verify
+from daq.recording.sensor_record import SensorRecord
 from daq.recording.storage.journal import journal_path
 from tests.torture.recording_program import CREATED, POLLED, counts_of, instants_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from daq.recording.sensor_record import SensorRecord
 
 Acknowledged = dict[str, Any]
 NOTHING: Acknowledged = {"sensors": {}, "events": 0}

@@ -9,15 +9,12 @@ from __future__ import annotations
 import re
 import time
 from importlib import resources
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
 from daq.devices.bench_file import load
 from daq.errors import BenchFileError
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 LIMIT = 10.0
 """Seconds that a bench file may take."""

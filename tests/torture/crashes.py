@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
@@ -15,9 +15,6 @@ from daq.errors import RecordingError
 from daq.python_process import python_command
 from tests.torture.after_crash import fault_after_repair, last_acknowledged
 from tests.torture.power_cuts import run_program
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 CALLS = ("pwrite", "fsync", "write", "ftruncate")
 _CALLS_MADE = {"pwrite": (60, 500), "fsync": (1, 60), "write": (3, 33), "ftruncate": (1, 4)}

@@ -19,8 +19,9 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
@@ -34,10 +35,6 @@ from daq.recording.repair import verify, write_results
 from daq.recording.storage.trial import remember, trials
 from daq.recording.writer import RecordingWriter
 from tests.daq.recording.version_1 import as_version_1, heap_headers
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-    from multiprocessing.connection import Connection
 
 CREATED = HostTime(1_000_000_000, 1_790_000_000_000_000_000)
 SECTOR = 512

@@ -10,11 +10,12 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from importlib import resources
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from pypdf import PdfReader
@@ -38,9 +39,6 @@ from tui.certificate.verification import JSON_NAME
 from tui.service.records.run_state import RunState
 from tui.service.records.store import RunStore
 from tui.simulation.devices import simulated
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
 
 _SPEED = 8.0
 """Of the simulated devices, in times real time."""

@@ -16,21 +16,17 @@ import sys
 import time
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING
+from selectors import SelectorKey
 
 import numpy as np
 
+from daq.bench.model import Bench
 from tests.tui.service.bench_files import HOURLY, SENSORS, FakeSteps, VirtualClock, bench_of
 from tests.virtual_time import Jumping, VirtualTimeLoop
 from tui.service.processes.finish import Outcome
 from tui.service.records.run_state import BandNoise
 from tui.service.records.store import RunStore
 from tui.service.service import Service
-
-if TYPE_CHECKING:
-    from selectors import SelectorKey
-
-    from daq.bench.model import Bench
 
 N_RUNS = 100_000
 N_CHANNELS = 9

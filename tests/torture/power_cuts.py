@@ -19,17 +19,14 @@ import shutil
 import struct
 import subprocess
 import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daq.errors import RecordingError
 from tests.torture.after_crash import fault_after_repair, last_acknowledged
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
 
 MODELS = {"synced": 0, "prefix": 0, "writes": 0, "pages": 4096, "sectors": 512}
 """Bytes of the pieces into which a write is torn; 0 where it is not torn."""

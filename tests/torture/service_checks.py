@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -11,10 +12,6 @@ from daq.errors import HuddleError
 from daq.recording.reader import Recording
 from daq.recording.repair import verify
 from daq.recording.storage.journal import journal_path
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
 
 def fault_of_recording(path: Path, truth: Path | None = None) -> str:

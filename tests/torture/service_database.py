@@ -10,19 +10,16 @@ import logging
 import sqlite3
 from collections import Counter
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from daq.bench.model import Bench
 from daq.errors import HuddleError
 from tests.torture.long_history import make_history
 from tui.service.healing import heal
 from tui.service.records.store import NAME, RunStore, StoreError
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from daq.bench.model import Bench
 
 PAGE = 4096
 KINDS = ("bit", "zeros", "random", "another page", "cut")

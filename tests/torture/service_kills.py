@@ -21,16 +21,17 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from importlib import resources
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daq.bench.loading import dump
+from daq.bench.model import Bench
 from daq.bench.tables.unattended import Schedule, ScheduledRun, Storage
 from daq.devices.bench_file import load, parse
 from daq.errors import HuddleError
@@ -38,15 +39,9 @@ from daq.python_process import python_command
 from daq.recorder.schedule import due_times
 from tests.torture.service_checks import fault_of_recording, faults_of_results
 from tests.torture.service_program import FastClock
-from tui.service.records.run_state import RunState
+from tui.service.records.run_state import Run, RunState
 from tui.service.records.store import RunStore
 from tui.simulation.devices import simulated
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from daq.bench.model import Bench
-    from tui.service.records.run_state import Run
 
 RATE = 20.0
 LEAK = 0.05

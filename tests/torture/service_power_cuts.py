@@ -20,14 +20,15 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from datetime import datetime, timedelta
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daq.bench.loading import dump
+from daq.bench.model import Bench
 from daq.bench.tables.unattended import Schedule, ScheduledRun, Storage
 from daq.devices.bench_file import load, parse
 from daq.errors import HuddleError
@@ -37,18 +38,12 @@ from tests.torture.service_kills import BEGIN, processes
 from tests.torture.service_program import FastClock
 from tests.torture.service_program import main as serve
 from tui.service.clock import SystemTime
-from tui.service.processes.finish import finish
+from tui.service.processes.finish import Outcome, Request, finish
 from tui.service.processes.steps import ProcessSteps
 from tui.service.records.run_state import RunState
 from tui.service.records.store import RunStore
 from tui.service.service import Service
 from tui.simulation.devices import simulated
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from daq.bench.model import Bench
-    from tui.service.processes.finish import Outcome, Request
 
 ENTRY = ScheduledRun(name="cut", cron="*/5 * * * *", time_zone="UTC", duration=150.0)
 RATE = 8.0

@@ -6,12 +6,9 @@ import contextlib
 import os
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 from benchmarks.recorder import case
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 BUSY_PER_PROCESSOR = 1
 """More would starve the played devices too: they need most of a processor themselves."""

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from tests.torture.damaged_files import FAULTS, LIMIT, make_recording, tally
 from tests.waiting import limit
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.mark.long

@@ -6,17 +6,12 @@
 from __future__ import annotations
 
 import errno
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from tests.torture.fault_commands import commands, device_commands, devices
-from tests.torture.faulty_disk import FAULTS, FOREVER, FaultyDisk, library, torture
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from tests.torture.faulty_disk import Command
+from tests.torture.faulty_disk import FAULTS, FOREVER, Command, FaultyDisk, library, torture
 
 SAMPLE = {"import": 3, "results in a recording": 2, "archive": 1}
 """Commands, and how many of their calls fail."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,9 +17,6 @@ from daq.recording.repair import repair
 from daq.recording.storage.journal import journal_path
 from daq.recording.writer import RecordingWriter
 from tests.torture.power_cuts import MODELS, Operation, faults, recorded, replay, shim
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.fixture(scope="module")

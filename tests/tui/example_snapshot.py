@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib import resources
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
+from daq.bench.model import Bench
 from daq.clocks.clock_model import ClockSource, ClockState
 from daq.devices.bench_file import parse
 from daq.devices.interface import DeviceInformation
@@ -30,21 +32,15 @@ from daq.recording.monitor import RecordingStatus, SensorStatus
 from daq.recording.sensor_state import SensorState
 from daq.recording.storage.names import CONTINUES
 from daq.recording.writer import RecordingWriter
+from daq.results.decision.verdict import TestVerdict
 from daq.results.result import Result
 from estimator.checks.advice import Rank
 from estimator.checks.advice_on_signals import NoSharedMotion
 from estimator.checks.diagnose import Diagnostics, diagnose
 from estimator.methods import self_noise
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
-
-    from daq.bench.model import Bench
-    from daq.results.decision.verdict import TestVerdict
-    from estimator.types import FloatArray
-    from tui.application.controls import Preview
-    from tui.application.plan import TestPlan
+from estimator.types import FloatArray
+from tui.application.controls import Preview
+from tui.application.plan import TestPlan
 
 SETTINGS = Settings(
     segment=2.0, methods=("three-sensor", "three-channel"), band=(1.0, 20.0), target_cov=0.05

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -11,10 +12,6 @@ from daq.protocols.block import Event, HostTime, Quantity, Reading
 from daq.recording.file_format import SensorLayout
 from daq.recording.writer import RecordingWriter
 from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 RATE, N_SAMPLES = 100.0, 6000
 HOSTILE = "<script>alert(1)</script>".replace("/", "⁄") + " & $x^2 {{7*7}}"

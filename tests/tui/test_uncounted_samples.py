@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import huddle
 from daq.recording.monitor import RecordingMonitor
@@ -14,9 +14,6 @@ from tui.application.test_view.details import details
 from tui.output.console import console
 from tui.report.contents import report_of
 from tui.report.parts import Table
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def test_samples_that_are_not_counted_are_events_of_the_result(tmp_path: Path) -> None:

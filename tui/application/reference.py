@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
+from daq.bench.model import Bench
 from daq.errors import HuddleError
 from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
 from daq.results.result import Result
 from tui.application.state import Reference
-
-if TYPE_CHECKING:
-    import threading
-    from collections.abc import Callable, Mapping
-    from pathlib import Path
-
-    from daq.bench.model import Bench
-    from daq.estimation.settings import Settings
 
 
 def reference_of(

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
+from daq.bench.masks.mask import Mask
+from daq.bench.model import Bench
 from daq.devices.bench_file import is_simulated
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from daq.bench.masks.mask import Mask
-    from daq.bench.model import Bench
-    from daq.estimation.snapshot import Snapshot
-    from daq.recording.monitor import RecordingStatus
-    from daq.results.result import Result
+from daq.estimation.snapshot import Snapshot
+from daq.recording.monitor import RecordingStatus
+from daq.results.result import Result
 
 VIEWS = ("bench", "test", "result", "recordings", "signal")
 BENCH, TEST, RESULT, RECORDINGS, SIGNAL = VIEWS

@@ -16,10 +16,13 @@ import hashlib
 import io
 import json
 import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from daq.errors import HuddleError
 from daq.memory_limit import memory_limit
@@ -33,11 +36,6 @@ from tui.certificate.dcc import NAME as DCC_NAME
 from tui.certificate.ledger import Entry, Ledger, ledgers_of
 from tui.output.extras import require
 from tui.report.certificate import SPECIMEN
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
-    from contextlib import AbstractContextManager
-    from pathlib import Path
 
 JSON_NAME = "result.json"
 """Name of the result in the certificate."""

@@ -4,16 +4,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from importlib import import_module
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import typer
 
 from tui.commands.help import ASKED_BY_SHELL
 from tui.commands.options import command
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 
 @command()

@@ -8,23 +8,21 @@ module of a command is imported when the command is used, or asked for its help.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from copy import copy
 from enum import Enum
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 import typer
 from typer.core import TyperArgument, TyperCommand, TyperGroup
 
 from tui.commands.options import ESSENTIAL, ESTIMATE_PANEL, LOG_PANEL, Guide, declared
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
-    Rows = Iterable[tuple[str, tuple[str, str]]]
-    """Panel, and a form with its help."""
+Rows = Iterable[tuple[str, tuple[str, str]]]
+"""Panel, and a form with its help."""
 
 PANELS: dict[str, dict[str, str]] = {
     "Bench": {

@@ -13,18 +13,16 @@ import gc
 import io
 import os
 import sys
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 import typer
 
 from tui import __version__
 from tui.commands.help import ASKED_BY_SHELL, LazyGroup
 from tui.output.exit_codes import ExitCode
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
 
 
 class HuddleGroup(LazyGroup):

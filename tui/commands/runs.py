@@ -4,8 +4,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -15,10 +16,6 @@ from tui.output.console import check_places, for_people, write_json, write_text
 from tui.output.csv_text import csv_text
 from tui.page.table import Cell, Table, Tone
 from tui.service.records.run_state import Run, RunState, utc_text
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
 
 _TONES: dict[RunState, Tone] = {
     RunState.FAILED: "bad",

@@ -5,8 +5,9 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -14,9 +15,6 @@ from daq.errors import RecordingError
 from tui.certificate.ledger import Ledger
 from tui.commands.options import command
 from tui.output.console import for_people, write_json
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
 
 
 @command()

@@ -5,30 +5,27 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Unpack, overload
+from typing import Literal, Unpack, overload
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from daq.archive.answers import FALSE_ALARM, Answer, answer
 from daq.archive.execution import carried_out
 from daq.archive.plan import STRETCHES
 from daq.archive.sources import are_waveforms, folder_for
+from daq.archive.store import Store
+from daq.archive.waveforms import Found, Reading
 from daq.errors import ArchiveError, WrongSettingError
 from daq.estimation.settings import Settings, check_fit
+from daq.formats.assembly import Overlap
 from daq.formats.sources import Selection
 from daq.recording.reader import Recording
 from tui.notebook.estimates import PathLike, response_sources
 from tui.notebook.options import EstimateOptions, called, changes_of, settings_of
 from tui.notebook.recording import nanoseconds
 from tui.runs.archives import Filling, reading_of
-
-if TYPE_CHECKING:
-    from datetime import datetime
-
-    from daq.archive.store import Store
-    from daq.archive.waveforms import Found, Reading
-    from daq.formats.assembly import Overlap
 
 
 class StationAnswers(Mapping[str, "Answer"]):

@@ -6,8 +6,9 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, TypeAlias, TypedDict
+from typing import TypeAlias, TypedDict
 
 import numpy as np
 
@@ -15,9 +16,6 @@ from daq.bench.durations import instant
 from daq.bench.estimate_settings import OPTIONS, table_keys
 from daq.errors import WrongSettingError
 from daq.estimation.settings import Settings, with_changes
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
 
 Time: TypeAlias = "str | float | datetime"
 """UTC, or a time after the start of the recording: seconds, or a text such as ``2h``."""

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daq.bench.durations import format_duration
+from daq.bench.model import Bench
 from daq.devices.bench_file import load
 from daq.errors import WrongSettingError
 from daq.estimation.noise_estimates import responses
@@ -22,23 +23,17 @@ from estimator.levels.interval import worth
 from estimator.likelihood.dimension import MIN_DETERMINED_SENSORS, ROOM, ROOM_OF_ONE_CHANNEL
 from estimator.likelihood.gradients import MIN_SENSORS
 from estimator.methods import self_noise
+from estimator.planning import Plan
 from estimator.responses.edge_leakage import slope_factor
 from estimator.responses.equalisation import THRESHOLD
 from estimator.spectra.welch import WelchSettings
 from estimator.spectra.windows import get_window
+from estimator.types import FloatArray
 from estimator.wording import percent, signed
 from tui.notebook.options import settings_of
 from tui.notebook.text import rendered
 from tui.page.table import Table
 from tui.simulation.devices import scenario_of
-
-if TYPE_CHECKING:
-    import os
-
-    from daq.bench.model import Bench
-    from estimator.planning import Plan
-    from estimator.types import FloatArray
-
 
 WAVES = 150.0  # m/s, of a floor; the ground is faster
 ASSUMED_RADIUS = 0.12  # m, of a bench of unknown positions

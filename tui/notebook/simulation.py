@@ -5,22 +5,20 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from daq.bench.durations import format_duration, parse_duration
+from daq.bench.model import Bench
 from daq.errors import WrongSettingError
+from estimator.types import FloatArray
 from sim_devices.errors import ScenarioError
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
 from tui.simulation.write_recording import bench_of, described, write
 
-if TYPE_CHECKING:
-    from daq.bench.model import Bench
-    from estimator.types import FloatArray
-
-    PathLike: TypeAlias = str | os.PathLike[str]
+PathLike: TypeAlias = str | os.PathLike[str]
 
 
 class Simulation(Mapping[str, "FloatArray"]):

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import importlib
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from types import ModuleType
 
 from daq.errors import HuddleError
 from daq.python_process import install_command
-
-if TYPE_CHECKING:
-    from types import ModuleType
 
 _EXTRA = {
     "pyarrow": "parquet",

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from pydantic_core import to_json
 
 from estimator.records import json_key
-
-if TYPE_CHECKING:
-    from estimator.types import FloatArray
+from estimator.types import FloatArray
 
 
 def plain(value: Any, *, array: Callable[[Any], Any] = np.ndarray.tolist) -> Any:  # noqa: ANN401

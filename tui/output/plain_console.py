@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import Any
 
 import rich.table
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -12,9 +13,6 @@ from rich.segment import Segment
 from tui.output.exit_codes import ExitCode
 from tui.page.table import Table
 from tui.page.terminal import terminal_table
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 WIDTH_OF_TABLES = 2000
 """Columns that a table in a file or a pipe may need."""

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Collection, Mapping
 
 import rich.table
 from rich.text import Text
 
 from tui.page.table import Cell, Table, Tone
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
-
 
 MUTED = "#9aa5b8"
 STYLES: Mapping[Tone, str] = {

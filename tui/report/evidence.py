@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daq.bench.units import decibels
+from daq.clocks.clock_model import ClockState
+from daq.estimation.snapshot import Snapshot
 from daq.protocols.block import EventKind
 from daq.results.clock_effect import grade, reference, residuals
 from daq.results.facts.fact import MARKS, Fact
+from daq.results.result import Result
 from daq.results.sources import LoggedEvent, Source, uncounted_events, with_uncounted
 from daq.results.vocabulary import clock_source
 from estimator.checks.advice import Rank
 from estimator.checks.advice_on_sensors import ANY_AXES
 from estimator.checks.advice_on_signals import NoSharedMotion
+from estimator.checks.band import BandDiagnosis
+from estimator.checks.relative_response import RelativeResponse
 from estimator.likelihood.goodness_of_fit import rejected_below
 from estimator.wording import several, span
 from tui.page.table import Cell
@@ -26,15 +31,6 @@ from tui.report.figures.standing import standing_plots
 from tui.report.parts import Items, Paragraph, Part, Section, Table, Tone
 from tui.wording.facts import NOTHING_TO_DO, RANKS
 from tui.wording.formatting import NOTHING, plain_number, probability, scientific, share, utc
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from daq.clocks.clock_model import ClockState
-    from daq.estimation.snapshot import Snapshot
-    from daq.results.result import Result
-    from estimator.checks.band import BandDiagnosis
-    from estimator.checks.relative_response import RelativeResponse
 
 LISTED = 40
 """Most lines of the list of what happened; with more, those of one kind go together."""

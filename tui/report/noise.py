@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping, Sequence
 
 from daq.bench.masks.mask import SOURCES, Mask
 from daq.bench.tables.certificate import CertificateTable, Rule
 from daq.bench.units import decibels
+from daq.estimation.snapshot import Snapshot
 from daq.results.band_summary import BandMeans, known_range
 from daq.results.decision.conformity import Conformity, Statement
+from daq.results.decision.verdict import TestVerdict
+from daq.results.result import Result
 from daq.results.vocabulary import FLAG_WORDS, PARTNER_WORDS
 from estimator.decision.verdict import Verdict
 from estimator.self_noise.result import Flag
@@ -26,13 +29,6 @@ from tui.wording.formatting import (
     scientific,
 )
 from tui.wording.verdict_text import TONES, WORDS, Decision, margin
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from daq.estimation.snapshot import Snapshot
-    from daq.results.decision.verdict import TestVerdict
-    from daq.results.result import Result
 
 STATEMENTS: Mapping[Statement, str] = {
     Statement.PASS: "pass",

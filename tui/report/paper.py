@@ -9,11 +9,12 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import singledispatchmethod
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
 import matplotlib as mpl
 from fpdf import FPDF, FontFace, TextStyle
@@ -23,10 +24,6 @@ from tui.page.table import Cell, tone_of
 from tui.report.figures import drawing, on_paper
 from tui.report.figures.curves import WIDTH as INNER
 from tui.report.parts import Facts, Items, Paragraph, Part, Plot, Report, Signatures, Table, Tone
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
 
 MARGIN, TOP, BOTTOM = 0.58, 0.5, 0.65
 TITLE, VERDICT = 17.0, 10.0

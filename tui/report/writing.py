@@ -4,27 +4,24 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import chain, count
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
+from daq.bench.masks.mask import Mask
 from daq.errors import HuddleError
+from daq.results.result import Result
 from daq.whole_file import write_whole
 from tui.page.table import tone_of
 from tui.report.contents import report_of
 from tui.report.figures import drawing
 from tui.report.figures.curves import WIDTH
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from daq.bench.masks.mask import Mask
-    from daq.results.result import Result
-    from tui.report.parts import Plot, Report
+from tui.report.parts import Plot, Report
 
 _LIGHT = {
     "ink": drawing.INK,

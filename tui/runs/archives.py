@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from daq.archive import execution, stations
+from daq.archive.plan import Plan
 from daq.archive.sources import recordings_in, sort
 from daq.archive.store import Store
+from daq.archive.task import Outcome
 from daq.archive.waveforms import Contents, Found, Reading, stations_in
 from daq.errors import ArchiveError
+from daq.estimation.settings import Settings
+from daq.formats.assembly import Overlap
+from daq.formats.sources import Selection
 from estimator.wording import several
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-    from pathlib import Path
-
-    from daq.archive.plan import Plan
-    from daq.archive.task import Outcome
-    from daq.estimation.settings import Settings
-    from daq.formats.assembly import Overlap
-    from daq.formats.sources import Selection
 
 
 def reading_of(

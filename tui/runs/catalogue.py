@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from datetime import datetime
+from pathlib import Path
 
 from daq.errors import HuddleError, RecordingError
 from daq.recorder.retention import remove_run
 from daq.recording.reader import Recording
 from daq.recording.storage.locking import is_being_written
 from daq.results.store import stored_verdict
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-    from datetime import datetime
-    from pathlib import Path
-
-    from estimator.decision.verdict import Verdict
+from estimator.decision.verdict import Verdict
 
 
 @dataclass(frozen=True, slots=True)

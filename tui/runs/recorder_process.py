@@ -20,10 +20,12 @@ import tempfile
 import threading
 import time
 from collections import deque
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import FrameType
+from typing import Any
 
 from daq.bench.end_condition import NEVER, EndCondition
 from daq.bench.estimate_settings import EstimateSettings, to_table
@@ -32,11 +34,6 @@ from daq.python_process import python_command
 from daq.recording.control import ask
 from tui.output.exit_codes import ExitCode
 from tui.output.logs import lines as logs
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from types import FrameType
-
 
 LINES_AT_ONCE, LINES_A_SECOND = 200, 5
 """Lines of a child that are logged at once, and on average: its log must not fill the disk."""

@@ -12,14 +12,12 @@ import ctypes
 import os
 import sys
 import time
-from typing import TYPE_CHECKING, Protocol
+from collections.abc import Callable, Iterator
+from datetime import datetime
+from typing import Protocol
 
 from daq.recorder.clock_trust import clock_state
 from daq.recorder.schedule import utc_now
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from datetime import datetime
 
 _ABSOLUTE, _CANCEL_ON_SET = 1, 2
 _FAR = 2**31 - 1

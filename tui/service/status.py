@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import shutil
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+from typing import Any
 
 from daq.bench.durations import format_duration
+from daq.bench.model import Bench
 from daq.errors import HuddleError
 from daq.recording.control import ask
 from tui.service.clock import SystemTime
 from tui.service.processes.locks import is_held
 from tui.service.records.places import service_lock
 from tui.service.records.run_state import UNFINISHED, Run, RunState, utc_text
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from datetime import datetime
-    from pathlib import Path
-
-    from daq.bench.model import Bench
 
 
 def service_status(bench: Bench, runs: list[Run], now: datetime) -> dict[str, Any]:

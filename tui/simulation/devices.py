@@ -7,11 +7,14 @@ import signal
 import sys
 import time
 import tomllib
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 from daq.bench.loading import dump
+from daq.bench.model import Bench, Sensor
 from daq.devices.bench_file import load, parse
 from daq.errors import BenchFileError, FileFault
 from daq.whole_file import write_whole
@@ -21,12 +24,6 @@ from sim_devices.faults import parse as parse_faults
 from sim_devices.server.launch import RunningDevice, start
 from sim_devices.world.scenario import Scenario
 from tui.output.console import console, hint, write_json
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
-    from daq.bench.model import Bench, Sensor
 
 _LOGGER = logging.getLogger(__name__)
 

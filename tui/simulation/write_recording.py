@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,19 +15,14 @@ from daq.devices.registry import driver_type
 from daq.protocols.block import EventKind, HostTime
 from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SIMULATED, SensorLayout
+from estimator.types import FloatArray
 from sim_devices.errors import ScenarioError
 from sim_devices.world import paper_scenarios
+from sim_devices.world.scenario import Scenario
 from sim_devices.world.tables import SensorClock
 from sim_devices.world.world import World
 from tui.output.console import for_people, progress, write_json
 from tui.simulation.devices import scenario_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from estimator.types import FloatArray
-    from sim_devices.world.scenario import Scenario
-
 
 DEFAULT_DURATION = 600.0
 BLOCK_SECONDS = 1.0

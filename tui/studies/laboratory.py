@@ -7,8 +7,8 @@ and (30) with the cross-spectra of the field, as such segments see them.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,16 +20,11 @@ from estimator.self_noise.bias import three_channel_bias, three_sensor_bias
 from estimator.spectra.parts import PartEnds, Parts, part_bins
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window
+from estimator.types import ComplexArray, FloatArray
 from sim_devices.world import paper_scenarios
+from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
 from tui.studies.study import Curve, Panel, Point, ProgressCallback, Series, Study
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from estimator.types import ComplexArray, FloatArray
-    from sim_devices.world.scenario import Scenario
-
 
 HANN = WelchSettings(
     sampling_rate=paper_scenarios.SAMPLING_RATE, segment_length=2000, overlap=0.5, window="hann"

@@ -8,14 +8,16 @@ direction cosines and levels, exactly as if its own samples had been transformed
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from estimator.methods import self_noise
 from estimator.self_noise.bias import three_channel_bias, three_sensor_bias
 from estimator.spectra.welch import CrossSpectra, WelchSettings
+from estimator.types import ComplexArray, FloatArray
 from sim_devices.errors import ScenarioError
 from sim_devices.world import paper_scenarios
 from sim_devices.world.scenario import Scenario
@@ -23,12 +25,6 @@ from sim_devices.world.spectrum import White
 from sim_devices.world.tables import CommonMotion, SensorModel
 from sim_devices.world.world import World
 from tui.studies.study import Panel, Point, ProgressCallback, Series, Study
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from estimator.types import ComplexArray, FloatArray
-
 
 PAPER = WelchSettings(
     sampling_rate=paper_scenarios.SAMPLING_RATE,

@@ -8,12 +8,12 @@ whose whole interval lies above the upper end of the bound contradicts the sampl
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from math import isfinite, nan
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 import numpy as np
 import typer
@@ -23,23 +23,18 @@ from daq.bench.units import is_motion
 from daq.errors import HuddleError, ImportFormatError
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.formats.importer import import_files
 from daq.formats.response import Responses, is_response
 from daq.recording.reader import Recording
 from daq.results.band_summary import data_means
 from daq.results.result import Result
 from estimator.self_noise.result import Flag
+from estimator.types import FloatArray
 from tui.output.console import check_places, for_people, notices, write_json
 from tui.output.extras import require
 from tui.page.table import Table
 from tui.studies.study import Curve, Panel, Study
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from daq.estimation.snapshot import Snapshot
-    from estimator.types import FloatArray
-
 
 PUBLIC = "public"
 BOUND = "bound"

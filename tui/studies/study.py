@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from estimator.types import FloatArray
-
+from estimator.types import FloatArray
 
 TOLERANCE = 4.0
 """Standard errors within which a point agrees with theory: 1 in 16,000 would not by chance."""

@@ -28,20 +28,16 @@ import os
 import secrets
 import time
 from collections import OrderedDict
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from daq.bench.model import Bench
+from daq.bench.tables.unattended import Web
 from daq.errors import HuddleError
 from daq.whole_file import PRIVATE, write_whole
 from tui.service.records.places import file_name
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from daq.bench.model import Bench
-    from daq.bench.tables.unattended import Web
 
 LASTS = 12 * 3600.0
 """Seconds for which a cookie is good."""

@@ -21,16 +21,14 @@ import contextlib
 import socket
 import time
 from collections import Counter
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from tui.web.access import network_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping
 
 HEAD = 10.0
 """Seconds for the TLS handshake and a request, and between two requests."""

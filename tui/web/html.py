@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from functools import cache
-from typing import TYPE_CHECKING
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -12,11 +11,9 @@ from markupsafe import Markup
 from estimator.checks.advice import Rank
 from estimator.wording import clock_time, several
 from tui.page.html import class_of, html_table
+from tui.page.table import Table
 from tui.wording.formatting import utc
 from tui.wording.verdict_text import TONES
-
-if TYPE_CHECKING:
-    from tui.page.table import Table
 
 _RANKS = {Rank.INVALIDATES: "bad", Rank.DELAYS: "doubtful", Rank.TO_KNOW: ""}
 _WIDE = Markup('<div class="wide" tabindex="0" role="region" aria-label="{}">{}</div>')

@@ -14,17 +14,27 @@ import json
 import logging
 import threading
 import time
+from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import groupby
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
+from daq.bench.model import Bench
 from daq.errors import HuddleError
 from daq.estimation.follow import follow
+from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
+from daq.protocols.block import Event
+from daq.recording.monitor import RecordingStatus
+from daq.recording.reader import Recording
 from daq.recording.storage.locking import LOCKS_ARE_VISIBLE, is_being_written
+from daq.results.band_summary import BandMeans
 from daq.results.result import Result
 from estimator.errors import EstimatorError
 from estimator.wording import span
+from tui.application.controls import Controls
 from tui.application.state import State
 from tui.application.test_view.channels import channel_table
 from tui.application.test_view.clocks import clock_line, clock_table
@@ -36,19 +46,6 @@ from tui.service.status import status_lines
 from tui.web.chart import choice_of, drawn, with_models
 from tui.web.html import instant, page
 from tui.web.traces import Trace, traces
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Sequence
-    from pathlib import Path
-
-    from daq.bench.model import Bench
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
-    from daq.protocols.block import Event
-    from daq.recording.monitor import RecordingStatus
-    from daq.recording.reader import Recording
-    from daq.results.band_summary import BandMeans
-    from tui.application.controls import Controls
 
 _LOGGER = logging.getLogger(__name__)
 LOOK = 1.0

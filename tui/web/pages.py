@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
 from daq.results.comparison import compare
 from tui.application.result_view.result_text import difference_cell
+from tui.application.state import State
 from tui.application.test_view.channels import channel_table
 from tui.page.table import Table
 from tui.web.chart import choice_of
 from tui.web.live import WIDE, band_means, of_band
 from tui.wording.facts import NOTHING_TO_DO
 from tui.wording.verdict_text import Decision, limit_line
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from tui.application.state import State
 
 
 def about_test(state: State, settings_table: Mapping[str, Any]) -> dict[str, Any]:

@@ -7,24 +7,21 @@ import math
 import struct
 import threading
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
+from daq.estimation.snapshot import Snapshot
 from daq.recording.reader import Recording
 from daq.results.signal import Signal, Spectrogram, Waveforms, fitting, panned, zoomed
+from estimator.types import FloatArray
 from tui.web.html import page
 from tui.web.work import check_wanted
 from tui.wording.signal import extent, most_first, sign, time_of, time_ticks, title, words
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from daq.estimation.snapshot import Snapshot
-    from estimator.types import FloatArray
 
 WIDTH, LEFT, ROW, TOP, LANE, AXIS = 1000, 110, 44, 6, 18, 24
 """Of a picture in its own units: width, room for names, height of a waveform, and of the rest."""

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import os
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
+from daq.bench.model import Bench
 from daq.errors import HuddleError
 from daq.estimation.estimation import estimate
 from daq.estimation.snapshot import NoResultError
 from daq.recording.storage.locking import is_being_written
 from daq.results.result import Result
+from tui.application.controls import Controls
 from tui.application.state import Reference, State
 from tui.certificate.ledger import Entry as Certificate
 from tui.certificate.ledger import ledger_of
@@ -20,13 +24,6 @@ from tui.runs.catalogue import Entry, catalogue
 from tui.runs.estimate_settings import settings_for
 from tui.web.chart import with_models
 from tui.web.work import Work, check_wanted
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from daq.bench.model import Bench
-    from tui.application.controls import Controls
 
 PAGE = 50
 """Tests on a page of the list."""

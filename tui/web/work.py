@@ -14,14 +14,12 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict, deque
+from collections.abc import Callable, Hashable
 from concurrent.futures import Future
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from daq.errors import HuddleError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable
 
 WAITING = 4
 """Pieces of work that wait for one visitor, at most."""

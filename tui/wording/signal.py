@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from datetime import UTC, datetime, time
-from typing import TYPE_CHECKING
 
 from daq.results.signal import CLIPPED, EXCLUDED, GAP, Mark, Trace, Waveforms
 from tui.wording.formatting import readings
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
 
 STEPS = (
     *(s * 10.0**e for e in (-3, -2, -1) for s in (1, 2, 5)),

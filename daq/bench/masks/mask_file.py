@@ -8,16 +8,13 @@ by commas, semicolons (numbers may then have decimal commas) or tabs.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from daq.bench.masks.mask import NOISE_MODELS, Mask, check_points
 from daq.bench.option_values import one_of
 from daq.bench.units import DensityUnit
 from daq.errors import FileFault, HuddleError, WrongSettingError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
 
 _MOST = 1 << 20
 """Bytes of a file: far more than a mask has."""

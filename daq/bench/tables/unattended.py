@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import ipaddress
 import re
+from collections.abc import Collection, Mapping
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from cronsim import CronSim, CronSimError
@@ -13,9 +14,6 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from daq.bench.end_condition import EndCondition
 from daq.bench.tables.fields import Duration, Name, PositiveNumber, Table
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
 
 _BYTES = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "tb": 10**12}
 _SIZE = re.compile(r"(\d+(?:\.\d*)?)\s*([a-z]*)", re.ASCII)

@@ -10,7 +10,8 @@ them appear as a gap in COUNT. The first block of a session starts at index 0.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -37,10 +38,6 @@ from daq.protocols.block import (
 )
 from daq.protocols.errors import several
 from daq.protocols.sample_counter import Run, SampleCounter
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
 
 OctetArray: TypeAlias = NDArray[np.uint8]
 BoolArray: TypeAlias = NDArray[np.bool_]

@@ -23,18 +23,14 @@ written.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
 from daq.protocols.sample_counter import SampleCounter
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
-
 
 SYNC_COB_ID, SYNC_PERIOD = 0x1005, 0x1006
 """Objects: COB-ID of SYNC, with the bit of its producer; period in µs."""

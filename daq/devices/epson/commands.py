@@ -21,12 +21,10 @@ commands and writes replies. Source: Seiko Epson, M-A352AD10 data sheet and the 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from numpy.typing import NDArray
 
 DELIMITER = 0x0D
 BURST_HEADER = 0x80

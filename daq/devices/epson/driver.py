@@ -19,8 +19,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import re
+from collections.abc import AsyncIterator, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from pydantic import PositiveFloat, Strict, field_validator
 
@@ -45,15 +46,10 @@ from daq.errors import (
     NotConnectedError,
     WrongDeviceError,
 )
+from daq.host_clock import HostClock
 from daq.protocols.block import DeviceItem, HostTime
+from daq.transport.byte_stream import ByteStream
 from daq.transport.ports import open_port
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator, Sequence
-
-    from daq.host_clock import HostClock
-    from daq.transport.byte_stream import ByteStream
-
 
 REPLY_TIMEOUT = 0.3
 QUIET = 0.03

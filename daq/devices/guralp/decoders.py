@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter, deque
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Iterator, Mapping
 
 from daq.devices.guralp.brp import (
     MAX_SIZE,
@@ -35,10 +35,6 @@ from daq.devices.guralp.scream import ACKNOWLEDGED, NO_SERVER, Packet, PacketFin
 from daq.protocols.block import Block, DeviceItem, Event, EventKind, HostTime, Quantity, Reading
 from daq.protocols.errors import RemoteProtocolError, several, shortened
 from daq.protocols.joined_streams import MAX_PENDING, JoinedStreams
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
-
 
 MAX_KEPT = 1024
 """Maximum number of blocks kept for streams that are not assigned yet."""

@@ -26,8 +26,8 @@ byte order 1 = big-endian, 2 = little-endian, for block and sequence. Assumed:
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -41,9 +41,6 @@ from daq.devices.guralp.gcf import (
     encode_status,
 )
 from daq.protocols.errors import RemoteProtocolError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 SEND = b"GCFSEND:B\0"
 STOP = b"GCFSTOP\0"

@@ -7,15 +7,12 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.devices.labjack.registers import FEEDBACK
 from daq.protocols.errors import RemoteProtocolError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 MAX_SAMPLES = 512
 MAX_CR_SAMPLES = 251

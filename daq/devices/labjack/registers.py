@@ -20,17 +20,14 @@ eight inputs and eleven ranges, from 64 bytes after 0x687000 (T-series datasheet
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from daq.protocols.errors import RemoteProtocolError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import ArrayLike, NDArray
 
 AIN_RANGE = 40000  # + 2 n, FLOAT32
 AIN_NEGATIVE_CHANNEL = 41000  # + n, UINT16

@@ -41,20 +41,16 @@ so. Either way, ``information`` scans are missing in its place.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.devices.labjack.packets import Packet, PacketFinder
 from daq.devices.labjack.registers import CORE_HZ, CORE_TIMER, STREAM_DATA_CAPTURE_16
 from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
 from daq.protocols.errors import several
 from daq.protocols.sample_counter import CLOCK_TOLERANCE, SLACK, SampleCounter
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
 
 AUTO_RECOVER_ACTIVE = 2940
 AUTO_RECOVER_END = 2941

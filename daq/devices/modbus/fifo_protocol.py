@@ -25,16 +25,14 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.devices.modbus import rtu
 from daq.devices.modbus.rtu import ReplyFinder
 from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 RATE_REGISTER = 0x01
 FIFO_REGISTER = 0x02

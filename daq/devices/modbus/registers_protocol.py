@@ -15,19 +15,15 @@ The simulated device encodes with the same map.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.protocols.block import Block, BlockFlag, CountsArray, Event, EventKind, HostTime
 from daq.protocols.errors import DeviceSettingError, RemoteProtocolError, several
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
-
 
 DataType: TypeAlias = Literal[
     "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"

@@ -11,16 +11,12 @@ confirms the frame. Other bytes are skipped one by one.
 from __future__ import annotations
 
 import struct
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
-
-    from numpy.typing import NDArray
+from numpy.typing import NDArray
 
 READ_HOLDING = 3
 READ_INPUT = 4

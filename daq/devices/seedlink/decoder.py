@@ -17,12 +17,14 @@ miniSEED records, read and written by libmseed (pymseed).
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.devices.seedlink.packets import RECORD_SIZE, WRAP, Packet, PacketFinder, Version
 from daq.protocols.block import Block, Event, EventKind, HostTime
@@ -30,12 +32,7 @@ from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.joined_streams import JoinedStreams
 from daq.python_process import install_command
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from numpy.typing import NDArray
-
-    SampleArray: TypeAlias = NDArray[np.int32] | NDArray[np.float32] | NDArray[np.float64]
+SampleArray: TypeAlias = NDArray[np.int32] | NDArray[np.float32] | NDArray[np.float64]
 
 
 try:

@@ -30,14 +30,12 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 from daq.protocols.errors import RemoteProtocolError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 Version: TypeAlias = Literal[3, 4]
 WRAP = 1 << 24

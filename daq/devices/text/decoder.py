@@ -37,11 +37,13 @@ from __future__ import annotations
 import contextlib
 import json
 from bisect import bisect_left, insort
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.devices.text.format import (
     LABELLED,
@@ -67,12 +69,6 @@ from daq.protocols.block import (
 from daq.protocols.errors import RemoteProtocolError, shortened
 from daq.protocols.sample_counter import SampleCounter
 from daq.protocols.sample_times import LATE_NS, Place, SampleTimes
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import NDArray
-
 
 PATIENCE = 2
 MAX_WAITING = 64

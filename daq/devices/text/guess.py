@@ -9,14 +9,12 @@ from __future__ import annotations
 import itertools
 import json
 import re
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from daq.devices.text.format import LABELLED, flatten, nmea_checksum, read_number
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
 
 MIN_ROWS = 3
 _DELIMITERS = (";", "\t", ",", " ")

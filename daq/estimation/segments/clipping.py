@@ -5,20 +5,15 @@ Stretches spread over the recording are searched (:mod:`estimator.checks.count_l
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
+from daq.bench.channel import Channel
 from daq.protocols.block import BlockFlag
+from daq.recording.interface import ReadableRecording, ReadableSensor
 from estimator.checks.count_limits import CountLimits
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from daq.bench.channel import Channel
-    from daq.recording.interface import ReadableRecording, ReadableSensor
 
 _STRETCHES = 16
 _ROWS = 2048  # of each

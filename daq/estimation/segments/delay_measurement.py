@@ -6,24 +6,19 @@ the prediction of one sensor by another costs as much for one segment as for man
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 
+from daq.clocks.aligned_recording import AlignedRecording
 from daq.clocks.delay_estimation import MIN_SEGMENTS, REFERENCES, DelayEstimator
 from daq.clocks.departures import departing
 from estimator.median import median
+from estimator.spectra.welch import SegmentSpectra, WelchSettings
 from estimator.spectra.windows import gap_window, get_window, without_trend
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from daq.clocks.aligned_recording import AlignedRecording
-    from estimator.spectra.welch import SegmentSpectra, WelchSettings
-
-    FloatArray = NDArray[np.float64]
-    IntArray = NDArray[np.int64]
-    BoolArray = NDArray[np.bool_]
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
 _HELD = 6  # segments that are measured together while a recording is followed
 _SHOWN = 0.5  # samples; a delay that must show in any segment

@@ -6,14 +6,10 @@ coarse. One that stands still most of the time is no news: it is dead, or always
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 _PARTS = 8  # of a hop, examined one by one
 _MIN_SAMPLES = 32  # samples of a part

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
+from daq.clocks.grid import OwnSamples
 from daq.estimation.segments.flatline import stands_still
+from daq.estimation.settings import Settings
 from estimator.spectra.shifted_windows import order_of, shifted_spectra
-from estimator.spectra.welch import trends
+from estimator.spectra.welch import WelchSettings, trends
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from daq.clocks.grid import OwnSamples
-    from daq.estimation.settings import Settings
-    from estimator.spectra.welch import WelchSettings
-
-    FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 
 def need_samples_of_grid(settings: Settings, *, filtered: bool, exact: bool) -> str:

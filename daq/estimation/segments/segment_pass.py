@@ -5,11 +5,14 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter, deque
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeVar
+from datetime import datetime
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.bench.durations import stretch
 from daq.clocks.aligned_recording import AlignedRecording
@@ -20,28 +23,19 @@ from daq.estimation.segments.delay_measurement import DelayMeasurement
 from daq.estimation.segments.flatline import FlatlineDetector, stands_still
 from daq.estimation.segments.own_spectra import OwnSpectra, need_samples_of_grid
 from daq.estimation.segments.stated_times import agree, compare
-from daq.recording.interface import at_rates, created_at
+from daq.estimation.settings import Settings
+from daq.recording.interface import ReadableRecording, at_rates, created_at
 from estimator.spectra.channel_sets import ChannelSets
+from estimator.spectra.equaliser import Equaliser
 from estimator.spectra.multiresolution import MultiResolution
 from estimator.spectra.parts import MOST, PartEnds, Parts, by_part, part_bins
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
 from estimator.spectra.welch import CrossSpectra, SegmentSpectra, WelchSettings, kept_bins
 from estimator.spectra.windows import Leakage, gap_window, get_window, without_trend
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Sequence
-    from datetime import datetime
-
-    from numpy.typing import NDArray
-
-    from daq.estimation.settings import Settings
-    from daq.recording.interface import ReadableRecording
-    from estimator.spectra.equaliser import Equaliser
-
-    FloatArray = NDArray[np.float64]
-    ComplexArray = NDArray[np.complex128]
-    BoolArray = NDArray[np.bool_]
-    from collections.abc import Iterator
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+BoolArray = NDArray[np.bool_]
 
 
 def surrounded(usable: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:

@@ -20,27 +20,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
+from daq.clocks.aligned_recording import AlignedRecording
 from daq.clocks.delay_estimation import REFERENCES, DelayEstimator
 from daq.clocks.quantiles import median
 from daq.estimation.segments.delay_measurement import around_gaps
+from daq.estimation.settings import Settings
+from estimator.spectra.welch import SegmentSpectra, WelchSettings
 from estimator.spectra.windows import get_window
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from daq.clocks.aligned_recording import AlignedRecording
-    from daq.estimation.settings import Settings
-    from estimator.spectra.welch import SegmentSpectra, WelchSettings
-
-    BoolArray = NDArray[np.bool_]
-    FloatArray = NDArray[np.float64]
-    IntArray = NDArray[np.int64]
-    ComplexArray = NDArray[np.complex128]
-    Delays = tuple[FloatArray, FloatArray, FloatArray]
+BoolArray = NDArray[np.bool_]
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+ComplexArray = NDArray[np.complex128]
+Delays = tuple[FloatArray, FloatArray, FloatArray]
 
 _PIECES = 40  # lengths of a piece in the recording, at least where it is short
 _LONGEST = 60.0  # s of a piece, where there are few gaps

@@ -42,12 +42,15 @@ import math
 import re
 import warnings
 from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from itertools import groupby, islice, pairwise
-from typing import TYPE_CHECKING, TextIO
+from pathlib import Path
+from typing import TextIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.errors import ImportFormatError
 from daq.formats.foreign_sensor import (
@@ -58,13 +61,6 @@ from daq.formats.foreign_sensor import (
     Stretch,
     finite_stretches,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
 
 _HEAD_BYTES = 1 << 16
 _HEAD_LINES = 400

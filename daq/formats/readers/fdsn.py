@@ -10,16 +10,14 @@ from __future__ import annotations
 
 import re
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from daq.errors import ImportFormatError
 from daq.formats.foreign_sensor import NS_PER_S
 from daq.formats.readers.waveforms import load_obspy
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 FDSN = "fdsn://"
 _DAY_NS = 86_400 * NS_PER_S

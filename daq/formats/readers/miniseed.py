@@ -9,17 +9,15 @@ first and the last record state: the clock of the digitizer is in them.
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from daq.errors import ImportFormatError
 from daq.formats.readers.packages import load
 from daq.formats.traces import Trace
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
 
 _PART_BYTES = 1 << 20
 _HEADER_BYTES = 40

@@ -16,18 +16,15 @@ import math
 import struct
 import zipfile
 import zlib
-from typing import TYPE_CHECKING, Any, BinaryIO
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.errors import ImportFormatError, RecordingError
 from daq.formats.foreign_sensor import ForeignSensor, finite_stretches
 from daq.recording.storage.refusals import check_names, dataset
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 _LARGE = 1 << 28
 _INFLATION = 100

@@ -18,9 +18,11 @@ from __future__ import annotations
 import logging
 import re
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,11 +30,6 @@ from daq.errors import ImportFormatError
 from daq.formats.foreign_sensor import NS_PER_S, Calibration, ForeignSensor, finite_stretches
 from daq.formats.readers.packages import load
 from daq.formats.traces import Trace
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
 
 _SAMPLES = 1 << 18
 

@@ -13,8 +13,10 @@ import io
 import math
 import re
 import warnings
+from collections.abc import Iterator, Sequence
 from importlib.metadata import entry_points
-from typing import TYPE_CHECKING, Any, TypeAlias
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -23,10 +25,6 @@ from daq.errors import ImportFormatError
 from daq.formats.foreign_sensor import Calibration
 from daq.formats.readers.packages import load
 from daq.formats.traces import FilePart, LoadedPart, Trace
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
 
 FORMATS = (
     *("MSEED", "SAC", "GSE2", "GSE1", "SLIST", "TSPAIR", "SEGY", "SEG2", "WAV", "KNET"),

@@ -16,15 +16,13 @@ less than to concatenate them.
 from __future__ import annotations
 
 from functools import cache, lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.recording.file_format import BLOCK_DTYPE
 from daq.recording.storage.packing import deflate
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _POLYNOMIAL = 0xEDB88320  # CRC-32, reflected
 _PLACES = np.arange(32, dtype=np.uint32)

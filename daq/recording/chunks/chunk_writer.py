@@ -5,22 +5,19 @@ from __future__ import annotations
 import hashlib
 import zlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import h5py
 import numpy as np
 from h5py import h5s, h5t
+from numpy.typing import NDArray
 
 from daq.errors import RecordingError
+from daq.protocols.block import Block, HostTime
 from daq.recording import file_format
+from daq.recording.file_format import SensorLayout
 from daq.recording.storage.packing import RAW, packed
 from daq.recording.storage.retries import repeated, report
-
-if TYPE_CHECKING:
-    import h5py
-    from numpy.typing import NDArray
-
-    from daq.protocols.block import Block, HostTime
-    from daq.recording.file_format import SensorLayout
 
 _MERGED_SECONDS = 0.1
 """Length of merged blocks in seconds."""

@@ -18,20 +18,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.errors import NotARecordingError
 from daq.recording.file_format import texts
 from daq.recording.storage.refusals import dataset, member
 from daq.recording.storage.whole_hdf5 import contents_sha256, little_endian
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-
-    from numpy.typing import NDArray
 
 MANIFEST, RESULTS = "manifest", "results"
 RESULTS_MANIFEST = "results_manifest"

@@ -23,9 +23,12 @@ import os
 import struct
 import zlib
 from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
+import h5py
 import numpy as np
 
 from daq.recording import file_format
@@ -33,12 +36,6 @@ from daq.recording.storage.refusals import MAX_CHUNK
 from daq.recording.storage.retries import repeated
 from daq.recording.storage.superblock import Superblock
 from daq.recording.storage.whole_hdf5 import WholeHdf5
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
-
-    import h5py
 
 _MAGIC = b"huddle-journal 1\n"
 _FRAME = struct.Struct("<II")

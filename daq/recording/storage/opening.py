@@ -15,7 +15,8 @@ import contextlib
 import ctypes
 import sys
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import h5py
 
@@ -24,9 +25,6 @@ from daq.recording.storage import trial
 from daq.recording.storage.locking import is_being_written
 from daq.recording.storage.refusals import hdf5_function
 from daq.recording.storage.superblock import ClearedFile, Superblock
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 READ_ATTEMPTS = 30
 """Attempts to read a metadata block that its writer may be rewriting: one second in total."""

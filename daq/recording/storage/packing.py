@@ -18,20 +18,18 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 try:
     from isal import isal_zlib as deflate
 except ModuleNotFoundError:  # the extra "fast" is not installed
     import zlib as deflate  # type: ignore[no-redef]  # the same interface
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
 
 __all__ = ["PIPELINE", "RAW", "InflationError", "check_chunks", "deflate", "packed", "unpacked"]
 

@@ -10,18 +10,16 @@ import contextlib
 import ctypes
 import math
 import os
+from collections.abc import Callable, Iterator
 from functools import cache
-from typing import TYPE_CHECKING, Any, cast
+from pathlib import Path
+from typing import Any, cast
 
 import h5py
 import numpy as np
 
 from daq.errors import NotARecordingError, RecordingError
 from daq.recording.storage.packing import PIPELINE, check_chunks
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
 
 MAX_CHUNK = 1 << 28
 """Maximum size of a chunk in bytes."""

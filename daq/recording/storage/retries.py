@@ -5,10 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import time
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
+from collections.abc import Callable
 
 _LOGGER = logging.getLogger(__name__)
 PAUSES = (0.05, 0.2, 0.75)

@@ -14,13 +14,10 @@ import shlex
 import stat
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from daq.errors import NotARecordingError, RecordingError
 from daq.foreign_files import import_command
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _FIELDS = struct.Struct("<8sBBBBQQQQ")

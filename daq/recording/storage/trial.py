@@ -18,14 +18,12 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
 from daq.errors import NotARecordingError
 from daq.python_process import python_command
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
 
 LIMIT = 10.0
 """Seconds without progress after which a child is ended."""

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from typing import TYPE_CHECKING, Any, Self
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.recording.storage.packing import check_chunks
 from daq.whole_file import RememberingFile, wrong_content
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-    from types import TracebackType
-
-    from numpy.typing import NDArray
 
 _BYTES_PER_READ = 1 << 22
 

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Mapping
+from typing import ClassVar
 
 from daq.results.facts.fact import Fact
 from daq.results.vocabulary import CAUSES
+from estimator.checks.sensitivities import Cause
 from estimator.decision.verdict import MIN_AVERAGES, Obstacle
-from estimator.records import record
+from estimator.records import Hertz, record
 from estimator.wording import Words, listed
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from estimator.checks.sensitivities import Cause
-    from estimator.records import Hertz
-
 
 _OBSTACLES: Mapping[Obstacle, tuple[str, str]] = {
     Obstacle.SENSORS_LOST: (

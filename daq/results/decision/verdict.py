@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 from daq.bench.units import decibels
-from daq.results.decision.facts import LimitNotJudged, LimitUndecided
+from daq.results.decision.facts import LimitNotJudged, LimitUndecided, WrongSensitivity
+from daq.results.facts.fact import Fact
 from estimator.checks.advice import Rank
 from estimator.decision.decision_time import INTERVAL_FACTOR
-from estimator.decision.verdict import Obstacle, Verdict
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from daq.results.decision.facts import WrongSensitivity
-    from daq.results.facts.fact import Fact
-    from estimator.decision.verdict import Prediction
-    from estimator.records import Hertz
+from estimator.decision.verdict import Obstacle, Prediction, Verdict
+from estimator.records import Hertz
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
+from daq.estimation.snapshot import Snapshot
+from daq.results.band_summary import Estimate
 from daq.results.facts.channels import facts_of_channels, facts_of_linearity, facts_of_rounding
 from daq.results.facts.clocks import facts_of_clocks
-from daq.results.facts.fact import Finding
+from daq.results.facts.fact import Fact, Finding
 from daq.results.facts.methods import facts_of_methods
 from daq.results.facts.model import facts_of_model
 from daq.results.facts.precision import facts_of_precision
 from daq.results.facts.recordings import facts_of_recordings
 from daq.results.facts.segments import facts_of_segments
-from estimator.checks.advice import Rank
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
-    from daq.estimation.snapshot import Snapshot
-    from daq.results.band_summary import Estimate
-    from daq.results.facts.fact import Fact
-    from estimator.checks.advice import Advice
+from estimator.checks.advice import Advice, Rank
 
 
 def facts_of(estimate: Estimate) -> list[Fact]:

@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Iterator
+from typing import ClassVar
 
 import numpy as np
 
 from daq.estimation.contributions import contributions
+from daq.estimation.snapshot import Snapshot
 from daq.results.facts.fact import Fact
 from estimator.checks.advice import Rank
 from estimator.levels.contributions import Source
 from estimator.levels.interval import NORMAL_95
-from estimator.records import record
-from estimator.self_noise.result import Flag, Refusal
+from estimator.records import Decibels, record
+from estimator.self_noise.result import Flag, Refusal, SelfNoise
+from estimator.types import BoolArray
 from estimator.wording import Words, listed, span
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from daq.estimation.snapshot import Snapshot
-    from estimator.records import Decibels
-    from estimator.self_noise.result import SelfNoise
-    from estimator.types import BoolArray
-
 
 _NOT_IDENTIFIED = {
     Refusal.SHORT: "the recording is too short to compare parts of it",

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Iterator
+from typing import ClassVar
 
 import numpy as np
 
 from daq.estimation.contributions import MUCH_NONLINEAR
+from daq.estimation.snapshot import Snapshot
 from daq.results.band_summary import known_range
 from daq.results.facts.fact import Fact
 from estimator.checks.advice import Rank
 from estimator.levels.bands import third_octaves
-from estimator.records import record
+from estimator.records import Hertz, Seconds, record
 from estimator.wording import Words, listed, percent, several
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from daq.estimation.snapshot import Snapshot
-    from estimator.records import Hertz, Seconds
-
 
 MUCH_ROUNDING = 0.1
 """Share of the noise from which rounding that channels share is a fact."""

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Iterator, Mapping
+from typing import ClassVar
 
-from daq.clocks.clock_model import ClockSource
-from daq.protocols.block import UNCOUNTED_CHECK
+from daq.clocks.clock_model import ClockSetting, ClockSource
+from daq.estimation.snapshot import Snapshot
+from daq.protocols.block import UNCOUNTED_CHECK, Uncounted
 from daq.results.band_summary import known_range
 from daq.results.clock_effect import reference
 from daq.results.facts.fact import Fact
@@ -14,17 +16,8 @@ from estimator.checks.advice import Rank
 from estimator.checks.advice_on_model import ModelMisfit
 from estimator.checks.advice_on_sensors import Delay, Gain
 from estimator.checks.advice_on_signals import NoSharedMotion
-from estimator.records import record
+from estimator.records import Seconds, record
 from estimator.wording import Words, listed, several, signed, time_of_day
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from daq.clocks.clock_model import ClockSetting
-    from daq.estimation.snapshot import Snapshot
-    from daq.protocols.block import Uncounted
-    from estimator.records import Seconds
-
 
 _LIKE_A_CLOCK = Delay | Gain | ModelMisfit | NoSharedMotion
 """Findings that unknown clocks alone can bring about."""

@@ -6,15 +6,12 @@ with the units that their types name.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Mapping
+from typing import ClassVar
 
 from estimator.checks.advice import Advice, Names, Rank
 from estimator.records import Record, record
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from estimator.wording import Words
+from estimator.wording import Words
 
 MARKS: Mapping[Rank, str] = {Rank.INVALIDATES: "✗", Rank.DELAYS: "▲", Rank.TO_KNOW: "·"}
 OUTSIDE = "Outside your band: "

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Iterator
+from typing import ClassVar
 
 import numpy as np
 
+from daq.estimation.snapshot import Snapshot
 from daq.results.band_summary import known_range
 from daq.results.facts.changes import facts_of_changes
 from daq.results.facts.fact import Fact
@@ -19,12 +21,6 @@ from estimator.records import record
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
 from estimator.wording import Words, listed
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from daq.estimation.snapshot import Snapshot
-
 
 WITHOUT_ESTIMATE = (
     Flag.DEAD_CHANNEL

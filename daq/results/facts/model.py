@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Iterator, Sequence
+from typing import ClassVar
 
 import numpy as np
 
+from daq.estimation.snapshot import Snapshot
 from daq.results.facts.fact import Fact
 from estimator.checks.advice import Rank, Untested, model
 from estimator.checks.advice_on_model import ModelMisfit, TooFewDimensions
 from estimator.checks.advice_on_signals import NoSharedMotion, TooFewSensors
-from estimator.records import Share, record
+from estimator.likelihood.dimension import BandDimension
+from estimator.records import Hertz, Share, record
 from estimator.wording import Words, listed, percent, span
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from daq.estimation.snapshot import Snapshot
-    from estimator.likelihood.dimension import BandDimension
-    from estimator.records import Hertz
-
 
 _WHY_UNTESTED = {
     Untested.UNFINISHED: "The diagnosis follows with the first segments.",

@@ -3,28 +3,22 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Iterator, Mapping
+from typing import ClassVar
 
 import numpy as np
 
-from daq.results.band_summary import averages_at, correlation_of
+from daq.results.band_summary import Estimate, averages_at, correlation_of
 from daq.results.facts.fact import Fact
 from daq.results.facts.recordings import LEAST_SHARE
 from daq.results.vocabulary import SOURCE_WORDS
 from estimator.checks.advice import Rank
 from estimator.checks.relative_response import pair_coherence
 from estimator.errors import BandError
+from estimator.levels.contributions import Source
 from estimator.levels.interval import NORMAL_95
-from estimator.records import record
+from estimator.records import Degrees, Seconds, record
 from estimator.wording import Words, listed, percent, roughly, signed, span
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from daq.results.band_summary import Estimate
-    from estimator.levels.contributions import Source
-    from estimator.records import Degrees, Seconds
-
 
 _TWO = 2  # sensors
 

@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Iterator
+from typing import ClassVar
 
+from daq.estimation.settings import Settings
+from daq.estimation.snapshot import SensorTotals, Snapshot
+from daq.recording.monitor import RecordingStatus
+from daq.recording.sensor_state import SensorState
 from daq.results.facts.fact import Fact
 from daq.results.vocabulary import STATE_ALERTS
 from estimator.checks.advice import Rank
-from estimator.records import record
+from estimator.records import Seconds, record
 from estimator.wording import Words, clock_time, listed, several, time_of_day
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import SensorTotals, Snapshot
-    from daq.recording.monitor import RecordingStatus
-    from daq.recording.sensor_state import SensorState
-    from estimator.records import Seconds
-
 
 SIMULATED = "Simulated sensors: the noise is that of a model, not of instruments."
 LEAST_SHARE = 0.01

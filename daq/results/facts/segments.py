@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from daq.estimation.noise_estimates import BY_MOTION
+from daq.estimation.snapshot import Snapshot
 from daq.results.facts.fact import Fact
 from daq.results.vocabulary import REASONS
 from estimator.checks.advice import Rank
-from estimator.records import record
+from estimator.records import Hertz, Seconds, Share, record
 from estimator.spectra.segment_rejection import Reason
 from estimator.wording import Words, listed, percent, several, span
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from daq.estimation.snapshot import Snapshot
-    from estimator.records import Hertz, Seconds, Share
 
 
 @record

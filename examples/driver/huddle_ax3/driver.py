@@ -5,23 +5,19 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import re
-from typing import TYPE_CHECKING
+from collections.abc import AsyncIterator, Sequence
 
 from pydantic import PositiveInt
 
+from daq.bench.model import Sensor
 from daq.devices.interface import DeviceInformation, Driver, DriverSettings, Session
 from daq.devices.port_rules import only, port_label
 from daq.errors import DeviceError, NoAnswerError, WrongDeviceError
+from daq.host_clock import HostClock
+from daq.protocols.block import Block, Event
+from daq.transport.byte_stream import ByteStream
 from daq.transport.ports import open_port
 from huddle_ax3.protocol import FRAME, RATES, Decoder
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Sequence
-
-    from daq.bench.model import Sensor
-    from daq.host_clock import HostClock
-    from daq.protocols.block import Block, Event
-    from daq.transport.byte_stream import ByteStream
 
 REPLY_TIMEOUT = 1.0
 """Seconds."""

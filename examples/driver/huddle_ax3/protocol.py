@@ -15,18 +15,12 @@ The stream is a sequence of frames of 18 bytes, little-endian: 0xA5 0x5A, a coun
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.devices.epson.burst import find_frames
-from daq.protocols.block import Block, BlockFlag, Event, EventKind
+from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
 from daq.protocols.sample_counter import SampleCounter
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from daq.protocols.block import HostTime
 
 FRAME = np.dtype([("sync", "<u2"), ("counter", "<u2"), ("counts", "<i4", (3,)), ("sum", "<u2")])
 SYNC = 0x5AA5

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import socket
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from huddle_ax3.protocol import FRAME
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 
 class SdkError(Exception):

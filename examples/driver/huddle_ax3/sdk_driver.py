@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import TYPE_CHECKING
+from collections.abc import AsyncIterator, Sequence
 
+from daq.bench.model import Sensor
 from daq.devices.blocking import BlockingSource, Samples
 from daq.devices.interface import DeviceInformation
 from daq.devices.port_rules import only, port_label
 from daq.errors import NotConnectedError, WrongDeviceError
+from daq.host_clock import HostClock
 from daq.transport.address import host_and_port
 from huddle_ax3.driver import AX3Driver
 from huddle_ax3.sdk import Device, SdkError
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Sequence
-
-    from daq.bench.model import Sensor
-    from daq.host_clock import HostClock
 
 
 class SdkDriver(AX3Driver):

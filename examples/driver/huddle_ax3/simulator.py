@@ -10,16 +10,12 @@ import argparse
 import asyncio
 import contextlib
 import os
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from huddle_ax3.protocol import RATES, encode
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from numpy.typing import NDArray
 
 COUNTS_PER_UNIT = 1e6
 MOTION_PSD = 1e-6

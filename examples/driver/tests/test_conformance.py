@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import AsyncIterator
+from typing import ClassVar
 
 from huddle_ax3.driver import DRIVER
 from huddle_ax3.sdk_driver import DRIVER as SDK_DRIVER
@@ -12,11 +13,7 @@ from huddle_ax3.simulator import COUNTS_PER_UNIT, serve_tcp
 from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.conformance.suite import DriverConformance, Sent, Served
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from daq.devices.interface import AnyDriver
+from daq.devices.interface import AnyDriver
 
 
 class TestAX3(DriverConformance):

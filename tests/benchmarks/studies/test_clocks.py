@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,9 +18,6 @@ from daq.estimation.settings import Settings
 from daq.results.result import Result
 from sim_devices.world.scenario import Scenario
 from tui.commands.main import app
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 LATENCIES = pytest.mark.parametrize(
     "latency",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,9 +10,6 @@ import pytest
 from benchmarks.studies.random_recordings import draw, random_recordings
 from benchmarks.studies.synthesis import synthesise
 from daq.recording.reader import Recording
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def test_lost_samples_are_gaps_and_the_others_are_those_of_the_whole(tmp_path: Path) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.archive.execution import carried_out, tasks_of
 from daq.archive.index import FILE as INDEX
@@ -15,6 +18,7 @@ from daq.archive.index import ROLLUP
 from daq.archive.plan import Plan
 from daq.archive.sources import sort
 from daq.archive.store import PLAN_FILE, Store
+from daq.archive.task import Task
 from daq.bench.channel import Channel
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
@@ -22,15 +26,6 @@ from daq.protocols.block import HostTime
 from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-    from datetime import datetime
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from daq.archive.task import Task
 
 RATE = 10.0
 START_NS = 1_788_134_400 * 10**9  # Monday 2026-08-31, 00:00 UTC

@@ -8,13 +8,15 @@ import pickle
 import shutil
 import signal
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from daq.archive.answers import answer
+from daq.archive.answers import Answer, answer
 from daq.archive.density import LOWEST_DB, Density
 from daq.archive.execution import carried_out, is_exposed
 from daq.archive.facts import AbsencesNotUsed, facts_of_archive
@@ -47,13 +49,6 @@ from tests.daq.archive.months import (
     three,
     with_reject,
 )
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from daq.archive.answers import Answer
 
 SNR = 25.0**2
 """Of the recordings: rounding of the motion's spectra counts so many times in the noise's."""

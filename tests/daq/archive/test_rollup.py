@@ -4,24 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import UTC
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.archive.averages import Average, Estimator
 from daq.archive.plan import Plan
-from daq.archive.rollup import Grid, merged_levels, rolled_up, summaries
+from daq.archive.rollup import Grid, Rollup, merged_levels, rolled_up, summaries
 from daq.archive.spectra_file import Described, Origin, Summary
 from daq.bench.channel import Channel
 from daq.estimation.settings import Settings
 from daq.results.result import Result
 from tests.traced_memory import peak_of
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from daq.archive.rollup import Rollup
 
 RATE = 20.0
 CHANNELS = tuple((s, Channel(name="X", sensitivity=1.0, unit="m/s²")) for s in "ABC")

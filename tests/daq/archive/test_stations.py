@@ -4,35 +4,29 @@ from __future__ import annotations
 
 import copy
 import shutil
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from daq.archive.answers import answer
 from daq.archive.execution import carried_out
+from daq.archive.plan import Plan
 from daq.archive.sources import are_waveforms
 from daq.archive.spectra_file import SpectraFile
-from daq.archive.stations import archives_in, begun, summaries, work
-from daq.archive.waveforms import FILE, Contents, Reading, stations_in
+from daq.archive.stations import Run, archives_in, begun, summaries, work
+from daq.archive.store import Store
+from daq.archive.task import Outcome, Task
+from daq.archive.waveforms import FILE, Contents, Found, Reading, stations_in
 from daq.errors import ImportFormatError, WrongArchiveError, WrongSettingError
 from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
 from daq.formats.importer import import_files
 from daq.formats.sources import Selection
 from tests.daq.archive.day_files import DAY_NS, FIRST_NS, ROWS, SETTINGS, append, write_station
 from tests.daq.archive.months import assert_same, record
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-    from pathlib import Path
-
-    from daq.archive.plan import Plan
-    from daq.archive.stations import Run
-    from daq.archive.store import Store
-    from daq.archive.task import Outcome, Task
-    from daq.archive.waveforms import Found
-    from daq.estimation.settings import Settings
 
 HOUR_NS = 3600 * 10**9
 PLAIN = Reading()

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import stat
 import tomllib
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from daq.bench.editing import set_sensor_values, with_sensor, without_sensor
 from tests.full_disk import files_limited_to
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 BENCH = """\
 # The bench in room 3.

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, cast
+from pathlib import Path
+from typing import Literal, cast
 
 import numpy as np
 import pytest
@@ -13,16 +15,11 @@ from pydantic import BaseModel, ConfigDict
 
 from daq.bench.durations import format_duration, parse_duration
 from daq.bench.loading import dump, load, parse
+from daq.bench.model import Bench, Sensor
 from daq.bench.response import PolesZeros
 from daq.devices import bench_file
+from daq.devices.interface import AnyDriver
 from daq.errors import BenchFileError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from daq.bench.model import Bench, Sensor
-    from daq.devices.interface import AnyDriver
 
 
 class _Settings(BaseModel):

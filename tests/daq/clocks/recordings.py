@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.bench.channel import Channel
 from daq.protocols.block import Block, BlockFlag, HostTime
 from daq.recording.file_format import SensorLayout
 from daq.recording.storage.names import CONTINUES
 from daq.recording.writer import RecordingWriter
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 ORIGIN = HostTime(7_000_000_000_000, 1_468_458_000_000_000_000)
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.clocks.aligned_recording import AlignedRecording
 from daq.clocks.resampling import reach
@@ -14,11 +15,6 @@ from daq.errors import CannotAlignError
 from daq.protocols.block import HostTime
 from daq.recording.reader import Recording
 from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, counts, create, write
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 
 def test_samples_of_one_clock_are_bit_exact_for_any_division_of_reads(tmp_path: Path) -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pytest
 
 from daq.clocks.arrival_times import ArrivalTimes
 from daq.clocks.clock_model import (
+    Clock,
     MeasuredDelays,
 )
 from daq.clocks.kalman import Observations, Smoothed, smooth
@@ -17,9 +16,6 @@ from daq.clocks.slips import Step, lost_by_delays
 from daq.clocks.usb_polling import Polls
 from daq.protocols.block import BlockFlag
 from daq.recording.file_format import BLOCK_DTYPE
-
-if TYPE_CHECKING:
-    from daq.clocks.clock_model import Clock
 
 RATE = 200.0
 BLOCK = 20

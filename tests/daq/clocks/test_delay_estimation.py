@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.clocks.delay_estimation import DelayEstimator
 from daq.clocks.resampling import resample
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 RATE, LENGTH, HOP = 200.0, 1000, 500
 WINDOW = np.hanning(LENGTH + 1)[:-1]

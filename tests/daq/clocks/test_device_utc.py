@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,9 +16,6 @@ from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
 from sim_devices.world.scenario import Scenario
 from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, counts, create, write
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def test_exact_times_align_samples_and_give_the_start(tmp_path: Path) -> None:

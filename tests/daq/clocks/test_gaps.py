@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.clocks.aligned_recording import AlignedRecording
 from daq.clocks.resampling import resample
@@ -20,11 +22,6 @@ from daq.results.facts.recordings import NotInLiveEstimate, SensorLost, SpanShor
 from daq.results.result import Result
 from tests.daq.clocks.recordings import ORIGIN, blocks, counts, create, write, write_polled
 from tests.daq.clocks.recordings import Sensor as FreeRunning
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 RATE, N_SAMPLES = 50, 18_000
 NAMES = ("a", "b", "c")

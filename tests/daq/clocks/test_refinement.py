@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.clocks.aligned_recording import AlignedRecording
 from daq.estimation.estimation import estimate
@@ -14,11 +15,6 @@ from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
 from estimator.checks.advice_on_signals import Copies
 from tests.daq.clocks.recordings import Sensor, counts, write
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 
 def test_a_first_sensor_with_noise_only_does_not_prevent_refinement_of_others(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,9 +15,6 @@ from daq.clocks.clock_model import MeasuredDelays
 from daq.estimation.estimation import estimate
 from daq.recording.reader import Recording
 from sim_devices.world.scenario import Scenario
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 SECONDS, NOISE = 160.0, 1e-14
 POLLED = Latency("batching", 16e-3)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +19,8 @@ from daq.devices.text.format import RASPBERRY_SHAKE, TextFormat
 from daq.errors import CannotAlignError
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
-from daq.protocols.block import BlockFlag, HostTime
+from daq.estimation.snapshot import Snapshot
+from daq.protocols.block import BlockFlag, DeviceItem, HostTime
 from daq.recorder.block_writer import BlockWriter
 from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
@@ -30,12 +31,6 @@ from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, create
 from tests.peers.digitizer import CODES, START, Digitizer, seedlink
 from tests.peers.text_logger import CHANNELS as TEXT_CHANNELS
 from tests.peers.text_logger import TextLogger
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from daq.estimation.snapshot import Snapshot
-    from daq.protocols.block import DeviceItem
 
 RATE, SECONDS, SNR = 100, 240.0, 1e3
 SETTINGS = Settings(segment=4.0, methods=("three-sensor",))

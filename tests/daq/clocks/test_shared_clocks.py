@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.clocks.aligned_recording import AlignedRecording
 from daq.clocks.clock_model import ClockSource, OffsetSource
@@ -13,11 +14,6 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
 from tests.daq.clocks.recordings import Sensor, counts, write
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 
 @pytest.mark.parametrize("begun", [0.0, 8.0])  # seconds after the recording was created

@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from daq.clocks.clock_model import ClockState
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.recording.reader import Recording
 from daq.results.facts.clocks import ClockNotUnderstood, SamplesUncounted
 from daq.results.result import Result
 from tests.daq.clock_facts import clock_facts
-from tests.known_clocks import NOISE, Oscillator, Scene, growing, record, seconds_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from daq.clocks.clock_model import ClockState
-    from daq.estimation.snapshot import Snapshot
-    from tests.known_clocks import Motion, Truth
+from tests.known_clocks import NOISE, Motion, Oscillator, Scene, Truth, growing, record, seconds_of
 
 SETTINGS = Settings(equalise="off")
 LONG = pytest.mark.long

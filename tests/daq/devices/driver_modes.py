@@ -5,30 +5,26 @@ from __future__ import annotations
 import contextlib
 import json
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from daq.bench.model import Sensor
 from daq.conformance.suite import Sent
 from daq.devices.epson import commands
+from daq.host_clock import SystemClock
 from sim_devices.devices.interface import Source
+from sim_devices.server.launch import RunningDevice
 from sim_devices.server.serve import WorldClock, device_spec
 from sim_devices.world.scenario import Scenario
 from tests.devices import paced_clock, serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    from daq.bench.model import Sensor
-    from daq.host_clock import SystemClock
-    from sim_devices.server.launch import RunningDevice
 
 RATE = 100.0
 XYZ = ("x", "y", "z")

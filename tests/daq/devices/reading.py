@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import TYPE_CHECKING, cast
+from collections.abc import AsyncGenerator, AsyncIterator, Sequence
+from typing import cast
 
+from daq.bench.model import Sensor
+from daq.devices.interface import AnyDriver, Session
 from daq.errors import NoAnswerError
-from daq.protocols.block import Block, Event
+from daq.protocols.block import Block, DeviceItem, Event
 from tests.devices import host_clock
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, AsyncIterator, Sequence
-
-    from daq.bench.model import Sensor
-    from daq.devices.interface import AnyDriver, Session
-    from daq.protocols.block import DeviceItem
-
 
 LEAST_PATIENCE = 5.0
 """Seconds: what is sent may wait in the system while the clock of the devices goes on."""

@@ -8,19 +8,16 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import canopen
 import numpy as np
 from canopen import objectdictionary
+from numpy.typing import NDArray
 
 from daq.devices.epson import canopen as protocol
 from sim_devices.devices.epson import temperature_counts
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from numpy.typing import NDArray
 
 OPERATIONAL = "OPERATIONAL"
 HEARTBEAT = 0x1017

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import AsyncGenerator, Callable, Iterator
 from contextlib import aclosing
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,9 +17,6 @@ from daq.errors import NoAnswerError, NotConnectedError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag
 from tests.waiting import limit
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Callable, Iterator
 
 
 def sensor(name: str, n_channels: int = 1) -> Sensor:

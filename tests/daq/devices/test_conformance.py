@@ -5,11 +5,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from typing import TYPE_CHECKING, cast
+from collections.abc import AsyncGenerator, AsyncIterator, Iterator
+from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
 
+from daq.bench.model import Sensor
 from daq.conformance.replay import replay
 from daq.conformance.suite import (
     EARLY,
@@ -20,20 +23,13 @@ from daq.conformance.suite import (
 )
 from daq.devices.registry import driver_names, driver_type
 from daq.errors import DeviceError, NoAnswerError, NotConnectedError
-from daq.protocols.block import Block, BlockFlag, Event
+from daq.protocols.block import Block, BlockFlag, DeviceItem, Event
 from daq.protocols.errors import RemoteProtocolError
 from daq.transport.wire_log import WireLog, session_ends, using
 from tests.daq.devices.driver_modes import CASES, RATE, Served, serving_all
 from tests.daq.devices.reading import reading
 from tests.devices import host_clock
 from tests.waiting import limit
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, AsyncIterator, Iterator
-    from pathlib import Path
-
-    from daq.bench.model import Sensor
-    from daq.protocols.block import DeviceItem
 
 pytestmark = pytest.mark.devices
 

@@ -11,7 +11,8 @@ from __future__ import annotations
 import asyncio
 import itertools
 import math
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,14 +22,9 @@ from daq.errors import DeviceError
 from daq.protocols.block import BlockFlag
 from daq.recorder.connection import MAX_RETRY_DELAY
 from daq.recorder.recorder import RecorderStatus, record
-from daq.recording.reader import Recording
+from daq.recording.reader import Recording, SensorRecord
 from tests.daq.devices.driver_modes import CASES, Served, serving_all, world_clock
 from tests.devices import host_clock, run
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from daq.recording.reader import SensorRecord
 
 pytestmark = [pytest.mark.devices, pytest.mark.timeout(240)]
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,14 +15,9 @@ import pytest
 from daq.bench.model import Bench
 from daq.errors import DeviceError
 from daq.recorder.recorder import RecorderStatus, record
-from daq.recording.reader import Recording
+from daq.recording.reader import Recording, SensorRecord
 from tests.daq.devices.driver_modes import CASES, RATE, Served, serving_all, world_clock
 from tests.devices import host_clock, run
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from daq.recording.reader import SensorRecord
 
 pytestmark = [pytest.mark.devices, pytest.mark.timeout(240)]
 

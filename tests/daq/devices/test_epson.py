@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 import pytest
@@ -16,10 +16,8 @@ from daq.devices.epson.driver import Configuration, Device, EpsonSession, EpsonS
 from daq.devices.interface import DeviceInformation
 from daq.errors import NoAnswerError
 from daq.protocols.block import Block, HostTime
+from daq.transport.byte_stream import ByteStream
 from tests.devices import host_clock
-
-if TYPE_CHECKING:
-    from daq.transport.byte_stream import ByteStream
 
 pytestmark = pytest.mark.virtual_time
 

@@ -5,14 +5,16 @@ from __future__ import annotations
 import contextlib
 import itertools
 import re
+from collections.abc import Iterator
 from functools import partial
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import can
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from daq.bench.channel import Channel
 from daq.bench.model import Sensor
@@ -24,16 +26,8 @@ from daq.devices.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.host_clock import SystemClock
 from daq.protocols import block
-from daq.protocols.block import Block, BlockFlag, HostTime, Quantity, Reading
+from daq.protocols.block import Block, BlockFlag, DeviceItem, HostTime, Quantity, Reading
 from tests.daq.devices.simulated_can_bus import BUS_CELSIUS, SimulatedBus, encode_sample
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from daq.protocols.block import DeviceItem
 
 RATE = 100.0
 DRIVER = driver_type("epson-can")

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, cast
+from collections.abc import Iterator
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
+from daq.bench.model import Sensor
 from daq.devices.interface import DeviceInformation
 from daq.devices.modbus import rtu
 from daq.devices.modbus.fifo import FifoSession, FifoSettings
@@ -15,23 +17,18 @@ from daq.devices.modbus.fifo_protocol import FifoDecoder
 from daq.devices.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
+from daq.transport.byte_stream import ByteStream
 from daq.transport.ports import open_port
 from sim_devices.devices.fifo import create
 from sim_devices.devices.interface import Source
 from sim_devices.faults import LineFaults
+from sim_devices.server.launch import RunningDevice
 from sim_devices.server.serve import Served, WorldClock, device_spec
+from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
 from tests.daq.devices.reading import reading
 from tests.devices import host_clock, paced_clock, serving
 from tests.sim_devices.simulated_bench import device, scenario, sensors, spec
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from daq.bench.model import Sensor
-    from daq.transport.byte_stream import ByteStream
-    from sim_devices.server.launch import RunningDevice
-    from sim_devices.world.scenario import Scenario
 
 pytestmark = pytest.mark.devices
 

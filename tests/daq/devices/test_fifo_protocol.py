@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from pymodbus.framer.rtu import FramerRTU
 
 from daq.devices.modbus import rtu
 from daq.devices.modbus.fifo_protocol import MAX_WORDS, FifoDecoder, Header
 from daq.devices.modbus.rtu import ReplyFinder, Request, RequestFinder
-from daq.protocols.block import Block, BlockFlag, Event, HostTime
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
-
-    from daq.protocols.block import DeviceItem
+from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, HostTime
 
 RATE = 7812.0
 

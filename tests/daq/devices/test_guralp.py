@@ -4,30 +4,26 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import AsyncIterator, Iterator, Sequence
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
+from daq.bench.model import Sensor
 from daq.devices.guralp import scream
 from daq.devices.guralp.gcf import SampleBlock, SystemId
 from daq.devices.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, NotConnectedError, WrongDeviceError
 from daq.protocols.block import Block, BlockFlag, Event
 from sim_devices.devices import guralp
-from sim_devices.devices.interface import DeviceSpec
+from sim_devices.devices.interface import DeviceSpec, Source
 from sim_devices.errors import ScenarioError
+from sim_devices.server.launch import RunningDevice
 from tests.daq.devices import reading
 from tests.devices import device_at, host_clock, serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator, Sequence
-
-    from daq.bench.model import Sensor
-    from sim_devices.devices.interface import Source
-    from sim_devices.server.launch import RunningDevice
 
 pytestmark = pytest.mark.devices
 

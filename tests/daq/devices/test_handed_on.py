@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import os
 import tty
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -20,16 +20,11 @@ from daq.devices.modbus.rtu import RequestFinder, encode_registers
 from daq.devices.registry import driver_type
 from daq.devices.seedlink.packets import Packet, PacketFinder, encode_packet
 from daq.errors import NotConnectedError
-from daq.host_clock import SystemClock
+from daq.host_clock import HostClock, SystemClock
 from daq.protocols.block import Block
 from daq.protocols.errors import RemoteProtocolError
 from tests.daq.devices.guralp.sample_blocks import RATE, expected, raw_blocks
 from tests.waiting import limit
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from daq.host_clock import HostClock
 
 
 @pytest.fixture

@@ -10,7 +10,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
-from typing import TYPE_CHECKING, Any
+from collections.abc import AsyncIterator, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,10 +25,6 @@ from daq.recording.reader import Recording
 from tests.daq.devices.driver_modes import Served, serving_all
 from tests.daq.devices.test_conformance_faults import HELD_UP, hold_against_the_world
 from tests.devices import host_clock, run
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Sequence
-    from pathlib import Path
 
 pytestmark = [pytest.mark.devices, pytest.mark.timeout(240)]
 

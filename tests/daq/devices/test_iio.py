@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, cast
+from collections.abc import Sequence
+from typing import Any, cast
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.bench.channel import Channel
 from daq.bench.model import Sensor
@@ -14,18 +16,11 @@ from daq.devices.iio.protocol import Device, ScanElement, ScanLayout
 from daq.devices.interface import DeviceInformation
 from daq.devices.registry import driver_type
 from daq.errors import WrongDeviceError
-from daq.protocols.block import Block, BlockFlag, Event, HostTime, Quantity, Reading
+from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, HostTime, Quantity, Reading
+from sim_devices.server.launch import RunningDevice
 from tests.daq.devices.reading import reading, record
 from tests.devices import serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from daq.protocols.block import DeviceItem
-    from sim_devices.server.launch import RunningDevice
 
 pytestmark = pytest.mark.devices
 

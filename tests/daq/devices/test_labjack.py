@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.bench.channel import Channel
 from daq.bench.model import Sensor
@@ -21,17 +23,11 @@ from daq.errors import (
     WrongDeviceError,
 )
 from daq.protocols.block import Block, BlockFlag, Event, Reading
+from sim_devices.server.launch import RunningDevice
 from sim_devices.world.world import World
 from tests.daq.devices.reading import reading
 from tests.devices import host_clock, serving
 from tests.sim_devices.simulated_bench import scenario, spec
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from sim_devices.server.launch import RunningDevice
 
 pytestmark = pytest.mark.devices
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from daq.devices.labjack import stream
 from daq.devices.labjack.packets import (
@@ -19,15 +21,8 @@ from daq.devices.labjack.packets import (
     encode_response,
 )
 from daq.devices.labjack.stream import StreamDecoder
-from daq.protocols.block import Block, BlockFlag, Event, HostTime
+from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, HostTime
 from daq.protocols.errors import RemoteProtocolError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from numpy.typing import NDArray
-
-    from daq.protocols.block import DeviceItem
 
 S = 1_000_000_000
 RATE = 1000.0

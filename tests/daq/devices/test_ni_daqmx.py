@@ -12,12 +12,14 @@ import ctypes
 import itertools
 import shutil
 import subprocess
+from collections.abc import AsyncGenerator, AsyncIterator, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.bench.channel import Channel
 from daq.bench.model import Sensor
@@ -27,11 +29,6 @@ from daq.devices.ni_daqmx import DRIVER
 from daq.errors import BenchFileError, NotConnectedError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, AsyncIterator, Iterator
-
-    from numpy.typing import NDArray
 
 RATE = 2048.0
 INPUTS = {"A": (0, 1, 2), "B": (5, 7, 4)}

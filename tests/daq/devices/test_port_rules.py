@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import pytest
 
@@ -13,9 +14,6 @@ from daq.bench.tables.toml_text import to_toml
 from daq.devices.bench_file import parse
 from daq.devices.registry import driver_type
 from daq.errors import BenchFileError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 LABJACK, SCREAM, BUS = "modbus-tcp://10.0.0.5", "udp://10.0.0.6:1567", "/dev/ttyUSB0"
 ZNE, OTHERS = ["0123Z2", "0123N2", "0123E2"], ["0124Z2", "0124N2", "0124E2"]

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import struct
 from collections import Counter
-from typing import TYPE_CHECKING
+from collections.abc import AsyncIterator, Callable
 
 import numpy as np
 import pytest
@@ -20,9 +20,6 @@ from daq.devices.registry import driver_type
 from daq.errors import NoAnswerError
 from daq.protocols.block import Block, Event
 from tests.devices import host_clock
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
 
 pytestmark = pytest.mark.virtual_time
 

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from daq.devices.modbus.registers_protocol import DataType, RegisterDecoder, RegisterMap
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
 from daq.protocols.errors import DeviceSettingError, RemoteProtocolError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 MS = 1_000_000
 WITMOTION = RegisterMap.of({"preset": "witmotion"}, 3)

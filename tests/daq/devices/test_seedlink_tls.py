@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -10,15 +12,10 @@ from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.devices.registry import driver_type
 from daq.errors import BenchFileError, NotConnectedError, WrongDeviceError
+from sim_devices.server.launch import RunningDevice
 from tests.daq.devices.reading import record
 from tests.devices import host_clock, serving
 from tests.sim_devices.simulated_bench import device, spec
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from sim_devices.server.launch import RunningDevice
 
 DRIVER = driver_type("seedlink")
 PASSWORD = "4-accelerometers"  # noqa: S105 -- of the simulated server

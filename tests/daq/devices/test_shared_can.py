@@ -5,25 +5,20 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
 from daq.bench.channel import Channel
 from daq.bench.model import Sensor
+from daq.devices.interface import DeviceInformation
 from daq.devices.registry import driver_type
 from daq.errors import NoAnswerError
 from daq.host_clock import SystemClock
-from daq.protocols.block import Block, BlockFlag, Event, EventKind
+from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, EventKind
 from tests.daq.devices.can_peer import Peer
 from tests.waiting import limit, wait_until
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from daq.devices.interface import DeviceInformation
-    from daq.protocols.block import DeviceItem
 
 RATE = 100.0
 DRIVER = driver_type("epson-can")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections import defaultdict
-from typing import TYPE_CHECKING
+from collections.abc import AsyncIterator
+from contextlib import AbstractAsyncContextManager
 
 import numpy as np
 import pytest
@@ -15,22 +16,15 @@ from daq.bench.model import Sensor
 from daq.conformance import suite
 from daq.conformance.suite import DriverConformance, Served
 from daq.devices import shared_port
+from daq.devices.interface import Session
 from daq.devices.registry import driver_type
 from daq.devices.seedlink import driver
 from daq.devices.seedlink.packets import PacketFinder
 from daq.errors import NotConnectedError, WrongDeviceError
-from daq.host_clock import SystemClock
-from daq.protocols.block import Block, Event, EventKind
+from daq.host_clock import HostClock, SystemClock
+from daq.protocols.block import Block, DeviceItem, Event, EventKind
 from tests.daq.devices.seedlink_peer import PER_RECORD, RATE, Server, record, value
 from tests.waiting import limit, wait_until
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-    from contextlib import AbstractAsyncContextManager
-
-    from daq.devices.interface import Session
-    from daq.host_clock import HostClock
-    from daq.protocols.block import DeviceItem
 
 DRIVER = driver_type("seedlink")
 NAMES = ["AAA", "BBB", "CCC"]

@@ -5,23 +5,18 @@ The digitizer is `tests.peers.digitizer`, which shares no code with the drivers.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.devices.guralp.decoders import ScreamDecoder
 from daq.devices.seedlink.decoder import SeedLinkDecoder, Selection
 from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
 from daq.recorder.sample_index import SampleIndexer
-from tests.peers.digitizer import CODES, START, Digitizer, scream, seedlink
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
-
-    from tests.peers.digitizer import Sent
+from tests.peers.digitizer import CODES, START, Digitizer, Sent, scream, seedlink
 
 STREAMS = ("DEMOZ2", "DEMON2", "DEMOE2")
 STEPS = [0.02, 0.3, 1.0, 20.0, 3600.0]

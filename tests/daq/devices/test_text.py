@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,15 +18,11 @@ from daq.devices.text.driver import TextDriver
 from daq.errors import BenchFileError, NoAnswerError
 from daq.protocols.block import Block, BlockFlag, Event, EventKind
 from daq.transport.address import host_and_port
+from sim_devices.server.launch import RunningDevice
 from sim_devices.world.world import World
 from tests.daq.devices import reading
 from tests.devices import serving
 from tests.sim_devices.simulated_bench import device, scenario, sensors, spec
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from sim_devices.server.launch import RunningDevice
 
 pytestmark = pytest.mark.devices
 

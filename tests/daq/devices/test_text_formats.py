@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,14 +11,10 @@ import pytest
 from daq.devices.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError
 from daq.preflight.device_check import discover
+from sim_devices.server.launch import RunningDevice
 from tests.daq.devices import reading
 from tests.devices import host_clock, serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from sim_devices.server.launch import RunningDevice
 
 pytestmark = pytest.mark.devices
 

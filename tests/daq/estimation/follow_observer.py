@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
-    from daq.recording.monitor import RecordingStatus
+from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
+from daq.recording.monitor import RecordingStatus
 
 
 class NoWait(threading.Event):

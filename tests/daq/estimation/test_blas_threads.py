@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Generator
 from dataclasses import asdict
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -14,10 +15,6 @@ from daq.estimation.blas_threads import one_blas_thread
 from daq.estimation.estimation import Estimation
 from tests.daq.clocks.recordings import write
 from tests.daq.estimation.test_estimation import SETTINGS, huddle
-
-if TYPE_CHECKING:
-    from collections.abc import Generator
-    from pathlib import Path
 
 
 @pytest.fixture(autouse=True)

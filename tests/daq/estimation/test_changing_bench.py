@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -13,13 +12,11 @@ from scipy.spatial.transform import Rotation
 import huddle
 from daq.estimation.estimation import Estimation
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.formats.arrays import recording_of_arrays
 from daq.results.calibration import calibrate
 from daq.results.result import Result
 from estimator.checks.advice_on_noise import NoiseChanges, ResponseChanges
-
-if TYPE_CHECKING:
-    from daq.estimation.snapshot import Snapshot
 
 RATE = 40.0
 N = round(1200 * RATE)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import huddle
 from daq.errors import NotARecordingError
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.segments.clipping import limits_of
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.formats.arrays import recording_of_arrays
 from daq.formats.importer import import_files
 from daq.recording.reader import Recording
@@ -27,13 +29,6 @@ from estimator.checks.count_limits import CountLimits
 from estimator.levels.pooled import blocks_of
 from estimator.self_noise.result import Flag, SelfNoise, combined
 from estimator.spectra.segment_rejection import Reason
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from daq.estimation.snapshot import Snapshot
 
 RATE, PART, N_PARTS = 20.0, 4000, 4
 NOISE = 3.0

@@ -4,31 +4,27 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from benchmarks.studies.synthesis import synthesise
 from daq.bench.response import Fir, Measured, PolesZeros, Response
 from daq.estimation import equalisation, noise_estimates
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from estimator.checks.advice_on_sensors import UnequalResponses
 from estimator.methods import self_noise
+from estimator.self_noise.result import SelfNoise
 from sim_devices.world.scenario import Scenario
 from tests import known_clocks
 from tests.daq.clocks.recordings import Sensor, blocks, create, write
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from daq.estimation.snapshot import Snapshot
-    from estimator.self_noise.result import SelfNoise
-
-    FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 RATE, N = 50.0, 14_000
 NOISE = 2 * 100.0**2 / RATE  # one-sided PSD of white noise of 100 counts

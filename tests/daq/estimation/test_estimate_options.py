@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from daq.errors import CannotAlignError
 from daq.estimation.diagnosis import vertical_channel
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.settings import Settings
-from daq.estimation.snapshot import NoResultError
+from daq.estimation.snapshot import NoResultError, Snapshot
 from daq.protocols.block import BlockFlag
 from daq.results.facts.channels import ChannelsWrap, ReadingsRepeat
 from daq.results.result import Result
@@ -26,11 +27,6 @@ from estimator.methods import Flag, self_noise
 from estimator.spectra.segment_rejection import Reason
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from tests.daq.clocks.recordings import Sensor, blocks, create, write
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from daq.estimation.snapshot import Snapshot
 
 RATE = 100.0
 SETTINGS = Settings(segment=1.0)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,17 +16,12 @@ from daq.bench.units import canonical
 from daq.errors import CannotAlignError, WrongSettingError
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.settings import Settings
-from daq.estimation.snapshot import NoResultError
+from daq.estimation.snapshot import NoResultError, Snapshot
 from estimator.errors import InsufficientDataError
 from estimator.methods import self_noise
 from estimator.spectra.segment_rejection import Reason
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, counts, create, write
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from daq.estimation.snapshot import Snapshot
 
 SETTINGS = Settings(segment=1.0, methods=("three-sensor",))
 

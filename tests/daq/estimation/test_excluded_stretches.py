@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.bench.estimate_settings import from_text
 from daq.errors import WrongSettingError
@@ -20,13 +23,7 @@ from estimator.checks.advice import Rank
 from estimator.spectra.segment_rejection import Reason
 from tests.daq.clocks.recordings import ORIGIN, Sensor, write
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    Fault = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+Fault = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 RATE, SECONDS = 100, 120
 LORRY = slice(40 * RATE, 52 * RATE)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -12,15 +12,11 @@ from scipy import signal
 import huddle
 from daq.estimation.diagnosis import Findings
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.results.result import Result
 from estimator.checks.advice_on_noise import ResponseChanges
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from daq.estimation.snapshot import Snapshot
-
-    Filter = Callable[[np.ndarray], np.ndarray]
+Filter = Callable[[np.ndarray], np.ndarray]
 
 RATE = 40.0
 N = round(1200 * RATE)

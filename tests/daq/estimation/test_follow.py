@@ -5,9 +5,11 @@ from __future__ import annotations
 import asyncio
 import sys
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,8 +27,10 @@ from daq.estimation.follow import (
     follow,
 )
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.estimation.throttle import Throttle
 from daq.recording.control import Command, serve
+from daq.recording.monitor import RecordingStatus
 from daq.results.facts.recordings import NotInLiveEstimate
 from daq.results.result import Result
 from daq.results.sources import sources, uncounted_events
@@ -37,13 +41,6 @@ from tests.daq.recording.sending_bench import Bench
 from tests.known_clocks import Scene
 from tests.tui.example_snapshot import SETTINGS, growing
 from tests.waiting import limit
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from daq.estimation.snapshot import Snapshot
-    from daq.recording.monitor import RecordingStatus
 
 
 def test_an_estimate_is_made_only_when_a_segment_has_come(tmp_path: Path) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
+import pytest
+from numpy.typing import NDArray
 
 from daq.clocks.aligned_recording import AlignedRecording
 from daq.estimation.estimation import Estimation
@@ -13,12 +15,6 @@ from daq.estimation.segments.segment_pass import NewestSamples
 from daq.recording.reader import Recording
 from tests.daq.recording.sending_bench import Bench
 from tests.tui.example_snapshot import SETTINGS, growing
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import pytest
-    from numpy.typing import NDArray
 
 
 def test_channels_of_one_segment_are_not_called_copies(tmp_path: Path) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,9 +17,6 @@ from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
 from estimator.spectra.welch import WelchSettings
 from tests.daq.clocks.recordings import Sensor, write
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 RATE, SEGMENT = 100.0, 5.0
 SETTINGS = Settings(segment=SEGMENT, methods=("three-sensor",), equalise="off")

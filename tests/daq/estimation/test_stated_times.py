@@ -5,14 +5,15 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
 
 from benchmarks.studies.synthesis import synthesise
-from daq.clocks.aligned_recording import take_drift
+from daq.clocks.aligned_recording import AlignedRecording, take_drift
 from daq.clocks.clock_model import ClockSource
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.segments.segment_pass import Pass
@@ -28,16 +29,11 @@ from daq.results.facts.clocks import (
     StatedTimesUnchecked,
 )
 from daq.results.result import Result
+from estimator.spectra.welch import WelchSettings
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
 from tests.daq.clock_facts import clock_facts
 from tests.daq.clocks.recordings import Sensor, blocks, create, write
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from daq.clocks.aligned_recording import AlignedRecording
-    from estimator.spectra.welch import WelchSettings
 
 LONG, STUDY = pytest.mark.long, pytest.mark.study
 SETTINGS = Settings(segment=2.0, methods=("three-sensor",))

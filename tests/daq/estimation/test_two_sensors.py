@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.formats.arrays import recording_of_arrays
 from daq.results.band_summary import data_interval
 from daq.results.facts.changes import (
@@ -22,9 +22,6 @@ from daq.results.facts.model import FewSensors
 from daq.results.facts.precision import PairCompared
 from daq.results.result import Result
 from estimator.self_noise.result import Flag, Refusal
-
-if TYPE_CHECKING:
-    from daq.estimation.snapshot import Snapshot
 
 RATE, SECONDS = 50.0, 1500
 SETTINGS = Settings(segment=2.0)

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.errors import ImportFormatError
 from daq.formats.readers.delimited import grid_of, nanoseconds, read_delimited
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 NOON = 1_795_262_400_000_000_000
 """2026-11-21T12:00:00Z."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,9 +13,6 @@ from daq.errors import ImportFormatError, RecordingError
 from daq.formats.importer import import_files
 from daq.protocols.block import BlockFlag
 from daq.recording.reader import Recording
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 SENSOR = """
 [[sensors]]

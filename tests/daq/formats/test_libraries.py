@@ -5,7 +5,8 @@ from __future__ import annotations
 import struct
 import zlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import Any
 
 import h5py
 import nptdms
@@ -13,19 +14,14 @@ import numpy as np
 import pytest
 import pyuff
 import scipy.io
+from numpy.typing import NDArray
 from scipy.io import wavfile
 
 from daq.errors import ImportFormatError
+from daq.formats.foreign_sensor import ForeignSensor
 from daq.formats.importer import import_files
 from daq.formats.sources import open_sources
 from daq.recording.reader import Recording
-
-if TYPE_CHECKING:
-    from types import ModuleType
-
-    from numpy.typing import NDArray
-
-    from daq.formats.foreign_sensor import ForeignSensor
 
 START = "2026-11-21T03:00:00.25"
 START_NS = 1_795_230_000_250_000_000

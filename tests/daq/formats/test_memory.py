@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.bench.channel import Channel
 from daq.errors import RecordingError
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.formats.foreign_sensor import ForeignSensor, finite_stretches
 from daq.formats.importer import import_files
 from daq.formats.memory import RecordingInMemory, SensorInMemory
 from daq.formats.readers.npz import read_npz
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from daq.estimation.snapshot import Snapshot
 
 RATE = 200.0
 

@@ -6,7 +6,8 @@ import io
 import struct
 import zipfile
 import zlib
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,9 +19,6 @@ from daq.formats.readers import npz
 from daq.recording.reader import Recording
 from tests.daq.formats.test_libraries import opened
 from tests.traced_memory import peak_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 SAMPLES = np.arange(500)
 

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
 
 from daq.bench.loading import parse
+from daq.bench.model import Bench
 from daq.errors import ImportFormatError
-from daq.formats.importer import import_files
+from daq.formats.importer import Taken, import_files
 from daq.formats.readers.waveforms import _reftek
 from daq.formats.sources import open_sources
 from daq.recording.reader import Recording
-
-if TYPE_CHECKING:
-    from daq.bench.model import Bench
-    from daq.formats.importer import Taken
 
 obspy: Any = pytest.importorskip("obspy", reason="ObsPy is an extra")
 pyuff: Any = pytest.importorskip("pyuff", reason="pyuff is an extra")

@@ -9,23 +9,18 @@ import io
 import lzma
 import tarfile
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.errors import HuddleError, ImportFormatError
 from daq.formats.importer import import_files
 from daq.recording.reader import Recording
 from tests.daq.formats.test_sources import counts, write_records
 from tests.traced_memory import peak_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
-
 
 ZIPS = {
     "zip": zipfile.ZIP_DEFLATED, "zip, bzip2": zipfile.ZIP_BZIP2, "zip, lzma": zipfile.ZIP_LZMA

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,9 +12,6 @@ import pytest
 import huddle
 from daq.errors import ImportFormatError
 from daq.formats.response import ChannelResponse, Responses
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 ZEROS, POLES = (0j, 0j, 0j), (-4 + 4j, -4 - 4j, -900 + 0j)
 CONSTANT = 5e9

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import pickle
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.io import savemat
 
 from daq.errors import ImportFormatError
+from daq.formats.foreign_sensor import ForeignSensor
 from daq.formats.readers.delimited import read_delimited
 from daq.formats.readers.npz import read_mat, read_npz
 from daq.formats.sources import Selection, open_sources
-
-if TYPE_CHECKING:
-    from typing import Any
-
-    from daq.formats.foreign_sensor import ForeignSensor
 
 RATE = 200.0
 START_NS = 1_700_000_000_123_456_000

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import warnings
 import zipfile
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,9 +16,6 @@ from daq.formats.importer import import_files
 from daq.formats.response import ChannelResponse, Responses
 from daq.recording.reader import Recording
 from tests.traced_memory import peak_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 obspy: Any = pytest.importorskip("obspy", reason="ObsPy is an extra")
 RATE = 50.0

@@ -2,35 +2,30 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pymseed
 import pytest
+from numpy.typing import NDArray
 
 from daq.bench.channel import Channel
 from daq.clocks.aligned_recording import AlignedRecording
 from daq.errors import ImportFormatError
+from daq.formats.foreign_sensor import ForeignSensor, Stretch
 from daq.formats.importer import import_files
 from daq.formats.memory import RecordingInMemory, SensorInMemory
 from daq.formats.readers import miniseed
 from daq.formats.readers.miniseed import MiniSeedPart
 from daq.formats.sources import Selection, open_sources, sensors_of_parts
-from daq.formats.traces import LoadedPart, PartCache, Trace
+from daq.formats.traces import LoadedPart, Part, PartCache, Trace
 from daq.protocols.block import HostTime
 from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
 from tests.traced_memory import peak_of
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from daq.formats.foreign_sensor import ForeignSensor, Stretch
-    from daq.formats.traces import Part
 
 RATE = 100.0
 STEP = 10_000_000

@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,13 +26,10 @@ from daq.bench.response import Fir, Gain, Measured, Response, response_from_json
 from daq.errors import ImportFormatError
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
-from daq.formats.importer import import_files
+from daq.formats.importer import ImportResult, import_files
 from daq.formats.miniseed_export import export_miniseed
 from daq.formats.response import Responses, whole_response
 from daq.recording.reader import Recording
-
-if TYPE_CHECKING:
-    from daq.formats.importer import ImportResult
 
 obspy: Any = pytest.importorskip("obspy", reason="ObsPy is an extra")
 SHIPPED = Path(obspy.__file__).parent

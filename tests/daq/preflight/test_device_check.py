@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,14 +23,10 @@ from daq.preflight.device_check import (
 )
 from daq.preflight.preview import arrivals
 from daq.protocols.block import Block, HostTime
+from sim_devices.server.launch import RunningDevice
 from tests.devices import host_clock, serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
 from tui.commands.main import app
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from sim_devices.server.launch import RunningDevice
 
 pytestmark = pytest.mark.devices
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,12 +17,8 @@ from daq.preflight.preflight import check_list, is_complete
 from daq.preflight.preview import SensorPreview, arrivals
 from daq.protocols.block import Block, HostTime
 from estimator.checks.sensitivities import Cause
+from estimator.types import FloatArray
 from tests.tui.example_snapshot import demo_bench
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from estimator.types import FloatArray
 
 RATE = 200.0
 BENCH = demo_bench()

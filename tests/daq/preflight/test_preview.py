@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING
 
 import pytest
 
-from daq.preflight.preview import preview
+from daq.preflight.preview import SensorPreview, preview
 from tests.devices import host_clock, serving
 from tests.sim_devices.simulated_bench import bench_of, device, spec
-
-if TYPE_CHECKING:
-    from daq.preflight.preview import SensorPreview
 
 pytestmark = pytest.mark.devices
 

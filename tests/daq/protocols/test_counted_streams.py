@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.protocols.block import HostTime
 from daq.protocols.sample_counter import SampleCounter
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 RATE = 100.0
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from daq.protocols.block import Event, EventKind
 from daq.recorder.block_writer import BlockWriter
-from daq.recorder.connection import Connected, SensorLate, SensorLost
+from daq.recorder.connection import Connected, Item, SensorLate, SensorLost
 from daq.recording.file_format import SensorLayout
 from daq.recording.monitor import RecordingMonitor
 from daq.recording.reader import Recording
@@ -19,12 +20,6 @@ from daq.recording.sensor_state import SensorState
 from daq.recording.writer import RecordingWriter
 from estimator.checks.count_limits import share_of_repeats
 from tests.scripted_driver import RATE, ManualClock, PlayedDriver, bench, block
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from daq.recorder.connection import Item
 
 LOST_BY = (EventKind.STALLED, EventKind.DISCONNECTED, EventKind.REFUSED)
 

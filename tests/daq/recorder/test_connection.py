@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import TYPE_CHECKING
+from collections.abc import AsyncIterator, Sequence
 
 import numpy as np
 import pytest
 
+from daq.bench.model import Sensor
 from daq.devices.interface import DEFAULT_PATIENCE
 from daq.errors import NoAnswerError, NotConnectedError
-from daq.host_clock import SystemClock
+from daq.host_clock import HostClock, SystemClock
 from daq.protocols.block import Block, Event
 from daq.recorder.connection import (
     MAX_RETRY_DELAY,
     BackOff,
     Connection,
+    Item,
     SensorLate,
     SensorLost,
 )
@@ -28,13 +30,6 @@ from tests.scripted_driver import (
     bench,
     block,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Sequence
-
-    from daq.bench.model import Sensor
-    from daq.host_clock import HostClock
-    from daq.recorder.connection import Item
 
 pytestmark = pytest.mark.virtual_time
 

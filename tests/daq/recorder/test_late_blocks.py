@@ -5,10 +5,11 @@ The logger is `tests.peers.text_logger`, which shares no code with the driver.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.bench.channel import Channel
 from daq.devices.text.decoder import TextDecoder
@@ -20,11 +21,6 @@ from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
 from daq.recording.writer import RecordingWriter
 from tests.peers.text_logger import UNIX, TextLogger
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 ROWS = TextFormat(columns=(1, 2, 3), whole=True)
 RATE = 100.0

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
 
 import pytest
 
 from daq.errors import NotConnectedError
 from daq.protocols.block import Event
-from daq.recorder.connection import Connected, Connection, SensorLost
+from daq.recorder.connection import Connected, Connection, Item, SensorLost
 from daq.transport.serial_ports import SerialPort
 from tests.scripted_driver import ManualClock, PlayedDevice, PlayedDriver, bench, block
-
-if TYPE_CHECKING:
-    from daq.recorder.connection import Item
 
 pytestmark = pytest.mark.virtual_time
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,9 +15,6 @@ from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
 from daq.recording.writer import RecordingWriter
 from tests.daq.recorder.test_recorder import Run
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 CHANNELS = (
     Channel(name="x", sensitivity=1.0),

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -23,9 +24,6 @@ from tests.acceptance.sample_accounting import Log, accounts
 from tests.daq.recorder.test_recorder_process import started
 from tests.devices import host_clock
 from tests.sim_devices.simulated_bench import bench_of, device, sensors, spec
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 pytestmark = pytest.mark.devices
 

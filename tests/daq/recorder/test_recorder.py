@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import re
+from collections.abc import AsyncIterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,10 +24,6 @@ from daq.recording.reader import Recording
 from daq.recording.repair import verify
 from daq.recording.sensor_state import SensorState
 from tests.scripted_driver import ManualClock, PlayedDevice, PlayedDriver, bench, block, counts
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-    from pathlib import Path
 
 pytestmark = pytest.mark.virtual_time
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import stat
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -15,9 +15,6 @@ from daq.errors import (
 from daq.recording.control import ControlRefusedError, ask
 from daq.recording.reader import Recording, control_address
 from tests.daq.recorder.test_recorder import Run
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 pytestmark = pytest.mark.virtual_time
 

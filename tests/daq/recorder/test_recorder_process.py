@@ -9,7 +9,9 @@ import os
 import signal
 import subprocess
 import sys
-from typing import TYPE_CHECKING, Any
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,15 +23,10 @@ from daq.recording.control import ask
 from daq.recording.reader import Recording
 from daq.recording.repair import repair, verify
 from daq.recording.sensor_state import SensorState
+from sim_devices.server.launch import RunningDevice
 from sim_devices.world.world import World
 from tests.devices import host_clock, serving
 from tests.sim_devices.simulated_bench import bench_of, device, scenario, sensors, spec
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator
-    from pathlib import Path
-
-    from sim_devices.server.launch import RunningDevice
 
 pytestmark = pytest.mark.devices
 

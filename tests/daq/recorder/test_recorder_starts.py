@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -19,9 +19,6 @@ from daq.recording.sensor_state import SensorState
 from daq.recording.storage.names import recording_path
 from tests.daq.recorder.test_recorder import Run
 from tests.scripted_driver import ManualClock, bench
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 pytestmark = pytest.mark.virtual_time
 

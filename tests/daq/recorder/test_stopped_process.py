@@ -8,17 +8,14 @@ import subprocess
 import sys
 import threading
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from daq.protocols.block import EventKind
 from daq.recording.reader import Recording
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 RATE = 200.0
 BEFORE, AFTER = 8.0, 9.0

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
-
-if TYPE_CHECKING:
-    from daq.recording.writer import RecordingWriter
-
+from daq.recording.writer import RecordingWriter
 
 RATE = 200
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import time
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.bench.channel import Channel
 from daq.errors import RecordingError
@@ -17,11 +19,6 @@ from daq.recording.file_format import NO_COUNTER, SensorLayout
 from daq.recording.reader import Recording
 from daq.recording.repair import verify
 from daq.recording.writer import RecordingWriter
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 CREATED = HostTime(5_000_000_000, 1_790_000_000_000_000_000)
 RATE = 100.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -14,9 +14,6 @@ from daq.errors import NotARecordingError
 from daq.recording.reader import Recording
 from daq.recording.repair import repair, verify
 from tests.torture.damaged_files import make_recording
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.fixture

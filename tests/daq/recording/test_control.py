@@ -7,15 +7,12 @@ import os
 import socket
 import stat
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from daq.errors import NotConnectedError
 from daq.recording.control import HOST, MAX_CONNECTIONS, Answer, Command, ask, serve
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.mark.parametrize(

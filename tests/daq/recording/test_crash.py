@@ -8,7 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -22,9 +22,6 @@ from daq.recording.reader import Recording, control_address
 from daq.recording.repair import repair, verify, write_results
 from daq.recording.storage.superblock import lookup3
 from daq.recording.writer import RecordingWriter
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 NOW = HostTime(1_000_000_000, 1_790_000_000_000_000_000)
 

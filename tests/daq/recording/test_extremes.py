@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.recording import extremes
 from daq.recording.extremes import BUCKET, SUFFIX, Extremes, extremes_of
 from daq.recording.reader import Recording
 from daq.recording.repair import verify
 from tests.daq.clocks.recordings import Sensor, blocks, counts, create, write
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 N_SAMPLES = 60 * BUCKET + 77
 

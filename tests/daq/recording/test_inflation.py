@@ -7,7 +7,8 @@ import io
 import json
 import struct
 import zlib
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -22,10 +23,6 @@ from daq.recording.storage.whole_hdf5 import contents_sha256
 from estimator.errors import EstimatorError
 from estimator.spectra.welch import CrossSpectra
 from tests.traced_memory import peak_of
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
 MAGIC = b"huddle-journal 1\n"
 

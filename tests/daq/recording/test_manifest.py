@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import runpy
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
@@ -16,9 +16,6 @@ from daq.recording.reader import Recording
 from daq.recording.repair import verify, write_results
 from tests.daq.recording.version_1 import as_version_1
 from tests.torture.damaged_files import make_recording
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 PROGRAM = Path(__file__).parents[3] / "docs" / "manifest_root.py"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import stat
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -19,9 +19,6 @@ from daq.recording.repair import repair, verify
 from daq.recording.storage.journal import journal_path
 from daq.recording.storage.superblock import Superblock, lookup3
 from daq.recording.writer import RecordingWriter, make_datasets
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 NOW = HostTime(1_000_000_000, 1_790_000_000_000_000_000)
 SENSOR = SensorLayout("a", (Channel(name="x", sensitivity=1.0),), 100.0, np.dtype("i4"))

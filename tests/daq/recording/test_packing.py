@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import zlib
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.bench.channel import Channel
 from daq.protocols.block import Block, HostTime
@@ -16,11 +17,6 @@ from daq.recording.reader import Recording
 from daq.recording.sensor_record import ChunkedRows
 from daq.recording.storage import packing
 from daq.recording.writer import RecordingWriter
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 NOW = HostTime(10**9, 1_790_000_000 * 10**9)
 N_ROWS = 1050

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from daq.errors import RecordingError
 from daq.recording.repair import verify
 from tests.torture.damaged_files import make_recording, plain_h5py_reads
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 _HEADER = re.compile(rb"(?:BTHD|BTLF|FRHP|FHDB|EAHD|FSHD|FSSE)\x00")
 """Of indexes, heaps and lists of free space, which our own reader may not need."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -17,9 +17,6 @@ from daq.recording.reader import Recording
 from daq.recording.repair import repair, verify, write_results
 from daq.recording.storage.journal import journal_path
 from daq.recording.writer import RecordingWriter
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 NOW = HostTime(10**12, 10**18)
 WRITTEN = tuple(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -14,10 +15,6 @@ from daq.errors import NotARecordingError, RecordingError
 from daq.recording.reader import Recording, control_address
 from daq.recording.repair import verify
 from tests.torture.damaged_files import make_recording
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 
 def external_storage(file: h5py.File) -> None:

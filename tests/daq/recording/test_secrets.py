@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,9 +14,6 @@ from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
 from daq.recording.repair import verify
 from daq.recording.writer import RecordingWriter
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 BENCH = """
 name = "lab"  # a comment that stays

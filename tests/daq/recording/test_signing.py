@@ -6,7 +6,7 @@ import base64
 import json
 import shutil
 import subprocess
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -27,9 +27,6 @@ from daq.recording.signing import (
 from tests.tui.service.bench_files import HOURLY, bench_of
 from tests.tui.service.test_continuations import record
 from tui.commands.main import app
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.fixture

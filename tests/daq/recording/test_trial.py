@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -16,9 +16,6 @@ from daq.recording.storage import trial
 from tests.daq.recording.version_1 import with_heap_loop
 from tests.torture.damaged_files import make_recording, write_recording
 from tests.waiting import limit
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 pytestmark = pytest.mark.trial
 

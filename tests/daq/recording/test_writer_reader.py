@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -21,9 +21,6 @@ from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
 from daq.recording.storage.locking import is_being_written
 from daq.recording.writer import RecordingWriter
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 NOW = HostTime(1_000_000_000, 1_790_000_000_000_000_000)
 RATE = 100.0

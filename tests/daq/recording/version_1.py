@@ -5,18 +5,14 @@ from __future__ import annotations
 import json
 import struct
 import zlib
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from pathlib import Path
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.recording.chunks.manifest import MANIFEST, RESULTS_MANIFEST
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 
 def with_variable_strings(path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -11,13 +10,11 @@ import pytest
 from daq.bench.estimate_settings import from_text, to_table
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.formats.arrays import recording_of_arrays
 from daq.results.result import Result
 from estimator.checks.advice_on_noise import SharedNoise
 from estimator.levels.contributions import across
-
-if TYPE_CHECKING:
-    from daq.estimation.snapshot import Snapshot
 
 RATE, SNR = 100.0, 5e4
 BANDS = ((2.0, 10.0), (10.0, 30.0), (5.0, 6.0))

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pytest
 
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.formats.arrays import recording_of_arrays
 from daq.results.result import Result
-
-if TYPE_CHECKING:
-    from daq.estimation.snapshot import Snapshot
 
 RATE, N_SAMPLES = 100.0, 60_000
 SETTINGS = Settings(segment=5.0)

@@ -6,7 +6,7 @@ import json
 import math
 from dataclasses import replace
 from datetime import date
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +19,7 @@ from daq.clocks.clock_model import RelativeTime
 from daq.errors import WrongSettingError
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.formats.arrays import recording_of_arrays
 from daq.results.band_summary import judged_method
 from daq.results.calibration import calibrate
@@ -29,11 +30,6 @@ from tests.daq.clocks.recordings import Sensor, write
 from tui.commands.calibrate import side_by_side
 from tui.commands.main import app
 from tui.output.calibration import angle, remarks, sensitivity_table, with_error
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from daq.estimation.snapshot import Snapshot
 
 GAINS = {"a": 1.0, "b": 1.03, "c": 0.98}
 SETTINGS = Settings(segment=2.0, band=(1.0, 20.0))

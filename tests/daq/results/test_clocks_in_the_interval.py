@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,9 +19,6 @@ from estimator.methods import self_noise
 from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot
 from tui.output.results import result_table
 from tui.wording.formatting import level_with_error
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 BAND = (5.0, 15.0)
 OPPOSITE = np.array([[0.0, 1.0, 1.0], [1.0, 0.0, 4.0], [1.0, 4.0, 0.0]])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
@@ -12,9 +12,6 @@ from daq.protocols.block import HostTime, Quantity
 from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
 from daq.results.sources import conditions, sources
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 START = datetime(2026, 11, 25, 12, tzinfo=UTC)
 BENCH = """

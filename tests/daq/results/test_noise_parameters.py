@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from importlib import resources
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from daq.bench.model import Bench
 from daq.bench.sensitivity import KnownSensitivity
 from daq.devices.bench_file import parse
 from daq.errors import BenchFileError
@@ -29,11 +30,6 @@ from daq.results.result import Result
 from estimator.noise_parameters.fit import Term
 from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot
 from tui.output.noise_parameters import notes, quantisation_notes, sheet_table, term_table
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from daq.bench.model import Bench
 
 SHEET = """
 [sensors.data_sheet]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +10,7 @@ import pytest
 from daq.bench.channel import Channel
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.protocols.block import HostTime
 from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
@@ -19,11 +20,6 @@ from estimator.levels.bands import band_levels
 from estimator.methods import self_noise
 from estimator.self_noise.result import Flag
 from tests.estimator.csm_models import wishart
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from daq.estimation.snapshot import Snapshot
 
 RATE = 100.0
 N_AVERAGES = 189.0

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING
+
+import pytest
 
 from daq.results import band_summary, result
 from daq.results.decision import limits
@@ -12,9 +13,6 @@ from tests.daq.results.decision.benches import bench_with
 from tests.tui.example_snapshot import SETTINGS, diagnosed
 from tui.commands.estimate import show_result
 from tui.output.json_document import document
-
-if TYPE_CHECKING:
-    import pytest
 
 ONCE = (
     (limits, "judge"),

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.results.facts.recordings import SpanShortened
 from daq.results.result import Result
 from estimator.checks.advice import Rank
 from tests.daq.clocks.recordings import Sensor, write
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from daq.estimation.snapshot import Snapshot
 
 SETTINGS = Settings(segment=2.0)
 RATE, SECONDS = 20.0, 1200.0

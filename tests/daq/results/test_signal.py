@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,13 +13,8 @@ from daq.formats.arrays import recording_of_arrays
 from daq.protocols.block import Event, HostTime
 from daq.recording.reader import Recording
 from daq.results import signal as signals
-from daq.results.signal import CLIPPED, GAP, Mark, Signal, joined
+from daq.results.signal import CLIPPED, GAP, Mark, Signal, Trace, joined
 from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, create
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from daq.results.signal import Trace
 
 START = ORIGIN.utc_ns * 1e-9
 RATE = 100.0

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import shutil
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.recording.reader import Recording, SensorRecord
 from daq.results.store import store_results
 from tests.tui.example_snapshot import growing, made_snapshot
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 
 def test_all_methods_are_stored_with_one_copy_and_no_sample_read(

@@ -8,8 +8,9 @@ import os
 import struct
 import threading
 import tty
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,10 +28,6 @@ from daq.transport import address
 from daq.transport.address import host_and_port
 from daq.transport.ports import open_port
 from tests.waiting import limit
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-    from pathlib import Path
 
 
 class _Far:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from daq.transport.serial_ports import stable_path
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def test_the_constant_name_of_a_port_is_found(tmp_path: Path) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from typing import TYPE_CHECKING
+from collections.abc import AsyncIterator
+from pathlib import Path
 
 import pytest
 
@@ -13,10 +14,6 @@ from daq.errors import NotConnectedError, ReplayError
 from daq.host_clock import SystemClock
 from daq.transport.ports import open_port
 from daq.transport.wire_log import Replay, logging_to, session_ends, using
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-    from pathlib import Path
 
 
 @contextlib.asynccontextmanager

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.signal import butter, sosfilt
 
 from estimator.checks.count_limits import CountLimits, codes, share_at_ends, share_of_repeats, wraps
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
-
-    Signal = Callable[[np.random.Generator, int], NDArray[np.float64]]
+Signal = Callable[[np.random.Generator, int], NDArray[np.float64]]
 
 
 def white(rng: np.random.Generator, n: int) -> NDArray[np.float64]:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
 from estimator.checks.counts import before_rounding, covariance, shared_rounding
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 N_SAMPLES, LENGTH = 1 << 18, 512
 

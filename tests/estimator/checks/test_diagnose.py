@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import pytest
@@ -27,10 +27,8 @@ from estimator.checks.advice_on_signals import NoSharedMotion
 from estimator.checks.diagnose import Diagnostics, diagnose
 from estimator.errors import InsufficientDataError, InvalidMatrixError
 from estimator.likelihood.factor_analysis import maximise
+from estimator.types import ComplexArray, FloatArray
 from tests.estimator.csm_models import pentagon, plane_waves, random_bench, wishart
-
-if TYPE_CHECKING:
-    from estimator.types import ComplexArray, FloatArray
 
 FREQUENCY = np.linspace(1, 20, 96)
 THREE = (3, 3, 3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,12 +17,8 @@ from estimator.checks.rules import orientation
 from estimator.checks.shared_motion import CanonicalCoherence, matched_coherence
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.spectra.welch import CrossSpectra, WelchSettings
+from estimator.types import ComplexArray, FloatArray
 from tests.estimator.csm_models import wishart
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from estimator.types import ComplexArray, FloatArray
 
 FREQUENCY = np.linspace(0.5, 20, 200)
 MOTION = np.array([[2.0, 0.5, 0], [0.5, 1.0, 0.2], [0, 0.2, 0.8]])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -28,10 +27,8 @@ from estimator.spectra.welch import (
     kept_bins,
 )
 from estimator.spectra.windows import get_window
+from estimator.types import ComplexArray
 from tests.estimator.csm_models import rotation
-
-if TYPE_CHECKING:
-    from estimator.types import ComplexArray
 
 LENGTH, HOP = 256, 128
 N_SEGMENTS = 300

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
 from estimator.decision.decision_time import INTERVAL_FACTOR, LIKELY, Margins, predict
-
-if TYPE_CHECKING:
-    from estimator.decision.verdict import Prediction
-    from estimator.types import FloatArray
+from estimator.decision.verdict import Prediction
+from estimator.types import FloatArray
 
 QUANTILE = 3.5
 

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pytest
 
 from estimator.levels import noise_matrices
 from estimator.levels.pooled import Pooled, pooled_noise
-
-if TYPE_CHECKING:
-    from estimator.types import ComplexArray
+from estimator.types import ComplexArray
 
 TRIAXIAL = np.repeat(np.arange(9), 3)
 

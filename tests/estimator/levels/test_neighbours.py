@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pytest
 
 from estimator.levels.bands import band_levels
 from estimator.levels.pooled import blocks_of
 from estimator.methods import self_noise
-
-if TYPE_CHECKING:
-    from estimator.types import ComplexArray
+from estimator.types import ComplexArray
 
 
 @pytest.mark.parametrize("steep", ["motion", "noise"])

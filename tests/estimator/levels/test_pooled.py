@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pytest
 
@@ -12,10 +10,8 @@ from estimator.levels.interval import worth
 from estimator.levels.pooled import pooled_noise
 from estimator.methods import Flag, self_noise
 from estimator.self_noise.three_sensor import three_sensor
+from estimator.types import ComplexArray, FloatArray
 from tests.estimator.csm_models import wishart
-
-if TYPE_CHECKING:
-    from estimator.types import ComplexArray, FloatArray
 
 N_BINS = 61
 ONE = np.ones(1)

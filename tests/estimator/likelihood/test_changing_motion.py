@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -17,12 +17,8 @@ from estimator.likelihood.changing_motion import (
 )
 from estimator.likelihood.multi_part import multi_part
 from estimator.self_noise.result import Flag, Refusal
+from estimator.types import ComplexArray, FloatArray
 from tests.estimator.csm_models import rotation, wishart
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from estimator.types import ComplexArray, FloatArray
 
 N_PARTS = 12
 N_BINS = 10

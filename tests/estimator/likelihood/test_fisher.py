@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pytest
 
@@ -11,10 +9,8 @@ from estimator.errors import InsufficientDataError, InvalidMatrixError
 from estimator.likelihood import fisher
 from estimator.likelihood.factor_analysis import maximise
 from estimator.self_noise.three_sensor import three_sensor
+from estimator.types import ComplexArray, FloatArray
 from tests.estimator.csm_models import common_motion, planar_sensors, random_bench, wishart
-
-if TYPE_CHECKING:
-    from estimator.types import ComplexArray, FloatArray
 
 
 def bound_by_definition(A: ComplexArray, noise_psd: FloatArray, n: int) -> FloatArray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import permutations
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -19,10 +18,8 @@ from estimator.likelihood.goodness_of_fit import (
 )
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import effective_averages, get_window
+from estimator.types import ComplexArray
 from tests.estimator.csm_models import pentagon, plane_waves, random_bench, wishart
-
-if TYPE_CHECKING:
-    from estimator.types import ComplexArray
 
 
 def bench(dims: tuple[int, ...], *, snr: float = 1e3) -> ComplexArray:

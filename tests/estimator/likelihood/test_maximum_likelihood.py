@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pytest
 
@@ -12,6 +10,7 @@ from estimator.likelihood import factor_analysis, fisher
 from estimator.likelihood.factor_analysis import DECREMENT, max_factors, maximise
 from estimator.likelihood.maximum_likelihood import maximum_likelihood
 from estimator.self_noise.result import Flag
+from estimator.types import ComplexArray, FloatArray
 from tests.estimator.csm_models import (
     common_motion,
     pentagon,
@@ -21,9 +20,6 @@ from tests.estimator.csm_models import (
     rotation,
     wishart,
 )
-
-if TYPE_CHECKING:
-    from estimator.types import ComplexArray, FloatArray
 
 
 def tilted(degrees: float) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -14,11 +14,7 @@ from estimator.noise_parameters.allan import allan_deviation, averaging_times
 from estimator.noise_parameters.fit import NoiseParameters, Term, fit, terms_at
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from estimator.types import FloatArray
+from estimator.types import FloatArray
 
 FREQUENCY: FloatArray = np.arange(1001, dtype=np.float64) * 0.1
 INDEPENDENT = np.eye(1, N_LAGS)[0]

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from estimator.errors import InsufficientDataError
 from estimator.levels.bands import bin_correlation
-from estimator.responses.calibration import calibrate_sensor, response_curve
+from estimator.responses.calibration import SensorCalibration, calibrate_sensor, response_curve
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from estimator.responses.calibration import SensorCalibration
-
-    FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 RATE, LENGTH, N = 50.0, 100, 6000
 DIMS = (3, 3, 3)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -12,9 +11,7 @@ from estimator.checks.advice_on_sensors import Delay, ReversedPolarity
 from estimator.checks.relative_response import cycle_is_ambiguous, relative_response
 from estimator.checks.rules import orientation
 from estimator.responses.calibration import calibrate_sensor
-
-if TYPE_CHECKING:
-    from estimator.types import ComplexArray, FloatArray
+from estimator.types import ComplexArray, FloatArray
 
 NARROW = np.asarray(20.0 + 0.5 * np.arange(4), dtype=np.float64)
 WIDE = np.asarray(16.0 + 0.5 * np.arange(17), dtype=np.float64)

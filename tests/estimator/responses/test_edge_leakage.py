@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pytest
 
 from estimator.checks.advice import Rank
+from estimator.checks.advice_on_sensors import UnequalResponses
 from estimator.methods import self_noise
 from estimator.responses.edge_leakage import (
     band_shares,
@@ -22,9 +21,6 @@ from estimator.responses.equalisation import (
     significant_minimum,
 )
 from estimator.spectra.windows import get_window
-
-if TYPE_CHECKING:
-    from estimator.checks.advice_on_sensors import UnequalResponses
 
 DIMS = (3, 3, 3)
 T = 10.0

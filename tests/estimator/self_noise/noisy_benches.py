@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from estimator.types import ComplexArray
 from tests.estimator.csm_models import random_bench
-
-if TYPE_CHECKING:
-    from estimator.types import ComplexArray
-
 
 BENCHES = [(1, 1, 1), (2, 2, 2), (3, 3, 3), (2, 2, 2, 2), (3, 3, 3, 3, 3)]
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pytest
 
@@ -15,11 +13,9 @@ from estimator.errors import (
 )
 from estimator.methods import METHODS, Flag, SelfNoise, self_noise
 from estimator.self_noise.three_sensor import three_sensor
+from estimator.types import ComplexArray
 from tests.estimator.csm_models import wishart
 from tests.estimator.self_noise.noisy_benches import bench
-
-if TYPE_CHECKING:
-    from estimator.types import ComplexArray
 
 
 def spoilt(fault: str) -> ComplexArray:

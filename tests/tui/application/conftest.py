@@ -6,18 +6,14 @@ Textual parses them when an application starts, and when its colours change.
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import pytest
+from textual.css.model import RuleSet
 from textual.css.parse import parse
 from textual.css.tokenize import tokenize_values
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from textual.css.model import RuleSet
-    from textual.css.tokenizer import Token
-    from textual.css.types import CSSLocation
+from textual.css.tokenizer import Token
+from textual.css.types import CSSLocation
 
 _tokens: dict[frozenset[tuple[str, str]], dict[str, list[Token]]] = {}
 _rules: dict[tuple[object, ...], list[RuleSet]] = {}

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from unittest.mock import patch
 
 from rich.console import Console
-
-if TYPE_CHECKING:
-    from textual.app import App
-    from textual.pilot import Pilot
+from textual.app import App
+from textual.pilot import Pilot
 
 FOLDER = Path(__file__).parent / "pictures"
 TURNS = 100

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
+from textual.app import App
+from textual.message import Message
+from textual.pilot import Pilot
 from textual.widgets import Static
 
 from daq.bench.end_condition import EndCondition
@@ -30,13 +33,6 @@ from tui.application.app import HuddleApp
 from tui.application.messages import ErrorReported, RecordingOpened, SnapshotReady, StatusUpdated
 from tui.application.state import BENCH
 from tui.application.test_view.view import TestView
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from textual.app import App
-    from textual.message import Message
-    from textual.pilot import Pilot
 
 NARROW, WIDE = (80, 24), (160, 45)
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from importlib import resources
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
+from textual.pilot import Pilot
 
 from daq.bench.loading import dump
 from daq.devices.bench_file import load, parse
@@ -20,12 +22,6 @@ from tests.waiting import limit
 from tui.application.app import HuddleApp
 from tui.commands.tui_controls import BenchControls
 from tui.simulation.devices import simulated
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    from textual.pilot import Pilot
 
 pytestmark = [
     pytest.mark.long,

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import io
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import date
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,10 +35,6 @@ from tui.application.bench_view.sensors import (
 from tui.application.bench_view.view import SITES
 from tui.application.state import State
 from tui.commands.tui_controls import BenchControls
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 MOTION = np.random.default_rng(1).normal(size=(2000, 3)).cumsum(axis=0) * 1e-4
 SOUND = tuple(

@@ -6,14 +6,18 @@ import asyncio
 import sys
 import threading
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from textual.pilot import Pilot
 from textual.widgets import Input
 
+from daq.bench.model import Bench
 from daq.devices.bench_file import load, parse
 from daq.devices.interface import DeviceInformation
 from daq.errors import NotConnectedError
@@ -29,14 +33,6 @@ from tui.application.first_bench import FirstBenchApp, FirstBenchScreen, Network
 from tui.commands.tui_controls import BenchControls, FirstBenchControls
 from tui.runs.first_bench import draft
 from tui.simulation.devices import simulated
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from pathlib import Path
-
-    from textual.pilot import Pilot
-
-    from daq.bench.model import Bench
 
 SIZES = {"small": (80, 24), "middle": (120, 36), "wide": (200, 60)}
 PORTS = tuple(f"/dev/ttyUSB{n}" for n in range(4))

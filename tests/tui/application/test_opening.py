@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from importlib import resources
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -11,9 +11,6 @@ from typer.testing import CliRunner
 from tests.tui.example_snapshot import growing
 from tui.application.app import HuddleApp
 from tui.commands.main import app
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.mark.parametrize("name", ["lab.toml", "lab.h5"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from textual.events import Key
@@ -34,9 +34,6 @@ from tui.application.state import TEST, State
 from tui.application.view import status_line
 from tui.commands.tui_controls import BenchControls, announce
 from tui.wording.verdict_text import WORDS
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 LIMIT = Limit(name="data sheet", frequency=(1.0, 30.0), psd=(7e-12, 7e-12))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,9 +32,6 @@ from tui.application.test_view.plotted import (
     zoomed,
 )
 from tui.application.test_view.units import GRAVITY, SpectrumUnit, units_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.fixture

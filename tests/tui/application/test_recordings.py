@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
+from textual.pilot import Pilot
 from textual.widgets import Input
 
 from daq.results.store import store_results
@@ -17,11 +18,6 @@ from tui.application.app import HuddleApp
 from tui.application.messages import CatalogueRead
 from tui.application.state import RECORDINGS
 from tui.runs.catalogue import Entry
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from textual.pilot import Pilot
 
 
 @pytest.fixture

@@ -7,9 +7,9 @@ from dataclasses import replace
 from importlib import resources
 from json import loads
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
+from textual.pilot import Pilot
 from textual.widgets import Input
 
 from daq.bench.model import Limit
@@ -24,9 +24,6 @@ from tui.application.state import RECORDINGS, RESULT, Reference
 from tui.commands.tui_controls import save_result
 from tui.output.results import curves_csv
 from tui.simulation.write_recording import simulate_recording
-
-if TYPE_CHECKING:
-    from textual.pilot import Pilot
 
 LIMIT = Limit(name="data sheet", frequency=(1.0, 30.0), psd=(7e-12, 7e-12))
 

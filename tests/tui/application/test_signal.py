@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
+from textual.app import App
+from textual.pilot import Pilot
 
 from daq.recording.reader import Recording
 from daq.results.signal import Signal
@@ -23,13 +26,6 @@ from tui.application.signal_view.picture import Drawn, Look, picture
 from tui.application.signal_view.source import SignalSource
 from tui.application.signal_view.view import SignalView
 from tui.wording.signal import time_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from textual.app import App
-    from textual.pilot import Pilot
 
 SIZES = {"small": (40, 12), "narrow": (80, 24), "middle": (120, 36), "wide": (160, 45)}
 START = 1_468_458_000.0

@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import itertools
 import re
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from daq.estimation.noise_estimates import ALL_METHODS
+from estimator.types import FloatArray
 from tests.tui.application.screen_text import screen_text
 from tests.tui.application.test_app import NARROW, running, shown
 from tests.tui.example_snapshot import ProgressCallback
 from tui.application.app import HuddleApp
 from tui.application.test_view.plotted import STYLES
 from tui.application.themes import COLOUR_BLIND, NO_COLOUR, SAFE, THEMES
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from estimator.types import FloatArray
 
 # Machado, Oliveira, Fernandes (2009), severity 1: linear RGB as colour-blind eyes see it.
 SEEN = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from importlib import resources
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -27,11 +27,7 @@ from tests.tui.example_snapshot import (
 )
 from tui.application.app import HuddleApp
 from tui.application.messages import ErrorReported, Progress, SnapshotReady, StatusUpdated
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from tui.application.plan import TestPlan
+from tui.application.plan import TestPlan
 
 
 @dataclass

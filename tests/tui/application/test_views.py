@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -16,9 +16,6 @@ from tests.waiting import limit
 from tui.application.app import HuddleApp
 from tui.application.messages import CatalogueRead, SnapshotReady
 from tui.application.state import RESULT, TEST, TITLES, VIEWS
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
@@ -16,9 +16,6 @@ from typer.testing import CliRunner
 
 from tests.tui.night_recording import BENCH, HOSTILE, SENSOR, record
 from tui.commands.main import app
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 ABOUT = """
 [laboratory]

@@ -9,9 +9,9 @@ import re
 import sqlite3
 import stat
 import sys
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
@@ -32,9 +32,6 @@ from tui.certificate.ledger import Ledger
 from tui.certificate.verification import JSON_NAME
 from tui.commands.main import app
 from tui.service.records.store import NAME as RUNS
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 NAMESPACES = {"dcc": "https://ptb.de/dcc", "si": "https://ptb.de/si"}
 

@@ -9,10 +9,11 @@ import shutil
 import sqlite3
 import sys
 import zlib
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import h5py
 import numpy as np
@@ -33,9 +34,6 @@ from tui.certificate.ledger import NAME, Ledger
 from tui.certificate.signing import PdfSignature, Signer, signatures
 from tui.certificate.verification import JSON_NAME, Claims, VerificationError, _signatures, verify
 from tui.commands.main import app
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 def bomb(n: int) -> bytes:

@@ -8,17 +8,12 @@ import subprocess
 import sys
 from contextlib import closing
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from tests.waiting import limit
-from tui.certificate.ledger import NAME, Ledger, LedgerError
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from tui.certificate.ledger import Entry
+from tui.certificate.ledger import NAME, Entry, Ledger, LedgerError
 
 AT = datetime(2026, 11, 25, 12, tzinfo=UTC)
 

@@ -13,7 +13,8 @@ import sys
 from contextlib import ExitStack
 from dataclasses import replace
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,9 +50,6 @@ from tui.commands.main import app
 from tui.output.archive.tables import course_table
 from tui.report.figures import archive, drawing
 from tui.report.figures.archive import days_figure, density_figure
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 SCHEMA: dict[str, Any] = json.loads(
     (resources.files("tui.resources") / "archive-2.schema.json").read_text("utf-8")

@@ -6,7 +6,7 @@ import contextlib
 import os
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -15,9 +15,6 @@ from daq.devices.bench_file import load
 from tests.devices import serving
 from tests.sim_devices.simulated_bench import bench_of, device, spec
 from tui.commands.main import app
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 pytestmark = pytest.mark.devices
 TABLES = [

@@ -6,7 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -17,9 +17,6 @@ from daq.errors import BenchFileError
 from tests.daq.devices.test_sound import ALSA, CARD, has_portaudio
 from tests.waiting import limit
 from tui.commands.main import app
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 BENCH = """
 name = "b"

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import re
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from daq.bench.estimate_settings import (
     table_keys,
     to_table,
 )
+from daq.bench.model import Bench
 from daq.bench.option_fit import max_dimension
 from daq.bench.option_values import METHODS
 from daq.devices.bench_file import parse
@@ -31,11 +33,6 @@ from tui.commands.main import app
 from tui.commands.options import with_estimate_options
 from tui.runs.estimate_settings import check_fit, chosen
 from tui.simulation.write_recording import simulate_recording
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from daq.bench.model import Bench
 
 TEMPLATE = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
 KEYS = (

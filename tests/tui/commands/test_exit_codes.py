@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from typing import TYPE_CHECKING
+from types import ModuleType
 
 import pytest
 
@@ -23,9 +23,6 @@ from sim_devices.errors import ScenarioError, ServeError, SimulationError
 from tui.commands.main import exit_code, messages
 from tui.output.exit_codes import ExitCode
 from tui.runs.recorder_process import RecorderFailedError
-
-if TYPE_CHECKING:
-    from types import ModuleType
 
 USAGE_ERRORS = {
     ArrayError,

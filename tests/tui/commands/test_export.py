@@ -9,9 +9,10 @@ import io
 import json
 import os
 import zlib
+from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import h5py
 import numpy as np
@@ -20,11 +21,12 @@ import pyuff
 import xarray as xr
 from numcodecs import blosc
 from scipy.io import loadmat
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 import huddle
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.formats.importer import import_files
 from daq.formats.miniseed_export import export_miniseed
 from daq.formats.readers.waveforms import load_obspy
@@ -34,13 +36,6 @@ from tests.daq.formats.test_sources import START, STEP, counts, write_records
 from tui.commands.main import app
 from tui.notebook.curve_files import WRITERS
 from tui.output.exit_codes import ExitCode
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from typer.testing import Result
-
-    from daq.estimation.snapshot import Snapshot
 
 BENCH = """
 name = "lab"

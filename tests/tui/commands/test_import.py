@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,9 +16,6 @@ from tests.daq.formats.test_sources import START, STEP, counts, write_records
 from tui.commands.main import app
 from tui.output.exit_codes import ExitCode
 from tui.runs.estimate_settings import chosen_for_files
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.mark.usefixtures("needs_obspy")

@@ -7,16 +7,13 @@ import os
 import re
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from daq.python_process import python_command
 from tui.commands.main import app
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 LONG = ("run", "record", "watch", "serve", "devices", "demo", "import", "simulate", "reproduce")
 pseudo_terminals = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals")

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.estimation.estimation import Estimation
 from daq.estimation.settings import Settings
@@ -16,11 +17,6 @@ from estimator.spectra.segment_rejection import Reason
 from tests.daq.clocks.recordings import write_polled
 from tui.application.test_view.panels import findings
 from tui.commands.watch import watch
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 RATE, N_SAMPLES = 50, 3000
 SETTINGS = Settings(segment=4.0)

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import re
 from importlib import resources
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from tui.commands.main import app
 from tui.notebook.planning import plan_bench
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 TEMPLATE = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
 OMEGA = 2 * 3.141592653589793 * 30.0

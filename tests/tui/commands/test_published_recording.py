@@ -5,21 +5,18 @@ from __future__ import annotations
 import json
 import math
 import re
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
-from tui.commands.estimate import show_result
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from daq.estimation.snapshot import Snapshot
-    from daq.results.result import Result
+from daq.estimation.snapshot import Snapshot
+from daq.results.result import Result
 from tests.tui.commands.test_command import huddle
+from tui.commands.estimate import show_result
 
 PUBLISHED = (
     "--segment", "409.6s", "--overlap", "0.125", "--window", "hann", "--detrend", "none",

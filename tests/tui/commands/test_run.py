@@ -8,11 +8,12 @@ import os
 import signal
 import subprocess
 import sys
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from daq.bench.end_condition import EndCondition
 from daq.bench.loading import dump
@@ -22,11 +23,6 @@ from daq.recording.reader import Recording
 from daq.recording.repair import verify
 from tests.waiting import finish, wait_until
 from tui.commands.main import app
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from typer.testing import Result
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals and SIGKILL")
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import socket
+import subprocess
 import time
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,11 +24,6 @@ from tests.acceptance.run_bench import command
 from tests.devices import paced_clock, serving
 from tests.waiting import LOOK, limit
 from tui.simulation.devices import connected, specification
-
-if TYPE_CHECKING:
-    import subprocess
-    from pathlib import Path
-
 
 SPEED = 4.0
 RATE = 200.0

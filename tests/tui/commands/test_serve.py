@@ -8,13 +8,14 @@ import os
 import signal
 import sys
 import time
-from datetime import timedelta
+from datetime import datetime, timedelta
 from importlib import resources
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from daq.bench.loading import dump
+from daq.bench.model import Bench
 from daq.bench.tables.unattended import Schedule, ScheduledRun
 from daq.devices.bench_file import load, parse
 from daq.errors import BenchFileError, RecordingError
@@ -29,12 +30,6 @@ from tui.service.records.places import service_lock
 from tui.service.records.run_state import RUN, Run, RunState
 from tui.service.records.store import RunStore
 from tui.simulation.devices import simulated
-
-if TYPE_CHECKING:
-    from datetime import datetime
-    from pathlib import Path
-
-    from daq.bench.model import Bench
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals")
 DEMO = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")

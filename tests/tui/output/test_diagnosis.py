@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from rich.console import Console
+from rich.console import Console, RenderableType
 from scipy.linalg import block_diag
 
 from daq.estimation.settings import Settings
@@ -29,11 +29,6 @@ from tests.tui.example_snapshot import SETTINGS, STRANGER, diagnosed, made_snaps
 from tui.output.diagnosis import details
 from tui.output.results import result_table
 from tui.page.terminal import terminal_table
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from rich.console import RenderableType
 
 
 def test_angles_have_the_minus_of_typography_and_pairs_are_put_together() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,9 +26,6 @@ from tui.output.console import write_json
 from tui.output.json_document import document, result_document
 from tui.output.json_values import json_text
 from tui.wording.verdict_text import headline, what_to_do
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def test_advice_has_its_kind_its_numbers_and_its_words() -> None:

@@ -7,7 +7,8 @@ import hashlib
 import json
 from dataclasses import dataclass
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 from jsonschema import Draft202012Validator
@@ -20,9 +21,6 @@ from tests.tui.night_recording import HOSTILE, record
 from tests.tui.thinned import thinned
 from tui.commands.main import app
 from tui.output.json_document import SCHEMA_VERSION
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 SCHEMA: dict[str, Any] = json.loads(
     (resources.files("tui.resources") / f"result-{SCHEMA_VERSION}.schema.json").read_text("utf-8")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
-from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -16,6 +15,7 @@ from daq.bench.model import Limit
 from daq.bench.sensitivity import KnownSensitivity
 from daq.bench.units import decibels
 from daq.estimation.contributions import with_sensitivities
+from daq.estimation.snapshot import Snapshot
 from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics, Synchronisation
 from daq.results.facts.precision import IntervalsWidened
 from daq.results.result import Result
@@ -34,9 +34,6 @@ from tui.page.terminal import terminal_table
 from tui.report.noise import noise_section
 from tui.report.parts import Table
 from tui.web.chart import _numbers
-
-if TYPE_CHECKING:
-    from daq.estimation.snapshot import Snapshot
 
 BAND = (9.0, 11.0)  # within one third of an octave: a limit there is judged in one band
 THIRD = replace(SETTINGS, band=BAND, methods=("three-sensor",))

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import math
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 import huddle
+from daq.results.result import Result
 from daq.results.standing import pair_coherence, stances
 from tui.output.standing import caption, remark, sketch, standing
-
-if TYPE_CHECKING:
-    from daq.results.result import Result
 
 SNR = 400.0
 TURNED = Rotation.from_euler("zx", [30, 2], degrees=True).as_matrix()

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from daq.bench.channel import Certificate, Channel
 from daq.bench.model import Bench, Sensor
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.formats.arrays import recording_of_arrays
 from daq.results.result import Result
 from tui.output.calibration import share
 from tui.report.contents import calibration_section
 from tui.report.parts import Facts, Paragraph, Table
-
-if TYPE_CHECKING:
-    from daq.estimation.snapshot import Snapshot
 
 SETTINGS = Settings(segment=2.0, band=(1.0, 20.0))
 

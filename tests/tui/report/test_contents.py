@@ -6,7 +6,7 @@ import hashlib
 import re
 import shutil
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,9 +25,6 @@ from tui.report.contents import by_sensor, report_of
 from tui.report.evidence import facts_section
 from tui.report.figures.drift import without_line
 from tui.report.parts import Plot, Section, Table
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def test_it_says_what_was_tested_on_what_by_whom_and_when(reported: Reported) -> None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from pypdf import PdfReader
+from matplotlib.axes import Axes
+from pypdf import PageObject, PdfReader
 from pypdf.generic import Destination
 from typer.testing import CliRunner
 
@@ -22,12 +24,6 @@ from tui.report.contents import report_of
 from tui.report.figures.curves import WIDTH
 from tui.report.parts import Facts, Paragraph, Plot, Report, Section, Table
 from tui.report.writing import write
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from matplotlib.axes import Axes
-    from pypdf import PageObject
 
 
 @pytest.mark.long

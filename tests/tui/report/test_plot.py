@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import functools
 import re
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
@@ -17,6 +19,7 @@ import huddle
 from daq.bench.loading import parse
 from daq.bench.masks.mask import NOISE_MODELS, Mask
 from daq.bench.masks.mask_file import masks_named
+from daq.bench.model import Bench
 from daq.errors import WrongSettingError
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
@@ -30,15 +33,7 @@ from tui.commands.main import app
 from tui.report.figures import drawing
 from tui.report.figures.curves import MODEL_RANGE_DB, noise_plots, write_figure
 from tui.report.figures.signal import signal_plots
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-    from pathlib import Path
-
-    from matplotlib.axes import Axes
-
-    from daq.bench.model import Bench
-    from tui.report.parts import Plot
+from tui.report.parts import Plot
 
 SNAPSHOT = made_snapshot()
 LIMIT = """

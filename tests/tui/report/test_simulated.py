@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -22,9 +22,6 @@ from tui.application.view import status_line
 from tui.commands.main import app
 from tui.report.figures.archive import days_figure
 from tui.report.figures.curves import noise_plots
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.mark.usefixtures("empty_figures")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -15,12 +14,9 @@ from daq.recording.reader import Recording
 from daq.results.result import Result
 from daq.results.uncertainty_budget import band_budgets
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
-from tests.tui.report.written_report import by_channel, tables
+from tests.tui.report.written_report import Reported, by_channel, tables
 from tui.report.parts import Paragraph, Plot, Table
 from tui.report.uncertainty import half_octaves, uncertainty_section
-
-if TYPE_CHECKING:
-    from tests.tui.report.written_report import Reported
 
 
 def number(text: str) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -16,9 +16,6 @@ from tests.tui.report.written_report import ROOT, Reported, Words
 from tui.commands.main import app
 from tui.commands.tui_controls import BenchControls
 from tui.report.writing import ReportError, write
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.mark.long

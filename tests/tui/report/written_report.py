@@ -7,19 +7,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.results.result import Result
 from daq.results.sources import sources
 from tui.report.paper import write_paper
-from tui.report.parts import Facts, Items, Paragraph, Plot, Report, Table
+from tui.report.parts import Facts, Items, Paragraph, Part, Plot, Report, Table
 from tui.report.writing import page
-
-if TYPE_CHECKING:
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
-    from tui.report.parts import Part
-
 
 ROOT = Path(__file__).parents[3]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -16,9 +16,6 @@ from estimator.decision.verdict import Verdict
 from tests.tui.example_snapshot import SETTINGS, demo_bench, growing, made_snapshot
 from tui.application.recordings_view.view import about, verdict
 from tui.runs.catalogue import catalogue, delete_recording
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 LIMIT = Limit(name="data sheet", frequency=(1.0, 30.0), psd=(1e-9, 1e-9))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -19,9 +19,6 @@ from tui.runs.first_bench import (
     with_device,
     with_limits,
 )
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def found(number: int) -> DiscoveredDevice:

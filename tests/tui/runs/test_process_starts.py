@@ -10,22 +10,18 @@ import sys
 from datetime import UTC, datetime
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
 from daq.bench.end_condition import EndCondition
 from daq.bench.loading import dump
-from daq.bench.model import Limit
+from daq.bench.model import Bench, Limit
 from daq.devices.bench_file import parse
 from tests.daq.archive import months
 from tests.waiting import limit
 from tui.service.processes.finish import Outcome, Request
 from tui.service.processes.steps import ProcessSteps
 from tui.simulation.devices import simulated
-
-if TYPE_CHECKING:
-    from daq.bench.model import Bench
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals")
 
@@ -34,7 +30,6 @@ MODULES = ("random", "cronsim", "json", "numpy", "typer", "huddle")
 PACKAGES = ("tui", "daq", "estimator", "sim_devices")
 FOREIGN = """
 from pathlib import Path
-from typing import TYPE_CHECKING
 with Path({record!r}).open("a") as record:
     print(__file__, file=record)
 raise SystemExit(f"{{__file__}} was executed")

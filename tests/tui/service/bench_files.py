@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
+from daq.bench.end_condition import EndCondition
 from daq.bench.loading import parse
+from daq.bench.model import Bench
 from daq.errors import HuddleError
 from tui.service.clock import SystemTime
 from tui.service.processes.finish import Outcome, Request
+from tui.service.processes.steps import Recorder
+from tui.service.records.run_state import Run
 from tui.service.records.storage import tidy
 from tui.service.records.store import RunStore
 from tui.service.service import Service
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from daq.bench.end_condition import EndCondition
-    from daq.bench.model import Bench
-    from tui.service.processes.steps import Recorder
-    from tui.service.records.run_state import Run
 
 START = datetime(2026, 11, 21, 12, 0, 30, tzinfo=UTC)
 SENSORS = """

@@ -12,30 +12,25 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from importlib import resources
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from daq.bench.loading import dump
+from daq.bench.model import Bench
 from daq.devices.bench_file import load, parse
 from daq.protocols.block import EventKind
 from daq.recording.reader import Recording
 from tests.waiting import limit
 from tui.service import clock as clock_module
 from tui.service.clock import SystemTime
-from tui.service.records.run_state import RunState
+from tui.service.records.run_state import Run, RunState
 from tui.service.records.store import RunStore
 from tui.simulation.devices import simulated
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    from daq.bench.model import Bench
-    from tui.service.records.run_state import Run
 
 DEMO = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
 SECONDS = 8

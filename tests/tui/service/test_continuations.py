@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,9 +19,6 @@ from tui.commands.verify import verify
 from tui.service.processes.finish import Request, finish
 from tui.service.records.run_state import RunState
 from tui.service.records.storage import remove
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 RATE = 200  # of the demo
 

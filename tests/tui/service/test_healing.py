@@ -10,7 +10,7 @@ import math
 import sqlite3
 from dataclasses import asdict, replace
 from datetime import timedelta
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,9 +29,6 @@ from tui.service.processes.finish import Outcome, Request, finish
 from tui.service.records.parts import mark_of
 from tui.service.records.run_state import Run, RunState
 from tui.service.records.store import COPIES, RunStore
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 HOUR = 3600.0
 

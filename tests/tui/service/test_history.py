@@ -7,26 +7,20 @@ import io
 import json
 import math
 from dataclasses import replace
-from datetime import timedelta
-from typing import TYPE_CHECKING
+from datetime import datetime, timedelta
+from pathlib import Path
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from daq.results.change_test import BLOCK, DECIBEL, WIDTHS, Evidence, changes
+from daq.results.change_test import BLOCK, DECIBEL, WIDTHS, Evidence, FloatArray, changes
 from tests.tui.service.bench_files import START
 from tui.commands.main import app
 from tui.service.history.series import history
 from tui.service.history.shown import history_figure, history_table, label_lines
 from tui.service.records.run_state import BandNoise, Run, RunState
 from tui.service.records.store import RunStore
-
-if TYPE_CHECKING:
-    from datetime import datetime
-    from pathlib import Path
-
-    from daq.results.change_test import FloatArray
 
 
 def test_false_alarms_are_as_rare_as_stated() -> None:

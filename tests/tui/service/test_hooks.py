@@ -8,7 +8,7 @@ import json
 import sqlite3
 import sys
 from datetime import timedelta
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -18,9 +18,6 @@ from tests.waiting import limit
 from tui.service.hooks import HookRunner, events_of, run_hook
 from tui.service.records.run_state import BandNoise, Run, RunState
 from tui.service.records.store import RunStore
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="a shell")
 NOISE = BandNoise(

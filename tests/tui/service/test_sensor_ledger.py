@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sqlite3
 from contextlib import closing
-from typing import TYPE_CHECKING
+from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -22,9 +22,6 @@ from daq.results.result import Result
 from tui.commands.main import app
 from tui.service.history.ledger import ledger_path, noise_of, noted, record_test, sensor_tests
 from tui.web.months import Months
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 RATE, SECONDS = 64.0, 1200
 SETTINGS = Settings(segment=4.0, methods=("three-sensor",), band=(1.0, 16.0))

@@ -6,10 +6,11 @@ import asyncio
 import errno
 from dataclasses import replace
 from datetime import timedelta
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
+from daq.bench.model import Bench
 from daq.errors import BenchFileError, FileFault
 from tests.tui.service.bench_files import HOURLY, START, Place, bench_of
 from tui.service.processes.finish import Outcome
@@ -19,11 +20,6 @@ from tui.service.records.store import RunStore, StoreError
 from tui.service.service import MAX_ATTEMPTS, REFUSED
 from tui.service.window import STALL, STOPPED
 from tui.service.window import START as START_LIMIT
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from daq.bench.model import Bench
 
 pytestmark = pytest.mark.virtual_time
 HOUR = 3600.0

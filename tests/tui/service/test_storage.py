@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import timedelta
-from typing import TYPE_CHECKING
+from pathlib import Path
+
+import pytest
 
 from daq.recording.storage.locking import WriterLock
 from tests.tui.service.bench_files import START, bench_of
 from tui.service.records.run_state import Run, RunState
 from tui.service.records.storage import MIN_KEPT_RUNS, tidy
 from tui.service.records.store import RunStore
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import pytest
 
 DAY = timedelta(days=1)
 

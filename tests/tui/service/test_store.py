@@ -9,7 +9,7 @@ import threading
 from contextlib import closing
 from dataclasses import replace
 from datetime import timedelta
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -19,9 +19,6 @@ from tui.commands.main import app
 from tui.commands.runs import PAGE
 from tui.service.records.run_state import BandNoise, Run, RunState
 from tui.service.records.store import RunStore
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 NOISE = BandNoise("A", "M", "7", "x", "m/s²", "three-sensor", 1.0, 10.0, 1e-12, 5e-13, 2e-12)
 

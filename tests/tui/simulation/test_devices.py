@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 from importlib import resources
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -24,9 +24,6 @@ from tests.sim_devices.simulated_bench import device, spec
 from tests.waiting import limit
 from tui.commands.main import app
 from tui.simulation.devices import simulated
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGTERM kills there")

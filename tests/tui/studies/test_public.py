@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from daq.estimation.estimation import estimate
@@ -18,11 +19,6 @@ from daq.results.result import Result
 from tui.commands.main import app
 from tui.output.exit_codes import ExitCode
 from tui.studies.public import BOUND, levels, model_free_bound
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 RATE = 50.0
 

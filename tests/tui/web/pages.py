@@ -5,19 +5,16 @@ from __future__ import annotations
 import http.client
 import os
 import subprocess
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from pathlib import Path
 from urllib.parse import urlencode, urlsplit
 
 from daq.python_process import python_command
 from tests.tui.night_recording import record
 from tests.waiting import limit, wait_until
 from tui.web.access import token_hash
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-    from pathlib import Path
 
 READER, STEERER = "a token of who looks at pages", "a password of who steers"
 STEERER_HASH = (

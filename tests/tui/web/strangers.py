@@ -5,13 +5,10 @@ from __future__ import annotations
 import random
 import socket
 from collections import Counter
-from typing import TYPE_CHECKING
 from urllib.parse import quote_from_bytes, urlsplit
 
+from tests.tui.web.pages import Server
 from tests.waiting import limit
-
-if TYPE_CHECKING:
-    from tests.tui.web.pages import Server
 
 METHODS = (b"GET",) * 12 + (b"POST",) * 5 + (b"HEAD", b"PUT", b"OPTIONS", b"TRACE", b"X-" * 20)
 PATHS = (

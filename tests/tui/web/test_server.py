@@ -14,9 +14,9 @@ import socket
 import ssl
 import subprocess
 import sys
+from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING
 from urllib.parse import urlencode, urlsplit
 
 import pytest
@@ -31,9 +31,6 @@ from tests.tui.web.pages import READER, SECRETS, STEERER, Server, Visit, bench_f
 from tests.waiting import limit, wait_until
 from tui.commands.main import app
 from tui.web.access import token_hash
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 SERVICE = """
 [[schedule]]

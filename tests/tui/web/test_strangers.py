@@ -9,10 +9,12 @@ import socket
 import stat
 import threading
 import time
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from datetime import UTC, datetime
+from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, cast
+from typing import cast
 from urllib.parse import urlsplit
 
 import pytest
@@ -23,19 +25,14 @@ from daq.devices.bench_file import load
 from tests.tui.web.pages import READER, SECRETS, STEERER, Server, bench_file, serving
 from tests.tui.web.strangers import fuzzed
 from tests.waiting import limit, wait_until
+from tui.application.controls import Controls
+from tui.application.state import State
 from tui.certificate.ledger import Ledger
 from tui.web.access import Right, token_hash
 from tui.web.connections import HEAD, OF_ADDRESS, Connections
 from tui.web.server import Server as Pages
 from tui.web.tests import Tests
 from tui.web.work import WAITING, LeftError, Piece, TooMuchWorkError, Work, check_wanted
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
-    from tui.application.controls import Controls
-    from tui.application.state import State
 
 resource = pytest.importorskip("resource", reason="limits of descriptors")
 OPEN = {"/login"}

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import pytest
 
+from daq.estimation.snapshot import Snapshot
 from daq.results.decision.end import Goal, Remaining
 from daq.results.result import Result
 from estimator.checks.advice import Rank
@@ -21,9 +21,6 @@ from tui.notebook import text
 from tui.report.noise import verdict
 from tui.wording.facts import NOTHING_TO_DO, brief
 from tui.wording.verdict_text import Decision, how_long, in_tone
-
-if TYPE_CHECKING:
-    from daq.estimation.snapshot import Snapshot
 
 ALONE = ModelMisfit(
     rank=Rank.INVALIDATES, sensors=(), band=(0.5, 8.3), statistic=30.0, n_factors=3,

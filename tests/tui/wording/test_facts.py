@@ -8,7 +8,6 @@ import re
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from rich.console import Console
 
 import huddle
 from daq.estimation.settings import Settings
-from daq.estimation.snapshot import Bridged
+from daq.estimation.snapshot import Bridged, Snapshot
 from daq.results.facts.fact import Fact, Finding
 from daq.results.facts.methods import MethodRefused
 from daq.results.facts.recordings import BlocksDamaged, SensorsSimulated
@@ -35,9 +34,6 @@ from tui.output.json_document import document
 from tui.output.json_values import json_text
 from tui.report.contents import report_of
 from tui.wording.facts import MOST_LINES, brief
-
-if TYPE_CHECKING:
-    from daq.estimation.snapshot import Snapshot
 
 ROOT = Path(__file__).parents[3]
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import pytest
 
 from daq.results.facts.fact import Finding
-from estimator.checks.advice import Advice, Rank
+from estimator.checks.advice import Advice, Names, Rank
 from estimator.checks.advice_on_model import NearlySingular, WeakMotion
+from estimator.wording import Words
 from tests.tui.wording.advice_examples import (
     BAND,
     EXAMPLES,
@@ -23,12 +24,6 @@ from tests.tui.wording.advice_examples import (
     names,
 )
 from tests.tui.wording.fact_examples import kinds
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from estimator.checks.advice import Names
-    from estimator.wording import Words
 
 
 def together(found: Sequence[Advice], who: Names) -> Words:

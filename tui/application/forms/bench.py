@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from textual import on
 from textual.widgets import Input
@@ -13,9 +13,6 @@ from daq.devices.bench_file import parse
 from daq.errors import BenchFileError
 from tui.application.forms.form import Field, Form
 from tui.runs.first_bench import answers_in, with_answers, with_limits
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 HINTS = {
     "operator": "Who does the tests. It stands in recordings and reports.",

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from datetime import date
-from typing import TYPE_CHECKING
 
 from pydantic import BaseModel, ValidationError
 
@@ -12,9 +12,6 @@ from daq.bench.editing import with_values
 from daq.bench.tables.certificate import CertificateTable, Customer, Laboratory, Rule
 from estimator.wording import listed
 from tui.application.forms.form import Field, Form
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 TABLES: Mapping[str, type[BaseModel]] = {
     "laboratory": Laboratory,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import tomllib
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from textual import work
 
@@ -16,10 +17,6 @@ from daq.preflight.device_check import DiscoveredDevice, search_description
 from daq.transport.serial_ports import serial_ports
 from estimator.wording import listed
 from tui.application.forms.form import Field, Form
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
 
 SETTING = "setting-"
 """Before the name of a driver's setting, in the id of its field."""

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.text import Text
 
-from daq.results.signal import EXCLUDED, Mark
+from daq.results.signal import EXCLUDED, Mark, Spectrogram, Waveforms
+from estimator.types import FloatArray, IntArray
 from tui.application.test_view.braille import cells
 from tui.wording.signal import extent, moment, most_first, sign, time_ticks, title, words
-
-if TYPE_CHECKING:
-    from daq.results.signal import Spectrogram, Waveforms
-    from estimator.types import FloatArray, IntArray
 
 MUTED, CHOSEN, PLAIN, BAD = "#9aa5b8", "#4cc9f0", "#c5cedb", "bold #ff6b6b"
 CURSOR = "on #26324a"

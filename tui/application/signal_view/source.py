@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
 
 from daq.estimation.throttle import Throttle
 from daq.recording.reader import Recording
 from daq.results.signal import Signal
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 _SHARE = 0.03
 """Of the time of the thread that follows a recording."""

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daq.clocks.clock_model import ClockSource, ClockState
+from daq.estimation.snapshot import Snapshot
 from daq.results.clock_effect import (
     NEGLIGIBLE_EFFECT,
     NO_EFFECT,
@@ -17,13 +17,10 @@ from daq.results.clock_effect import (
     reference,
     residuals,
 )
+from daq.results.result import Result
 from daq.results.vocabulary import clock_source
 from tui.application.test_view.curves import Line
 from tui.page.table import Cell, Table
-
-if TYPE_CHECKING:
-    from daq.estimation.snapshot import Snapshot
-    from daq.results.result import Result
 
 COLOURS = ("#4cc9f0", "#f4a261", "#c297ff", "#e9d86b", "#7bd88f", "#ff7b9c", "#9aa5b8")
 _MIN_POINTS = 3

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.bench.units import levels_db
+from daq.results.band_summary import BandMeans
 from estimator.levels.bands import log_edges
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from daq.results.band_summary import BandMeans
-    from estimator.types import FloatArray
+from estimator.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
 from daq.protocols.block import EventKind
+from daq.recording.monitor import RecordingStatus
+from daq.results.result import Result
 from daq.results.sources import LoggedEvent, uncounted_events, with_uncounted
 from estimator.wording import clock_time
 from tui.application.test_view.panels import grouped, state
@@ -17,12 +19,6 @@ from tui.page import table as page
 from tui.page.table import Cell
 from tui.page.terminal import screen_table
 from tui.wording.formatting import utc
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from daq.recording.monitor import RecordingStatus
-    from daq.results.result import Result
 
 LATEST_EVENTS = 200
 MUTED, HEADER, BAD = "#9aa5b8", "bold #4cc9f0", "bold #ff6b6b"

@@ -7,15 +7,12 @@ since an earlier snapshot are the difference of two sums: ``(n2 S2 - n1 S1) / (n
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
+from daq.estimation.snapshot import Snapshot
 from estimator.checks.advice import Rank
 from estimator.checks.advice_on_signals import NoSharedMotion
 from estimator.checks.shared_motion import CanonicalCoherence, outsiders, shared_motion
-
-if TYPE_CHECKING:
-    from daq.estimation.snapshot import Snapshot
-    from estimator.types import ComplexArray
+from estimator.types import ComplexArray
 
 SPAN = 60.0
 """Seconds that are looked at, at least."""

@@ -16,17 +16,15 @@ import re
 import socket
 import struct
 import sys
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from tui.output.console import notices, reserve_standard_error
 from tui.output.logs.options import LogFormat, LogLevel
 from tui.output.plain_console import SHOWN_CONTROLS
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
 
 OWN_LOGGERS = ("daq", "estimator", "sim_devices", "tui", "huddle")
 """Packages that log from the chosen level on; others log from WARNING on."""

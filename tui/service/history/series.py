@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from daq.results.change_test import DECIBEL, NORMAL_95, Change, changes
 from tui.service.records.run_state import BandNoise, utc_text
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-    from datetime import datetime
-
-    Found = tuple[str, datetime, BandNoise, bool]
-    """Name of the bench, time at which the run was due, the noise that the run found, and whether
-    a sensor was simulated."""
+Found = tuple[str, datetime, BandNoise, bool]
+"""Name of the bench, time at which the run was due, the noise that the run found, and whether
+a sensor was simulated."""
 
 SCATTER = 0.1
 """Standard deviation in dB from run to run that is no change."""

@@ -15,9 +15,10 @@ import json
 import os
 import sys
 import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from daq.bench.estimate_settings import OPTIONS, table_keys
 from daq.bench.model import EstimateTable
@@ -40,10 +41,6 @@ from tui.runs.estimate_settings import chosen
 from tui.service.history.ledger import band_noise, noted
 from tui.service.records.parts import with_continuations
 from tui.service.records.run_state import RUN, BandNoise
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-
 
 MEMORY_SHARE = 0.6
 """Of the memory of the service that an estimate may take: the least of the computer's and of the

@@ -10,15 +10,12 @@ import contextlib
 import os
 import signal
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from daq.whole_file import PRIVATE
 
 if sys.platform != "win32":
     import fcntl
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 class Lock:

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from daq.errors import HuddleError
 from daq.recording.reader import Recording
 from daq.recording.storage.journal import journal_path
 from daq.recording.storage.names import continuation_names
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
 
 
 def with_continuations(parts: Iterable[Path]) -> list[Path]:

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
+from daq.bench.model import Bench
 from daq.devices.bench_file import load
 from daq.errors import HuddleError
+from tui.service.records.run_state import Run
 from tui.service.records.store import NAME, RunStore
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from daq.bench.model import Bench
-    from tui.service.records.run_state import Run
 
 
 class NoServiceError(HuddleError):

@@ -12,10 +12,11 @@ import json
 import os
 import shutil
 import sqlite3
+from collections.abc import Iterator, Sequence
 from dataclasses import astuple, fields, replace
 from datetime import date, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from daq.bench.end_condition import EndCondition
 from daq.errors import HuddleError
@@ -29,9 +30,6 @@ from tui.service.records.run_state import (
     from_text,
     utc_text,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
 
 NAME = "runs.sqlite"
 VERSION = 1

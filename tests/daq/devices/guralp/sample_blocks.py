@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.devices.guralp import gcf
 from daq.devices.guralp.gcf import SampleBlock, SystemId
-from daq.protocols.block import Block, Event, HostTime
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from numpy.typing import NDArray
-
-    from daq.protocols.block import DeviceItem
-
+from daq.protocols.block import Block, DeviceItem, Event, HostTime
 
 S = 1_000_000_000
 START_NS = 1_795_219_200 * S

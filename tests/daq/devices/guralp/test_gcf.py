@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from fractions import Fraction
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import ArrayLike
 
 from daq.devices.guralp import gcf
 from daq.devices.guralp.gcf import SampleBlock, StatusBlock, SystemForm, SystemId
 from daq.protocols.errors import RemoteProtocolError
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 START_NS = 1_795_219_200 * 1_000_000_000  # 2026-11-21T00:00:00Z
 SYSTEM = SystemId("DEMO")

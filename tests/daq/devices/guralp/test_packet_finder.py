@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import pytest
 
 from daq.devices.guralp import scream
-
-if TYPE_CHECKING:
-    import pytest
 
 
 def test_invalid_bytes_are_examined_only_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from random import Random
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from daq.devices.guralp import brp, gcf
 from daq.devices.guralp.decoders import SerialDecoder, Streams
 from daq.devices.guralp.gcf import SampleBlock, StatusBlock
-from daq.protocols.block import Block, BlockFlag, Event, Reading
+from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, Reading
 from tests.daq.devices.guralp.sample_blocks import (
     AT,
     RATE,
@@ -28,14 +31,6 @@ from tests.daq.devices.guralp.sample_blocks import (
     raw_blocks,
     sample_block,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from random import Random
-
-    from numpy.typing import NDArray
-
-    from daq.protocols.block import DeviceItem
 
 
 def test_the_frame_of_the_specification_is_decoded() -> None:

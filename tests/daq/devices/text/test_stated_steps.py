@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -22,9 +22,6 @@ from daq.errors import NotConnectedError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, EventKind, HostTime
 from tests.peers.text_logger import CHANNELS, UNIX, TextLogger
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 ROWS = TextFormat(columns=(1, 2, 3), time_column=0, whole=True)
 SIZES = [0.02, 0.3, 1.0, 3600.0]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -13,10 +14,6 @@ from daq.protocols.block import BlockFlag
 from daq.recording.file_format import BLOCK_DTYPE, BLOCKS_PER_CHUNK
 from daq.recording.sensor_record import BlockTable
 from tests.traced_memory import peak_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 N_BLOCKS = 100_000
 LENGTH = 10

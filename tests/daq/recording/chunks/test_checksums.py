@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -17,9 +17,6 @@ from daq.recording.file_format import BLOCK_DTYPE, block_crc32
 from daq.recording.reader import Recording
 from daq.recording.repair import verify, write_results
 from tests.torture.damaged_files import make_recording
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @settings(max_examples=50, deadline=None)

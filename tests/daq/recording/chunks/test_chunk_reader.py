@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import zlib
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import h5py
 import numpy as np
@@ -15,9 +16,6 @@ import pytest
 from daq.recording import sensor_record
 from daq.recording.sensor_record import ChunkedRows, RawChunks
 from daq.recording.storage import packing
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 LENGTH, N_ROWS = 10, 257
 

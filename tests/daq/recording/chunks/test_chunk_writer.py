@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 
 from daq.recording.chunks.chunk_writer import AppendedRows, ChunkBuffer
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 ROWS = np.arange(12).reshape(4, 3)
 LAYOUTS = {

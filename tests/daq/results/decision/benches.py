@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from importlib import resources
-from typing import TYPE_CHECKING
 
 from daq.bench.loading import parse
+from daq.bench.model import Bench
+from daq.estimation.snapshot import Snapshot
+from daq.results.decision.verdict import TestVerdict
 from daq.results.result import Result
 from tests.tui.example_snapshot import SETTINGS
-
-if TYPE_CHECKING:
-    from daq.bench.model import Bench
-    from daq.estimation.snapshot import Snapshot
-    from daq.results.decision.verdict import TestVerdict
 
 MASK = """
 [[limits]]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ from daq.bench.tables.certificate import Rule
 from daq.estimation.contributions import with_sensitivities
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Snapshot
 from daq.recording.reader import Recording
 from daq.results.decision.conformity import (
     QUANTILES,
@@ -25,11 +26,6 @@ from daq.results.result import Result
 from estimator.decision.verdict import Obstacle, Verdict
 from estimator.levels.interval import interval
 from tests.tui.night_recording import record
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from daq.estimation.snapshot import Snapshot
 
 LIMIT = np.array([1.0])
 

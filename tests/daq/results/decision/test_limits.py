@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from importlib import resources
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
 from daq.bench.loading import parse
 from daq.estimation.contributions import contributions
+from daq.estimation.snapshot import Snapshot
 from daq.estimation.snapshot_diagnostics import Synchronisation
+from daq.results.decision.verdict import LimitResult
 from daq.results.result import Result
 from estimator.checks.advice import Rank
 from estimator.checks.advice_on_model import ModelMisfit
@@ -25,10 +26,6 @@ from estimator.methods import self_noise
 from estimator.self_noise.result import SelfNoise
 from tests.daq.results.decision.benches import bench_with, verdict_on
 from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot
-
-if TYPE_CHECKING:
-    from daq.estimation.snapshot import Snapshot
-    from daq.results.decision.verdict import LimitResult
 
 
 def failing(psd: float, more: str = "", *, n_effective: float = 1000.0) -> list[str]:

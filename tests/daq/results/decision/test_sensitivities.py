@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from daq.estimation.snapshot import Snapshot
+from daq.results.decision.verdict import TestVerdict
 from daq.results.result import Result
 from estimator.checks.relative_response import relative_response
 from estimator.decision.verdict import Obstacle, Verdict
@@ -16,10 +17,6 @@ from estimator.methods import self_noise
 from tests.daq.results.decision.benches import bench_with
 from tests.estimator.csm_models import wishart
 from tests.tui.example_snapshot import SETTINGS, diagnosed
-
-if TYPE_CHECKING:
-    from daq.estimation.snapshot import Snapshot
-    from daq.results.decision.verdict import TestVerdict
 
 NOISE = 1e-12
 N_AVERAGES = 600

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import logging
 import re
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -14,10 +15,6 @@ from tui.output.logs import lines as logs
 from tui.output.logs.lines import configure
 from tui.output.logs.options import LogFormat, LogLevel
 from tui.runs.recorder_process import LINES_AT_ONCE, ChildLog
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 LOGGER = logging.getLogger("daq.recorder.recorder")
 STAMP = r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z"
