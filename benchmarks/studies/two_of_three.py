@@ -74,7 +74,7 @@ def main() -> None:
             ends = interval(course, found.found.cumulants)
             inside = (ends[0] - found.found.lever <= true) & (true <= ends[1] + found.found.lever)
             total[0] += found.found.identified.sum()
-            given, held = given + known.sum(), held + (known & inside).sum()
+            given, held = given + int(known.sum()), held + int((known & inside).sum())
             off += np.abs(10 * np.log10(found.found.level / true))[known].tolist()
         ratio = np.einsum("fii->i", whole[bins]).real / truth[bins].sum(axis=0) - 1
         total += [0, given, held]
