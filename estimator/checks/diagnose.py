@@ -16,6 +16,7 @@ import numpy as np
 from estimator.checks.advice import Advice, Rank, Untested
 from estimator.checks.advice_on_noise import DisturbedSegments, NoiseChanges, ResponseChanges
 from estimator.checks.band import BandDiagnosis
+from estimator.checks.noise_within import beside_matrices
 from estimator.checks.relative_response import (
     PairProducts,
     RelativeResponse,
@@ -272,7 +273,19 @@ def diagnose(
     tested = fit
     if q != d:
         tested = _fit(part, frequency, there, q, n_effective=n_effective, maxima=maxima)
+    between = HANN_HALF if neighbours is None else neighbours
+    insides = _insides(frequency)
     model, untested = _test(tested, there, n_effective, len(csm))
+    model, widened = beside_matrices(
+        model,
+        part,
+        frequency,
+        insides,
+        dims=there.dims,
+        n_factors=q,
+        n_effective=n_effective,
+        neighbours=between,
+    )
     snr, lost = np.full((2, len(csm), sum(dims)), np.nan)
     if isinstance(fit, Maximum):
         error = standard_error(fit, n_effective=n_effective)
@@ -280,8 +293,6 @@ def diagnose(
         lost = there.spread((error >= fit.psi).astype(np.float64), sum(dims))
     canonical = CanonicalCoherence(part.matrix, part.valid & (frequency > 0))
     dimension = significant_dimensions(canonical, there.dims, n_effective)
-    number = bands(frequency)
-    insides = [number == band for band in sorted(set(number.tolist()))]
     found = tuple(
         BandDiagnosis(
             low=float(frequency[inside][0]),
@@ -304,7 +315,6 @@ def diagnose(
             gone = moved(course.spectra, there.dims, n_effective)
             left = frozenset(there.sensors[sensor] for sensor in gone)
             found = tuple(replace(b, shared=_without(b.shared, left)) for b in found)
-    between = HANN_HALF if neighbours is None else neighbours
     if isinstance(tested, Maximum) and q >= d:
         if parts is not None and parts.each:
             steady = stability(
@@ -332,7 +342,9 @@ def diagnose(
             neighbours=between,
             inflation=1.0 if steady is None else steady.inflations,
         )
-        shared = None if shared is None else shared.among(there.channels, sum(dims))
+        if shared is not None:  # matrices explain what pairs would
+            explained = np.where(widened, 0.0, shared.explained)
+            shared = replace(shared, explained=explained).among(there.channels, sum(dims))
     responses = _responses(csm, given, frequency, there, vertical=vertical, coherence=canonical)
     return Diagnostics(
         frequency=frequency,
@@ -370,6 +382,12 @@ def diagnose(
         ),
         stability=steady,
     )
+
+
+def _insides(frequency: FloatArray) -> list[BoolArray]:
+    """Return the frequencies of every band."""
+    number = bands(frequency)
+    return [number == band for band in sorted(set(number.tolist()))]
 
 
 def _allowed(test: BandTest, inflation: float) -> BandTest:

@@ -27,6 +27,7 @@ from estimator.checks.advice_on_signals import NoSharedMotion
 from estimator.checks.diagnose import Diagnostics, diagnose
 from estimator.errors import InsufficientDataError, InvalidMatrixError
 from estimator.likelihood.factor_analysis import maximise
+from estimator.likelihood.goodness_of_fit import rejected_below
 from estimator.types import ComplexArray, FloatArray
 from tests.estimator.csm_models import pentagon, plane_waves, random_bench, wishart
 
@@ -175,6 +176,26 @@ def test_swapped_channels_are_distinguished_from_a_rotated_sensor() -> None:
     other = of(averages(bench(np.eye(3), turned, np.eye(3))))
     assert not advice_of(SwappedChannels, other)
     assert advice_of(Rotated, other)[0].angle_deg == pytest.approx(90, abs=0.1)
+
+
+@pytest.mark.parametrize("snr", [0.3, 1e4])
+def test_noise_that_one_sensor_shares_within_does_not_fail_the_model(snr: float) -> None:
+    """The paper's formula is unbiased for it; motion that differs still fails, next test."""
+    rng = np.random.default_rng(46)
+    csm = random_bench(rng, dims=(3, 3, 3), snr=snr, noise_psd=np.ones(9))
+    csm[3:6, 3:6] += np.outer([1.0, 0.7, 0.5], [1.0, 0.7, 0.5])
+    frequency = np.linspace(1, 20, 40)
+    found = diagnose(
+        wishart(csm, 226, rng, n_draws=40),
+        frequency,
+        dims=(3, 3, 3),
+        n_effective=226,
+        neighbours=np.zeros(0),
+    )
+    assert min(band.test.p_value for band in found.bands) > rejected_below(
+        band.test for band in found.bands
+    )
+    assert not [each for each in found.advice if isinstance(each, ModelMisfit)]
 
 
 def test_incoherence_is_reported_in_its_band() -> None:

@@ -1,0 +1,90 @@
+"""Noise that only the channels of one sensor share: no motion, and no fault of the model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from estimator.likelihood.factor_analysis import Maximum, maximise, n_noise
+from estimator.likelihood.goodness_of_fit import ModelTest, model_test, pool, rejected_below
+from estimator.self_noise.coherency import Coherency, testable
+from estimator.types import BoolArray, ComplexArray, FloatArray
+
+CLEARLY = 10.0
+"""p value of a band beside one sensor's matrix, over that of a band that fails, from which it
+explains the band: motion that differs looks a little like it."""
+ALIKE = 0.5
+"""Correlation of the shared noise with the motion in the sensor, from which it is motion that
+others do not share: what clocks, gaps and waves that differ leave."""
+STEADY = 0.9
+"""Mean of what channels share over its rms, from which it is that of one source."""
+LOOK = 16
+"""Frequencies of a band at which sensors are tried first."""
+
+
+def beside_matrices(
+    model: ModelTest,
+    part: Coherency,
+    frequency: FloatArray,
+    insides: Sequence[BoolArray],
+    *,
+    dims: tuple[int, ...],
+    n_factors: int,
+    n_effective: float,
+    neighbours: FloatArray,
+) -> tuple[ModelTest, BoolArray]:
+    """Return the test with the noise of one sensor as a matrix where that explains a failed band.
+
+    Not of all sensors: motion that differs between three sensors fits matrices of all three. Also
+    returns whether it is such a test, in each of the bands `insides`.
+    """
+    tests = [pool(model, inside, neighbours=neighbours) for inside in insides]
+    rejected = rejected_below(tests)
+    ones = [
+        (*(1,) * sum(dims[:sensor]), d, *(1,) * sum(dims[sensor + 1 :]))
+        for sensor, d in enumerate(dims)
+        if d > 1
+    ]
+    ones = [each for each in ones if (sum(dims) - n_factors) ** 2 > n_noise(each)]
+    widened = np.zeros(len(insides), np.bool_)
+    found = [each.copy() for each in (model.statistic, model.degrees, model.p_value)]
+    for number, test in enumerate(tests if ones else ()):
+        if not test.p_value < rejected:
+            continue
+        rows = np.flatnonzero(insides[number] & np.isfinite(model.statistic))
+        matrix = testable(part.block(rows), frequency[rows])
+        look = matrix[:: -(-len(rows) // LOOK)]
+        least = [np.nansum(maximise(look, n_factors, dims=each).discrepancy) for each in ones]
+        fit = maximise(matrix, n_factors, dims=ones[int(np.argmin(least))])
+        beside = model_test(fit, n_effective=n_effective)
+        every = np.ones(len(rows), np.bool_)
+        explained = pool(beside, every, neighbours=neighbours).p_value >= CLEARLY * rejected
+        if explained and _is_noise(fit, matrix):
+            widened[number] = True
+            for each, values in zip(
+                found, (beside.statistic, beside.degrees, beside.p_value), strict=True
+            ):
+                each[rows] = values
+    return ModelTest(*found), widened
+
+
+def _is_noise(fit: Maximum, matrix: ComplexArray) -> bool:
+    """Return whether what channels of one sensor share is alike at all frequencies, and no motion.
+
+    Clocks, gaps and waves that differ leave a part of the motion, at random from one frequency to
+    the next.
+    """
+    at = np.flatnonzero(np.bincount(fit.sensor)[fit.sensor] > 1)
+    i, j = (at[each] for each in np.triu_indices(len(at), 1))
+    good = ~fit.singular
+    scale = np.sqrt(fit.psi[good][:, i] * fit.psi[good][:, j])
+    noise = fit.noise[good][:, i, j]
+    motion = (matrix[good][:, i, j] - noise) / scale
+    noise = noise / scale
+    size, steady = float(np.linalg.norm(noise)), float(np.linalg.norm(noise.mean(axis=0)))
+    like = float(np.vdot(motion, noise).real)
+    return (
+        like < ALIKE * size * float(np.linalg.norm(motion))
+        and steady * len(noise) ** 0.5 > STEADY * size
+    )
