@@ -13,7 +13,7 @@ from daq.bench.units import conversion
 from daq.errors import WrongSettingError
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
-from daq.estimation.snapshot import RoundedAlike
+from daq.estimation.snapshot import RejectedSegment, RoundedAlike
 from daq.recording.interface import ReadableRecording
 from estimator.checks.counts import shared_rounding
 from estimator.errors import InsufficientDataError
@@ -129,6 +129,17 @@ def _parts(passes: Sequence[Pass]) -> Parts | None:
             for part in of_pass.each
         ]
     return Parts(known[0].bins, tuple(parts))
+
+
+def rejected_segments(passes: Sequence[Pass], bands: Sequence[Band]) -> tuple[RejectedSegment, ...]:
+    """Return the segments of all recordings that these bands leave out for transients."""
+    longest = max((b.settings.segment_length / b.settings.sampling_rate for b in bands), default=0)
+    return tuple(
+        RejectedSegment(begin + later, end + later, column)
+        for later, each in zip(_later(passes), passes, strict=True)
+        for begin, end, column in each.rejected()
+        if end - begin < longest * (1 + 1e-9)
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -138,6 +138,16 @@ class NoSegment:
     longest: float
 
 
+@dataclass(frozen=True, slots=True)
+class RejectedSegment:
+    """A segment that is left out for a transient, the largest of which is in channel `column`."""
+
+    begin: Seconds
+    """From the first grid sample on, as `end`."""
+    end: Seconds
+    column: int
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Bridged:
     """Segments that count though they have gaps.
@@ -259,6 +269,9 @@ class Snapshot:
         of the sensor. Of all recordings together.
     parts : Parts or None
         The same averages in parts of time. Of a finished estimate; None where they are not kept.
+    rejected : tuple of RejectedSegment
+        Segments that all channels have, but that are left out for transients: at most the latest
+        20,000 of a recording or an octave. Of a finished estimate.
     """
 
     frequency: FloatArray
@@ -294,6 +307,7 @@ class Snapshot:
     channel_segments: tuple[int, ...] = ()
     shortened: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     parts: Parts | None = None
+    rejected: tuple[RejectedSegment, ...] = ()
 
     @property
     def sensor_names(self) -> tuple[str, ...]:

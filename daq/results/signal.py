@@ -12,7 +12,7 @@ takes to arrive.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import groupby, pairwise
@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.bench.channel import Channel
+from daq.bench.durations import stretch
 from daq.bench.units import levels_db
 from daq.clocks.arrival_times import ArrivalTimes
 from daq.clocks.clock_model import Clock
@@ -29,11 +30,14 @@ from daq.estimation.noise_estimates import responses
 from daq.estimation.snapshot import Snapshot
 from daq.protocols.block import EventKind
 from daq.recording.extremes import Extremes, extremes_of
-from daq.recording.interface import ReadableRecording, ReadableSensor
+from daq.recording.interface import ReadableRecording, ReadableSensor, created_at
+from daq.results.vocabulary import REASONS
 from estimator.errors import EstimatorError
 from estimator.levels.bands import log_edges
+from estimator.median import median
 from estimator.methods import self_noise
 from estimator.spectra.parts import grouped
+from estimator.spectra.segment_rejection import Reason
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 
 FloatArray = NDArray[np.float64]
@@ -43,12 +47,15 @@ GAP, CLIPPED, EXCLUDED = "gap", "clipped", "excluded"
 """Kinds of marks beside those of events."""
 LEAST_PARTS = 6
 """Parts of time in a span, from which a spectrogram is made of them."""
+STANDS_OUT = 6.0
+"""Decibels."""
 MOST_SAMPLES = 1 << 19
 """Of a channel, of which a spectrogram is made: more take longer than a key may."""
 MOST_ARRIVALS = 1000
 """Arrivals by which the clock of a long recording is known here."""
 AVERAGES = 6
 """Averages that the noise of a part needs for each channel of a sensor."""
+_TOUCHING = 1e-6  # seconds
 _SHORTEST, _LONGEST = 16, 1024
 """Samples of a segment of a spectrogram made of samples."""
 
@@ -99,7 +106,7 @@ class Trace:
 class Mark:
     """Something that happened, from `begin` to `end`, to a sensor or, if empty, to all.
 
-    `kind` is `GAP`, `CLIPPED` or that of an event; `count` is how many are joined.
+    `kind` is `GAP`, `CLIPPED`, `EXCLUDED` or that of an event; `count` is how many are joined.
     """
 
     begin: float
@@ -168,6 +175,21 @@ class Spectrogram:
             return 0.0, 1.0
         low, high = (float(each) for each in np.percentile(known, (2, 99)))
         return low, max(high, low + 1.0)
+
+    @property
+    def loudest(self) -> float:
+        """Frequency of the band that stands out on average, such as that of a hum, in Hz.
+
+        NaN where none is `STANDS_OUT` above half of the others.
+        """
+        known = np.isfinite(self.psd)
+        total = np.sum(self.psd, axis=0, where=known)
+        level = levels_db(total / np.maximum(known.sum(axis=0), 1))
+        some = np.isfinite(level)
+        if not some.any() or level[some].max() - median(level[some]) < STANDS_OUT:
+            return float("nan")
+        band = int(np.flatnonzero(some)[np.argmax(level[some])])
+        return float(np.sqrt(self.frequency[band] * self.frequency[band + 1]))
 
     def grid(
         self, begin: float, end: float, n_columns: int, n_rows: int
@@ -301,8 +323,10 @@ class Signal:
         """Events, gaps, and stretches at the end of the range, in order."""
         return self._marks
 
-    def view(self, begin: float, end: float, n_columns: int) -> Waveforms:
-        """Return a span in columns.
+    def view(
+        self, begin: float, end: float, n_columns: int, besides: Sequence[Mark] = ()
+    ) -> Waveforms:
+        """Return a span in columns, with the marks of the recording and those `besides`.
 
         Raises
         ------
@@ -325,7 +349,7 @@ class Signal:
                         ends.max(axis=0),
                     )
                 )
-        here = [mark for mark in self._marks if mark.begin < end and mark.end >= begin]
+        here = [mark for mark in (*self._marks, *besides) if mark.begin < end and mark.end >= begin]
         return Waveforms(begin, end, tuple(traces), joined(here, (end - begin) / n_columns))
 
     def _all_marks(self) -> Iterable[Mark]:
@@ -346,6 +370,29 @@ class Signal:
                 yield Mark(float(begin), float(end), GAP, name, reason.decode(errors="replace"))
             for begin, end in (self._origin + sensor.at(each.astype(float)) for each in clipped):
                 yield Mark(float(begin), float(end), CLIPPED, name, "at the end of its range")
+
+    def excluded(self, snapshot: Snapshot | None, exclude: Iterable[str] = ()) -> list[Mark]:
+        """Return what an estimate leaves out beside gaps and ends of ranges.
+
+        Parameters
+        ----------
+        snapshot : Snapshot, optional
+            Whose segments with transients are marked, those that overlap as one.
+        exclude : iterable of str
+            Stretches left out by choice, as in its settings.
+        """
+        text, created = REASONS[Reason.CHOSEN], created_at(self.recording)
+        ends = (stretch(each, created) for each in exclude)
+        chosen = [Mark(a.timestamp(), b.timestamp(), EXCLUDED, text=text) for a, b in ends]
+        if snapshot is None:
+            return chosen
+        origin, text = snapshot.start_utc_ns * 1e-9, f"{REASONS[Reason.TRANSIENT]} (--reject)"
+        rejected = (
+            Mark(origin + each.begin, origin + each.end, EXCLUDED, channel.sensor, text)
+            for each in snapshot.rejected
+            for channel in [snapshot.channels[each.column]]
+        )
+        return [*chosen, *joined(rejected, _TOUCHING)]
 
     def channel(self, number: int) -> tuple[str, Channel]:
         """Return the sensor and the channel of a trace."""

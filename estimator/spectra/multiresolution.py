@@ -160,6 +160,25 @@ class MultiResolution:
         for own, added in zip(self._stages, other._stages, strict=True):
             own.merge(added, later=later, run=run)
 
+    def rejected(self) -> list[tuple[int, int, int]]:
+        """Return which samples the segments with transients have, and in which channel these are.
+
+        Returns
+        -------
+        list of (int, int, int)
+            First sample, the one after the last, and the channel, of each stage in turn.
+        """
+        found = []
+        for level, stage in enumerate(self._stages):
+            size, late = 2**level, TAPS // 2 * (2**level - 1)
+            hop, length = stage.settings.hop, stage.settings.segment_length
+            found += [
+                (begin - late, begin - late + length * size, channel)
+                for number, channel in stage.rejected()
+                for begin in [number * hop * size]
+            ]
+        return found
+
     @property
     def sets(self) -> ChannelSets:
         """Segments of the top stage that only some channels have."""
@@ -293,6 +312,11 @@ class _Stage:
         transient = self.judged - self.total().n_segments + disturbed
         return Counter({Reason.GAP: self.incomplete - disturbed, Reason.TRANSIENT: transient})
 
+    def rejected(self) -> list[tuple[int, int]]:
+        """Return numbers of the segments with transients, and the channel with the largest."""
+        found = () if self._undisturbed is None else self._undisturbed.all_rejected()
+        return [(each.segment, each.channel) for each in found if each.channel is not None]
+
     def _own_parts(self) -> tuple[Part, ...]:
         """Return the averages of the accepted segments in parts of time."""
         return self._parts or self.total().parts(self._n_seen)
@@ -336,8 +360,12 @@ class _Stage:
         self.incomplete += n - int(whole.sum())
         self.judged += int(whole.sum())
         sums = self._spectra if self._undisturbed is None else self._undisturbed
-        for part in by_part(sums, self._n_seen + np.flatnonzero(whole)):
-            sums.add(self._samples, starts[whole][part])
+        places = self._n_seen + np.flatnonzero(whole)
+        for part in by_part(sums, places):
+            if isinstance(sums, SelectedSpectra):
+                sums.add(self._samples, starts[whole][part], numbers=places[part])
+            else:
+                sums.add(self._samples, starts[whole][part])
         self._n_seen += n
         self._total = None
         if not whole.all():

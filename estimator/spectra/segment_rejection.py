@@ -37,7 +37,7 @@ FLATLINE_SAMPLES = 32  # consecutive equal samples of a dead channel
 LONGER = 2.0  # ratio to the usual time for channels that are often constant, at threshold 6
 MIN_FOR_MEDIAN = 5  # minimum number of segments for a median
 SEGMENTS_PER_BLOCK = 32
-REPORTED = 1000  # maximum number of excluded segments kept individually
+REPORTED = 20_000  # maximum number of excluded segments kept individually
 
 
 class Reason(enum.StrEnum):
@@ -93,7 +93,7 @@ class Rejected:
     Attributes
     ----------
     segment : int
-        Index of the segment, from 0, in the order of addition.
+        Its number, by default from 0 in the order of addition.
     reason : Reason
     channel : int or None
         The channel with the largest deviation; None for a gap.
@@ -166,7 +166,14 @@ class SelectedSpectra:
         self._since_renewal = 0
         self._in_a_row = 0
 
-    def add(self, samples: FloatArray, starts: IntArray, complete: BoolArray | None = None) -> None:
+    def add(
+        self,
+        samples: FloatArray,
+        starts: IntArray,
+        complete: BoolArray | None = None,
+        *,
+        numbers: IntArray | None = None,
+    ) -> None:
         """Test the segments of `samples` that begin at `starts`, and add the accepted ones.
 
         Parameters
@@ -177,6 +184,8 @@ class SelectedSpectra:
             In order of time.
         complete : bool, shape (n_samples,), optional
             False if any sensor has a gap.
+        numbers : int64, shape (n_segments,), optional
+            By which excluded segments are known; default: how many were tested before.
 
         Raises
         ------
@@ -185,14 +194,19 @@ class SelectedSpectra:
         """
         starts = np.asarray(starts, dtype=np.int64)
         self._accepted.check(samples, starts)
+        if numbers is None:
+            numbers = self.n_segments + np.arange(len(starts))
+        self.n_segments += len(starts)
         passed = []
         for first in range(0, len(starts), SEGMENTS_PER_BLOCK):
-            rows = starts[first : first + SEGMENTS_PER_BLOCK]
-            for row, levels in zip(rows, self._levels(samples, rows), strict=True):
+            some = slice(first, first + SEGMENTS_PER_BLOCK)
+            tested = zip(starts[some], numbers[some], strict=True)
+            levels_of = self._levels(samples, starts[some])
+            for (row, number), levels in zip(tested, levels_of, strict=True):
                 stretch = slice(row, row + self.settings.segment_length)
                 whole = bool(np.isfinite(levels).all())
                 whole &= complete is None or bool(complete[stretch].all())
-                if self._passes(samples[stretch], levels, whole=whole):
+                if self._passes(int(number), samples[stretch], levels, whole=whole):
                     passed.append(row)
         self._accepted.add(samples, np.array(passed, dtype=np.int64))
 
@@ -206,6 +220,10 @@ class SelectedSpectra:
         for held in self._agreeing(self._held)[0]:
             total.add(held.samples, np.zeros(1, dtype=np.int64))
         return total
+
+    def all_rejected(self) -> list[Rejected]:
+        """Return the latest excluded segments, and those held back that do not agree."""
+        return [*self.rejected, *self._agreeing(self._held)[1]]
 
     @property
     def ends(self) -> PartEnds | None:
@@ -245,8 +263,7 @@ class SelectedSpectra:
         levels = np.concatenate([power, step**2, still[:, None]], axis=1)
         return np.asarray(np.log(np.maximum(levels, np.finfo(np.float64).tiny)))
 
-    def _passes(self, segment: FloatArray, levels: FloatArray, *, whole: bool) -> bool:
-        number, self.n_segments = self.n_segments, self.n_segments + 1
+    def _passes(self, number: int, segment: FloatArray, levels: FloatArray, *, whole: bool) -> bool:
         if not whole:
             self._leave_out(Rejected(number, Reason.GAP, None, np.nan))
             return False

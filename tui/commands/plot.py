@@ -45,8 +45,8 @@ def plot(
     width : MM
         Width of the figure in mm.
     signal
-        Draw the waveforms of all channels with marks, events and gaps, and spectrograms of the
-        recorded PSD and of the noise, from --start to --end.
+        Draw the waveforms of all channels with marks, events, gaps and excluded segments, and
+        spectrograms of the recorded PSD and of the noise, from --start to --end.
     sensors
         Draw how the sensors stand: the axes of each (rotation, lean, polarity), and the coherence
         of all pairs.
@@ -109,10 +109,10 @@ def _plot_signal(
     except EstimatorError:
         pass
     with Recording.open(files[0]) as recording, notices().status("drawing"):
-        settings = settings_of(recording, start=start, end=end)
+        settings = settings_of(recording, start=start, end=end, **wanted)
         signal = Signal(recording)
         ends = zip((settings.start, settings.end), signal.span, strict=True)
         begin, last = (each if given is None else given.timestamp() for given, each in ends)
-        plots = signal_plots(signal, snapshot, (begin, last))
+        plots = signal_plots(signal, snapshot, (begin, last), settings.exclude)
         write_plots(plots, out, width=width, title=f"{files[0].name} against time")
     console().print(f"{out} written", soft_wrap=True)

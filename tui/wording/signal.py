@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from datetime import UTC, datetime, time
 
-from daq.results.signal import CLIPPED, EXCLUDED, GAP, Mark, Trace, Waveforms
+from daq.results.signal import CLIPPED, EXCLUDED, GAP, Mark, Spectrogram, Trace, Waveforms
 from tui.wording.formatting import readings
 
 STEPS = (
@@ -16,7 +16,7 @@ STEPS = (
     *(3600.0 * s for s in (1, 2, 3, 6, 12)),
 )
 """Seconds between ticks of time; beyond them whole days."""
-_DAY = 86400.0
+DAY = 86400.0
 SIGNS = {"mark": "▼", GAP: "░", CLIPPED: "▲", EXCLUDED: "╳"}
 """Signs of marks; of all other kinds `EVENT`."""
 EVENT = "◆"
@@ -25,14 +25,14 @@ EVENT = "◆"
 def time_ticks(begin: float, end: float, most: int) -> list[tuple[float, str]]:
     """Return at most so many round times between two, UTC in s since 1970, with their labels."""
     least = (end - begin) / max(most, 1)
-    step = next((each for each in STEPS if each >= least), _DAY * math.ceil(least / _DAY))
+    step = next((each for each in STEPS if each >= least), DAY * math.ceil(least / DAY))
     first = math.ceil(begin / step - 1e-9)
     return [(n * step, _label(n * step, step)) for n in range(first, math.floor(end / step) + 1)]
 
 
 def _label(at: float, step: float) -> str:
     of = datetime.fromtimestamp(round(at, 3), UTC)
-    if step >= _DAY:
+    if step >= DAY:
         return f"{of:%m-%d}"
     if step >= 60:
         return f"{of:%H:%M}"
@@ -59,8 +59,25 @@ def time_of(text: str, near: float, whole: tuple[float, float]) -> float | None:
             at = datetime.combine(day, time.fromisoformat(text.strip()), UTC).timestamp()
         except ValueError:
             return None
-        at = next((each for each in (at, at + _DAY, at - _DAY) if begin <= each <= end), at)
+        at = next((each for each in (at, at + DAY, at - DAY) if begin <= each <= end), at)
     return at if begin <= at <= end else None
+
+
+def stretch_text(begin: float, end: float) -> str:
+    """Return a stretch between times of UTC in s, as the option --exclude takes it."""
+    return "/".join(datetime.fromtimestamp(at, UTC).isoformat() for at in (begin, end))
+
+
+def scale(found: Spectrogram) -> str:
+    """Return the levels that the colours of a spectrogram show."""
+    low, high = found.range_db
+    return f"{low:.0f} to {high:.0f} dB re 1 ({found.unit})²/Hz".replace("-", "−")
+
+
+def loudest(found: Spectrogram) -> str:
+    """Return where a spectrogram is loudest; empty where no frequency stands out."""
+    at = float(f"{found.loudest:.2g}")
+    return f", most near {at:g} Hz" if math.isfinite(at) else ""
 
 
 def title(view: Waveforms) -> str:

@@ -265,6 +265,27 @@ class Pass:
             self._selected = self._undisturbed.spectra()
         return self._selected
 
+    def rejected(self) -> list[tuple[float, float, int]]:
+        """Return the segments with transients that are left out for all channels.
+
+        Returns
+        -------
+        list of (float, float, int)
+            Begin and end in s from the first grid sample, and the column of the largest transient.
+        """
+        hop, length = self.welch.hop, self.welch.segment_length
+        found = [] if self.octaves is None else self.octaves.rejected()
+        if self._undisturbed is not None:
+            found = [
+                (each.segment * hop, each.segment * hop + length, each.channel)
+                for each in self._undisturbed.all_rejected()
+                if each.channel is not None
+            ]
+        per_s, reach = self.welch.sampling_rate, self.reach
+        return [
+            ((begin + reach) / per_s, (end + reach) / per_s, column) for begin, end, column in found
+        ]
+
     @property
     def parts(self) -> Parts | None:
         """Averages in parts of time; None where they are not kept, or do not hold all segments."""
@@ -534,8 +555,12 @@ class Pass:
         `first` is the grid sample of row 0.
         """
         sums = self._all if self._undisturbed is None else self._undisturbed
-        for some in by_part(sums, (first + starts - self.reach) // self.welch.hop):
-            sums.add(samples, starts[some])
+        places = (first + starts - self.reach) // self.welch.hop
+        for some in by_part(sums, places):
+            if isinstance(sums, SelectedSpectra):
+                sums.add(samples, starts[some], numbers=places[some])
+            else:
+                sums.add(samples, starts[some])
         self._kept_at.add(first + starts)
         self._selected = None
 

@@ -13,7 +13,8 @@ from daq.formats.arrays import recording_of_arrays
 from daq.protocols.block import Event, HostTime
 from daq.recording.reader import Recording
 from daq.results import signal as signals
-from daq.results.signal import CLIPPED, GAP, Mark, Signal, Trace, joined
+from daq.results.signal import CLIPPED, EXCLUDED, GAP, Mark, Signal, Trace, joined
+from estimator.spectra.segment_rejection import Reason
 from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, create
 
 START = ORIGIN.utc_ns * 1e-9
@@ -118,6 +119,7 @@ def test_a_spectrogram_of_the_noise_shows_which_sensor_hums_and_when() -> None:
         half = len(level) // 2
         rise = np.nanmean(level[half + 1 :]) - np.nanmean(level[: half - 1])
         assert (rise > 6) == hums
+        assert found.loudest == pytest.approx(20 if hums else float("nan"), rel=0.1, nan_ok=True)
         white = 10 * np.log10(2 / RATE)
         assert np.nanmedian(found.level_db) == pytest.approx(white, abs=1)
 
@@ -146,3 +148,27 @@ def test_a_spectrogram_of_samples_leaves_out_what_a_gap_breaks(path: Path) -> No
     unknown = np.flatnonzero(np.isnan(found.psd).all(axis=1))
     assert {25, 30, 34} <= set(unknown.tolist())
     assert not {10, 50} & set(unknown.tolist())
+
+
+@pytest.mark.parametrize("octaves", [False, True])
+def test_segments_with_transients_are_marked_where_they_are(octaves: bool) -> None:
+    """Every one that is counted: with octaves, also the longer segments of lower ones."""
+    samples = humming()
+    lorry = slice(30_000, 30_500)
+    samples["B"][lorry, 0] += 400 * np.sin(2 * np.pi * 0.05 * np.arange(500))
+    recording = recording_of_arrays(samples, RATE)
+    settings = Settings(segment=2.0, clocks="nominal", reject=True, octaves=octaves)
+    snapshot = estimate([recording], settings)
+    counts = [each.left_out for each in snapshot.octaves] or [snapshot.left_out]
+    assert len(snapshot.rejected) == sum(each.get(Reason.TRANSIENT, 0) for each in counts) > 2
+    signal = Signal(recording)
+    begin = snapshot.start_utc_ns * 1e-9
+    marks = signal.excluded(snapshot, ("0s/20s",))
+    assert (marks[0].begin - begin, marks[0].end - begin) == pytest.approx((0, 20), abs=0.01)
+    rejected = [mark for mark in marks[1:] if mark.sensor == "B"]
+    assert min(mark.begin for mark in rejected) - begin <= 300
+    assert max(mark.end for mark in rejected) - begin >= 305
+    if not octaves:
+        assert all(295 < mark.begin - begin < mark.end - begin < 310 for mark in rejected)
+    found = signal.view(*signal.span, 600, marks).marks
+    assert sum(mark.count for mark in found if mark.kind == EXCLUDED) == 1 + len(snapshot.rejected)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from rich.text import Text
@@ -10,7 +10,17 @@ from rich.text import Text
 from daq.results.signal import EXCLUDED, Mark, Spectrogram, Waveforms
 from estimator.types import FloatArray, IntArray
 from tui.application.test_view.braille import cells
-from tui.wording.signal import extent, moment, most_first, sign, time_ticks, title, words
+from tui.wording.signal import (
+    extent,
+    loudest,
+    moment,
+    most_first,
+    scale,
+    sign,
+    time_ticks,
+    title,
+    words,
+)
 
 MUTED, CHOSEN, PLAIN, BAD = "#9aa5b8", "#4cc9f0", "#c5cedb", "bold #ff6b6b"
 CURSOR = "on #26324a"
@@ -70,6 +80,8 @@ class Drawn:
     waves: Waveforms
     spectrum: Spectrogram | None = None
     why: str = ""
+    of: tuple[str, int] = ("", 0)
+    """What the look has for spectrum and channel."""
 
 
 def name_width(waves: Waveforms) -> int:
@@ -80,6 +92,8 @@ def name_width(waves: Waveforms) -> int:
 
 def picture(drawn: Drawn, look: Look, width: int, height: int) -> Text:
     """Return a picture of so many cells."""
+    if drawn.of != (look.spectrum, look.channel):
+        drawn = replace(drawn, spectrum=None, why="drawing …")
     waves, left = drawn.waves, name_width(drawn.waves)
     columns, rows = width - left, max(1, height - BESIDE)
     body = (
@@ -113,9 +127,9 @@ def _title(drawn: Drawn, look: Look, width: int) -> Text:
         if drawn.spectrum is None:
             text.append(f": {drawn.why}", MUTED)
         else:
-            low, high = drawn.spectrum.range_db
-            scale = f"  {low:.0f} to {high:.0f} dB re 1 ({drawn.spectrum.unit})²/Hz"
-            text.append(scale.replace("-", "−"), MUTED)
+            text.append(f"  {scale(drawn.spectrum)}", MUTED)
+            if text.cell_len + len(most := loudest(drawn.spectrum)) <= width:
+                text.append(most, CHOSEN)
     text.truncate(width, overflow="ellipsis")
     return text
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, ClassVar
 
 from rich.text import Text
@@ -30,9 +29,10 @@ from tui.application.signal_view.picture import (
 )
 from tui.application.state import SIGNAL, State
 from tui.application.view import MUTED, View
-from tui.wording.signal import time_of
+from tui.wording.signal import stretch_text, time_of
 
 if TYPE_CHECKING:
+    from datetime import datetime
     from pathlib import Path
 
     from textual.app import ComposeResult
@@ -209,10 +209,13 @@ class SignalView(View):
                     made.note = "reading …"
                 else:
                     made.whole, made.created = signal.span, created_at(signal.recording)
-                    made.marks = tuple(m.begin for m in signal.marks if m.end >= made.whole[0])
+                    rejected = signal.excluded(snapshot)
+                    marks = sorted((*signal.marks, *rejected), key=lambda mark: mark.begin)
+                    made.marks = tuple(m.begin for m in marks if m.end >= made.whole[0])
                     span = made.whole if look.span is None else fitting(look.span, made.whole)
                     width, height = self._room
-                    waves = signal.view(*span, 2 * (width - name_width(signal.view(*span, 1))))
+                    columns = 2 * (width - name_width(signal.view(*span, 1)))
+                    waves = signal.view(*span, columns, rejected)
                     spectrum = None
                     if look.spectrum and waves.traces:
                         spectrum = signal.spectrogram(
@@ -223,7 +226,8 @@ class SignalView(View):
                             snapshot=snapshot,
                             noise=look.spectrum == NOISE,
                         )
-                    made.drawn = Drawn(waves, spectrum, NOT_YET if snapshot is None else NONE)
+                    why = NOT_YET if snapshot is None else NONE
+                    made.drawn = Drawn(waves, spectrum, why, (look.spectrum, look.channel))
         except (HuddleError, OSError) as error:
             made.note = str(error)
         self.post_message(made)
@@ -324,7 +328,7 @@ class SignalView(View):
         settings = result.settings
         changes = {name: getattr(settings, name) for name in FIELDS if name != "methods"}
         self._change(excluded=chosen, begun=None)
-        changes |= excluding([_text(*each) for each in chosen])
+        changes |= excluding([stretch_text(*each) for each in chosen])
         self.post_message(OpeningRequested(path, changes, SIGNAL))
 
     def action_mark(self, step: int = 1) -> None:
@@ -407,9 +411,3 @@ class SignalView(View):
         self.capture_mouse(capture=False)
         if not self._has_moved:
             self._change(cursor=self._time_at(event.screen_x))
-
-
-def _text(begin: float, end: float) -> str:
-    """Return a stretch between times of UTC in s, as the option takes it."""
-    ends = (datetime.fromtimestamp(at, UTC).isoformat() for at in (begin, end))
-    return "/".join(ends)

@@ -11,29 +11,37 @@ import numpy as np
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from daq.protocols.block import EventKind
-from daq.results.signal import CLIPPED, GAP, Mark, Signal, Spectrogram, Trace, Waveforms
+from daq.results.signal import CLIPPED, EXCLUDED, GAP, Mark, Signal, Spectrogram, Trace, Waveforms
 from tui.report.figures import drawing
 from tui.report.parts import Plot
 from tui.wording.signal import extent, moment, time_ticks, title
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from matplotlib.axes import Axes
 
     from daq.estimation.snapshot import Snapshot
 
 COLUMNS, TIMES, BANDS, TICKS = 1200, 160, 60, 6
+COARSE = 24, 30
+"""Times and bands on a page: no picture is in it."""
 TRACE_HEIGHT, SPECTRUM_HEIGHT = 0.36, 0.7
 """Of each waveform and each spectrogram, in inches."""
-_COLOURS = {GAP: drawing.LIMIT, CLIPPED: drawing.LINES[1]}
+MOST_HEIGHT = 8.0
+"""Of all waveforms: they fit on a page."""
+_COLOURS = {GAP: drawing.LIMIT, CLIPPED: drawing.LINES[1], EXCLUDED: drawing.INK}
 _MOST_REMARKS = 12
 _CYCLE = 0.42
 """Half height of a waveform, of the distance from one to the next."""
 
 
 def signal_plots(
-    signal: Signal, snapshot: Snapshot | None, span: tuple[float, float] | None = None
+    signal: Signal,
+    snapshot: Snapshot | None,
+    span: tuple[float, float] | None = None,
+    exclude: Sequence[str] = (),
+    most_spectra: int | None = None,
 ) -> list[Plot]:
     """Return waveforms with marks, then the PSD of every channel and of its noise by time.
 
@@ -44,6 +52,10 @@ def signal_plots(
         Without it there are no spectrograms of longer recordings, nor of the noise.
     span : (float, float), optional
         UTC in s since 1970; default: all.
+    exclude : sequence of str
+        Stretches that the settings of the estimate leave out.
+    most_spectra : int, optional
+        Channels that have spectrograms, coarse ones without a picture in them; default: all.
 
     Raises
     ------
@@ -51,15 +63,18 @@ def signal_plots(
         If the file is damaged.
     """
     begin, end = span or signal.span
-    view = signal.view(begin, end, COLUMNS)
-    height = TRACE_HEIGHT * (len(view.traces) + 0.7)
+    view = signal.view(begin, end, COLUMNS, signal.excluded(snapshot, exclude))
+    height = min(TRACE_HEIGHT * (len(view.traces) + 0.7), MOST_HEIGHT)
     alt = f"Waveforms of {len(view.traces)} channels, {title(view)}"
     draw = partial(_draw_waveforms, view)
     recorded = "Recorded, simulated" if signal.recording.simulated else "Recorded"
     plots = [Plot(f"{recorded}, {title(view)}", (draw,), 1, height, alt)]
-    for number, trace in enumerate(view.traces):
-        if not trace.is_auxiliary:
-            plots.extend(_spectra(signal, snapshot, number, trace, (begin, end)))
+    main = [(n, trace) for n, trace in enumerate(view.traces) if not trace.is_auxiliary]
+    for number, trace in main[:most_spectra]:
+        found = _spectra(
+            signal, snapshot, number, trace, (begin, end), is_fine=most_spectra is None
+        )
+        plots.extend(found)
     return plots
 
 
@@ -69,12 +84,15 @@ def _spectra(
     number: int,
     trace: Trace,
     span: tuple[float, float],
+    *,
+    is_fine: bool,
 ) -> Iterator[Plot]:
     panels = []
     for noise, name in ((False, "recorded"), (True, "noise")):
-        found = signal.spectrogram(number, span, TIMES, BANDS, snapshot=snapshot, noise=noise)
+        n_times, n_bands = (TIMES, BANDS) if is_fine else COARSE
+        found = signal.spectrogram(number, span, n_times, n_bands, snapshot=snapshot, noise=noise)
         if found is not None:
-            panels.append(_Spectrum(found, span, f"{trace.name}, {name}"))
+            panels.append(_Spectrum(found, span, f"{trace.name}, {name}", is_fine))
     if panels:
         alt = f"Power spectral density of {trace.name} against time and frequency"
         yield Plot("", tuple(panels), 2, SPECTRUM_HEIGHT, alt, titled=True)
@@ -133,6 +151,7 @@ class _Spectrum:
     found: Spectrogram
     span: tuple[float, float]
     name: str
+    is_fine: bool
 
     def __call__(self, axes: Axes) -> None:
         found, (low, high) = self.found, self.found.range_db
@@ -144,7 +163,7 @@ class _Spectrum:
             cmap="viridis",
             vmin=low,
             vmax=high,
-            rasterized=True,
+            rasterized=self.is_fine,
         )
         axes.grid(visible=False)
         ends = np.log10(found.frequency[[0, -1]])
