@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +12,7 @@ from rich.text import Text
 
 from daq.results.standing import PairCoherence, Stance, pair_coherence, stances
 from estimator.wording import listed, signed
+from tui.page import table as page
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -71,7 +73,7 @@ def remark(stance: Stance) -> str:
         return "not known"
     parts = []
     if math.isfinite(stance.turn_deg):
-        parts.append(f"turned {signed(stance.turn_deg, '.1f')}°")
+        parts.append(f"turned {signed(round(stance.turn_deg, 1) + 0.0, '.1f')}°")
     if math.isfinite(stance.lean_deg):
         parts.append(f"leans {stance.lean_deg:.1f}°")
     if stance.is_upside_down:
@@ -80,6 +82,45 @@ def remark(stance: Stance) -> str:
         names = [stance.channels[each] for each in stance.reversed_channels]
         parts.append(f"reversed {' '.join(names)}")
     return ", ".join(parts) or "same polarity"
+
+
+@dataclass(frozen=True, slots=True)
+class Arrow:
+    """An axis of a sensor in a drawing: how far right, up and towards the viewer it points."""
+
+    right: float
+    up: float
+    out: float
+    channel: str
+    is_reversed: bool
+
+    @property
+    def is_end_on(self) -> bool:
+        """Whether it points more at the viewer, or away, than along the drawing."""
+        return abs(self.out) > math.hypot(self.right, self.up)
+
+
+def arrows(stance: Stance) -> list[Arrow]:
+    """Return the axes of a sensor; none of one that could not be compared."""
+    axes = stance.directions[:, list(stance.order)] if stance.is_known else ()
+    found = []
+    for number, axis in enumerate(axes):
+        right, up, out = [*axis.tolist(), 0.0, 0.0][:3]
+        is_reversed = number in stance.reversed_channels
+        found.append(Arrow(right, up, out, stance.channels[number], is_reversed))
+    return found
+
+
+def coherence_table(result: Result) -> page.Table | None:
+    """Return the mean coherence of all pairs over the band; None where none is known."""
+    found, names = pair_coherence(result), result.snapshot.sensor_names
+    if found is None:
+        return None
+    rows = (
+        (name, *("" if n == row else _shown(float(value)) for n, value in enumerate(values)))
+        for row, (name, values) in enumerate(zip(names, found.matrix, strict=True))
+    )
+    return page.Table(("sensor", *names), tuple(rows))
 
 
 def _row(found: Sequence[Stance]) -> Table:
@@ -100,11 +141,10 @@ def sketch(stance: Stance) -> list[str]:
         rows[down][across] = "?"
         return ["".join(row) for row in rows]
     rows[down][across] = "+"
-    for number, axis in enumerate(stance.directions[:, list(stance.order)]):
-        right, up, out = [*axis.tolist(), 0.0, 0.0][:3]
-        letter = stance.channels[number][-1:]
-        if math.hypot(right, up) <= _SMALL and len(axis) == 3:
-            rows[down][across] = "⊙" if out > 0 else "⊗"
+    for arrow in arrows(stance):
+        right, up, letter = arrow.right, arrow.up, arrow.channel[-1:]
+        if math.hypot(right, up) <= _SMALL and arrow.is_end_on:
+            rows[down][across] = "⊙" if arrow.out > 0 else "⊗"
             rows[down + 1][across + 1] = letter
             continue
         for step in range(1, 2 * down + 1):

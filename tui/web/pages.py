@@ -6,9 +6,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from daq.results.comparison import compare
+from daq.results.result import Result
+from daq.results.standing import stances
+from estimator.wording import span
 from tui.application.result_view.result_text import difference_cell
 from tui.application.state import State
 from tui.application.test_view.channels import channel_table
+from tui.output.standing import arrows, caption, coherence_table, remark
 from tui.page.table import Table
 from tui.web.chart import choice_of
 from tui.web.live import WIDE, band_means, of_band
@@ -47,6 +51,17 @@ def about_test(state: State, settings_table: Mapping[str, Any]) -> dict[str, Any
     }
 
 
+def how_sensors_stand(result: Result) -> dict[str, Any]:
+    """Return what a page shows of the axes of sensors, and of the coherence of pairs."""
+    found = stances(result.snapshot)
+    return {
+        "stances": [(each.name, remark(each), arrows(each)) for each in found],
+        "stances_caption": caption(found) if found else "",
+        "coherence": coherence_table(result),
+        "coherence_band": span(*result.band),
+    }
+
+
 def _differences(state: State) -> Table | None:
     """Return by how much the noise of each channel differs from that of the other test."""
     if state.reference is None or state.result is None:
@@ -60,7 +75,7 @@ def _differences(state: State) -> Table | None:
 
 def _value(value: object) -> str:
     if isinstance(value, list):
-        return ", ".join(map(_value, value))
+        return ", ".join(map(_value, value)) or "–"
     if isinstance(value, dict):
         parts = (f"{name} {_value(each)}".strip() for name, each in value.items())
         return ", ".join(parts) or "–"

@@ -28,6 +28,7 @@ import uvicorn
 from markupsafe import Markup
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import QueryParams
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import HTMLResponse, RedirectResponse, Response, StreamingResponse
@@ -62,9 +63,9 @@ from tui.web.connections import Connections, most_connections
 from tui.web.html import page
 from tui.web.live import Live
 from tui.web.months import Months
-from tui.web.pages import about_test
+from tui.web.pages import about_test, how_sensors_stand
 from tui.web.signal import Look, Opened, drawn, steps
-from tui.web.tests import PAGE, NoSuchTestError, Tests, compared, content_of
+from tui.web.tests import PAGE, NoSuchTestError, Tests, compared, content_of, exclude_of
 from tui.web.work import TooMuchWorkError, Work
 from tui.wording.verdict_text import WORDS
 
@@ -463,18 +464,32 @@ class Server:
         )
 
     async def _state(self, request: Request) -> State:
-        """Return the test that a request names, beside another one if it names two."""
-        asked = [request.path_params["name"]]
+        """Return the test that a request names, beside another one if it names two.
+
+        The first one without the stretches that the request leaves out.
+
+        Raises
+        ------
+        HTTPException
+            If one of these is no stretch of time.
+        """
+        try:
+            exclude = exclude_of(request.query_params)
+        except ValueError as error:
+            raise HTTPException(HTTPStatus.BAD_REQUEST, str(error)) from None
+        state = await self._estimated(request, request.path_params["name"], exclude)
         if other := request.query_params.get("with"):
-            asked.append(other)
-        known: list[State] = []
-        for name in asked:
-            key = await run_in_threadpool(self._tests.key_of, name)
-            made = await self._made(
-                request, self._tests.work, key, partial(self._tests.estimate, key[0]), PATIENCE
-            )
-            known.append(made)
-        return known[0] if len(known) == 1 else compared(known[0], known[1])
+            return compared(state, await self._estimated(request, other, None))
+        return state
+
+    async def _estimated(
+        self, request: Request, name: str, exclude: tuple[str, ...] | None
+    ) -> State:
+        """Return a test without some stretches; None: those that its settings leave out."""
+        key = await run_in_threadpool(self._tests.key_of, name)
+        act = partial(self._tests.estimate, key[0], exclude)
+        state: State = await self._made(request, self._tests.work, (key, exclude), act, PATIENCE)
+        return state
 
     async def _made(
         self,
@@ -518,7 +533,8 @@ class Server:
         state = await self._state(request)
         key = await run_in_threadpool(self._tests.key_of, request.path_params["name"])
         act = partial(self._tests.report, state, kind)
-        return state, await self._made(request, self._tests.work, (kind, key), act)
+        chosen = None if state.result is None else state.result.settings.exclude
+        return state, await self._made(request, self._tests.work, (kind, key, chosen), act)
 
     async def _later(self, request: Request, _: Exception) -> Response:
         text = "The estimate is being made. This page shows it as soon as it is there."
@@ -527,11 +543,13 @@ class Server:
     async def _test(self, request: Request) -> Response:
         state = await self._state(request)
         about = await run_in_threadpool(_chart, state, request.query_params)
-        document, certificates, problem = await self._made(
-            request,
-            self._tests.reading,
-            None,
-            lambda: (self._tests.document(state), *self._certificates(state)),
+
+        def read() -> tuple[Any, ...]:
+            standing = {} if state.result is None else how_sensors_stand(state.result)
+            return self._tests.document(state), *self._certificates(state), standing
+
+        document, certificates, problem, standing = await self._made(
+            request, self._tests.reading, None, read
         )
         listed = await run_in_threadpool(self._tests.listed)
         name = request.path_params["name"]
@@ -545,12 +563,15 @@ class Server:
             "test",
             **about_test(state, document["settings"]),
             **about,
+            **standing,
             base=f"/tests/{quote(name)}",
             averages=averages_line(state.snapshot) if state.snapshot is not None else "",
             certificates=certificates,
             problem=problem,
             others=others,
             other=request.query_params.get("with", ""),
+            excluded=(chosen := request.query_params.getlist("exclude")),
+            query="?" * bool(chosen) + urlencode([("exclude", each) for each in chosen]),
         )
 
     def _certificates(self, state: State) -> tuple[list[tuple[Entry, Path]], str]:
@@ -567,7 +588,7 @@ class Server:
             return Response("the estimate is being made", HTTPStatus.SERVICE_UNAVAILABLE)
         return await self._curves(state, request.query_params)
 
-    async def _looked(self, request: Request, asked: Mapping[str, str]) -> dict[str, Any]:
+    async def _looked(self, request: Request, asked: QueryParams) -> dict[str, Any]:
         """Return what is asked to be seen of a recording against time.
 
         Raises
@@ -578,27 +599,32 @@ class Server:
         key = await run_in_threadpool(self._tests.key_of, request.path_params["name"])
         act = partial(Opened.of, key[0])
         opened = await self._made(request, self._tests.work, ("signal", key), act, PATIENCE)
-        look = Look.of(opened.signal, asked)
+        look = Look.of(opened, asked)
         snapshot = None
-        if look.spectrum:
-            snapshot = (await self._state(request)).snapshot
-        found = await run_in_threadpool(drawn, opened, look, snapshot)
-        return {**found, "is_simulated": opened.signal.recording.simulated}
+        if look.spectrum or look.exclude or look.is_changed or opened.settings.reject:
+            name, chosen = request.path_params["name"], look.exclude if look.is_changed else None
+            snapshot = (await self._estimated(request, name, chosen)).snapshot
+        return await run_in_threadpool(drawn, opened, look, snapshot)
 
     async def _signal(self, request: Request) -> Response:
-        problem = ""
-        try:
-            about = await self._looked(request, request.query_params)
-        except (ValueError, OverflowError, IndexError) as error:
-            problem, about = str(error), await self._looked(request, {})
+        problem, given = "", request.query_params
+        kept = QueryParams([("exclude", each) for each in given.getlist("exclude")])
+        for asked in (given, kept, QueryParams()):
+            try:
+                about = await self._looked(request, asked)
+                break
+            except (ValueError, OverflowError, IndexError) as error:
+                problem = problem or str(error)
         name = request.path_params["name"]
+        look = about["look"]
         return self._page(
             request,
             "signal",
             title=f"{name.removesuffix('.h5')}, signal",
             test=name.removesuffix(".h5"),
             base=f"/tests/{quote(name)}",
-            steps=steps(about["look"].span, about["whole"]),
+            steps=steps(look, about["whole"]),
+            query="?" * look.is_changed + urlencode(look.query),
             problem=problem,
             **about,
         )

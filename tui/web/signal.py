@@ -7,21 +7,39 @@ import math
 import struct
 import threading
 import zlib
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlencode
 
 import numpy as np
 from markupsafe import Markup
+from starlette.datastructures import QueryParams
 
+from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Snapshot
 from daq.recording.reader import Recording
 from daq.results.signal import Signal, Spectrogram, Waveforms, fitting, panned, zoomed
 from estimator.types import FloatArray
+from tui.output.results import averages_line
+from tui.runs.estimate_settings import settings_for
 from tui.web.html import page
+from tui.web.tests import exclude_of
 from tui.web.work import check_wanted
-from tui.wording.signal import extent, most_first, sign, time_of, time_ticks, title, words
+from tui.wording.signal import (
+    DAY,
+    extent,
+    loudest,
+    most_first,
+    scale,
+    sign,
+    stretch_text,
+    time_of,
+    time_ticks,
+    title,
+    words,
+)
 
 WIDTH, LEFT, ROW, TOP, LANE, AXIS = 1000, 110, 44, 6, 18, 24
 """Of a picture in its own units: width, room for names, height of a waveform, and of the rest."""
@@ -41,6 +59,7 @@ class Opened:
     """A recording whose signal is drawn by one visitor at a time."""
 
     signal: Signal
+    settings: Settings
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     @classmethod
@@ -52,19 +71,36 @@ class Opened:
         HuddleError
             If it cannot be read.
         """
-        return cls(Signal(Recording.open(path), check_wanted))
+        settings, _ = settings_for(path)
+        return cls(Signal(Recording.open(path), check_wanted), settings)
 
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """What a request asks to see: a span in s of UTC, a channel by number, a key of `SPECTRA`."""
+    """What a request asks to see.
+
+    Attributes
+    ----------
+    span : (float, float)
+        In s of UTC.
+    channel : int
+        Number of a trace.
+    spectrum : str
+        A key of `SPECTRA`.
+    exclude : tuple of str
+        Stretches that the estimate leaves out.
+    is_changed : bool
+        Whether these are not those of the settings of the test.
+    """
 
     span: tuple[float, float]
     channel: int
     spectrum: str
+    exclude: tuple[str, ...]
+    is_changed: bool
 
     @classmethod
-    def of(cls, signal: Signal, asked: Mapping[str, str]) -> Look:
+    def of(cls, opened: Opened, asked: QueryParams) -> Look:
         """Return what is asked for.
 
         Raises
@@ -72,6 +108,7 @@ class Look:
         ValueError
             If that is nothing of the recording.
         """
+        signal = opened.signal
         whole = signal.span
         begin, end = (
             float(asked.get(name, at)) for name, at in zip(("from", "to"), whole, strict=True)
@@ -88,14 +125,51 @@ class Look:
         if spectrum not in SPECTRA or channel < 0:
             raise ValueError("no such channel or spectrum")
         signal.channel(channel)
-        return cls(span, channel, spectrum)
+        own, chosen = opened.settings.exclude, exclude_of(asked)
+        exclude = list(own if chosen is None else chosen)
+        if "shown" in asked:
+            exclude.append(stretch_text(*span))
+        elif wanted := asked.get("add", "").strip():
+            exclude.append(_stretch(wanted, span[0], whole))
+        for mark in signal.excluded(None, exclude):
+            if not (mark.begin < whole[1] and mark.end > whole[0]):
+                raise ValueError(f"{words(mark)}: not within the recording")
+        used = tuple(dict.fromkeys(exclude))
+        return cls(span, channel, spectrum, used, is_changed=used != own)
+
+    @property
+    def query(self) -> list[tuple[str, str]]:
+        """What an address needs so that it leaves out the same stretches."""
+        return exclusions(self.exclude) if self.is_changed else []
+
+    def address(self, begin: float, end: float, exclude: tuple[str, ...] | None = None) -> str:
+        """Return the address of another span, or of the same one without other stretches."""
+        chosen = self.query if exclude is None else exclusions(exclude)
+        shown = [("from", begin), ("to", end), ("channel", self.channel)]
+        return "?" + urlencode([*shown, ("spectrum", self.spectrum), *chosen])
+
+
+def exclusions(exclude: Sequence[str]) -> list[tuple[str, str]]:
+    """Return fields of an address that leave out these stretches, and no others."""
+    return [("exclude", each) for each in exclude or ("",)]
+
+
+def _stretch(text: str, near: float, whole: tuple[float, float]) -> str:
+    """Return a stretch between two times as people write them, as the settings take it."""
+    around = whole[0] - 1, whole[1] + 1  # as far as a browser rounds
+    ends = [time_of(each, near, around) for each in text.split("/")]
+    begin, end = ends if len(ends) == 2 else (None, None)
+    if begin is None or end is None or begin == end:
+        raise ValueError(f"{text}: expected two times as 03:10/03:15, within the recording")
+    return stretch_text(begin, end if end > begin else end + DAY)
 
 
 def drawn(opened: Opened, look: Look, snapshot: Snapshot | None) -> dict[str, Any]:
     """Return what the page shows of a look. Blocks."""
     with opened.lock:
         signal = opened.signal
-        waves = signal.view(*look.span, COLUMNS)
+        chosen = signal.excluded(None, look.exclude)
+        waves = signal.view(*look.span, COLUMNS, signal.excluded(snapshot, look.exclude))
         found = None
         if look.spectrum:
             is_noise = look.spectrum == "noise"
@@ -126,11 +200,18 @@ def drawn(opened: Opened, look: Look, snapshot: Snapshot | None) -> dict[str, An
         "channels": [trace.name for trace in waves.traces],
         "spectra": SPECTRA,
         "left": LEFT / WIDTH,
+        "excluded": [
+            (words(mark), look.address(*look.span, look.exclude[:n] + look.exclude[n + 1 :]))
+            for n, mark in enumerate(chosen)
+        ],
+        "averages": "" if snapshot is None else averages_line(snapshot),
+        "is_simulated": signal.recording.simulated,
     }
 
 
-def steps(span: tuple[float, float], whole: tuple[float, float]) -> list[tuple[str, float, float]]:
-    """Return what leads on from a span without a script: names, begins and ends."""
+def steps(look: Look, whole: tuple[float, float]) -> list[tuple[str, str]]:
+    """Return what leads on from a look without a script: names and addresses."""
+    span = look.span
     found = {
         "Earlier": panned(span, whole, -0.5),
         "Later": panned(span, whole, 0.5),
@@ -138,7 +219,7 @@ def steps(span: tuple[float, float], whole: tuple[float, float]) -> list[tuple[s
         "Further": zoomed(span, whole, 2.0),
         "All": whole,
     }
-    return [(name, *ends) for name, ends in found.items()]
+    return [(name, look.address(*ends)) for name, ends in found.items()]
 
 
 def _x(waves: Waveforms, at: float) -> float:
@@ -170,14 +251,13 @@ def _marks(waves: Waveforms) -> list[tuple[float, float, str, str]]:
 def _spectrum(found: Spectrogram, span: tuple[float, float]) -> dict[str, Any]:
     frequency, share = found.grid(*span, COLUMNS, BANDS)
     rows = np.linspace(0, BANDS - 1, FREQUENCIES).round().astype(int).tolist()
-    low, high = found.range_db
     return {
         "image": base64.b64encode(png(share[::-1])).decode(),
         "height": SPECTRUM,
         "rows": [
             (TOP + SPECTRUM * (1 - (row + 0.5) / BANDS), f"{frequency[row]:.3g} Hz") for row in rows
         ],
-        "scale": f"{low:.0f} to {high:.0f} dB re 1 ({found.unit})²/Hz".replace("-", "−"),
+        "scale": f"{scale(found)}{loudest(found)}",
     }
 
 

@@ -9,7 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from starlette.datastructures import QueryParams
+
 from daq.bench.model import Bench
+from daq.bench.option_values import stretches
 from daq.errors import HuddleError
 from daq.estimation.estimation import estimate
 from daq.estimation.snapshot import NoResultError
@@ -25,6 +28,8 @@ from tui.runs.estimate_settings import settings_for
 from tui.web.chart import with_models
 from tui.web.work import Work, check_wanted
 
+MOST_EXCLUDED = 50
+"""Stretches that a request leaves out."""
 PAGE = 50
 """Tests on a page of the list."""
 Key = tuple["Path", int, int]
@@ -131,9 +136,11 @@ class Tests:
         about = path.stat()
         return path, about.st_mtime_ns, about.st_size
 
-    def estimate(self, path: Path) -> State:
-        """Return the estimate of a test. Blocks."""
+    def estimate(self, path: Path, exclude: tuple[str, ...] | None = None) -> State:
+        """Return the estimate of a test, without stretches of a visitor's choice. Blocks."""
         settings, bench = settings_for(path)
+        if exclude is not None:
+            settings = replace(settings, exclude=exclude)
         try:
             snapshot = estimate([path], settings, progress=check_wanted)
         except NoResultError as error:
@@ -178,6 +185,26 @@ class Tests:
             for entry in ledger.entries()
             if source.run_id in entry.runs and entry.file
         ]
+
+
+def exclude_of(asked: QueryParams) -> tuple[str, ...] | None:
+    """Return the stretches that a request leaves out; None as the settings of the test have it.
+
+    An empty one is none: so a stretch of the settings is taken back.
+
+    Raises
+    ------
+    ValueError
+        If one is no stretch of time, or there are too many.
+    """
+    given = [each for each in asked.getlist("exclude") if each]
+    if len(given) > MOST_EXCLUDED:
+        raise ValueError(f"{len(given)} excluded stretches: expected at most {MOST_EXCLUDED}")
+    try:
+        chosen = stretches(given)
+    except OverflowError:
+        raise ValueError("expected START/END, within the recording") from None
+    return tuple(dict.fromkeys(chosen)) if "exclude" in asked else None
 
 
 def content_of(certificate: Path) -> bytes:

@@ -94,6 +94,8 @@ def test_a_test_has_verdict_table_picture_facts_and_settings(server: Server) -> 
     assert 'role="img" aria-label="A X   power spectral density' in text
     assert len(re.findall(r'<path d="M[^"]+" fill="none"', text)) == 5  # data, models, limit, noise
     assert "B: 2 gaps, 131 samples missing" in text
+    assert 'aria-label="B: turned 0.0°"' in text
+    assert "Coherence of pairs, mean over 2–20 Hz" in text
     assert '<th scope="row">segment</th><td>1.0</td>' in text
 
 

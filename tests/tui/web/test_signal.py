@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import struct
 import zlib
@@ -126,5 +127,76 @@ def test_without_a_script_links_lead_on(server: Server, browser: Browser, wrong:
     page.locator("a:text('Later')").click()
     assert span(page) == pytest.approx((30, 60), abs=0.5)
     page.locator("input[name=at]").fill("01:00:10")
-    page.locator("button:text('Show')").click()
+    page.get_by_role("button", name="Show", exact=True).click()
     assert span(page) == pytest.approx((0, 60), abs=0.5)
+
+
+def test_a_stretch_is_excluded_and_taken_back(
+    server: Server, browser: Browser, wrong: list[str]
+) -> None:
+    """With Shift and the mouse, as text, or what is shown; the estimate and its result follow."""
+    page = opened(browser, wrong)
+    page.goto(server.url + PAGE)
+    box = page.locator("svg.signal").bounding_box()
+    assert box is not None
+    left, width = box["x"] + 0.11 * box["width"], 0.89 * box["width"]
+    page.keyboard.down("Shift")
+    page.mouse.move(left + width / 3, box["y"] + 50)
+    page.mouse.down()
+    page.mouse.move(left + width / 2, box["y"] + 50, steps=4)
+    page.mouse.up()
+    page.keyboard.up("Shift")
+    excluded = page.locator("li:has-text('excluded: by choice')")
+    page.get_by_text("Take back").wait_for()
+    assert "01:00:19" in excluded.first.inner_text() or "01:00:20" in excluded.first.inner_text()
+    assert page.locator("rect.excluded").count() == 1
+    without = page.locator("p:has-text('effective averages')").inner_text()
+    page.locator("input[name=add]").fill("01:00:40/01:00:50")
+    page.get_by_role("button", name="Exclude", exact=True).click()
+    page.get_by_text("01:00:40 to 01:00:50").first.wait_for()
+    assert page.locator("p:has-text('effective averages')").inner_text() != without
+    page.get_by_role("link", name="Result without").click()
+    page.get_by_text("by choice of the time (--exclude)").wait_for()
+    assert page.url.count("exclude=") == 2
+    page.get_by_role("link", name="Signal").click()
+    page.locator("li:has-text('01:00:40') >> text=Take back").click()
+    page.locator("a:text('Closer')").click()
+    wait_until(lambda: "01:00:40 to" not in page.content(), "it is taken back")
+    page.locator("text=Take back").click()
+    wait_until(lambda: page.locator("text=Take back").count() == 0, "none is left")
+    page.get_by_role("button", name="Exclude what is shown").click()
+    page.get_by_text("Take back").wait_for()
+
+
+def test_an_exclusion_of_nothing_is_answered(server: Server) -> None:
+    """With why, and with those that were right; results without them are refused."""
+    visit = Visit(server.url)
+    kept = "exclude=2016-07-14T01:00:20/2016-07-14T01:00:30"
+    for wrong in ("soon", "01:00:30", "01:00:30/01:00:30", "03:00/04:00"):
+        text = visit.get(f"/{PAGE}?{kept}&add={wrong}").text
+        assert "within the recording" in text
+        assert text.count("Take back") == 1
+    far = visit.get(f"/{PAGE}?exclude=1h/2h")
+    assert (far.status, "not within the recording" in far.text) == (200, True)
+    for wrong in ("x", "9/8", f"{'9' * 400}d/{'9' * 401}d", "1h/2h"):
+        assert visit.get(f"/tests/night.h5?exclude={wrong}").status in {400, 409}
+    many = "&".join(["exclude=0s/1s"] * 51)
+    assert visit.get(f"/tests/night.h5?{many}").status == 400
+
+
+def test_a_result_without_a_stretch_is_the_same_everywhere(server: Server) -> None:
+    """On its page, as JSON, CSV and report; of the whole test nothing has changed."""
+    visit = Visit(server.url)
+    chosen = "?exclude=20s/30s"
+    found = [visit.get(f"/tests/night.h5/result.json{each}").text for each in ("", chosen)]
+    whole, part = map(json.loads, found)
+    assert part["settings"]["exclude"] == ["20s/30s"]
+    assert whole["settings"]["exclude"] == []
+    n_excluded = [each["diagnostics"]["excluded_segments"] for each in (whole, part)]
+    assert n_excluded[0] < n_excluded[1]
+    csv = [visit.get(f"/tests/night.h5/curves.csv{each}").content for each in ("", chosen)]
+    assert csv[0] != csv[1]
+    assert "by choice of the time" in visit.get(f"/tests/night.h5/report.html{chosen}").text
+    page = visit.get(f"/tests/night.h5{chosen}").text
+    assert 'href="/tests/night.h5/report.html?exclude=20s%2F30s"' in page
+    assert '<input type="hidden" name="exclude" value="20s/30s">' in page

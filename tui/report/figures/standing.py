@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.ticker import FuncFormatter, NullLocator
 
 from daq.results.standing import PairCoherence, Stance, pair_coherence, stances
-from tui.output.standing import caption, remark
+from tui.output.standing import arrows, caption, remark
 from tui.report.figures import drawing
 from tui.report.figures.curves import logarithmic
 from tui.report.parts import Plot
@@ -67,20 +67,19 @@ def _draw_axes(stance: Stance, axes: Axes) -> None:
     if not stance.is_known:
         axes.text(0, 0, "?", ha="center", va="center", size=12)
         return
-    for number, axis in enumerate(stance.directions[:, list(stance.order)]):
-        right, up, out = [*axis.tolist(), 0.0, 0.0][:3]
-        colour = drawing.LIMIT if number in stance.reversed_channels else drawing.NOISE
-        size = np.hypot(right, up)
-        if len(axis) == 3 and abs(out) > size:
+    for arrow in arrows(stance):
+        right, up = arrow.right, arrow.up
+        colour = drawing.LIMIT if arrow.is_reversed else drawing.NOISE
+        if arrow.is_end_on:
             axes.plot(0, 0, "o", ms=7, mfc="none", mec=colour, mew=0.9)
-            axes.plot(0, 0, "." if out > 0 else "x", ms=4, color=colour)
+            axes.plot(0, 0, "." if arrow.out > 0 else "x", ms=4, color=colour)
             axes.plot([0, right], [0, up], color=colour, lw=0.9)
-            axes.text(right - 0.2, up - 0.3, stance.channels[number], ha="center", size=6)
+            axes.text(right - 0.2, up - 0.3, arrow.channel, ha="center", size=6)
             continue
         tip = {"arrowstyle": "->", "color": colour, "lw": 1.0, "shrinkA": 0, "shrinkB": 0}
         axes.annotate("", (right, up), (0, 0), arrowprops=tip)
         place = 1.2 * right, 1.2 * up
-        axes.text(*place, stance.channels[number], ha="center", va="center", size=6)
+        axes.text(*place, arrow.channel, ha="center", va="center", size=6)
 
 
 def _draw_coherence(found: PairCoherence, names: tuple[str, ...], axes: Axes) -> None:

@@ -187,7 +187,11 @@ function signal() {
   let span = box.dataset.span.split(" ").map(Number), isLoading = false, isOld = false, drag = null;
   byId("how").hidden = false;
 
-  const query = () => new URLSearchParams({ from: span[0], to: span[1], channel: form.elements.channel.value, spectrum: form.elements.spectrum.value });
+  function query() {
+    const found = new URLSearchParams(new FormData(form));
+    for (const name of ["at", "add"]) found.delete(name);
+    return found;
+  }
 
   async function load() {
     if (isLoading) { isOld = true; return; }
@@ -221,6 +225,12 @@ function signal() {
     const { left, width } = box.querySelector("svg").getBoundingClientRect();
     return ((event.clientX - left) / width - LEFT) / (1 - LEFT);
   };
+  /* What is chosen while the pointer is dragged. */
+  function stretch() {
+    const svg = box.querySelector("svg"), found = document.createElementNS("http://www.w3.org/2000/svg", "rect");
+    for (const [name, value] of [["class", "excluded"], ["height", svg.viewBox.baseVal.height], ["width", 0]]) found.setAttribute(name, value);
+    return svg.appendChild(found);
+  }
   const inPicture = (event) => event.target.closest("svg") && share(event) >= 0;
   const pan = (by) => show(span[0] + by * (span[1] - span[0]), span[1] + by * (span[1] - span[0]));
 
@@ -231,20 +241,36 @@ function signal() {
   }, { passive: false });
   box.addEventListener("pointerdown", (event) => {
     if (!inPicture(event)) return;
-    drag = { at: share(event), span };
+    drag = { at: share(event), span, chosen: event.shiftKey ? stretch() : null };
     box.setPointerCapture(event.pointerId);
   });
   box.addEventListener("pointermove", (event) => {
     if (!drag) return;
+    if (drag.chosen) {
+      const { width } = box.querySelector("svg").viewBox.baseVal;
+      drag.ends = [drag.at, Math.min(Math.max(share(event), 0), 1)].sort((a, b) => a - b);
+      drag.chosen.setAttribute("x", width * (LEFT + (1 - LEFT) * drag.ends[0]));
+      drag.chosen.setAttribute("width", width * (1 - LEFT) * (drag.ends[1] - drag.ends[0]));
+      return;
+    }
     const by = (drag.at - share(event)) * (drag.span[1] - drag.span[0]);
     show(drag.span[0] + by, drag.span[1] + by);
   });
-  for (const end of ["pointerup", "pointercancel"]) box.addEventListener(end, () => { drag = null; });
+  box.addEventListener("pointerup", () => {
+    const ended = drag;
+    drag = null;
+    if (!ended || !ended.chosen) return;
+    if (!ended.ends || ended.ends[0] === ended.ends[1]) { ended.chosen.remove(); return; }
+    const at = (place) => new Date(1000 * (ended.span[0] + place * (ended.span[1] - ended.span[0]))).toISOString();
+    form.elements.add.value = ended.ends.map(at).join("/");
+    form.submit();
+  });
+  box.addEventListener("pointercancel", () => { drag = null; });
   box.addEventListener("keydown", (event) => {
     const act = { ArrowLeft: () => pan(-0.25), ArrowRight: () => pan(0.25), "+": () => zoom(0.5), "=": () => zoom(0.5), "-": () => zoom(2), Escape: () => show(...whole) }[event.key];
     if (act && !event.ctrlKey && !event.metaKey) { event.preventDefault(); act(); }
   });
-  form.addEventListener("change", (event) => { if (event.target.name !== "at") load(); });
+  form.addEventListener("change", (event) => { if (!["at", "add"].includes(event.target.name)) load(); });
 }
 
 /* ------------------------------------------------------------- the running test */
