@@ -137,6 +137,7 @@ def report_of(
         evidence.model_test_section(result),
         evidence.alignment_section(result),
         evidence.clocks_section(result),
+        evidence.signal_section(result),
         evidence.events_section(snapshot, found),
         certificate.parties_section(found, about, issue),
         _test_section(found),

@@ -10,11 +10,14 @@ import numpy as np
 
 from daq.bench.units import decibels
 from daq.clocks.clock_model import ClockState
+from daq.errors import HuddleError
 from daq.estimation.snapshot import Snapshot
 from daq.protocols.block import EventKind
+from daq.recording.reader import Recording
 from daq.results.clock_effect import grade, reference, residuals
 from daq.results.facts.fact import MARKS, Fact
 from daq.results.result import Result
+from daq.results.signal import Signal
 from daq.results.sources import LoggedEvent, Source, uncounted_events, with_uncounted
 from daq.results.vocabulary import clock_source
 from estimator.checks.advice import Rank
@@ -27,11 +30,14 @@ from estimator.wording import several, span
 from tui.page.table import Cell
 from tui.report.figures.drift import drift_plot
 from tui.report.figures.model_test import model_test_plot
+from tui.report.figures.signal import signal_plots
 from tui.report.figures.standing import standing_plots
 from tui.report.parts import Items, Paragraph, Part, Section, Table, Tone
 from tui.wording.facts import NOTHING_TO_DO, RANKS
 from tui.wording.formatting import NOTHING, plain_number, probability, scientific, share, utc
 
+MOST_SPECTROGRAMS = 1
+"""Channels that have spectrograms: each takes a tenth of the time of a report."""
 LISTED = 40
 """Most lines of the list of what happened; with more, those of one kind go together."""
 TONES: Mapping[Rank, Tone] = {
@@ -218,6 +224,28 @@ def clocks_section(result: Result) -> Section:
     elif rows:
         parts.append(Paragraph("No clock drifts against the others.", "quiet"))
     return Section("Clocks", tuple(parts))
+
+
+def signal_section(result: Result) -> Section | None:
+    """Return the recording against time; None where it cannot be read any more.
+
+    Of several recordings the first one; spectrograms are of the first channel.
+    """
+    source = result.sources[0]
+    try:
+        with Recording.open(source.path) as recording:
+            plots = signal_plots(
+                Signal(recording),
+                result.snapshot,
+                exclude=result.settings.exclude,
+                most_spectra=MOST_SPECTROGRAMS,
+            )
+    except (HuddleError, OSError):
+        return None
+    text = "Extremes of each channel. Red: gaps; grey: excluded; dashed: remarks."
+    if len(result.sources) > 1:
+        text = f"The first of {len(result.sources)} recordings. {text}"
+    return Section("The recording against time", (Paragraph(text, "quiet"), *plots))
 
 
 def events_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:

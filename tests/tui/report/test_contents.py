@@ -105,6 +105,7 @@ def test_alignment_clocks_and_model_test_are_there(reported: Reported) -> None:
     text = Words(reported.page).text
     assert "Alignment of the sensors" in text
     assert "Model test" in text
+    assert "The recording against time" in text
     (clocks,) = tables(reported.report, "Clocks")
     assert [row[0] for row in clocks.rows] == ["A", "B", "C", HOSTILE]
 
