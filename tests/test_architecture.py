@@ -101,6 +101,7 @@ OTHER_WRITERS = {
     "daq/recording/storage/journal.py": "the hidden copy of a repair, which is verified",
     "daq/recording/repair.py": "the hidden copy of a repair, which is verified",
     "daq/formats/readers/packed.py": "unpacked files in a temporary folder",
+    "daq/recording/extremes.py": "a file that grows with its recording",
     "daq/transport/wire_log.py": "a log that grows while devices are read",
     "tui/output/console.py": "pipes and devices, and lines that `huddle watch` appends",
     "tui/service/processes/finish.py": "a file of the kernel",

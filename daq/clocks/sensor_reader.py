@@ -279,7 +279,7 @@ class SensorSource:
     def _lacking(self, first_row: int, last_row: int) -> Iterator[tuple[int, slice]]:
         """Yield channels without samples, by their place in `columns`, and where."""
         if len(self.record.absent):
-            for column, rows in absences(self.record, first_row, last_row):
+            for column, rows in absences(self.record.absent, first_row, last_row):
                 if column in self.columns:
                     yield self.columns.index(column), rows
 

@@ -293,7 +293,7 @@ def _records(
 
 def _present(sensor: SensorRecord, first_row: int, last_row: int) -> Iterator[tuple[int, int, int]]:
     """Yield each channel's number with each piece of the rows, from `first_row`, that it has."""
-    absent = list(absences(sensor, first_row, last_row))
+    absent = list(absences(sensor.absent, first_row, last_row))
     for number in range(len(sensor.channels)):
         begin = 0
         for lacking in sorted((rows.start, rows.stop) for n, rows in absent if n == number):

@@ -81,9 +81,13 @@ class ReadableSensor(Protocol):
         """Return the host monotonic time of each sample of a polled sensor, in ns."""
 
 
-def absences(sensor: ReadableSensor, first_row: int, last_row: int) -> Iterator[tuple[int, slice]]:
-    """Yield columns without samples, with the rows, counted from `first_row`, that lack them."""
-    absent = sensor.absent
+def absences(
+    absent: NDArray[np.int64], first_row: int, last_row: int
+) -> Iterator[tuple[int, slice]]:
+    """Yield columns without samples, with the rows, counted from `first_row`, that lack them.
+
+    `absent` is that of a `ReadableSensor`.
+    """
     begins, ends = np.maximum(absent[:, 1], first_row), np.minimum(absent[:, 2], last_row)
     for at in np.flatnonzero(begins < ends).tolist():
         yield int(absent[at, 0]), slice(int(begins[at]) - first_row, int(ends[at]) - first_row)

@@ -39,6 +39,7 @@ from daq.recording import file_format
 from daq.recording.chunks.chunk_writer import SensorRows, TableBuffer
 from daq.recording.chunks.manifest import differences, make_manifest, write_manifest
 from daq.recording.description import make_checksums, write_checksums
+from daq.recording.extremes import GrowingFile
 from daq.recording.storage.journal import Journal
 from daq.recording.storage.locking import WriterLock
 from daq.recording.storage.names import publish, remove_leftovers, taken
@@ -209,6 +210,8 @@ class RecordingWriter:
         self._readings = TableBuffer(file["readings"])
         self._committed = file["committed"]
         self._run_id = text(file.attrs, "run_id")
+        extremes = {name: each.extremes for name, each in self._sensors.items()}
+        self._extremes = GrowingFile(path, self._run_id, extremes)
         self._failed = False
 
     @classmethod
@@ -392,6 +395,7 @@ class RecordingWriter:
         self.abandon()
         with contextlib.suppress(OSError):
             self.path.unlink(missing_ok=True)
+            self._extremes.path.unlink(missing_ok=True)
             if self._journal is not None:
                 self._journal.remove()
 
@@ -402,6 +406,7 @@ class RecordingWriter:
         finally:
             if self._hidden is not None:
                 self._hidden.unlink(missing_ok=True)
+                self._extremes.path.unlink(missing_ok=True)
 
     def _close_hdf5(self) -> None:
         """Close the file; do not print errors of HDF5 while it frees objects."""
@@ -453,6 +458,8 @@ class RecordingWriter:
                 write_checksums(self._file)
                 write_manifest(self._file, contents=self._contents_sha256())
             repeated(self._file.flush)
+        blocks = {name: (s.blocks.n_rows, s.of_blocks) for name, s in self._sensors.items()}
+        self._extremes.append(self._hidden or self.path, blocks, last=closed)
         return Committed(
             {
                 name: SensorCounts(*map(int, row))

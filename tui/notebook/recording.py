@@ -167,7 +167,7 @@ class SampledSensors:
                 sensitivity = np.array([channel.sensitivity for channel in channels])
                 places = at[row - begin : last + 1 - begin]
                 samples[places] = record.counts(row, last + 1) / sensitivity
-                for column, rows in absences(record, row, last + 1):
+                for column, rows in absences(record.absent, row, last + 1):
                     samples[places[rows], column] = np.nan
         return samples, clock.times(np.arange(low, max(low, high)))
 

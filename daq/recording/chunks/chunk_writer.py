@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from daq.errors import RecordingError
 from daq.protocols.block import Block, HostTime
 from daq.recording import file_format
+from daq.recording.extremes import NewExtremes, checksum
 from daq.recording.file_format import SensorLayout
 from daq.recording.storage.packing import RAW, packed
 from daq.recording.storage.retries import repeated, report
@@ -92,11 +94,19 @@ class ChunkBuffer:
         Pack chunks as in `daq.recording.storage.packing`. Not in a file that may be left open: when
         HDF5 2.0 shrinks a dataset to what was acknowledged, it filters the last chunk without
         regard to the chunk's mask, and destroys it.
+    wrote : callable, optional
+        Takes all rows once they are written.
     """
 
-    def __init__(self, dataset: h5py.Dataset, *, packs: bool = False) -> None:
+    def __init__(
+        self,
+        dataset: h5py.Dataset,
+        *,
+        packs: bool = False,
+        wrote: Callable[[NDArray[Any]], None] = lambda _: None,
+    ) -> None:
         self.dataset = dataset
-        self._packs = packs
+        self._packs, self._wrote = packs, wrote
         self._rows = AppendedRows(dataset)
         self._buffer = np.empty(dataset.chunks, dataset.dtype)
         self._filled = 0
@@ -168,6 +178,7 @@ class ChunkBuffer:
             report(error)
             repeated(self.write_again)
         self.n_written += len(rows)
+        self._wrote(rows)
         self.sha256.update(np.ascontiguousarray(rows, self._buffer.dtype).data)
 
     def _store(self, rows: NDArray[Any]) -> None:
@@ -213,7 +224,8 @@ class SensorRows:
     """
 
     def __init__(self, group: h5py.Group, sensor: SensorLayout, *, packs: bool = False) -> None:
-        self.samples = ChunkBuffer(group["samples"], packs=packs)
+        self.extremes, self.of_blocks = NewExtremes(sensor), 0
+        self.samples = ChunkBuffer(group["samples"], packs=packs, wrote=self.extremes.add)
         self.instants = ChunkBuffer(group["instants"], packs=packs)
         self._polled: bool | None = None
         self.blocks = TableBuffer(group["blocks"])
@@ -259,6 +271,7 @@ class SensorRows:
             if row["first_row"][0] + row["n_samples"][0] > written:
                 break
             self.blocks.add(row)
+            self.of_blocks = checksum(row, self.of_blocks)
             done += 1
         del self._finished[:done]
 

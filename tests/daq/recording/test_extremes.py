@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from daq.bench.channel import Channel
 from daq.recording import extremes
+from daq.recording.array_writer import ArrayWriter
 from daq.recording.extremes import BUCKET, SUFFIX, Extremes, extremes_of
+from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
 from daq.recording.repair import verify
-from tests.daq.clocks.recordings import Sensor, blocks, counts, create, write
+from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, counts, create, write
 
 N_SAMPLES = 60 * BUCKET + 77
 
@@ -118,14 +121,84 @@ def test_large_recordings_keep_theirs(path: Path, monkeypatch: pytest.MonkeyPatc
     read: list[int] = []
     with Recording.open(path) as recording:
         again = [each.between(edges) for each in extremes_of(recording, read.append)]
-    assert not read
+    assert read == [N_SAMPLES % BUCKET] * 2
     np.testing.assert_array_equal(made, again)
+    read.clear()
     other = {name: Sensor(counts(N_SAMPLES, 2, n + 5), clock="one") for n, name in enumerate("AB")}
-    path.unlink()
-    write(path, other)
-    with Recording.open(path) as recording:
+    kept.rename(path.with_name("other.extremes"))
+    write(path.with_name("new.h5"), other).rename(path.with_name("other.h5"))
+    with Recording.open(path.with_name("other.h5")) as recording:
         extremes_of(recording, read.append)
     assert sum(read) == 2 * N_SAMPLES
+
+
+def test_a_writer_appends_them_as_the_recording_grows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who opens it, growing or closed, reads only samples that are in no full bucket."""
+    monkeypatch.setattr(extremes, "KEPT_FROM", 10 * BUCKET)
+    monkeypatch.setattr(extremes, "WAITING", 4)
+    sensors = {name: Sensor(counts(N_SAMPLES, 2, n)) for n, name in enumerate("AB")}
+    path, read = tmp_path / "run.h5", list[int]()
+    writer = create(path, sensors)
+    pieces = [block for name, sensor in sensors.items() for block in blocks(name, sensor)]
+    pieces.sort(key=lambda block: block.first_sample)
+    for number, block in enumerate(pieces):
+        writer.append(block)
+        if number % 20 == 0:
+            writer.commit()
+        if number == len(pieces) // 2:
+            writer.commit()
+            with Recording.open(path) as recording:
+                extremes_of(recording, read.append)
+                assert sum(read) < sum(each.n_samples for each in recording.sensors) / 2
+    writer.close()
+    assert path.with_suffix(SUFFIX).stat().st_mode == path.stat().st_mode
+    read.clear()
+    edges = np.linspace(0, N_SAMPLES, 12).astype(np.int64)
+    with Recording.open(path) as recording:
+        kept = [each.between(edges) for each in extremes_of(recording, read.append)]
+    assert read == [N_SAMPLES % BUCKET] * 2
+    path.with_suffix(SUFFIX).unlink()
+    with Recording.open(path) as recording:
+        made = [each.between(edges) for each in extremes_of(recording)]
+    np.testing.assert_array_equal(kept, made)
+
+
+def test_a_recording_goes_on_without_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where something that is no file has their name."""
+    monkeypatch.setattr(extremes, "KEPT_FROM", 1)
+    (tmp_path / "run.extremes").mkdir()
+    path = write(tmp_path / "run.h5", {"A": Sensor(counts(N_SAMPLES, 2, 0))})
+    assert verify(path).intact
+    with Recording.open(path) as recording:
+        (found,) = extremes_of(recording)
+        assert found.n_rows == N_SAMPLES
+
+
+def test_samples_that_a_channel_lacks_are_no_extremes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither in what the writer keeps, nor in what is made of the samples."""
+    monkeypatch.setattr(extremes, "KEPT_FROM", 1)
+    layout = SensorLayout(
+        "A",
+        tuple(Channel(name=name, sensitivity=1.0) for name in "XY"),
+        100.0,
+        np.dtype(np.int32),
+        absent=np.array([[1, BUCKET // 2, 3 * BUCKET]]),
+    )
+    samples = counts(8 * BUCKET, 2, 0)
+    samples[BUCKET, 1] = 1 << 30
+    with ArrayWriter(tmp_path / "run.h5", sensors=[layout], created=ORIGIN) as writer:
+        writer.samples("A", samples)
+    edges, found = np.array([0, 4 * BUCKET, 8 * BUCKET]), []
+    for _ in range(2):
+        with Recording.open(tmp_path / "run.h5") as recording:
+            found.append(extremes_of(recording)[0].between(edges))
+        (tmp_path / "run.extremes").unlink()
+    np.testing.assert_array_equal(found[0], found[1])
+    assert np.nanmax(found[0]) < 1 << 30
 
 
 @pytest.mark.parametrize("size", [0, 10, 5000])
@@ -138,7 +211,7 @@ def test_what_is_damaged_of_them_is_made_again(
         made = [each.between(np.array([0, N_SAMPLES])) for each in extremes_of(recording)]
     kept = path.with_suffix(SUFFIX)
     content = bytearray(kept.read_bytes())
-    content[2000:2100] = bytes(range(100))
+    content[-2000:-1900] = bytes(range(100))
     kept.write_bytes(content[: size or None])
     with Recording.open(path) as recording:
         again = [each.between(np.array([0, N_SAMPLES])) for each in extremes_of(recording)]
