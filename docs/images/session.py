@@ -44,6 +44,10 @@ name = "data sheet"
 frequency = [2.0, 20.0]
 psd = [3.6e-12, 3.6e-12]
 """
+_WHITE = '{shape = "white", level = 2.0e-12}'
+_HUM = '{shape = "resonance", level = 2e-9, frequency = 60.0, damping = 0.002}'
+HUM = _WHITE, f'{{shape = "sum", terms = [{_WHITE}, {_HUM}]}}'
+"""What B.X has for noise, and what it has here."""
 FAULTS = """
 [[faults]]
 kind = "disconnect"
@@ -126,7 +130,8 @@ def simulated(folder: Path) -> Iterator[Path]:
     """Play the devices of the demo's bench; yields a bench file that reaches them."""
     demo = (ROOT / "tui" / "resources" / "demo.toml").read_text(encoding="utf-8")
     bench, faults, reachable = (folder / f"{n}.toml" for n in ("demo", "faults", "lab"))
-    bench.write_text(demo.replace('name = "demo"', 'name = "lab"', 1) + LIMIT, encoding="utf-8")
+    demo = demo.replace('name = "demo"', 'name = "lab"', 1).replace(*HUM, 1)
+    bench.write_text(demo + LIMIT, encoding="utf-8")
     faults.write_text(FAULTS, encoding="utf-8")
     command = python_command("tui", "devices", str(bench), "--speed", str(SPEED))
     command += ["--faults", str(faults), "--out", str(reachable)]
@@ -211,8 +216,9 @@ def signal_view(session: Session) -> None:
     session.ask(f"What happened at {at}?", "t", at, "\r", answer=" to ")
     session.ask("When was it loud?", "g", answer="recorded")
     session.ask("When was the noise loud?", "g", answer="noise")
+    session.ask("Which sensor hums?", "\x1b[B", "\x1b[B", "\x1b[B", answer="B.X noise")
     session.ask("Leave this out.", "g", "x", ">", "x", answer="excluded (x: take it back)")
-    session.ask("Take it back.", "x", answer=" A.X −")
+    session.ask("Take it back.", "x", answer=" B.X −")
 
 
 def main() -> None:

@@ -254,7 +254,10 @@ async def test_the_palette_does_what_the_keys_do(tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals")
-async def test_from_cables_to_a_running_test_in_few_keys(tmp_path: Path) -> None:
+async def test_from_cables_to_a_specimen_of_the_certificate_in_few_keys(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tui.report.figures.drawing.draw", lambda *_, **__: None)
     text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
     path = tmp_path / "bench.toml"
     keys: list[str] = []
@@ -290,10 +293,16 @@ async def test_from_cables_to_a_running_test_in_few_keys(tmp_path: Path) -> None
                 await until(opened, lambda: "● recording" in screen_text(app))
             judged_by = None if app.state.result is None else app.state.result.bench
             assert judged_by is None or judged_by.operator == "Ann"
-            controls.stop(controls.started[0].out)
-            await until(opened, lambda: app.snapshot is not None and app.snapshot.closed)
+            await until(opened, lambda: "i Issue" in screen_text(app))
+            await press(opened, "i", "enter")
+            await until(opened, lambda: certificates(tmp_path) == 1)
         controls.release()
     assert len(keys) <= MOST_KEYS, keys
+
+
+def certificates(folder: Path) -> int:
+    """Return how many certificates have been made."""
+    return len(list(folder.rglob("*.pdf")))
 
 
 async def until(pilot: Pilot[Any], reached: Callable[[], bool]) -> None:
