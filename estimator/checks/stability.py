@@ -238,6 +238,7 @@ class Stability:
                 clearest[each.sensor] = each
                 second_order += each.statistic * each.size**2
         runs = [each.runs for each in found if each.runs is not None]
+        added = np.stack([each.added for each in found]).max(axis=0) * float(is_added)
         return replace(
             found[-1],
             low=np.concatenate([each.low for each in found]),
@@ -246,7 +247,7 @@ class Stability:
             runs=Scatter.joined(runs) if len(runs) == len(found) else None,
             inflations=np.concatenate([each.inflations for each in found]),
             changes=tuple(clearest.values()),
-            added=np.max([each.added for each in found], axis=0) * float(is_added),
+            added=added,
             explained=np.concatenate([each.explained for each in found]),
             within=np.concatenate([each.within for each in found]),
             steadied=tuple(
