@@ -204,6 +204,7 @@ def _with_neighbours(
     steps = [np.diff(each[rows], prepend=-1) != 0 for each in (blocks, n_dims)]
     number = np.cumsum(steps[0] | steps[1]) - 1
     order, live = together(live, group[left > 0])
+    most = most_pooled((usual,) * len(live))  # sensors that share noise count as one
     columns = columns[order]
     psd = given.psd[rows[:, None], columns]
     matrix = given.matrix
@@ -223,7 +224,7 @@ def _with_neighbours(
         matrix,
         number,
         n_dims[rows],
-        most=most_pooled(live) if further.any() else 0,
+        most=most if further[rows].any() else 0,
         dims=live,
         n_effective=n_effective,
         correlation=correlation,

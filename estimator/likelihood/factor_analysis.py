@@ -314,7 +314,7 @@ class Maxima:
         Nothing is kept of those that are wanted the `last` time.
         """
         keys = [  # no minus zeros
-            (n_factors, dims, sha256((each + 0.0).data).digest()) for each in csm
+            (n_factors, dims, sha256(np.add(each, 0.0, order="C").data).digest()) for each in csm
         ]
         before = [self._found.pop(key, None) if last else self._found.get(key) for key in keys]
         missing = [row for row, each in enumerate(before) if each is None]
