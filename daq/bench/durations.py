@@ -84,6 +84,8 @@ def instant(text: str, created: datetime) -> datetime:
     """
     try:
         return created + timedelta(seconds=parse_duration(text, zero=True))
+    except OverflowError:
+        raise ValueError(f"{text!r} after the start is after the year 9999") from None
     except ValueError:
         pass
     try:

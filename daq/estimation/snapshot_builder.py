@@ -710,8 +710,8 @@ def why_nothing(
         available = sum(each.aligned.n_available for each in passes)
         seconds = available / passes[0].welch.sampling_rate
         return (
-            f"{names}: not one whole segment: {seconds:.3g} s with all"
-            f" sensors, {snapshot.n_dropped} segments left out (gaps, clipping), and a segment"
+            f"{names}: not one whole segment: {seconds:.3g} s with all sensors, "
+            f"{snapshot.n_dropped} segments left out (gaps, clipping, --exclude), and a segment"
             f" takes {segment:g} s; record longer or choose a shorter segment"
         )
     if snapshot.results:

@@ -8,6 +8,7 @@ symbol and a word, and each curve a mark.
 from __future__ import annotations
 
 import select
+import signal
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final, TypeVar
 
@@ -19,6 +20,7 @@ from textual.theme import Theme
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
+    from types import FrameType
 
     from rich.color import Color as RichColor
     from textual.color import Color
@@ -127,6 +129,13 @@ class HarmlessLines(LineFilter):
 _TERMINAL_CHECK = 1.0  # seconds between looks at whether there is still a terminal
 
 
+def _has_gone() -> bool:
+    """Whether the terminal of standard input has hung up."""
+    terminal = select.poll()
+    terminal.register(0, 0)
+    return any(events & select.POLLHUP for _, events in terminal.poll(0))
+
+
 class ThemedApp(App[Outcome]):
     """An application in these themes, whose lines are harmless to a terminal; ends with it."""
 
@@ -145,12 +154,17 @@ class ThemedApp(App[Outcome]):
         """Look after the terminal; Textual calls this beside that of each subclass."""
         if not self.is_headless and hasattr(select, "poll"):
             self.set_interval(_TERMINAL_CHECK, self._end_without_terminal)
+            resume = signal.getsignal(signal.SIGCONT)
+
+            def resumed(number: int, frame: FrameType | None) -> None:
+                if callable(resume) and not _has_gone():  # comes with a hang-up, too
+                    resume(number, frame)
+
+            signal.signal(signal.SIGCONT, resumed)
 
     def _end_without_terminal(self) -> None:
         """End where the terminal has gone without a signal: Textual would read its end for ever."""
-        terminal = select.poll()
-        terminal.register(0, 0)
-        if any(events & select.POLLHUP for _, events in terminal.poll(0)):
+        if _has_gone():
             self.exit()
 
     def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:

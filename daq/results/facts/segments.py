@@ -50,6 +50,9 @@ class NoSegmentUsable(Fact):
         if self.reason is Reason.CLIPPED:
             text = f"{head} samples are clipped."
             do = "Choose a larger range, reduce the motion, or keep them (--no-reject)."
+        elif self.reason is Reason.CHOSEN:
+            text = f"{head} their time is excluded by choice."
+            do = "Exclude less (--exclude)."
         else:
             text = f"{head} there are transients."
             do = "Wait for a quieter time, or leave out --reject."

@@ -17,6 +17,7 @@ from daq.errors import WrongSettingError
 from daq.estimation.estimation import estimate
 from daq.estimation.segments import clipping
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import NoResultError
 from daq.results.facts.segments import SegmentsExcluded
 from daq.results.result import Result
 from estimator.checks.advice import Rank
@@ -141,7 +142,18 @@ def test_an_exclusion_of_nothing_is_refused(tmp_path: Path) -> None:
         estimate([path], Settings(segment=4.0, exclude=("10min/11min",)))
 
 
-@pytest.mark.parametrize("text", ["40s", "52s/40s", "40s/", "a/b", "40s/40s", "1/2/3"])
+def test_what_leaves_no_segment_is_named(tmp_path: Path) -> None:
+    settings = Settings(segment=4.0, exclude=("0s/10min",))
+    with pytest.raises(NoResultError, match="--exclude") as raised:
+        estimate([recording(tmp_path / "r.h5", 0)], settings)
+    facts = Result(raised.value.snapshot, settings).facts
+    (fact,) = (each for each in facts if each.name == "no-segment-usable")
+    assert "excluded by choice" in fact.words.explanation
+
+
+@pytest.mark.parametrize(
+    "text", ["40s", "52s/40s", "40s/", "a/b", "40s/40s", "1/2/3", "0s/99999999999d"]
+)
 def test_wrong_stretches_are_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="expected"):
+    with pytest.raises(ValueError, match=r"expected|9999"):
         from_text("exclude", [text])

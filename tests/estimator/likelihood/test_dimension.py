@@ -366,8 +366,9 @@ def test_a_band_without_averages_is_not_called_biased() -> None:
 
 def test_the_order_of_a_matrix_in_memory_does_not_count() -> None:
     averages = wishart(np.broadcast_to(np.eye(6) + 9, (24, 6, 6)), 99, np.random.default_rng(1))[0]
-    known = {"dims": (1,) * 6, "n_effective": 99.0}
     turned = averages.swapaxes(1, 2).copy().swapaxes(1, 2)
-    frequency = np.linspace(1, 2, 24)
-    one, other = (choose_dimension(each, frequency, **known)[1] for each in (averages, turned))
+    one, other = (
+        choose_dimension(each, np.linspace(1, 2, 24), dims=(1,) * 6, n_effective=99)[1]
+        for each in (averages, turned)
+    )
     assert [each.test for each in one] == [each.test for each in other]
