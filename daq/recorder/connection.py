@@ -122,22 +122,14 @@ class BlockValidator:
             return f"an event of {event.sensor!r}; expected {self._expected_names()}"
         if not _are_texts(event.kind, event.text):
             return f"an event {event.kind!r}, {event.text!r}; expected text"
-        return (
-            ""
-            if _are_times(event.received)
-            else f"an event received at {event.received!r}; {_TIMES}"
-        )
+        return _time_problem("an event", event.received)
 
     def _reading_problem(self, reading: Reading) -> str:
         if reading.sensor not in self._n_channels:
             return f"a reading of {reading.sensor!r}; expected {self._expected_names()}"
         if not _are_texts(reading.quantity) or not _is_finite(reading.value):
             return f"a reading {reading.quantity!r}, {reading.value!r}; expected text and a number"
-        return (
-            ""
-            if _are_times(reading.received)
-            else f"a reading received at {reading.received!r}; {_TIMES}"
-        )
+        return _time_problem("a reading", reading.received)
 
     def _expected_names(self) -> str:
         return " or ".join(map(repr, self._n_channels))
@@ -154,7 +146,7 @@ def _number_problem(block: Block) -> str:
         return f"a block with flags {block.flags!r}; expected 0 to {_MAX_FLAGS}"
     if not _are_texts(block.reason):
         return f"a block with reason {block.reason!r}; expected text"
-    return "" if _are_times(block.received) else f"a block received at {block.received!r}; {_TIMES}"
+    return _time_problem("a block", block.received)
 
 
 def _shape(array: object) -> tuple[int, ...] | None:
@@ -165,8 +157,9 @@ def _are_texts(*values: object) -> bool:
     return all(isinstance(value, str) for value in values)
 
 
-def _are_times(at: HostTime) -> bool:
-    return all(_is_int64(getattr(at, name, None)) for name in ("monotonic_ns", "utc_ns"))
+def _time_problem(what: str, at: HostTime) -> str:
+    is_time = all(_is_int64(getattr(at, name, None)) for name in ("monotonic_ns", "utc_ns"))
+    return "" if is_time else f"{what} received at {at!r}; {_TIMES}"
 
 
 def _is_finite(value: object) -> bool:
