@@ -21,10 +21,13 @@ from tests.tui.example_snapshot import ProgressCallback
 from tests.tui.night_recording import record
 from tests.waiting import limit
 from tui.application.app import HuddleApp
+from tui.application.forms.estimate import as_changes
 from tui.application.messages import RecordingOpened
 from tui.application.signal_view.picture import Drawn, Look, picture
 from tui.application.signal_view.source import SignalSource
 from tui.application.signal_view.view import SignalView
+from tui.commands.tui_controls import RecordingControls
+from tui.runs.estimate_settings import settings_for
 from tui.wording.signal import time_of
 
 SIZES = {"small": (40, 12), "narrow": (80, 24), "middle": (120, 36), "wide": (160, 45)}
@@ -223,3 +226,14 @@ def test_a_time_as_people_write_it(text: str, seconds: float | None) -> None:
     found = time_of(text, START, (START, START + 60))
     assert found == (None if seconds is None else START + seconds)
     assert time_of("00:30", START, (START, START + 86400)) == START + 23.5 * 3600
+
+
+def test_an_excluded_stretch_changes_no_other_setting(path: Path) -> None:
+    """Neither those of options, nor those that the bench file has otherwise."""
+    chosen: dict[str, object] = {"reject": True, "octaves": True, "axis_tolerance": {"": 2.0}}
+    shown, _ = settings_for(
+        path, start="5s", end="50s", methods=("three-sensor",), exclude=("10s/20s",), **chosen
+    )
+    asked = as_changes(shown) | {"exclude": ()}
+    found, _ = RecordingControls(path, shown).about(path, asked)
+    assert found == replace(shown, exclude=())

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import fields
 from typing import TYPE_CHECKING
 
 from daq.bench.estimate_settings import OPTIONS, from_text
@@ -51,12 +52,15 @@ class SettingsForm(Form[Mapping[str, object]]):
         """Estimate with what was given."""
         given = {name: text for name in FIELDS if (text := self.value(name))}
         kept = () if self._settings is None else self._settings.exclude
-        self.dismiss(excluding(kept) | {n: from_text(n, text) for n, text in given.items()})
+        excluded = {"exclude": kept} if kept else {}
+        self.dismiss(excluded | {n: from_text(n, text) for n, text in given.items()})
 
 
-def excluding(stretches: Sequence[str]) -> dict[str, object]:
-    """Return the change of the settings that excludes these stretches."""
-    return {"exclude": tuple(stretches)} if stretches else {}
+def as_changes(settings: Settings) -> dict[str, object]:
+    """Return the changes of a bench file's settings by which its recording is estimated so."""
+    found = {each.name: getattr(settings, each.name) for each in fields(settings)}
+    found |= {name: (end := found[name]) and end.isoformat() for name in ("start", "end")}
+    return {name: value for name, value in found.items() if value not in ({}, ())}
 
 
 def _placeholder(field: str, settings: Settings | None) -> str:

@@ -229,6 +229,9 @@ def _read_off(waves: Waveforms, look: Look, width: int) -> Text:
     text = f"{at}  {trace.name} {values}".replace("-", "−")
     if look.here is not None:
         text += f"  {sign(Mark(*look.here, EXCLUDED))} excluded (x: take it back)"
+    elif look.begun is not None:
+        begun = Mark(look.begun, look.begun, EXCLUDED)
+        text += f"  {sign(begun)} begun; x at its end excludes, esc does not"
     for mark in most_first(waves.near(look.cursor)):
         text += f"  {sign(mark)} {words(mark)}"
     return Text(text[:width])

@@ -16,7 +16,7 @@ from daq.errors import HuddleError
 from daq.recording.interface import created_at
 from daq.results.signal import fitting, panned, zoomed
 from tui.application.dialogs import MarkScreen
-from tui.application.forms.estimate import FIELDS, excluding
+from tui.application.forms.estimate import as_changes
 from tui.application.messages import OpeningRequested
 from tui.application.signal_view.picture import (
     BESIDE,
@@ -312,23 +312,21 @@ class SignalView(View):
             return
         if look.cursor is None:
             self.action_cursor(0.0)
-            self.app.notify("Place the cursor where the stretch begins (, . or a click), then x")
+            self.app.notify("x begins the stretch at the cursor (, . or a click)", timeout=3)
             return
         if look.here is not None:
             chosen = tuple(each for each in look.excluded if each != look.here)
         elif look.begun is None:
             self._change(begun=look.cursor)
-            self.app.notify("Move the cursor to the end of the stretch, then x; esc: not")
             return
         elif look.begun == look.cursor:
             return
         else:
             ends = sorted((look.begun, look.cursor))
             chosen = (*look.excluded, (ends[0], ends[1]))
-        settings = result.settings
-        changes = {name: getattr(settings, name) for name in FIELDS if name != "methods"}
         self._change(excluded=chosen, begun=None)
-        changes |= excluding([stretch_text(*each) for each in chosen])
+        exclude = tuple(stretch_text(*each) for each in chosen)
+        changes = as_changes(result.settings) | {"exclude": exclude}
         self.post_message(OpeningRequested(path, changes, SIGNAL))
 
     def action_mark(self, step: int = 1) -> None:
