@@ -29,11 +29,21 @@ BENCH = parse(resources.files("tui.resources").joinpath("demo.toml").read_text(e
 
 
 def leaning(
-    rng: np.random.Generator, *, n_sensors: int, n_channels: int, degrees: float, snr: float
+    rng: np.random.Generator,
+    *,
+    n_sensors: int,
+    n_channels: int,
+    degrees: float,
+    snr: float,
+    gradients: float = 0.0,
 ) -> dict[str, np.ndarray]:
-    """Return samples of sensors of unit noise whose axes are off by so much, rms."""
+    """Return samples of sensors of unit noise whose axes are off by so much, rms.
+
+    The motion's gradients change it by a share of it from the middle of the bench to its edge.
+    """
     n = round(SECONDS * RATE)
     motion = np.sqrt(snr) * rng.standard_normal((n, 3))
+    across_bench = gradients * np.sqrt(snr) * rng.standard_normal((n, 2)) if gradients else 0.0
     samples = {}
     for number in range(n_sensors):
         axes = np.eye(3)[::-1][:n_channels].copy()  # z, then y
@@ -41,7 +51,10 @@ def leaning(
         axes += across * (axes == 0)
         gains = 1 + 0.01 * rng.standard_normal((n_channels, 1))
         noise = rng.standard_normal((n, n_channels))
-        samples[f"s{number:02}"] = motion @ (axes * gains).T + noise
+        felt = motion @ (axes * gains).T
+        if gradients:
+            felt += (across_bench @ rng.uniform(-1, 1, 2))[:, None]
+        samples[f"s{number:02}"] = felt + noise
     return samples
 
 
@@ -92,26 +105,32 @@ def random_benches(n_benches: int, seed: int) -> None:
 
 
 def plumb() -> None:
-    """Print what single-axis sensors 1° off plumb at SNR 5e4 give."""
-    print("| sensors | covered | upper end, dB | half-width, dB | estimate / truth | method |")
-    print("|---|---|---|---|---|---|")
-    for n_sensors in (3, 5, 6, 7, 12):
-        held, ends, halves, ratios, method = [], [], [], [], ""
-        for number in range(20):
+    """Print what single-axis sensors 1° off plumb give."""
+    print("| sensors, SNR | covered, misses beyond 7 % | upper end, dB | half-width | / truth |")
+    print("|---|---|---|---|---|")
+    cases = [(n, 5e4, 0.0) for n in (3, 5, 6, 7, 12)]
+    cases += [(n, 10.0**power, 0.01) for n in (6, 7, 12) for power in (2, 3, 4, 5)]
+    for n_sensors, snr, gradients in cases:
+        held, beyond, ends, halves, ratios = [], 0, [], [], []
+        for number in range(4 if gradients else 20):
             rng = np.random.default_rng([29, n_sensors, number])
-            samples = leaning(rng, n_sensors=n_sensors, n_channels=1, degrees=1.0, snr=5e4)
+            samples = leaning(
+                rng, n_sensors=n_sensors, n_channels=1, degrees=1.0, snr=snr, gradients=gradients
+            )
             snapshot = estimate([recording_of_arrays(samples, RATE)], SETTINGS)
-            ((method, noise),) = snapshot.results.items()
+            (noise,) = snapshot.results.values()
             for band in BANDS:
                 for mean in Result(snapshot, SETTINGS).means(noise.method, band):
                     held.append(float(mean.low[0]) <= TRUTH <= float(mean.high[0]))
+                    beyond += mean.low[0] > 1.07 * TRUTH or mean.high[0] < TRUTH / 1.07
                     low, high = max(float(mean.low[0]), 0.0), float(mean.high[0])
                     ends.append(10 * np.log10(high / TRUTH))
                     halves.append(5 * np.log10(high / low) if low else np.inf)
                     ratios.append(float(mean.mean[0]) / TRUTH)
         print(
-            f"| {n_sensors} | {np.mean(held):.3f} | {np.median(ends):.2f} |"
-            f" {np.median(halves):.2f} | {np.median(ratios):.2f} | {method} |",
+            f"| {n_sensors}, {snr:.0e}{', gradients of 1 %' if gradients else ''} |"
+            f" {np.mean(held):.3f}, {beyond} of {len(held)} | {np.median(ends):.2f} |"
+            f" {np.median(halves):.2f} | {np.median(ratios):.2f} |",
             flush=True,
         )
 

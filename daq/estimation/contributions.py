@@ -34,6 +34,9 @@ from estimator.types import BoolArray, FloatArray
 SECOND_ORDER = 2.5
 """Bias by further dimensions over the squared c.o.v. of one frequency, one standard deviation
 (docs/validation/gradients.md)."""
+UNTESTED = 0.2
+"""What one dimension more took from the noise of six to eight sensors off plumb, or left in it, as
+a share, where they cannot test for it (docs/validation/levels.md)."""
 MOST_SHARED = 0.99
 """Part of its noise that a channel shares at most."""
 MUCH_CHANGED = 0.1
@@ -287,6 +290,8 @@ def _dimensions(snapshot: Snapshot, method: str) -> tuple[FloatArray, BoolArray]
             averages = snapshot.n_effective * choice.test.n_frequencies / choice.test.spread
             edge = 2 * math.sqrt(n_channels / averages) / (n_channels - choice.n_factors)
             share[inside] = np.where(pooled[inside], edge, NORMAL_95 * error)
+            if choice.usual < DIMENSIONS and choice.n_factors >= most_testable(snapshot.dims):
+                share[inside] += UNTESTED
     return share, explained
 
 
