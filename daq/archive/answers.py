@@ -28,6 +28,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from daq.archive import spectra_file
 from daq.archive.averages import Average, Estimator, converted
 from daq.archive.changes import Course, courses
 from daq.archive.density import MIN_BINS, Density
@@ -42,14 +43,6 @@ from daq.archive.rollup import (
     rolled_up,
     series_of,
     summaries,
-)
-from daq.archive.spectra_file import (
-    SUMMARY_VERSION,
-    Described,
-    SpectraFile,
-    Summary,
-    packed,
-    unpacked,
 )
 from daq.archive.store import Store
 from daq.errors import ArchiveError, HuddleError
@@ -142,7 +135,7 @@ class Years:
 
     def _digest(self, month: str) -> str:
         parts = [(e.described.origin.run_id, e.months[month]) for e in self._months[month]]
-        text = json.dumps([SUMMARY_VERSION, self._reference, parts])
+        text = json.dumps([spectra_file.SUMMARY_VERSION, self._reference, parts])
         return hashlib.sha256(text.encode()).hexdigest()
 
     def _current(self, year: str) -> dict[str, str]:
@@ -239,10 +232,10 @@ class Years:
         """Whether the sum of a recording's matrices is one of single precision."""
         return entry.daily or (entry.single and not self._own)
 
-    def _summary(self, entry: Entry, month: str) -> Summary:
+    def _summary(self, entry: Entry, month: str) -> spectra_file.Summary:
         """Return the summary of a recording, its total in the units of the archive."""
         described = entry.described
-        with SpectraFile(entry.path) as file:
+        with spectra_file.SpectraFile(entry.path) as file:
             if self._own and month in file.months:
                 found = file.summary(month)
             else:
@@ -295,7 +288,7 @@ def _write(hdf5: WholeHdf5, group: str, rollup: Rollup) -> None:
                     made[row] = some
             hdf5.expect(made, value)
         elif each.name != "n_segments":
-            hdf5.create(path, packed(value) if each.name == "total" else value)
+            hdf5.create(path, spectra_file.packed(value) if each.name == "total" else value)
     hdf5.file[group].attrs["n_segments"] = rollup.n_segments
 
 
@@ -379,7 +372,7 @@ class Answer:
     fine_hz: FloatArray
     spectrogram: NDArray[np.float32]
     problems: tuple[str, ...]
-    doubted: tuple[Described, ...]
+    doubted: tuple[spectra_file.Described, ...]
     lacking: Mapping[str, int]
 
     @property
@@ -444,7 +437,7 @@ def answer(
     usual = _bands(plan.noise_settings(settings), years.grid.frequency, *ends)
     pooled, lacking = Average(), Counter[int]()
     for file in years.each([years.grid.span(band) for band in usual]):
-        pooled.add_sum(unpacked(file["total"][...]), int(file.attrs["n_segments"]))
+        pooled.add_sum(spectra_file.unpacked(file["total"][...]), int(file.attrs["n_segments"]))
         tally.take(file)
     for entry in known:
         if entry.described.origin.run_id not in years.damaged:

@@ -27,18 +27,10 @@ from daq.bench.estimate_settings import OPTIONS, EstimateSettings, table_keys, t
 from daq.bench.masks.mask import NOISE_MODELS, Mask, check_points
 from daq.bench.response import PolesZeros, Response
 from daq.bench.sensitivity import REFERENCE_TEMPERATURE
+from daq.bench.tables import unattended
 from daq.bench.tables.certificate import CertificateTable, Customer, Laboratory
 from daq.bench.tables.fields import Duration, Name, Number, PositiveNumber, Table
 from daq.bench.tables.toml_text import to_toml
-from daq.bench.tables.unattended import (
-    History,
-    Hooks,
-    Metrics,
-    Schedule,
-    Signing,
-    Storage,
-    Web,
-)
 from daq.bench.units import DensityUnit
 from daq.errors import ABSENT, BenchFileError, FileFault
 
@@ -373,13 +365,13 @@ class Bench(Table):
         PlainSerializer(to_table),
     ] = EstimateSettings()
     recording: RecordingSettings = RecordingSettings()
-    schedule: Schedule = Schedule()
-    storage: Storage = Storage()
-    hooks: Hooks = Hooks()
-    metrics: Metrics | None = None
-    web: Web | None = None
-    signing: Signing | None = None
-    history: History = History()
+    schedule: unattended.Schedule = unattended.Schedule()
+    storage: unattended.Storage = unattended.Storage()
+    hooks: unattended.Hooks = unattended.Hooks()
+    metrics: unattended.Metrics | None = None
+    web: unattended.Web | None = None
+    signing: unattended.Signing | None = None
+    history: unattended.History = unattended.History()
     limits: tuple[Limit, ...] = ()
     laboratory: Laboratory = Laboratory()
     customer: Customer = Customer()

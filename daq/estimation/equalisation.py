@@ -42,14 +42,7 @@ from estimator.responses.equalisation import (
     significant_minimum,
 )
 from estimator.self_noise.result import SelfNoise
-from estimator.spectra.equaliser import (
-    USABLE,
-    Equaliser,
-    bounded,
-    design,
-    tail_leakage,
-    with_short_tails,
-)
+from estimator.spectra import equaliser
 from estimator.spectra.multiresolution import Band
 from estimator.spectra.welch import WelchSettings
 from estimator.spectra.windows import effective_averages, get_window
@@ -138,7 +131,7 @@ class Equalisation:
         """Where filters come from: "known", "estimated", both or neither."""
         return ("known",) * (self.known is not None) + ("estimated",) * (self._wanted is not None)
 
-    def _by_bench(self, channels: Sequence[tuple[str, Channel]]) -> Equaliser | None:
+    def _by_bench(self, channels: Sequence[tuple[str, Channel]]) -> equaliser.Equaliser | None:
         """Return filters that make all channels answer like one, by their poles and zeros."""
         if all(channel.response is None for _, channel in channels) and (
             len({channel.unit for _, channel in channels}) == 1
@@ -160,15 +153,17 @@ class Equalisation:
                 slope = np.gradient(ratio, grid[1]) / ratio
                 if np.mean(np.log1p(self._factor * np.abs(slope) ** 2 * _ASSUMED_SNR)) < _EQUAL:
                     continue
-                wanted[:, column] = bounded(ratio)
-                wanted[:, [column]] = with_short_tails(wanted[:, [column]])
-                tails = tail_leakage(wanted[:, [column]], rate, snr=snr, factor=self._factor)
+                wanted[:, column] = equaliser.bounded(ratio)
+                wanted[:, [column]] = equaliser.with_short_tails(wanted[:, [column]])
+                tails = equaliser.tail_leakage(
+                    wanted[:, [column]], rate, snr=snr, factor=self._factor
+                )
                 cost += float(tails[0]) + _EQUAL
             if best is None or cost < best[0]:
                 best = cost, wanted
         if best is None or (best[1] == 1).all():
             return None
-        return design(best[1], rate, longest=length)
+        return equaliser.design(best[1], rate, longest=length)
 
     def response(self, frequency: FloatArray) -> ComplexArray | None:
         """Return what the filters do to each channel; None without filters."""
@@ -205,7 +200,7 @@ class Equalisation:
 
     def _design(self, wanted: ComplexArray) -> None:
         longest = self._welch.segment_length // 2 - 1
-        estimated = design(wanted, self._welch.sampling_rate, longest=longest)
+        estimated = equaliser.design(wanted, self._welch.sampling_rate, longest=longest)
         self._wanted = wanted
         self.filters = estimated if self.known is None else self.known.then(estimated)
 
@@ -247,7 +242,7 @@ class Equalisation:
         noise = self._jackknifed(groups, None), self._jackknifed(groups, self.filters)
         proven = np.zeros(len(self._dims), np.bool_)
         if noise[0] is not None and noise[1] is not None:
-            inner = slice(1, int(USABLE * len(self._welch.frequencies)))
+            inner = slice(1, int(equaliser.USABLE * len(self._welch.frequencies)))
             frequency = self._welch.frequencies[inner]
             before, after = (each[:, inner] for each in noise if each is not None)
             proven = lowers_noise(before, after, frequency, dims=self._dims)
@@ -262,7 +257,7 @@ class Equalisation:
         return True
 
     def _jackknifed(
-        self, groups: Sequence[tuple[Pass, int, int]], filters: Equaliser | None
+        self, groups: Sequence[tuple[Pass, int, int]], filters: equaliser.Equaliser | None
     ) -> FloatArray | None:
         """Return the noise without each group of segments, shape (n_groups, n_freqs, n_channels).
 

@@ -29,6 +29,7 @@ import numpy as np
 from daq.bench.units import canonical
 from daq.clocks.sensor_reader import main_columns
 from daq.errors import CannotAlignError
+from daq.estimation import recording_set
 from daq.estimation.blas_threads import one_blas_thread
 from daq.estimation.equalisation import (
     FILTER_SEGMENTS,
@@ -40,14 +41,6 @@ from daq.estimation.equalisation import (
 )
 from daq.estimation.freed_memory import FREED_FROM, give_back
 from daq.estimation.noise_estimates import Dimensions, averages
-from daq.estimation.recording_set import (
-    check_same,
-    check_span,
-    continuations,
-    is_left,
-    open_another,
-    that_sent,
-)
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError, Snapshot
@@ -164,15 +157,15 @@ class Estimation:
         self._recordings: list[ReadableRecording] = []
         try:
             for path in paths:
-                self._recordings.append(open_another(path, self._recordings))
+                self._recordings.append(recording_set.open_another(path, self._recordings))
             self._open_continuations()
             first = self._recordings[0]
             wanted = Settings.of(first.outline) if settings is None else settings
             self.settings = wanted.at(created_at(first))
             self._sensors = live_sensors(first, self.settings) if live else None
-            self._sensors = self._sensors or that_sent(self._recordings)
+            self._sensors = self._sensors or recording_set.that_sent(self._recordings)
             self._passes = [self._pass(recording) for recording in self._recordings]
-            check_same(self._passes)
+            recording_set.check_same(self._passes)
             if not live:
                 announce(self._passes[0].n_channels, self._passes[0].welch)
             aligned = self._passes[0].aligned
@@ -217,7 +210,7 @@ class Estimation:
     @property
     def is_whole(self) -> bool:
         """Whether the sensors that are estimated are all that sent anything."""
-        return self._sensors == that_sent(self._recordings)
+        return self._sensors == recording_set.that_sent(self._recordings)
 
     @property
     def recordings(self) -> tuple[ReadableRecording, ...]:
@@ -328,7 +321,7 @@ class Estimation:
                 self._passes[number] = self._pass(each.recording)
             if not self._passes[number].shows_drifts:
                 self._passes[number].doubt_stated_times()
-        check_span(self._passes, self.settings)
+        recording_set.check_span(self._passes, self.settings)
         total = sum(each.n_complete for each in self._passes)
         done = self.n_seen
 
@@ -387,16 +380,16 @@ class Estimation:
 
     def _open_continuations(self) -> None:
         for recording in tuple(self._recordings):
-            self._recordings.extend(continuations(recording, self._recordings))
+            self._recordings.extend(recording_set.continuations(recording, self._recordings))
 
     def _continue(self) -> None:
         """Take in the files in which the recorder has gone on since."""
-        if not is_left(self._recordings[-1]):
+        if not recording_set.is_left(self._recordings[-1]):
             return
         self._open_continuations()
         for recording in self._recordings[len(self._passes) :]:
             self._passes.append(self._pass(recording))
-            check_same(self._passes)
+            recording_set.check_same(self._passes)
         self._filter()
 
     def _filter(self) -> None:

@@ -6,16 +6,7 @@ from typing import TYPE_CHECKING, Self, TypeAlias
 
 import numpy as np
 
-from daq.protocols.block import (
-    Block,
-    BlockFlag,
-    CountsArray,
-    Event,
-    EventKind,
-    HostTime,
-    Quantity,
-    Reading,
-)
+from daq.protocols import block
 from daq.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
@@ -71,7 +62,7 @@ class ArrayWriter:
         bench: Bench | None = None,
         *,
         sensors: Sequence[SensorLayout],
-        created: HostTime,
+        created: block.HostTime,
         attributes: dict[str, str | float] | None = None,
         chunk_seconds: float = CHUNK_SECONDS,
     ) -> None:
@@ -105,7 +96,7 @@ class ArrayWriter:
     def samples(
         self,
         sensor: str,
-        counts: CountsArray,
+        counts: block.CountsArray,
         *,
         first_sample: int = 0,
         block_rows: int = BLOCK_ROWS,
@@ -137,7 +128,7 @@ class ArrayWriter:
             Whether the sampling clock restarts at the first sample; default: only at index 0.
         """
         rate, n_samples = self._rates[sensor], len(counts)
-        flags = BlockFlag.NONE if utc_ns is None else BlockFlag.DEVICE_UTC
+        flags = block.BlockFlag.NONE if utc_ns is None else block.BlockFlag.DEVICE_UTC
         for number, row in enumerate(range(0, n_samples, block_rows)):
             end = min(row + block_rows, n_samples)
             received = (
@@ -152,7 +143,7 @@ class ArrayWriter:
                 self._writer.commit()
                 self._uncommitted = 0
             self._writer.append(
-                Block(
+                block.Block(
                     sensor=sensor,
                     first_sample=first_sample + row,
                     counts=samples,
@@ -160,7 +151,7 @@ class ArrayWriter:
                     device_counter=(
                         None if utc_ns is None else self.created.utc_ns + int(utc_ns[number])
                     ),
-                    flags=flags | BlockFlag.CLOCK_RESTART if starts_anew else flags,
+                    flags=flags | block.BlockFlag.CLOCK_RESTART if starts_anew else flags,
                     instants_ns=(
                         None
                         if instants_ns is None
@@ -173,15 +164,17 @@ class ArrayWriter:
         """Record that samples from `first_sample` on are missing."""
         self._writer.gap(sensor, first_sample, missing, reason=reason)
 
-    def event(self, kind: EventKind | str, text: str, *, at_ns: int = 0, sensor: str = "") -> None:
+    def event(
+        self, kind: block.EventKind | str, text: str, *, at_ns: int = 0, sensor: str = ""
+    ) -> None:
         """Record an event."""
-        self._writer.event(Event(sensor, kind, text, self._at(at_ns)))
+        self._writer.event(block.Event(sensor, kind, text, self._at(at_ns)))
 
     def reading(
-        self, quantity: Quantity | str, value: float, *, at_ns: int = 0, sensor: str = ""
+        self, quantity: block.Quantity | str, value: float, *, at_ns: int = 0, sensor: str = ""
     ) -> None:
         """Record a reading."""
-        self._writer.reading(Reading(sensor, quantity, value, self._at(at_ns)))
+        self._writer.reading(block.Reading(sensor, quantity, value, self._at(at_ns)))
 
-    def _at(self, ns: int) -> HostTime:
-        return HostTime(self.created.monotonic_ns + ns, self.created.utc_ns + ns)
+    def _at(self, ns: int) -> block.HostTime:
+        return block.HostTime(self.created.monotonic_ns + ns, self.created.utc_ns + ns)

@@ -20,31 +20,9 @@ from itertools import groupby
 
 import numpy as np
 
+from estimator.checks import advice_on_model, advice_on_sensors, advice_on_signals
 from estimator.checks.advice import Advice, Rank
-from estimator.checks.advice_on_model import (
-    MissingDimension,
-    ModelMisfit,
-    MotionAcross,
-    NearlySingular,
-    TooFewDimensions,
-    WeakMotion,
-)
 from estimator.checks.advice_on_noise import SharedNoise
-from estimator.checks.advice_on_sensors import (
-    Delay,
-    Gain,
-    NotOrthogonal,
-    ReversedPolarity,
-    Rotated,
-    SwappedChannels,
-)
-from estimator.checks.advice_on_signals import (
-    Copies,
-    MissingChannels,
-    NoSharedMotion,
-    NoSignal,
-    TooFewSensors,
-)
 from estimator.checks.band import BandDiagnosis
 from estimator.checks.relative_response import RelativeResponse
 from estimator.checks.shared_motion import outsiders
@@ -90,7 +68,7 @@ def orientation(
     counterpart, own = (sum(dims[:sensor]) for sensor in pair)
     swapped = {} if response.is_ambiguous else _swapped(response)
     if swapped:
-        yield SwappedChannels(
+        yield advice_on_sensors.SwappedChannels(
             rank=Rank.DELAYS,
             sensors=pair,
             band=band,
@@ -99,7 +77,7 @@ def orientation(
         return
     has_sign = not response.is_ambiguous
     if has_sign and _exceeds(response.rotation_deg, ROTATED_DEG, response.rotation_error_deg):
-        yield Rotated(
+        yield advice_on_sensors.Rotated(
             rank=Rank.TO_KNOW,
             sensors=pair,
             band=band,
@@ -110,14 +88,14 @@ def orientation(
     skew = response.nonorthogonality_deg
     if _exceeds(skew, SKEWED_DEG, response.nonorthogonality_error_deg):
         very = skew > VERY_SKEWED_DEG
-        yield NotOrthogonal(
+        yield advice_on_sensors.NotOrthogonal(
             rank=Rank.DELAYS if very else Rank.TO_KNOW,
             sensors=pair,
             band=band,
             deviation_deg=skew,
         )
     for channel in response.reversed_channels if has_sign else ():
-        yield ReversedPolarity(
+        yield advice_on_sensors.ReversedPolarity(
             rank=Rank.DELAYS,
             sensors=pair,
             band=band,
@@ -126,7 +104,7 @@ def orientation(
         )
     off = int(np.argmax(np.abs(response.gains - 1)))
     if _exceeds(abs(response.gains[off] - 1), GAIN, response.gain_errors[off]):
-        yield Gain(
+        yield advice_on_sensors.Gain(
             rank=Rank.TO_KNOW,
             sensors=pair,
             band=band,
@@ -136,7 +114,7 @@ def orientation(
         )
     samples = response.delay * 2 * nyquist
     if has_sign and _exceeds(abs(samples), DELAY_SAMPLES, response.delay_error * 2 * nyquist):
-        yield Delay(
+        yield advice_on_sensors.Delay(
             rank=Rank.DELAYS,
             sensors=pair,
             band=band,
@@ -235,7 +213,7 @@ def _overlap(one: Advice, other: Advice) -> bool:
 
 def _strangers(
     bands: tuple[BandDiagnosis, ...], n_sensors: int, n_effective: float
-) -> Iterator[NoSharedMotion]:
+) -> Iterator[advice_on_signals.NoSharedMotion]:
     """Yield advice on sensors that record none of the motion shared by others.
 
     Other findings in these bands are consequences, and not reported.
@@ -252,11 +230,11 @@ def _strangers(
 
 def _stranger(
     sensor: int, run: list[BandDiagnosis], groups: list[tuple[int, ...]]
-) -> NoSharedMotion:
+) -> advice_on_signals.NoSharedMotion:
     partners = max(groups, key=len)
     weights = [band.n_frequencies for band in run]
     shared = np.average([band.shared for band in run], axis=0, weights=weights)
-    return NoSharedMotion(
+    return advice_on_signals.NoSharedMotion(
         rank=Rank.INVALIDATES,
         sensors=(sensor,),
         band=_span(run),
@@ -295,7 +273,7 @@ def _absent(given: Coherency, dims: tuple[int, ...]) -> Iterator[Advice]:
     for sensor in range(len(dims)):
         own = np.flatnonzero((sensor_of == sensor) & (dead > 0.5))
         if len(own):
-            yield NoSignal(
+            yield advice_on_signals.NoSignal(
                 rank=Rank.INVALIDATES,
                 sensors=(sensor,),
                 channels=tuple(own.tolist()),
@@ -304,7 +282,7 @@ def _absent(given: Coherency, dims: tuple[int, ...]) -> Iterator[Advice]:
             )
     pairs = np.argwhere(np.triu(copies > 0.5))
     if len(pairs):
-        yield Copies(
+        yield advice_on_signals.Copies(
             rank=Rank.INVALIDATES,
             sensors=tuple(np.unique(sensor_of[pairs]).tolist()),
             channels=tuple((int(original), int(copy)) for original, copy in pairs),
@@ -313,9 +291,11 @@ def _absent(given: Coherency, dims: tuple[int, ...]) -> Iterator[Advice]:
     there = presence(given, dims)
     missing = tuple(s for s in range(len(dims)) if s not in there.whole)
     if len(there.sensors) < min(3, len(dims)):  # a bench of two lacks none
-        yield TooFewSensors(rank=Rank.INVALIDATES, sensors=there.sensors)
+        yield advice_on_signals.TooFewSensors(rank=Rank.INVALIDATES, sensors=there.sensors)
     elif missing and len(there.whole) < 3:
-        yield MissingChannels(rank=Rank.DELAYS, sensors=missing, whole_sensors=there.whole)
+        yield advice_on_signals.MissingChannels(
+            rank=Rank.DELAYS, sensors=missing, whole_sensors=there.whole
+        )
 
 
 def _statistic(*bands: BandDiagnosis) -> float:
@@ -328,7 +308,7 @@ def _too_few_dimensions(bands: tuple[BandDiagnosis, ...], n_factors: int) -> Ite
     rejected = rejected_below(band.test for band in bands)
     for run in _runs(bands, lambda band: band.test.p_value < rejected):
         worst = max(run, key=_statistic)
-        yield TooFewDimensions(
+        yield advice_on_model.TooFewDimensions(
             rank=Rank.INVALIDATES,
             band=_span(run),
             n_factors=n_factors,
@@ -353,7 +333,7 @@ def _incoherence(
         rank = Rank.DELAYS if likely >= SMALL_ERROR else Rank.TO_KNOW
         if likely >= LARGE_ERROR:
             rank = Rank.INVALIDATES
-        yield ModelMisfit(
+        yield advice_on_model.ModelMisfit(
             rank=rank,
             band=_span(run),
             n_factors=n_factors,
@@ -420,7 +400,7 @@ def _sensor_space(bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...]) -> It
     shared = [sorted(dims[:i] + dims[i + 1 :])[-2] for i in range(len(dims))]
     for d in sorted({n for n in shared if n < 3}):
         larger = tuple(i for i, n in enumerate(dims) if n > d)
-        yield MotionAcross(
+        yield advice_on_model.MotionAcross(
             rank=Rank.TO_KNOW,
             sensors=tuple(i for i, n in enumerate(shared) if n == d) if larger else (),
             band=_span(strong),
@@ -443,7 +423,7 @@ def _dimensions(
         return band.dimension < full and not hidden
 
     for run in _runs(bands, is_missing):
-        yield MissingDimension(
+        yield advice_on_model.MissingDimension(
             rank=Rank.DELAYS,
             band=_span(run),
             n_dimensions=min(b.dimension for b in run),
@@ -452,7 +432,7 @@ def _dimensions(
         )
     limit = max(_NEARLY_SINGULAR, float(np.sqrt(n_effective)))
     for run in _runs(bands, lambda band: band.dimension >= full and band.condition > limit):
-        yield NearlySingular(
+        yield advice_on_model.NearlySingular(
             rank=Rank.TO_KNOW, band=_span(run), condition=max(b.condition for b in run)
         )
 
@@ -460,4 +440,4 @@ def _dimensions(
 def _weak_motion(bands: tuple[BandDiagnosis, ...]) -> Iterator[Advice]:
     for run in _runs(bands, _is_weak):
         snr = float(np.nanmax([b.snr for b in run]))
-        yield WeakMotion(rank=Rank.TO_KNOW, band=_span(run), snr=snr)
+        yield advice_on_model.WeakMotion(rank=Rank.TO_KNOW, band=_span(run), snr=snr)

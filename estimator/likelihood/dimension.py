@@ -15,16 +15,8 @@ import numpy as np
 from estimator.errors import InsufficientDataError, InvalidMatrixError
 from estimator.levels.noise_matrices import together
 from estimator.levels.pooled import DIMENSIONS_OF_MOTION, blocks_of, most_pooled
+from estimator.likelihood import goodness_of_fit
 from estimator.likelihood.factor_analysis import Maxima, max_factors, maximise, n_noise
-from estimator.likelihood.goodness_of_fit import (
-    HANN_HALF,
-    REJECT,
-    BandTest,
-    ModelTest,
-    model_test,
-    pool,
-    upper_tail,
-)
 from estimator.likelihood.maximum_likelihood import standard_error
 from estimator.likelihood.prior import expected_noise, kinds, maximise_expecting
 from estimator.likelihood.shared_by_two import SHARING, SharedByTwo, local_shares
@@ -45,7 +37,7 @@ ROOM, ROOM_OF_ONE_CHANNEL = 4, 6
 """Sensors from which ``auto`` looks for more dimensions of motion than a sensor has channels."""
 MAX_CHANNELS = 96
 """Channels up to which ``auto`` is maximum likelihood, to limit its cost."""
-MISFIT_LEVEL = REJECT
+MISFIT_LEVEL = goodness_of_fit.REJECT
 """Probability that a dimension is rejected in any of the bands although it is right: in each band,
 this over their number. With 5 % for each band, four sensors had a rejected one in every second
 recording without fault."""
@@ -121,8 +113,8 @@ class BandDimension:
     n_factors: int = field(metadata={"key": "dimensions"})
     usual: int = field(metadata={"key": "usual_dimensions"})
     accepted: bool = field(metadata={"key": "is_accepted"})
-    test: BandTest
-    tried: tuple[BandTest, ...]
+    test: goodness_of_fit.BandTest
+    tried: tuple[goodness_of_fit.BandTest, ...]
     cov: float
     usual_cov: float
     n_sensors: int = field(default=MIN_DETERMINED_SENSORS, metadata={"key": "sensors"})
@@ -303,10 +295,10 @@ def choose_dimension(
         dims=there.dims,
         stride=stride,
     )
-    r = HANN_HALF if neighbours is None else neighbours
+    r = goodness_of_fit.HANN_HALF if neighbours is None else neighbours
     open_bands = list(stride)
     level /= len(open_bands)
-    tried: dict[int, list[BandTest]] = {b: [] for b in open_bands}
+    tried: dict[int, list[goodness_of_fit.BandTest]] = {b: [] for b in open_bands}
     cov: dict[tuple[int, int], float] = {}
     for q in range(most + 1):
         hopeless = {} if q in {usual, most} else search.hopeless(q, open_bands, stride, r)
@@ -359,14 +351,14 @@ def choose_dimension(
     return np.array([chosen[int(b)] for b in number]), choices
 
 
-def _are_rejected(tests: list[BandTest]) -> bool:
+def _are_rejected(tests: list[goodness_of_fit.BandTest]) -> bool:
     """Whether the tests of bands fail together.
 
     What a band alone hardly shows, such as weak gradients, biases the noise of all.
     """
     statistic = sum(test.statistic / test.spread for test in tests)
     degrees = sum(test.degrees / test.spread for test in tests)
-    return bool(tests) and upper_tail(degrees, statistic) < MISFIT_LEVEL
+    return bool(tests) and goodness_of_fit.upper_tail(degrees, statistic) < MISFIT_LEVEL
 
 
 def most_testable(dims: tuple[int, ...]) -> int:
@@ -392,7 +384,7 @@ class _Fit:
     number: IntArray
     psi: FloatArray
     cov: FloatArray
-    test: ModelTest
+    test: goodness_of_fit.ModelTest
 
     def median_cov(self, band: int) -> float:
         """Return the median c.o.v. in a band; infinite if the noise is undetermined."""
@@ -450,12 +442,12 @@ class _Search:
             number=self._number[rows],
             psi=maximum.psi,
             cov=error / maximum.psi,
-            test=model_test(maximum, n_effective=self._n_effective),
+            test=goodness_of_fit.model_test(maximum, n_effective=self._n_effective),
         )
 
     def together(
         self,
-        tried: dict[int, list[BandTest]],
+        tried: dict[int, list[goodness_of_fit.BandTest]],
         rejected: list[int],
         cov: dict[tuple[int, int], float],
         *,
@@ -483,7 +475,7 @@ class _Search:
         self,
         q: int,
         some: list[int],
-        tried: dict[int, list[BandTest]],
+        tried: dict[int, list[goodness_of_fit.BandTest]],
         cov: dict[tuple[int, int], float],
         neighbours: FloatArray,
     ) -> _Fit:
@@ -491,25 +483,25 @@ class _Search:
         fit = self.fit(q, some if q != self._usual else list(tried))
         for b in some:
             distant = neighbours[self._stride[b] - 1 :: self._stride[b]]
-            tried[b].append(pool(fit.test, fit.number == b, neighbours=distant))
+            tried[b].append(goodness_of_fit.pool(fit.test, fit.number == b, neighbours=distant))
             cov[b, q] = fit.median_cov(b)
         return fit
 
     def hopeless(
         self, q: int, some: list[int], stride: dict[int, int], neighbours: FloatArray
-    ) -> dict[int, BandTest]:
+    ) -> dict[int, goodness_of_fit.BandTest]:
         """Return the tests of bands that few of their frequencies reject beyond doubt."""
         look, found = self.fit(q, some, every=FIRST_LOOK), {}
         for b in some:
             distant = neighbours[FIRST_LOOK * stride[b] - 1 :: FIRST_LOOK * stride[b]]
-            test = pool(look.test, look.number == b, neighbours=distant)
+            test = goodness_of_fit.pool(look.test, look.number == b, neighbours=distant)
             if test.p_value < HOPELESS:
                 found[b] = test
         return found
 
     def sensor_test(
         self, q: int, band: int, group: IntArray, neighbours: FloatArray
-    ) -> tuple[BandTest, ComplexArray] | None:
+    ) -> tuple[goodness_of_fit.BandTest, ComplexArray] | None:
         """Test q factors beside a matrix of noise for each group of sensors, in a band.
 
         With the noise, shape (n_rows, n_channels, n_channels); None where nothing is left to test.
@@ -522,11 +514,11 @@ class _Search:
         rows = rows[every // 2 :: every]
         matrix = self._matrix[rows[:, None, None], order[:, None], order]
         fit = maximise(matrix, q, dims=dims, most=SENSOR_STEPS)
-        test = model_test(fit, n_effective=self._n_effective)
+        test = goodness_of_fit.model_test(fit, n_effective=self._n_effective)
         step = every * self._stride[band]
         back = np.argsort(order)
         return (
-            pool(test, ~fit.singular, neighbours=neighbours[step - 1 :: step]),
+            goodness_of_fit.pool(test, ~fit.singular, neighbours=neighbours[step - 1 :: step]),
             fit.noise[~fit.singular][:, back[:, None], back],
         )
 

@@ -20,13 +20,7 @@ from estimator.checks.advice_on_sensors import UnequalResponses
 from estimator.likelihood.dimension import bands
 from estimator.responses.edge_leakage import ChannelResponses, band_shares
 from estimator.self_noise.coherency import own_channels
-from estimator.spectra.equaliser import (
-    USABLE,
-    bounded,
-    smoothed,
-    tail_leakage,
-    with_short_tails,
-)
+from estimator.spectra import equaliser
 from estimator.types import BoolArray, ComplexArray, FloatArray
 
 THRESHOLD = 0.01
@@ -61,7 +55,7 @@ def significant_minimum(
     (n_freqs,)), where responses are not equalised.
     """
     least = np.maximum(share - SIGNIFICANCE * deviation, 0.0)
-    return np.where((frequency <= USABLE * frequency[-1])[:, None], least, 0.0)
+    return np.where((frequency <= equaliser.USABLE * frequency[-1])[:, None], least, 0.0)
 
 
 def leakage_advice(
@@ -158,7 +152,7 @@ def correction(
         wanted = _towards(
             sensor, responses, grid, dims=dims, snr=snr, n_effective=n_effective, factor=factor
         )
-        tails = tail_leakage(wanted, 2 * float(grid[-1]), snr=on_grid, factor=factor)
+        tails = equaliser.tail_leakage(wanted, 2 * float(grid[-1]), snr=on_grid, factor=factor)
         n_filtered = int((wanted != 1).any(axis=0).sum())
         cost = float(tails.max()) + _MORE_CHANNELS * n_filtered
         if best is None or cost < best[0]:
@@ -196,14 +190,14 @@ def _towards(
         weight = np.where(usable, weight / np.maximum(np.abs(inverse), 1e-150) ** 2, 0.0)
         if usable.sum() < len(usable) // 2:
             continue
-        known = usable & (g > _COHERENT / max(n_effective, 1.0)) & (f <= USABLE * f[-1])
+        known = usable & (g > _COHERENT / max(n_effective, 1.0)) & (f <= equaliser.USABLE * f[-1])
         if np.count_nonzero(known) < _MIN_KNOWN:
             continue
-        even = _held(smoothed(inverse, weight, stiffness=_STIFFNESS), known)
+        even = _held(equaliser.smoothed(inverse, weight, stiffness=_STIFFNESS), known)
         if len(f) != len(grid) or not np.array_equal(f, grid):
             even = np.interp(grid, f, even.real) + 1j * np.interp(grid, f, even.imag)
-        wanted[:, channel] = bounded(even)
-        wanted[:, [channel]] = with_short_tails(wanted[:, [channel]])
+        wanted[:, channel] = equaliser.bounded(even)
+        wanted[:, [channel]] = equaliser.with_short_tails(wanted[:, [channel]])
     return wanted
 
 

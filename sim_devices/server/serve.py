@@ -64,15 +64,7 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from sim_devices.devices.interface import (
-    NEVER,
-    ChannelSpec,
-    DeviceSpec,
-    Endpoint,
-    Kind,
-    Line,
-    Source,
-)
+from sim_devices.devices import interface
 from sim_devices.errors import ServeError
 from sim_devices.faults import Fault, LineFaults, SampleFaults, parse
 from sim_devices.world.scenario import Scenario
@@ -459,7 +451,7 @@ def self_signed(folder: Path) -> tuple[ssl.SSLContext, str]:
 
 
 def make_port(
-    kind: Kind, listener: Listener, *, scheme: str, number: int = 0, tls: bool = False
+    kind: interface.Kind, listener: Listener, *, scheme: str, number: int = 0, tls: bool = False
 ) -> DevicePort:
     """Return a line of this kind, not yet open; ``number`` is that of a TCP port."""
     if kind == "pty":
@@ -532,7 +524,7 @@ class Served:
     Units are sent at absolute instants of world time, so that delays do not accumulate.
     """
 
-    line: Line
+    line: interface.Line
     clock: WorldClock
     faults: LineFaults
     tell: Callable[[float, Fault], None]
@@ -542,7 +534,7 @@ class Served:
     def __post_init__(self) -> None:
         self._unsent: deque[tuple[float, bytes]] = deque()
         """Time and bytes of units accepted by the port, of which some wait in this process."""
-        self._endpoint: Endpoint = self.line.endpoint
+        self._endpoint: interface.Endpoint = self.line.endpoint
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._last = -math.inf
@@ -637,7 +629,7 @@ class Served:
         when = min(self._endpoint.next_due(), self.faults.next_due())
         if self._down:
             when = min(when, self.faults.down_until)
-        if when < NEVER:
+        if when < interface.NEVER:
             at = max(self.clock.monotonic(when), self._last + MIN_INTERVAL)
             self._timer = self._loop.call_at(at, self._tick)
 
@@ -683,10 +675,10 @@ async def serve(
         if fault.kind == "wrap":  # the counter has 16 bits
             first = round(-fault.at * device.sampling_rate) % 65536
             device = replace(device, settings={**device.settings, "first_count": first})
-    source = Source(scenario, device, faults=SampleFaults(faults))
+    source = interface.Source(scenario, device, faults=SampleFaults(faults))
     for sensor in device.sensors:  # the first sample is slow: compute it before clients wait
         source.counts(sensor, source.first_sample_after(sensor, clock.now()), 1)
-    lines: Sequence[Line] = getattr(import_module(module), function)(device, source)
+    lines: Sequence[interface.Line] = getattr(import_module(module), function)(device, source)
     loop = asyncio.get_running_loop()
     ended = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -734,7 +726,7 @@ async def serve(
 class _Log:
     """Lines of JSON that all processes of a bench append to one file; optional."""
 
-    def __init__(self, path: str | None, device: DeviceSpec) -> None:
+    def __init__(self, path: str | None, device: interface.DeviceSpec) -> None:
         self._path = path
         self._sensors = list(device.sensors)
 
@@ -751,7 +743,7 @@ class _Log:
                 file.write(line.encode())
 
 
-def _announcement(device: DeviceSpec, served: Sequence[Served]) -> dict[str, Any]:
+def _announcement(device: interface.DeviceSpec, served: Sequence[Served]) -> dict[str, Any]:
     return {
         "sensors": list(device.sensors),
         "driver": device.driver,
@@ -761,15 +753,15 @@ def _announcement(device: DeviceSpec, served: Sequence[Served]) -> dict[str, Any
     }
 
 
-def device_spec(table: Mapping[str, Any]) -> DeviceSpec:
+def device_spec(table: Mapping[str, Any]) -> interface.DeviceSpec:
     """Parse one entry of ``devices``."""
-    return DeviceSpec(
+    return interface.DeviceSpec(
         sensors=tuple(table["sensors"]),
         driver=table["driver"],
         port=table.get("port", "pty"),
         sampling_rate=float(table["sampling_rate"]),
         channels={
-            sensor: tuple(ChannelSpec(**channel) for channel in channels)
+            sensor: tuple(interface.ChannelSpec(**channel) for channel in channels)
             for sensor, channels in table["channels"].items()
         },
         settings=table.get("settings", {}),

@@ -18,16 +18,9 @@ from daq.bench.end_condition import EndCondition
 from daq.bench.option_fit import shortest_duration
 from daq.errors import HuddleError, RecordingError
 from daq.recording.storage.names import recording_path
+from tui.commands import options
 from tui.commands.check import check_before_test
 from tui.commands.estimate import exit_with, show_result
-from tui.commands.options import (
-    DetailsOption,
-    DurationOption,
-    OutOption,
-    command,
-    with_estimate_options,
-    with_logging,
-)
 from tui.commands.report import checked, write_report
 from tui.output.console import check_places, for_people, hint, progress
 from tui.output.exit_codes import ExitCode
@@ -51,18 +44,18 @@ STATUS_INTERVAL = 1.0
 """Seconds between two looks at a recorder whose estimate has failed."""
 
 
-@command(first="duration until_decided until_cov anyway out report json band segment unit")
-@with_logging
-@with_estimate_options
+@options.command(first="duration until_decided until_cov anyway out report json band segment unit")
+@options.with_logging
+@options.with_estimate_options
 def run(
     path: Path,
     *,
-    duration: DurationOption = None,
+    duration: options.DurationOption = None,
     until_cov: Annotated[float | None, typer.Option(min=0.001, max=1.0)] = None,
     until_decided: bool = False,
     anyway: bool = False,
-    out: OutOption = None,
-    diagnostics: DetailsOption = False,
+    out: options.OutOption = None,
+    diagnostics: options.DetailsOption = False,
     report: Path | None = None,
     json: str | None = None,
     csv: str | None = None,

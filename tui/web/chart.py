@@ -14,16 +14,8 @@ import numpy as np
 
 from daq.bench.masks.mask import NOISE_MODELS
 from daq.bench.units import is_motion
+from tui.application.test_view import plotted
 from tui.application.test_view.curves import Curve, level_limits
-from tui.application.test_view.plotted import (
-    MODEL_STYLE,
-    Choice,
-    curves,
-    plot_title,
-    reading,
-    unit_of,
-    whole_span,
-)
 from tui.application.test_view.units import SpectrumUnit, units_of
 from tui.web.html import page
 
@@ -44,7 +36,7 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 80, 12, 12, 48
 """Of a picture, in its own units: its size, and its margins."""
 
 
-def choice_of(state: State, asked: Mapping[str, str]) -> Choice:
+def choice_of(state: State, asked: Mapping[str, str]) -> plotted.Choice:
     """Return what a request asks to see: channel and unit by number, a span in Hz.
 
     Raises
@@ -53,7 +45,7 @@ def choice_of(state: State, asked: Mapping[str, str]) -> Choice:
         If it asks for what there is not.
     """
     if state.result is None:
-        return Choice()
+        return plotted.Choice()
     snapshot, settings = state.result.snapshot, state.result.settings
     channel, unit = int(asked.get("channel", 0)), int(asked.get("unit", 0))
     if not 0 <= channel < len(snapshot.channels) or not 0 <= unit < len(units_of(snapshot.unit)):
@@ -61,36 +53,36 @@ def choice_of(state: State, asked: Mapping[str, str]) -> Choice:
     span = None
     if "from" in asked and "to" in asked:
         low, high = (math.log10(float(asked[end])) for end in ("from", "to"))
-        first, last = whole_span(snapshot)
+        first, last = plotted.whole_span(snapshot)
         span = max(low, first), min(high, last)
         if not span[1] - span[0] > 1e-3:
             raise ValueError("no such span")
     wanted = settings.for_sensors(snapshot.dims).methods
     methods = sorted(snapshot.results, key=lambda name: (*wanted, name).index(name))
-    return Choice(channel=channel, methods=tuple(methods), unit=unit, span=span)
+    return plotted.Choice(channel=channel, methods=tuple(methods), unit=unit, span=span)
 
 
 @lru_cache(maxsize=64)
-def drawn(state: State, choice: Choice) -> tuple[Curve, ...]:
+def drawn(state: State, choice: plotted.Choice) -> tuple[Curve, ...]:
     """Return the curves of a choice; those of a state are made once for all who look."""
-    found = curves(state, choice, n_points=POINTS)
+    found = plotted.curves(state, choice, n_points=POINTS)
     if choice.span is None:
         return tuple(found)
     return tuple(each.within(*choice.span) for each in found)
 
 
-def numbers(state: State, choice: Choice) -> dict[str, Any]:
+def numbers(state: State, choice: plotted.Choice) -> dict[str, Any]:
     """Return what a script draws, in the chosen unit, with each value in words."""
     snapshot = state.snapshot
     if snapshot is None or not (found := drawn(state, choice)):
         return {"curves": []}
-    unit, low_high = unit_of(snapshot, choice), _levels(found)
+    unit, low_high = plotted.unit_of(snapshot, choice), _levels(found)
     return {
-        "title": plot_title(snapshot, choice),
+        "title": plotted.plot_title(snapshot, choice),
         "unit": unit.name,
         "is_logarithmic": not unit.is_db,
         "range": [unit.value(end) for end in low_high],
-        "span": [10**end for end in choice.span or whole_span(snapshot)],
+        "span": [10**end for end in choice.span or plotted.whole_span(snapshot)],
         "channels": [label.name for label in snapshot.channels],
         "units": [each.name for each in units_of(snapshot.unit)],
         "curves": [_numbers(each, unit, low_high[0]) for each in found],
@@ -106,7 +98,7 @@ def with_models(state: State) -> State:
 
 def _levels(found: Sequence[Curve]) -> tuple[float, float]:
     """Return limits in dB that hold the curves, and of models what is not too far from them."""
-    low, high = level_limits([each for each in found if each.style != MODEL_STYLE])
+    low, high = level_limits([each for each in found if each.style != plotted.MODEL_STYLE])
     whole = level_limits(found)
     return max(whole[0], low - MODEL_RANGE_DB), min(whole[1], high + MODEL_RANGE_DB)
 
@@ -122,7 +114,7 @@ def _numbers(curve: Curve, unit: SpectrumUnit, floor: float) -> dict[str, Any]:
         "level": _values(curve.level_db, unit),
         "low": _values(low, unit) if has_interval else [],
         "high": _values(curve.high_db, unit) if has_interval else [],
-        "words": [reading(curve, at, unit) for at in range(curve.level_db.size)],
+        "words": [plotted.reading(curve, at, unit) for at in range(curve.level_db.size)],
     }
 
 
@@ -171,17 +163,17 @@ class _Axes:
         return "".join(parts)
 
 
-def picture(state: State, choice: Choice) -> str:
+def picture(state: State, choice: plotted.Choice) -> str:
     """Return the curves as SVG, without styles of its own; empty before there are any."""
     snapshot = state.snapshot
     if snapshot is None or not (found := drawn(state, choice)):
         return ""
-    unit = unit_of(snapshot, choice)
-    axes = _Axes(choice.span or whole_span(snapshot), _levels(found))
+    unit = plotted.unit_of(snapshot, choice)
+    axes = _Axes(choice.span or plotted.whole_span(snapshot), _levels(found))
     ticks = unit.ticks(*axes.levels)
     return page(
         "picture",
-        title=plot_title(snapshot, choice),
+        title=plotted.plot_title(snapshot, choice),
         width=_WIDTH,
         height=_HEIGHT,
         left=_LEFT,

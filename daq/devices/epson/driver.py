@@ -27,16 +27,10 @@ from pydantic import PositiveFloat, Strict, field_validator
 
 from daq.bench.channel import Channel
 from daq.bench.model import Sensor
+from daq.devices import interface
 from daq.devices.epson import commands
 from daq.devices.epson.burst import BurstDecoder
 from daq.devices.epson.commands import BurstFormat, Register
-from daq.devices.interface import (
-    DEFAULT_PATIENCE,
-    DeviceInformation,
-    Driver,
-    DriverSettings,
-    Session,
-)
 from daq.devices.port_rules import only, port_label
 from daq.errors import (
     BenchFileError,
@@ -71,7 +65,7 @@ EXTERNAL = {
 }
 
 
-class EpsonSettings(DriverSettings, strict=True):
+class EpsonSettings(interface.DriverSettings, strict=True):
     """``[sensors.settings]`` of an Epson accelerometer."""
 
     baud_rate: Literal[460800, 230400, 115200] = 460800
@@ -94,7 +88,7 @@ class EpsonSettings(DriverSettings, strict=True):
     """Function of the EXT pin; 1PPS on the M-A370 only."""
     full_scale: PositiveFloat = 15.0
     """Full scale in g, peak; samples beyond are marked as clipped."""
-    patience: PositiveFloat = DEFAULT_PATIENCE
+    patience: PositiveFloat = interface.DEFAULT_PATIENCE
     """Seconds without a frame after which the device is lost and reconnected."""
 
     @field_validator("filter")
@@ -321,7 +315,7 @@ class Device:
                     return await self._stream.read()
         return None
 
-    async def information(self) -> DeviceInformation:
+    async def information(self) -> interface.DeviceInformation:
         """Read the device's information.
 
         Raises
@@ -336,7 +330,7 @@ class Device:
         version = await self.read(commands.VERSION)
         count = await self._temperature_count()
         diagnosis = await self.read(commands.DIAG_STAT)
-        return DeviceInformation(
+        return interface.DeviceInformation(
             sensor=self._sensor.name,
             model=model,
             serial_number=serial_number,
@@ -426,7 +420,7 @@ LISTEN = 0.5
 
 
 @dataclass(eq=False)
-class EpsonSession(Session):
+class EpsonSession(interface.Session):
     """An accelerometer, configured and idle until :meth:`read`, or still streaming.
 
     Attributes
@@ -437,7 +431,7 @@ class EpsonSession(Session):
 
     device: Device
     configuration: Configuration
-    information: tuple[DeviceInformation, ...]
+    information: tuple[interface.DeviceInformation, ...]
     decoder: BurstDecoder
     clock: HostClock
     heard: tuple[bytes, HostTime] | None = None
@@ -522,7 +516,7 @@ class EpsonSession(Session):
         return received, at
 
 
-async def identify(port: str, clock: HostClock, *, baud_rate: int) -> DeviceInformation:
+async def identify(port: str, clock: HostClock, *, baud_rate: int) -> interface.DeviceInformation:
     """Return the information of the Epson accelerometer on a port; leave it idle.
 
     Raises
@@ -545,7 +539,7 @@ async def identify(port: str, clock: HostClock, *, baud_rate: int) -> DeviceInfo
         return replace(information, sampling_rate=await device.sampling_rate())
 
 
-class EpsonDriver(Driver[EpsonSettings]):
+class EpsonDriver(interface.Driver[EpsonSettings]):
     """See :class:`daq.devices.interface.Driver`. Counts of all fields are int32."""
 
     name = "epson"
@@ -577,7 +571,7 @@ class EpsonDriver(Driver[EpsonSettings]):
 
     @contextlib.asynccontextmanager
     async def resume(
-        self, sensors: Sequence[Sensor], clock: HostClock, before: Session
+        self, sensors: Sequence[Sensor], clock: HostClock, before: interface.Session
     ) -> AsyncIterator[EpsonSession]:
         """Open the port and continue the device's stream; configure it if it does not stream."""
         sensor, configuration = self.check(sensors)

@@ -31,15 +31,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from daq.devices.guralp.gcf import (
-    BLOCK_SIZE,
-    SampleBlock,
-    StatusBlock,
-    Width,
-    decode_block,
-    encode_block,
-    encode_status,
-)
+from daq.devices.guralp import gcf
 from daq.protocols.errors import RemoteProtocolError
 
 SEND = b"GCFSEND:B\0"
@@ -64,18 +56,18 @@ class Packet:
 
     sequence: int
     source: str
-    block: SampleBlock | StatusBlock
+    block: gcf.SampleBlock | gcf.StatusBlock
 
 
-def encode_packet(packet: Packet, *, version: int = 40, width: Width | None = None) -> bytes:
+def encode_packet(packet: Packet, *, version: int = 40, width: gcf.Width | None = None) -> bytes:
     """Encode a big-endian packet; ``width`` as in :func:`daq.devices.guralp.gcf.encode_block`."""
     block = packet.block
-    if isinstance(block, SampleBlock):
+    if isinstance(block, gcf.SampleBlock):
         if width == 24:  # only the length distinguishes 24 from 32 bits; here it is always 1024
             raise ValueError("no differences of 24 bits over a network")
-        body = encode_block(block, width=width)
+        body = gcf.encode_block(block, width=width)
     else:
-        body = encode_status(block)
+        body = gcf.encode_status(block)
     source = packet.source.encode("ascii")[: _SOURCE_SIZE[version]]
     padded = source.ljust(_SOURCE_SIZE[version], b"\0")
     sequence = packet.sequence % 65536
@@ -83,7 +75,7 @@ def encode_packet(packet: Packet, *, version: int = 40, width: Width | None = No
         tail = struct.pack(">BB32sHB", version, len(source), padded, sequence, 1) + _PADDING
     else:
         tail = struct.pack(">BBHB", version, 1, sequence, len(source)) + padded
-    return body.ljust(BLOCK_SIZE, b"\0") + tail
+    return body.ljust(gcf.BLOCK_SIZE, b"\0") + tail
 
 
 def decode_packet(data: bytes) -> Packet:
@@ -94,19 +86,19 @@ def decode_packet(data: bytes) -> Packet:
     RemoteProtocolError
         If its version, length or byte order is unknown, or its block is damaged.
     """
-    version = data[BLOCK_SIZE] if len(data) > BLOCK_SIZE else 0
+    version = data[gcf.BLOCK_SIZE] if len(data) > gcf.BLOCK_SIZE else 0
     if len(data) != SIZES.get(version):
         raise RemoteProtocolError(f"a Scream packet of version {version} has {len(data)} bytes")
-    tail = data[BLOCK_SIZE + 1 :]
+    tail = data[gcf.BLOCK_SIZE + 1 :]
     if version == 31:
         length, order, raw_sequence, text = tail[0], tail[35], tail[33:35], tail[1:33]
     else:
         order, raw_sequence, length, text = tail[0], tail[1:3], tail[3], tail[4:]
     if order not in (1, 2) or length > len(text):
         raise RemoteProtocolError(f"a Scream packet with byte order {order}, source of {length}")
-    block = data[:BLOCK_SIZE] if order == 1 else swapped(data[:BLOCK_SIZE])
+    block = data[: gcf.BLOCK_SIZE] if order == 1 else swapped(data[: gcf.BLOCK_SIZE])
     sequence = int.from_bytes(raw_sequence, "big" if order == 1 else "little")
-    return Packet(sequence, text[:length].decode("ascii", "replace"), decode_block(block))
+    return Packet(sequence, text[:length].decode("ascii", "replace"), gcf.decode_block(block))
 
 
 def swapped(block: bytes) -> bytes:
@@ -115,7 +107,7 @@ def swapped(block: bytes) -> bytes:
     out[:12] = out[:12].reshape(3, 4)[:, ::-1].reshape(-1)
     sps, compression, records = (int(value) for value in out[13:16])
     if sps:
-        end = min(20 + 4 * records, BLOCK_SIZE - 4)
+        end = min(20 + 4 * records, gcf.BLOCK_SIZE - 4)
         size = {1: 4, 2: 2}.get(compression & 7, 1)
         for first, last, step in ((16, 20, 4), (20, end, size), (end, end + 4, 4)):
             out[first:last] = out[first:last].reshape(-1, step)[:, ::-1].reshape(-1)
@@ -133,14 +125,14 @@ class PacketFinder:
         """Yield packets, and before a packet after garbage the number of skipped bytes."""
         self._buffer += data
         buffer = bytes(self._buffer)
-        tails = np.frombuffer(buffer, np.uint8)[BLOCK_SIZE:]
+        tails = np.frombuffer(buffer, np.uint8)[gcf.BLOCK_SIZE :]
         starts = np.flatnonzero(np.isin(tails, tuple(SIZES)))
         here = 0
-        undecided = max(0, len(buffer) - BLOCK_SIZE)  # tails of later packets have not arrived
+        undecided = max(0, len(buffer) - gcf.BLOCK_SIZE)  # tails of later packets have not arrived
         for start in starts.tolist():
             if start < here:
                 continue
-            end = start + SIZES[buffer[start + BLOCK_SIZE]]
+            end = start + SIZES[buffer[start + gcf.BLOCK_SIZE]]
             if end > len(buffer):
                 if _plausible(buffer, start):
                     undecided = start

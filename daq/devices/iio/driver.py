@@ -17,14 +17,8 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from pydantic import PositiveFloat
 
+from daq.devices import interface
 from daq.devices.iio import protocol
-from daq.devices.interface import (
-    DEFAULT_PATIENCE,
-    DeviceInformation,
-    Driver,
-    DriverSettings,
-    Session,
-)
 from daq.devices.port_rules import host_of, only, port_label
 from daq.errors import NoAnswerError, WrongDeviceError
 from daq.protocols.block import (
@@ -57,7 +51,7 @@ BLOCK_SECONDS = 0.1
 """Seconds of samples in one buffer."""
 
 
-class IioSettings(DriverSettings):
+class IioSettings(interface.DriverSettings):
     """``[sensors.settings]`` of an IIO device."""
 
     device: str = ""
@@ -66,7 +60,7 @@ class IioSettings(DriverSettings):
     """IIO channel of each channel, as ``accel_x``; default: the device's first ones."""
     trigger: str = ""
     """Name of the trigger to use; default: the one that is set."""
-    patience: PositiveFloat = DEFAULT_PATIENCE
+    patience: PositiveFloat = interface.DEFAULT_PATIENCE
     """Seconds without samples after which the device is lost and reconnected."""
 
 
@@ -130,7 +124,7 @@ class _Iiod:
 
 
 @dataclass(eq=False)
-class IioSession(Session):
+class IioSession(interface.Session):
     """One device, ready to fill buffers."""
 
     hint = "expected buffers from IIOD; check the trigger of the device"
@@ -139,7 +133,7 @@ class IioSession(Session):
     sensor: Sensor
     device: protocol.Device
     inputs: tuple[str, ...]
-    information: tuple[DeviceInformation, ...]
+    information: tuple[interface.DeviceInformation, ...]
     patience: float
 
     def __post_init__(self) -> None:
@@ -283,7 +277,7 @@ class IioSession(Session):
         return rows, [0, *map(int, each)], flags, False
 
 
-class IioDriver(Driver[IioSettings]):
+class IioDriver(interface.Driver[IioSettings]):
     """See :class:`daq.devices.interface.Driver`."""
 
     name = "iio"
@@ -309,7 +303,7 @@ class IioDriver(Driver[IioSettings]):
             if settings.trigger:
                 await iiod.ask(f"SETTRIG {device.id} {settings.trigger}")
             rate = await _set_rate(iiod, device, inputs[0], sensor, label)
-            information = DeviceInformation(
+            information = interface.DeviceInformation(
                 sensor.name,
                 model=device.name,
                 sampling_rate=rate,

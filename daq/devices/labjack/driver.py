@@ -36,14 +36,7 @@ from pydantic import (
     PositiveFloat,
 )
 
-from daq.devices import port_rules
-from daq.devices.interface import (
-    DEFAULT_PATIENCE,
-    DeviceInformation,
-    Driver,
-    DriverSettings,
-    Session,
-)
+from daq.devices import interface, port_rules
 from daq.devices.labjack import registers as reg
 from daq.devices.labjack import stream as labjack
 from daq.devices.labjack.packets import MAX_CR_SAMPLES, MAX_SAMPLES, decode_response
@@ -94,7 +87,7 @@ def _power_of_two(value: int) -> int:
 Input = Annotated[int, BeforeValidator(_input_number), Field(ge=0, le=254)]
 
 
-class LabJackSettings(DriverSettings):
+class LabJackSettings(interface.DriverSettings):
     """``[sensors.settings]`` of a sensor on a LabJack.
 
     Inputs and range belong to each sensor; all other settings to the port's first sensor.
@@ -257,7 +250,7 @@ def inputs_of(
 
 async def identify(
     registers: Registers, sensors: Sequence[Sensor]
-) -> tuple[str, DeviceInformation]:
+) -> tuple[str, interface.DeviceInformation]:
     """Return the product, T7 or T8, and the device's information.
 
     Raises
@@ -287,7 +280,7 @@ async def identify(
                 f" '{serial}'",
                 found=serial,
             )
-    return product, DeviceInformation(
+    return product, interface.DeviceInformation(
         sensor=sensors[0].name,
         model=f"LabJack {product}",
         serial_number=str(serial),
@@ -379,7 +372,7 @@ def patience_of(settings: LabJackSettings, stream: StreamPlan, product: str) -> 
     if settings.patience is not None:
         return settings.patience
     n_samples = (settings.buffer_bytes or BUFFERS[product]) / 2
-    return max(DEFAULT_PATIENCE, n_samples / len(stream.scan_list) / stream.rate)
+    return max(interface.DEFAULT_PATIENCE, n_samples / len(stream.scan_list) / stream.rate)
 
 
 async def set_stream(
@@ -470,13 +463,13 @@ MAX_RESTARTS = 3
 
 
 @dataclass(eq=False)
-class LabJackSession(Session):
+class LabJackSession(interface.Session):
     """A digitizer with a configured scan list."""
 
     registers: Registers
     settings: LabJackSettings
     decoder: StreamDecoder
-    information: tuple[DeviceInformation, ...]
+    information: tuple[interface.DeviceInformation, ...]
     clock: HostClock
     stream_address: str
     packet_seconds: float
@@ -582,7 +575,7 @@ class LabJackSession(Session):
                 await asyncio.sleep(POLL_INTERVAL)
 
 
-class LabJackDriver(Driver[LabJackSettings]):
+class LabJackDriver(interface.Driver[LabJackSettings]):
     """See :class:`daq.devices.interface.Driver`."""
 
     name = "labjack"
@@ -614,7 +607,7 @@ class LabJackDriver(Driver[LabJackSettings]):
         return _opened(self.check(sensors), sensors, clock, None)
 
     def resume(
-        self, sensors: Sequence[Sensor], clock: HostClock, before: Session
+        self, sensors: Sequence[Sensor], clock: HostClock, before: interface.Session
     ) -> AbstractAsyncContextManager[LabJackSession]:
         """Open; continue the index of ``before`` if the device was not restarted."""
         last = before if isinstance(before, LabJackSession) else None
@@ -689,7 +682,7 @@ async def _opened(
 
 
 def _continues(
-    before: LabJackSession, uptime: Uptime | None, now: tuple[DeviceInformation, ...]
+    before: LabJackSession, uptime: Uptime | None, now: tuple[interface.DeviceInformation, ...]
 ) -> bool:
     """Return whether the device and its rate are the same, and it was not restarted."""
     then = before.information

@@ -21,13 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field, PositiveFloat, PositiveInt
 
-from daq.devices.interface import (
-    DEFAULT_PATIENCE,
-    DeviceInformation,
-    Driver,
-    DriverSettings,
-    Session,
-)
+from daq.devices import interface
 from daq.devices.modbus import rtu
 from daq.devices.modbus.fifo_protocol import MAX_WORDS, RATE_REGISTER, READ_OVERHEAD, FifoDecoder
 from daq.devices.modbus.rtu import ReplyFinder
@@ -51,7 +45,7 @@ MAX_FILLING_TIME = 3.0
 """Time without a decrease of the level, in s, after which the link is too slow."""
 
 
-class FifoSettings(DriverSettings, strict=True):
+class FifoSettings(interface.DriverSettings, strict=True):
     """``[sensors.settings]`` of a device with a block FIFO."""
 
     baud_rate: PositiveInt = 3_000_000
@@ -73,7 +67,7 @@ class FifoSettings(DriverSettings, strict=True):
 
 
 @dataclass(eq=False)
-class FifoSession(Session):
+class FifoSession(interface.Session):
     """A device that samples into its FIFO."""
 
     hint = "the device does not answer; check cable and power"
@@ -81,7 +75,7 @@ class FifoSession(Session):
     stream: ByteStream
     settings: FifoSettings
     decoder: FifoDecoder
-    information: tuple[DeviceInformation, ...]
+    information: tuple[interface.DeviceInformation, ...]
     clock: HostClock
     patience: float
 
@@ -140,7 +134,7 @@ class FifoSession(Session):
         return items, True
 
 
-class FifoDriver(Driver[FifoSettings]):
+class FifoDriver(interface.Driver[FifoSettings]):
     """See :class:`daq.devices.interface.Driver`."""
 
     name = "fifo"
@@ -175,7 +169,7 @@ class FifoDriver(Driver[FifoSettings]):
                 unit=settings.unit,
                 capacity=settings.capacity,
             )
-            information = DeviceInformation(
+            information = interface.DeviceInformation(
                 sensor=sensor.name,
                 model=sensor.model or "block FIFO",
                 sampling_rate=sensor.sampling_rate,
@@ -188,7 +182,7 @@ class FifoDriver(Driver[FifoSettings]):
                 decoder,
                 information=(information,),
                 clock=clock,
-                patience=settings.patience or max(DEFAULT_PATIENCE, kept),
+                patience=settings.patience or max(interface.DEFAULT_PATIENCE, kept),
             )
 
 

@@ -19,15 +19,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import Field, PositiveFloat, PositiveInt
 
 from daq.devices.interface import DeviceInformation, Driver, DriverSettings, Session
+from daq.devices.modbus import registers_protocol
 from daq.devices.modbus import registers_protocol as protocol
 from daq.devices.modbus.bus import DamagedReplyError, ModbusBus, RefusedError, Reply, open_bus
-from daq.devices.modbus.registers_protocol import (
-    DataType,
-    RegisterDecoder,
-    RegisterMap,
-    TimeFormat,
-    WordOrder,
-)
 from daq.devices.port_rules import port_label, require_address
 from daq.devices.shared_port import Presence, answering
 from daq.errors import (
@@ -73,14 +67,14 @@ class RegisterSettings(DriverSettings):
     """Address of the first channel, if the channels are contiguous."""
     addresses: tuple[Address, ...] | None = None
     """Address of each channel, if the channels are not contiguous."""
-    data_type: DataType | None = None
+    data_type: registers_protocol.DataType | None = None
     """Data type of each channel; default: int16."""
-    word_order: WordOrder | None = None
+    word_order: registers_protocol.WordOrder | None = None
     """Order of the registers of one value: most significant word first ("big") or last."""
     counter_address: Address | None = None
     """Address of a counter that changes with each new sample of the device."""
     time_address: Address | None = None
-    time_format: TimeFormat | None = None
+    time_format: registers_protocol.TimeFormat | None = None
     timeout: PositiveFloat = 0.5
     """Timeout of a reply, s."""
     baud_rate: PositiveInt = 9600
@@ -97,7 +91,7 @@ class _Polled:
 
     sensor: Sensor
     settings: RegisterSettings
-    registers: RegisterMap
+    registers: registers_protocol.RegisterMap
     device_id: int
     apart: bool = False
     """Whether the device refuses unused registers between the needed ones."""
@@ -106,7 +100,7 @@ class _Polled:
     def of(cls, sensor: Sensor, settings: RegisterSettings) -> _Polled:
         given = settings.model_dump(exclude_none=True)
         try:
-            registers = RegisterMap.of(given, len(sensor.channels))
+            registers = registers_protocol.RegisterMap.of(given, len(sensor.channels))
         except DeviceSettingError as error:
             value = sensor.settings.get(error.key, ABSENT)
             key = f"settings.{error.key}" if error.key else "settings"
@@ -193,7 +187,7 @@ class _Poller:
         self._replied_ns = self._clock.now().monotonic_ns
         self._min_silence = min(MIN_SILENCE, FAILURES * polled.settings.timeout)
         self._n_wrong: Counter[str] = Counter()
-        self._decoder = RegisterDecoder(
+        self._decoder = registers_protocol.RegisterDecoder(
             self.sensor, polled.registers, sampling_rate=polled.sensor.sampling_rate
         )
 

@@ -17,13 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, PositiveFloat, PositiveInt, Strict, field_validator
 
-from daq.devices.interface import (
-    DEFAULT_PATIENCE,
-    DeviceInformation,
-    Driver,
-    DriverSettings,
-    Session,
-)
+from daq.devices import interface
 from daq.devices.port_rules import only, port_label
 from daq.devices.text.decoder import TextDecoder
 from daq.devices.text.format import (
@@ -48,7 +42,7 @@ if TYPE_CHECKING:
     from daq.transport.byte_stream import ByteStream
 
 
-class TextSettings(DriverSettings, strict=True):
+class TextSettings(interface.DriverSettings, strict=True):
     """``[sensors.settings]`` of a device that sends text."""
 
     preset: Literal["none", "raspberry-shake", "lily"] = "none"
@@ -98,7 +92,7 @@ class TextSettings(DriverSettings, strict=True):
     """Command that stops the device."""
     baud_rate: PositiveInt = 19200
     parity: Literal["N", "E", "O"] = "N"
-    patience: PositiveFloat = DEFAULT_PATIENCE
+    patience: PositiveFloat = interface.DEFAULT_PATIENCE
     """Seconds without samples after which the device is lost and reconnected. If the device sends
     less often than every minute, set at least twice its interval."""
 
@@ -217,12 +211,12 @@ class _DatagramSource(_Source):
 
 
 @dataclass(eq=False)
-class TextSession(Session):
+class TextSession(interface.Session):
     """An open port; the device sends by itself or after the start command."""
 
     source: _Source
     settings: TextSettings
-    information: tuple[DeviceInformation, ...]
+    information: tuple[interface.DeviceInformation, ...]
     decoder: TextDecoder
 
     def __post_init__(self) -> None:
@@ -261,7 +255,7 @@ class TextSession(Session):
             raise
 
 
-class TextDriver(Driver[TextSettings]):
+class TextDriver(interface.Driver[TextSettings]):
     """See :class:`daq.devices.interface.Driver`."""
 
     name = "text"
@@ -286,7 +280,7 @@ class TextDriver(Driver[TextSettings]):
         decoder = TextDecoder(
             sensor.name, format_, sampling_rate=sensor.sampling_rate, joins=not settings.start
         )
-        information = DeviceInformation(
+        information = interface.DeviceInformation(
             sensor=sensor.name,
             model=sensor.model,
             details={"format": settings.preset if settings.preset != "none" else format_.layout},
