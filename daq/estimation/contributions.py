@@ -27,7 +27,7 @@ from estimator.levels.contributions import (
 )
 from estimator.levels.interval import NORMAL_95, interval
 from estimator.levels.pooled import blocks_of
-from estimator.likelihood.dimension import most_testable
+from estimator.likelihood.dimension import BandDimension, most_testable
 from estimator.self_noise.result import Flag, SelfNoise
 from estimator.types import BoolArray, FloatArray
 
@@ -236,10 +236,8 @@ def with_contributions(snapshot: Snapshot) -> Snapshot:
 
     Of noise that changes, estimates scatter more than their cumulants say.
     """
-    found = snapshot.diagnostics.diagnosis
-    steady = None if found is None else found.stability
-    if steady is not None and steady.inflation > 1:
-        inflation = steady.inflation_at(snapshot.frequency)
+    inflation = snapshot.diagnostics.inflation_at(snapshot.frequency)
+    if (inflation > 1).any():
         scale = np.stack([inflation, inflation**2, inflation**3])[:, :, None]
         results = {
             name: SelfNoise.of(name, each.noise_psd, scale * each.cumulants, each.flags)
@@ -258,6 +256,12 @@ def _widened(snapshot: Snapshot) -> Snapshot:
         low, high = by_chance(each.noise_psd, low, high, NORMAL_95 * deviation(parts))
         results[name] = replace(each, low=low, high=high)
     return replace(snapshot, results=results)
+
+
+def _averages(snapshot: Snapshot, choice: BandDimension) -> float:
+    """Return how many averages of steady noise those of a band are worth."""
+    ends = np.array([choice.low, choice.high])
+    return snapshot.n_effective / float(snapshot.diagnostics.inflation_at(ends).max())
 
 
 def _dimensions(snapshot: Snapshot, method: str) -> tuple[FloatArray, BoolArray]:
@@ -282,12 +286,12 @@ def _dimensions(snapshot: Snapshot, method: str) -> tuple[FloatArray, BoolArray]
         elif choice.n_factors > choice.usual and math.isfinite(choice.cov):
             n_channels = sum(snapshot.dims)
             error = (
-                misfit(choice.test, n_channels, snapshot.n_effective)
+                misfit(choice.test, n_channels, _averages(snapshot, choice))
                 if choice.gradients
                 else SECOND_ORDER * choice.cov**2
             )
             # pooled directions are linear in the averages: a dimension more or less counts
-            averages = snapshot.n_effective * choice.test.n_frequencies / choice.test.spread
+            averages = _averages(snapshot, choice) * choice.test.n_frequencies / choice.test.spread
             edge = 2 * math.sqrt(n_channels / averages) / (n_channels - choice.n_factors)
             share[inside] = np.where(pooled[inside], edge, NORMAL_95 * error)
             if choice.usual < DIMENSIONS and choice.n_factors >= most_testable(snapshot.dims):
@@ -317,7 +321,8 @@ def _left_out(snapshot: Snapshot, method: str) -> FloatArray:
     found = np.zeros(len(snapshot.frequency))
     for choice in snapshot.diagnostics.dimensions if method == "maximum-likelihood" else ():
         inside = (snapshot.frequency >= choice.low) & (snapshot.frequency <= choice.high)
-        found[inside] = choice.unseen(sum(snapshot.dims), snapshot.n_effective, quantile=NORMAL_95)
+        averages = _averages(snapshot, choice)
+        found[inside] = choice.unseen(sum(snapshot.dims), averages, quantile=NORMAL_95)
     return found
 
 
@@ -338,7 +343,7 @@ def _unseen(snapshot: Snapshot, method: str) -> FloatArray:
             unseen[inside] = (
                 0.0
                 if choice.n_factors >= DIMENSIONS
-                else misfit(choice.test, sum(snapshot.dims), snapshot.n_effective, NORMAL_95)
+                else misfit(choice.test, sum(snapshot.dims), _averages(snapshot, choice), NORMAL_95)
             )
     return unseen
 

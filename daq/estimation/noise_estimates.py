@@ -19,7 +19,12 @@ from estimator.checks.counts import shared_rounding
 from estimator.errors import InsufficientDataError
 from estimator.levels.bands import bin_correlation
 from estimator.levels.pooled import blocks_of
-from estimator.likelihood.dimension import BandDimension, choose_dimension, noise_groups
+from estimator.likelihood.dimension import (
+    MISFIT_LEVEL,
+    BandDimension,
+    choose_dimension,
+    noise_groups,
+)
 from estimator.likelihood.factor_analysis import Maxima
 from estimator.likelihood.goodness_of_fit import neighbour_correlation
 from estimator.median import median
@@ -32,6 +37,7 @@ from estimator.spectra.windows import effective_averages, get_window
 from estimator.types import ComplexArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
+    from estimator.checks.stability import Stability
     from estimator.likelihood.gradients import Gradients
     from estimator.likelihood.multi_part import Beside, MultiPart
 
@@ -72,6 +78,29 @@ class Estimates:
     dimensions: Dimensions | None
     multi_part: MultiPart | None = None
     beside: Beside | None = None
+
+
+def beside_changing_noise(
+    dimensions: Dimensions | None, bands: Sequence[Band], stability: Stability | None
+) -> Dimensions | None:
+    """Return dimensions of the motion without further ones that are noise which changes.
+
+    Its averages scatter more, by which the tests of fewer dimensions fail. The same object is
+    returned where that changes none.
+    """
+    if dimensions is None or stability is None or stability.inflation == 1:
+        return dimensions
+    n_factors = [each.copy() for each in dimensions.n_factors]
+    chosen = list(dimensions.chosen)
+    for number, choice in enumerate(chosen):
+        by = stability.inflation_at(np.array([choice.low, choice.high])).max()
+        chosen[number] = choice.beside(float(by), MISFIT_LEVEL / len(chosen))
+        for band, q in zip(bands, n_factors, strict=True):
+            inside = (band.frequencies >= choice.low) & (band.frequencies <= choice.high)
+            q[inside] = chosen[number].n_factors
+    if all(one is other for one, other in zip(chosen, dimensions.chosen, strict=True)):
+        return dimensions
+    return Dimensions(tuple(n_factors), tuple(chosen))
 
 
 def averages(passes: Sequence[Pass]) -> tuple[Band, ...]:

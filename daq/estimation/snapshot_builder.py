@@ -40,6 +40,7 @@ from daq.estimation.noise_estimates import (
     Estimates,
     averages,
     beside_changes,
+    beside_changing_noise,
     channel_sets,
     chosen_dimensions,
     in_units,
@@ -281,23 +282,10 @@ class SnapshotBuilder:
             n_segments = bands[-1].n_segments
         n_effective = bands[-1].n_effective if bands else 0.0
         n_partial = sum(each.n_segments for each in sets) - (0 if raw else n_segments)
-        latest = last.recording
-        events = latest.events
-        diagnostics = SnapshotDiagnostics(
-            synchronisation=bias_of_clocks(
-                synchronisation(passes),
-                dims=dims,
-                frequency=frequency,
-                csm=csm,
-                results=estimates.results,
-            ),
-            dimensions=() if estimates.dimensions is None else estimates.dimensions.chosen,
-            multi_part=estimates.multi_part,
-        )
+        latest, events = last.recording, last.recording.events
         left = _not_estimated(latest, channels)
         counting = _counting_rates(latest) if final else {}
         nonlinear = nonlinear_channels(passes, frequency, channels, self._unit) if final else ()
-        taken_off = nonlinear if self._settings.linearise else ()
         if final and csm.nbytes > FREED_FROM:
             give_back()
         psd = np.diagonal(csm, axis1=1, axis2=2).real
@@ -311,6 +299,21 @@ class SnapshotBuilder:
                     .of_all_segments(unless=final and bool(raw) and not sets)
                 )
             self._occasional_cost += self._diagnoses.cost
+        if not sets:
+            estimates = self._beside_changing_noise(
+                bands, raw, recordings[0], first, estimates, maxima=maxima
+            )
+        diagnostics = SnapshotDiagnostics(
+            synchronisation=bias_of_clocks(
+                synchronisation(passes),
+                dims=dims,
+                frequency=frequency,
+                csm=csm,
+                results=estimates.results,
+            ),
+            dimensions=() if estimates.dimensions is None else estimates.dimensions.chosen,
+            multi_part=estimates.multi_part,
+        )
         if final and raw and not sets:
             bands, estimates = self._within_parts(
                 recordings, passes, raw, bands, estimates, nonlinear=nonlinear
@@ -324,7 +327,7 @@ class SnapshotBuilder:
         snapshot = Snapshot(
             frequency=frequency,
             csm=csm,
-            results=linearised(estimates.results, taken_off),
+            results=linearised(estimates.results, nonlinear if self._settings.linearise else ()),
             refused=estimates.refused,
             channels=tuple(
                 ChannelLabel(sensor, channel.name, self._unit) for sensor, channel in channels
@@ -349,7 +352,7 @@ class SnapshotBuilder:
             diagnostics=replace(diagnostics, beside=estimates.beside),
             no_segment=None if sets else _no_segment(passes, self._settings.segment),
             nonlinear=nonlinear,
-            linearised=bool(taken_off),
+            linearised=self._settings.linearise and bool(nonlinear),
             bridged=_bridged(passes, estimates.results),
             not_estimated=left,
             across_axes=self._axes,
@@ -365,6 +368,24 @@ class SnapshotBuilder:
             ),
         )
         return with_contributions(snapshot)
+
+    def _beside_changing_noise(
+        self,
+        bands: tuple[Band, ...],
+        raw: tuple[Band, ...],
+        recording: ReadableRecording,
+        first: Pass,
+        estimates: Estimates,
+        *,
+        maxima: Maxima,
+    ) -> Estimates:
+        """Return estimates without dimensions of the motion that are noise which changes."""
+        before = estimates.dimensions
+        self._dimensions = beside_changing_noise(before, bands, self._findings.stability)
+        if self._dimensions is before:
+            return estimates
+        n = bands[-1].n_segments
+        return self._estimates(bands, raw, recording, first, n, maxima=maxima, final=False)
 
     def _within_parts(
         self,

@@ -213,3 +213,8 @@ class SnapshotDiagnostics:
     def advice(self) -> tuple[Advice, ...]:
         """Advice on the test; none before it is diagnosed."""
         return () if self.diagnosis is None else self.diagnosis.advice
+
+    def inflation_at(self, frequency: FloatArray) -> FloatArray:
+        """Return the variance of averages over that of steady noise, shape (n_freqs,)."""
+        steady = None if self.diagnosis is None else self.diagnosis.stability
+        return np.ones(len(frequency)) if steady is None else steady.inflation_at(frequency)

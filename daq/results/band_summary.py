@@ -250,7 +250,9 @@ class Spectrum:
             if inside.stop > inside.start:
                 begin, end = min(begin, inside.start), max(end, inside.stop)
             inside, snapshot = slice(begin, end), self._snapshot
-            averages = averages_at(snapshot, snapshot.frequency[inside])
+            frequency = snapshot.frequency[inside]
+            averages = averages_at(snapshot, frequency)
+            averages = averages / snapshot.diagnostics.inflation_at(frequency)
             rest, scatter = unpredicted(
                 snapshot.csm[inside], dims=snapshot.dims, n_effective=averages
             )

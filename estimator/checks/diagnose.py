@@ -114,7 +114,8 @@ def changes(
             excess=stability.excess,
             channel=stability.channel,
         )
-        return
+        if not stability.is_restless:
+            return
     found = stability.parts
     more = np.sqrt(np.maximum(found.deviation**2 - found.expected**2, 0.0))
     tested = int(np.isfinite(found.statistic).sum())

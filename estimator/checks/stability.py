@@ -19,7 +19,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.checks.steadied import Steadied, steadied
+from estimator.checks.steadied import LEAST_MOTION, Steadied, steadied
 from estimator.checks.steadiness import (
     FALSE_ALARM,
     MIN_DEGREES,
@@ -49,6 +49,8 @@ FREQUENCIES = 8
 """Number of frequencies per group of residuals."""
 DISTURBED = 8.0
 """Residuals of a group from which a segment is disturbed, in standard deviations by the median."""
+RESTLESS = 3.0
+"""Scatter of single segments over that of steady noise, from which none is disturbed."""
 KNOWN = 0.5
 """Standard error of the noise of a part, as a fraction, up to which its changes count."""
 MAX_DISTURBED = 0.2
@@ -189,6 +191,8 @@ class Stability:
         Noise added by these segments, as a fraction, for the worst band and channel.
     channel : int
         That channel.
+    is_restless : bool
+        Whether the noise changes from segment to segment, at some frequencies.
     steadied : tuple of Steadied or None
         Averages without the changes of responses, of each range of frequencies; None where nothing
         tells of any.
@@ -207,6 +211,7 @@ class Stability:
     disturbed: IntArray
     excess: float
     channel: int
+    is_restless: bool = False
     steadied: tuple[Steadied | None, ...] = ()
 
     @property
@@ -408,9 +413,9 @@ def stability(
             levels = [None if band is None else band.levels for band in bands]
     elif not (changes or suspect) and all(each is None for each in levels):
         return None
-    out, excess = np.zeros(0, np.bool_), np.zeros((1, n_channels))
+    out, excess, is_restless = np.zeros(0, np.bool_), np.zeros((1, n_channels)), False
     if course is not None and len(course.spectra) >= MIN_SEGMENTS * MIN_PARTS:
-        out, excess = _disturbed_segments(course, maximum, good)
+        out, excess, is_restless = _disturbed_segments(course, maximum, good)
     return Stability(
         low=low,
         high=high,
@@ -429,6 +434,7 @@ def stability(
         disturbed=np.flatnonzero(out),
         excess=float(excess.max()),
         channel=int(excess.max(axis=0).argmax()),
+        is_restless=is_restless,
         steadied=() if without is None else (without,),
     )
 
@@ -489,11 +495,12 @@ def _band(
     """Return what the parts show at some of their frequencies; None where that is too little."""
     if not len(places):
         return None
-    at_once = max(1, VALUES_AT_ONCE // (len(parts.each) * sum(dims) ** 2))
+    q, at_once = maximum.n_factors, max(1, VALUES_AT_ONCE // (len(parts.each) * sum(dims) ** 2))
     levels, of_runs, responses = [], [], []
     scores = _Scores(len(groups), sum(dims))
-    explained, spread = np.zeros((3, sum(dims))), 0.0
-    squares, of_parts = np.zeros((sum(dims), sum(dims))), np.zeros((len(groups), sum(dims)))
+    spread, beside = 0.0, np.zeros(sum(dims))
+    power, noise = np.zeros((2, len(groups), sum(dims)))
+    squares = np.zeros((sum(dims), sum(dims)))
     for some in np.array_split(places, -(-len(places) // at_once)):
         bins = parts.bins[some]
         lags = np.minimum(np.abs(bins[:, None] - bins), len(correlation) - 1)
@@ -501,10 +508,14 @@ def _band(
         if not np.isfinite(divided.csm).all():
             return None
         found = regression(divided, at, psd[bins])
-        scatter = found.scatter
-        beside = np.einsum("fpp->fp", found.projector).real
-        explained += [e.sum(axis=0) for e in (found.explained, scatter, beside)]
-        of_parts += np.einsum("kfpp->kp", found.covariance)
+        own_beside = np.einsum("fpp->p", found.projector).real
+        level = np.einsum("kfpp->kp", found.covariance)
+        motion = np.einsum("kfaa->k", found.motion).real / (found.averages + q) / (q * len(some))
+        used = motion > LEAST_MOTION * (level / own_beside).max(axis=1)
+        beside += own_beside / len(places)
+        if used.any():
+            power += found.explained(used) / len(places)
+            noise += level * used[:, None] / len(places)
         squares += (np.abs(found.projector) ** 2).sum(axis=0)
         spread += own.sum()
         piece = noise_levels(found, own)
@@ -518,17 +529,20 @@ def _band(
             of_runs.append(noise_levels(of_run, own))
     whole = Levels.joined(levels)
     known = median(np.ravel(whole.degrees)) >= LEAST_DEGREES
-    left = parts.averages.sum() / len(groups) - maximum.n_factors
-    n_alike = of_parts.sum(axis=0) ** 2 / (of_parts**2).sum(axis=0)  # parts, of equal noise
-    degrees = 2 * len(places) ** 2 / spread * float(n_alike.min()) * maximum.n_factors
+    total = parts.averages.sum()
+    # few averages of noise that changes look like a response, unless the motion is far stronger
+    strong = median(maximum.eigenvalues[parts.bins[places], q - 1]) > STRONG
+    more = scores.inflation(whole) if known else 1.0 if strong else np.inf
+    power, scatter = power.sum(axis=0) / total, more * q * noise.sum(axis=0) / total
+    n_alike = noise.sum(axis=0) ** 2 / np.maximum((noise**2).sum(axis=0), np.finfo(np.float64).tiny)
     return _Band(
         _Explained(
-            power=explained[0] / len(places),
-            scatter=explained[1] / len(places),
-            beside=explained[2] / len(places),
-            added=fisher.covariance(squares[None])[0] @ (explained[0] - explained[1]),
-            degrees=degrees,
-            left=left / maximum.n_factors,
+            power=power,
+            scatter=scatter,
+            beside=beside,
+            added=len(places) * fisher.covariance(squares[None])[0] @ (power - scatter),
+            degrees=2 * len(places) ** 2 / spread * float(n_alike.min()) * q,
+            left=total / len(groups) / q - 1,
         ),
         whole if known else None,
         Levels.joined(of_runs) if of_runs and known else None,
@@ -571,12 +585,12 @@ class _Explained:
         degrees = self.degrees * self.left / (1 + self.left)
         much = self.power - self.scatter > ADDED * self.scatter * (1 + self.left)
         much &= self.beside > LEAST_SHARE
-        return degrees * float((self.power / self.scatter)[much].max(initial=1.0)), degrees
+        return degrees * float((self.power[much] / self.scatter[much]).max(initial=1.0)), degrees
 
     def where_clear(self, alarm: float) -> FloatArray:
         """Return what is added to the noise, shape (n_channels,); zero where that is by chance."""
         statistic, degrees = self.clearest
-        is_clear = statistic > critical_value(degrees, alarm)
+        is_clear = degrees > 0 and statistic > critical_value(degrees, alarm)
         return np.nan_to_num(self.added) if is_clear else np.zeros_like(self.added)
 
 
@@ -680,25 +694,29 @@ def _changed(
 
 def _disturbed_segments(
     course: SegmentCourse, maximum: Maximum, good: BoolArray
-) -> tuple[BoolArray, FloatArray]:
-    """Return which segments are disturbed, and the noise they add, (n_groups, n_channels)."""
+) -> tuple[BoolArray, FloatArray, bool]:
+    """Return which segments are disturbed, the noise they add, and whether others change, too.
+
+    The noise has the shape (n_groups, n_channels). Where it changes all the time, at some
+    frequencies, segments are not disturbed.
+    """
     there = np.flatnonzero(course.bins < len(good))
     there = there[good[course.bins[there]]]
     bins = course.bins[there]
     none = np.zeros(len(course.spectra), np.bool_), np.zeros((1, maximum.psi.shape[1]))
     if len(bins) < FREQUENCIES:
-        return none
+        return *none, False
     at = maximum.take(bins)
     groups = np.array_split(np.arange(len(bins)), len(bins) // FREQUENCIES)
     residuals = _Residuals(course, there, at, groups)
-    out = _disturbed(residuals)
-    if not out.any():
-        return none
-    inverse = fisher.covariance(np.abs(residuals.projector) ** 2)
     own = np.einsum("fpp->fp", residuals.projector).real
+    out, calm = _disturbed(residuals, np.array([own[group].sum() for group in groups]))
+    if not out.any():
+        return *none, not calm.all()
+    inverse = fisher.covariance(np.abs(residuals.projector) ** 2)
     excess = np.einsum("fpq,fq->fp", inverse, residuals.powers(~out) - own)
     lack = [1 / np.maximum(1 + excess[group].mean(axis=0), 0.01) - 1 for group in groups]
-    return out, np.stack(lack)
+    return out, np.stack(lack)[calm], not calm.all()
 
 
 class _Residuals:
@@ -745,13 +763,20 @@ class _Residuals:
         return np.concatenate([np.mean(np.abs(each[some]) ** 2, axis=0) for each in self])
 
 
-def _disturbed(residuals: Iterable[ComplexArray]) -> BoolArray:
-    """Return whether each segment has outlying residuals; none if too many have."""
+def _disturbed(
+    residuals: Iterable[ComplexArray], degrees: FloatArray
+) -> tuple[BoolArray, BoolArray]:
+    """Return whether each segment has outlying residuals, and which groups count.
+
+    Those whose powers scatter no more than by `RESTLESS`, of so many complex degrees of freedom.
+    No segment is disturbed if too many are.
+    """
     power = np.stack([(np.abs(each) ** 2).sum(axis=(1, 2)) for each in residuals], axis=1)
     middle = median(power)
     scatter = 1.4826 * median(np.abs(power - middle))
-    out = np.asarray(((power - middle) > DISTURBED * scatter).any(axis=1))
-    return out if out.mean() <= MAX_DISTURBED else np.zeros_like(out)
+    calm = np.asarray(scatter < RESTLESS * middle / np.sqrt(degrees))
+    out = np.asarray(((power - middle) > DISTURBED * scatter)[:, calm].any(axis=1))
+    return (out if out.mean() <= MAX_DISTURBED else np.zeros_like(out)), calm
 
 
 class _Scores:

@@ -29,7 +29,7 @@ import numpy as np
 from estimator.likelihood import fisher
 from estimator.likelihood.factor_analysis import Maximum
 from estimator.spectra.parts import Divided
-from estimator.types import ComplexArray, FloatArray
+from estimator.types import BoolArray, ComplexArray, FloatArray
 
 MIN_PARTS = 3
 MIN_DEGREES = 2.0
@@ -74,9 +74,6 @@ class Regression:
         From squares of residuals to the noise of channels.
     noise : float64, shape (n_parts, n_bins, n_channels)
         Noise of each part less that of the fit, over that of the fit.
-    explained : float64, shape (n_bins, n_channels)
-        Averages of what the regressions explain: scatter alone explains one of the covariance for
-        each direction of the motion in each part.
     """
 
     left: ComplexArray
@@ -89,14 +86,19 @@ class Regression:
     covariance: FloatArray
     inverse: FloatArray
     noise: FloatArray
-    explained: FloatArray
 
-    @property
-    def scatter(self) -> FloatArray:
-        """What regressions explain by scatter, shape (n_bins, n_channels)."""
-        q = self.motion.shape[-1]
-        total = (self.averages + q).sum()
-        return np.asarray(q * np.einsum("kfpp->fp", self.covariance) / total)
+    def explained(self, some: BoolArray) -> FloatArray:
+        """Return what regressions of some parts explain that these do not share.
+
+        Summed over frequencies, shape (n_parts, n_channels), times the averages of each part:
+        scatter alone explains one of the covariance for each direction of the motion.
+        """
+        D, W = self.coefficients[some], self.motion[some]
+        both = (D @ W).sum(axis=0).swapaxes(1, 2), W.sum(axis=0).swapaxes(1, 2)
+        D = D - np.linalg.solve(both[1], both[0]).swapaxes(1, 2)
+        found = np.zeros((len(some), D.shape[2]))
+        found[some] = ((D @ W) * D.conj()).sum(axis=(1, 3)).real
+        return found
 
 
 def regression(parts: Divided, at: Maximum, psd: FloatArray) -> Regression:
@@ -109,7 +111,6 @@ def regression(parts: Divided, at: Maximum, psd: FloatArray) -> Regression:
     U = at.eigenvectors
     share = (np.abs(U) ** 2 @ at.eigenvalues[:, :, None])[:, :, 0]
     fitted = np.einsum("fpp->fp", at.rest).real + share
-    weight = n / n.sum()
     scale = np.sqrt(fitted / psd)
     S = parts.csm * scale[:, :, None] * scale[:, None, :]
     SU = S @ U
@@ -127,7 +128,6 @@ def regression(parts: Divided, at: Maximum, psd: FloatArray) -> Regression:
         covariance=covariance,
         inverse=inverse,
         noise=(inverse @ excess[..., None])[..., 0],
-        explained=np.einsum("k,kfpq,kfpq->fp", weight, D, PSU.conj(), optimize=True).real,
         coefficients=D,
         motion=n[:, None, None, None] * across,
         directions=U,

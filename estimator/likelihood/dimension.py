@@ -165,6 +165,32 @@ class BandDimension:
         least, most = (tuple(each) for each in over.tolist())
         return replace(self, pairs=pairs, alternatives=alternatives, least=least, most=most)
 
+    def beside(self, inflation: float, level: float) -> BandDimension:
+        """Return the choice for noise whose scores have `inflation` times the variance.
+
+        The smallest dimension, from the usual one on, that its test accepts at a level, if that is
+        fewer or none was; itself otherwise.
+        """
+        if inflation == 1 or (self.accepted and self.n_factors <= self.usual):
+            return self
+        for q, test in enumerate(self.tried[self.usual :], self.usual):
+            by_chance = goodness_of_fit.deflated(test, inflation)
+            if by_chance.p_value > level:
+                return replace(
+                    self,
+                    n_factors=q,
+                    accepted=q == self.usual or self.n_sensors >= MIN_DETERMINED_SENSORS,
+                    test=by_chance,
+                    tried=(*self.tried[:q], by_chance),
+                    cov=self.usual_cov if q == self.usual else self.cov,
+                    gradients=False,
+                    pairs=(),
+                    alternatives=(),
+                    least=(),
+                    most=(),
+                )
+        return self
+
     @property
     def is_biased(self) -> bool:
         """Whether tests reject all dimensions, in the band or with others; not without a test."""

@@ -6,9 +6,14 @@ import numpy as np
 import pytest
 
 import huddle
+from daq.estimation.settings import Settings
+from daq.results.result import Result
+from estimator.checks.advice_on_noise import DisturbedSegments, NoiseChanges
 
 RATE = 40.0
 N = round(1200 * RATE)
+EDGES = np.array([5, 20, 45, 90])
+"""Of bands: from 1 to 18 Hz."""
 
 
 def level_of(sensor: str, case: str) -> np.ndarray:
@@ -39,3 +44,27 @@ def test_intervals_cover_the_mean_noise(case: str, sensor: int, covered: float) 
         low, high = found.low[inside, own], found.high[inside, own]
         hits.append(np.mean((low <= truth[sensor]) & (truth[sensor] <= high)))
     assert np.mean(hits) > covered
+
+
+@pytest.mark.long
+def test_gusts_are_no_motion_and_bound_no_level() -> None:
+    """Few segments hold most of the noise: its averages are few, and look like more motion."""
+    rng = np.random.default_rng(3)
+    n = round(600 * RATE)
+    motion = 1000 * rng.standard_normal((n, 3))
+    level = np.exp(rng.standard_normal(n // 200)).repeat(200)[:, None]  # of 5 s each
+    samples = {
+        name: motion @ np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        + level * rng.standard_normal((n, 3))
+        for name in "ABCDE"
+    }
+    estimate = huddle.self_noise(samples, fs=RATE, segment="5s")
+    snapshot, truth = estimate.snapshot, float((level**2).mean()) * 2 / RATE
+    found = Result(snapshot, Settings()).spectrum("maximum-likelihood").levels(EDGES)
+    low, high = found.ends()
+    assert np.mean((low <= truth) & (truth <= high)) > 0.93
+    assert np.abs(10 * np.log10(found.mean / truth)).max() < 1.5
+    assert {choice.n_factors for choice in snapshot.diagnostics.dimensions} == {3}
+    kinds = [type(each) for each in snapshot.diagnostics.advice]
+    assert NoiseChanges in kinds
+    assert DisturbedSegments not in kinds

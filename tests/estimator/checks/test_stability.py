@@ -36,17 +36,28 @@ DIMS = (3, 3, 3)
 
 
 def diagnosed(
-    seed: int, *, change: float = 1.0, burst: bool = False, n_runs: int = 1
+    seed: int,
+    *,
+    change: float = 1.0,
+    burst: bool = False,
+    n_runs: int = 1,
+    gusts: float = 0.0,
+    ratio: float = 900.0,
 ) -> Diagnostics:
-    """White motion at SNR 900; noise of all channels changes in the middle by a factor."""
+    """White motion of a ratio; noise of all channels changes in the middle by a factor, in gusts.
+
+    Gusts last a segment each; the logarithm of their amplitude has this standard deviation.
+    """
     rng = np.random.default_rng(seed)
     directions = np.concatenate([rotation(rng, 3) for _ in DIMS])
     n = HOP * (N_SEGMENTS + 1)
     noise = rng.standard_normal((n, 9))
     noise[n // 2 :] *= np.sqrt(change)
+    if gusts:
+        noise *= np.exp(gusts * rng.standard_normal(n // HOP)).repeat(HOP)[:, None]
     if burst:
         noise[6400:6500, 4] += 40 * rng.standard_normal(100)
-    samples = 30 * rng.standard_normal((n, 3)) @ directions.T + noise
+    samples = np.sqrt(ratio) * rng.standard_normal((n, 3)) @ directions.T + noise
     settings = WelchSettings(100.0, LENGTH)
     single = SegmentSpectra(kept_bins(LENGTH // 2 + 1), 9)
     ends = PartEnds(part_bins(LENGTH // 2 + 1, 9), -(-N_SEGMENTS // MOST))
@@ -118,6 +129,18 @@ def test_changing_noise_causes_no_false_alarms() -> None:
     assert advice.expected < 0.3
     kinds = {each.name for each in found.advice}
     assert not kinds & {"model-misfit", "shared-noise"}
+
+
+@pytest.mark.parametrize("ratio", [30.0, 900.0])
+def test_gusts_are_noise_that_changes_and_neither_disturbances_nor_responses(ratio: float) -> None:
+    found = diagnosed(4, gusts=1.0, ratio=ratio)
+    assert found.stability is not None
+    assert found.stability.is_restless
+    assert found.stability.inflation > 3
+    assert not found.stability.changes
+    kinds = {each.name for each in found.advice}
+    assert "noise-changes" in kinds
+    assert not kinds & {"disturbed-segments", "response-changes", "model-misfit"}
 
 
 def test_kept_segments_are_bounded_in_number() -> None:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from estimator.errors import InsufficientDataError, InvalidMatrixError
-from estimator.likelihood.dimension import bands, choose_dimension
+from estimator.likelihood.dimension import BandDimension, bands, choose_dimension
 from estimator.likelihood.factor_analysis import maximise
-from estimator.likelihood.goodness_of_fit import model_test
+from estimator.likelihood.goodness_of_fit import BandTest, model_test, upper_tail
 from estimator.likelihood.maximum_likelihood import maximum_likelihood
 from estimator.likelihood.prior import expected_noise
 from estimator.self_noise.three_sensor import three_sensor
@@ -372,3 +372,18 @@ def test_the_order_of_a_matrix_in_memory_does_not_count() -> None:
         for each in (averages, turned)
     )
     assert [each.test for each in one] == [each.test for each in other]
+
+
+def test_further_dimensions_are_left_where_noise_that_changes_explains_them() -> None:
+    def tested(share: float) -> BandTest:
+        return BandTest(100 * share, 100.0, upper_tail(100.0, 100 * share), 10)
+
+    tests = (tested(300), tested(280), tested(7), tested(1))
+    choice = BandDimension(
+        1.0, 2.0, 3, 2, accepted=True, test=tests[3], tried=tests, cov=0.5, usual_cov=0.1
+    )
+    assert choice.beside(1.0, 0.01) is choice
+    assert choice.beside(2.0, 0.01).n_factors == 3
+    usual = choice.beside(7.0, 0.01)
+    assert (usual.n_factors, usual.accepted, usual.cov) == (2, True, 0.1)
+    assert usual.beside(7.0, 0.01) is usual
