@@ -9,12 +9,16 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
+import time
 from pathlib import Path
 
 if sys.platform != "win32":
     import fcntl
 
 
+_looking = threading.Lock()
+_WAITS = (0.0, 0.001, 0.005)  # s
 LOCKS_ARE_VISIBLE: bool = sys.platform != "win32"
 """Whether `is_being_written` works: Windows has only HDF5's own lock."""
 
@@ -35,9 +39,22 @@ class WriterLock:
 
 
 def is_being_written(path: Path) -> bool:
-    """Return whether a running process is writing this recording."""
+    """Return whether a running process is writing this recording.
+
+    Who looks holds a lock for a moment, as does a process that forks meanwhile: one who looks at
+    the same time looks again.
+    """
     if sys.platform == "win32":  # only HDF5's own lock
         return False
+    with _looking:
+        for wait in _WAITS:
+            time.sleep(wait)
+            if not _is_locked(path):
+                return False
+    return True
+
+
+def _is_locked(path: Path) -> bool:
     handle = os.open(path, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

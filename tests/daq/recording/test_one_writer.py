@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import stat
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import h5py
@@ -17,6 +18,7 @@ from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
 from daq.recording.repair import repair, verify
 from daq.recording.storage.journal import journal_path
+from daq.recording.storage.locking import is_being_written
 from daq.recording.storage.superblock import Superblock, lookup3
 from daq.recording.writer import RecordingWriter, make_datasets
 
@@ -114,3 +116,10 @@ def test_a_file_marked_closed_that_does_not_open_is_repaired(tmp_path: Path) -> 
 def test_a_closed_recording_leaves_no_journal(tmp_path: Path) -> None:
     record(tmp_path / "r.h5")
     assert [entry.name for entry in tmp_path.iterdir()] == ["r.h5"]
+
+
+def test_many_who_look_at_once_see_no_writer(tmp_path: Path) -> None:
+    path = tmp_path / "closed.h5"
+    path.touch()
+    with ThreadPoolExecutor(16) as some:
+        assert not any(some.map(is_being_written, [path] * 2000))

@@ -131,8 +131,8 @@ def test_one_channel_a_sensor_and_fifteen_sensors_fit(reported: Reported, tmp_pa
     )
     plots = [part for s in report.sections for part in s.parts if isinstance(part, Plot)]
     assert (
-        sum(len(plot.panels) for plot in plots) == 15 + 15 + 1 + 15 + 2
-    )  # spectra, Allan deviations, the model test, sketches of axes, coherence of pairs
+        sum(len(plot.panels) for plot in plots) == 15 + 15 + 1 + 15 + 2 + 3
+    )  # spectra, Allan deviations, the model test, sketches, coherence of pairs, against time
     for page in PdfReader(paper_of(report)).pages:
         places = places_of(page)
         assert places
