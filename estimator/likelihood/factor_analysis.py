@@ -40,7 +40,7 @@ _DAMPING, _DAMPED, _MOST = 1e-3, 10.0, 1e6  # of steps that gain nothing: first,
 _FALLING = 0.1  # of the noise at first: from there directions are tried at zero
 _AT_BOUND = 0.5  # of the bound of zero over the noise
 _RIDGE = 1e-10  # of the diagonal, added to information
-_HELD = 4  # rounds in which directions are held at their bounds
+_HELD = 8  # rounds in which directions are held at their bounds, and let go
 MAX_ITERATIONS = 200
 DECREMENT = 1e-7
 """Gain of the discrepancy promised by the next step, times two, at which a frequency has converged:
@@ -570,13 +570,18 @@ def _bounded(
     sensor: IntArray,
     penalty: FloatArray | None,
 ) -> tuple[FloatArray, ComplexArray, BoolArray]:
-    """Solve with directions of the noise that would fall below `low` held there."""
+    """Solve with directions of the noise that would fall below `low` held there.
+
+    One that is held although it would rise is let go again.
+    """
     a, b = pairs(sensor)
+    diagonal = np.flatnonzero(a == b)
     size, frame = size.copy(), np.broadcast_to(np.eye(size.shape[1]), axes.shape).astype(complex)
     axes, held = axes.copy(), np.zeros(size.shape, np.bool_)
+    let_go = np.zeros(len(size), np.bool_)
     for _ in range(_HELD):
         below = (size < low) & ~held
-        some = np.flatnonzero(below.any(axis=1))
+        some = np.flatnonzero(below.any(axis=1) | let_go)
         if not len(some):
             break
         held[some] |= below[some]
@@ -585,9 +590,13 @@ def _bounded(
         wanted = (_adjoint(turn) @ toward[some] @ turn)[:, a, b]
         fixed = held[some][:, a] | held[some][:, b]
         value = np.where(held[some][:, a] & (a == b), low[some][:, a] - 1, 0.0)
-        wanted = np.where(fixed, value, wanted - (J @ value[:, :, None])[:, :, 0])
-        J = np.where(fixed[:, :, None] | fixed[:, None], np.eye(len(a)) * fixed[:, None], J)
-        change = _solved(J, wanted)
+        beside = np.where(fixed, value, wanted - (J @ value[:, :, None])[:, :, 0])
+        alone = np.where(fixed[:, :, None] | fixed[:, None], np.eye(len(a)) * fixed[:, None], J)
+        change = _solved(alone, beside)
+        rise = (wanted - (J @ change[:, :, None])[:, :, 0])[:, diagonal].real * held[some]
+        most = rise.max(axis=1, keepdims=True)
+        let_go[some] = most[:, 0] > DECREMENT
+        held[some] &= (rise < most) | (most <= DECREMENT)
         size[some], axes[some] = axes_of(
             change + (a == b), np.full(held[some].shape, -np.inf), sensor
         )

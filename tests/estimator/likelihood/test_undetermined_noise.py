@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.maximum_likelihood import maximum_likelihood
 from estimator.self_noise.result import Flag
+from estimator.types import ComplexArray, FloatArray
 from tests.estimator.csm_models import (
     common_motion,
     random_bench,
@@ -102,8 +104,7 @@ def test_motion_measured_by_one_channel_is_not_reported_as_its_noise(
     assert np.isfinite(found.noise_psd[:, others]).all()
     assert not np.any(found.flags[:, others] & (Flag.UNRESOLVED | Flag.NO_COUNTERPART))
     covered = (found.low <= 1) & (found.high >= 1)
-    # of a matrix that hardly anything determines: .90 to .93 for 95 %
-    assert np.all(covered[:, others].mean(axis=0) > 0.92 - 4 * np.sqrt(0.05 * 0.95 / 200))
+    assert np.all(covered[:, others].mean(axis=0) > 0.9)
 
 
 @pytest.mark.long
@@ -154,3 +155,25 @@ def test_undetermined_noise_is_flagged() -> None:
     found = maximum_likelihood(csm, dims=(2, 2, 2), n_effective=200)
     assert np.all(found.flags[0] == Flag.UNRESOLVED)
     np.testing.assert_allclose(found.noise_psd[0], 1)
+
+
+def test_the_maximum_is_none_the_worse_for_channels_without_noise() -> None:
+    """Two in three of these are at zero noise in some channel; a general optimiser is no better."""
+    directions = np.concatenate([tilted(i * 5.0)[:k] for i, k in enumerate((3, 2, 2))])
+    csm = common_motion(directions, np.ones(7), snr=1e3)
+    some = wishart(csm, 1080, np.random.default_rng(41), n_draws=20)
+    some /= np.sqrt(np.einsum("fii,fjj->fij", some, some).real)
+
+    def discrepancy(x: FloatArray, matrix: ComplexArray) -> float:
+        scale = np.exp(-x / 2)
+        w = np.linalg.eigvalsh(matrix * scale[:, None] * scale)[:4]
+        return float((w - np.log(w) - 1).sum())
+
+    def least(matrix: ComplexArray) -> float:
+        begin = -np.log(np.diagonal(np.linalg.inv(matrix)).real)
+        bounds = [(each - 14, 0.0) for each in begin]
+        return float(minimize(discrepancy, begin, (matrix,), "L-BFGS-B", bounds=bounds).fun)
+
+    found = maximise(some, 3)
+    assert (found.discrepancy < np.array([least(each) for each in some]) + 1e-4).all()
+    assert found.boundary.any(axis=1).mean() > 0.5
