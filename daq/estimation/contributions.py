@@ -167,11 +167,10 @@ def _changes(snapshot: Snapshot, psd: FloatArray) -> list[Contribution]:
     steady = None if found is None else found.stability
     if steady is None:
         return []
-    share = steady.changed_at(snapshot.frequency)
+    share, within = steady.changed_at(snapshot.frequency)
     if not share.any():
         return []
-    if not any(steady.steadied):  # averages are those of all segments
-        share = np.where(share > MUCH_CHANGED, 1.0, WITHIN * share)
+    share = np.where(within, share, np.where(share > MUCH_CHANGED, 1.0, WITHIN * share))
     below, above = (psd * np.clip(part, 0.0, 1.0) for part in (share, -share))
     return [contribution(Source.CHANGES, psd.shape, below=below, above=above)]
 

@@ -182,7 +182,7 @@ class Stability:
         What these changes add to the noise, as a fraction of the PSD of the motion.
     explained, within : float64, shape (n_bands, n_channels)
         Share of the noise that changes of any form between parts explain, where that is clear; and
-        that may be left within parts by `steadied`. Negative where noise is too low.
+        that may be left within parts by `steadied`, NaN without. Negative where noise is too low.
     n_segments : int
         Number of examined segments.
     disturbed : int64, shape (n_disturbed,)
@@ -266,12 +266,15 @@ class Stability:
         """Return the inflation at frequencies, shape (n_freqs,); 1 outside of the bands."""
         return 1 + self._at(frequency, self.inflations[:, None] - 1)[:, 0]
 
-    def changed_at(self, frequency: FloatArray) -> FloatArray:
+    def changed_at(self, frequency: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Return the share of the noise that changes of responses may be, (n_freqs, n_channels).
 
-        Negative where noise may be too low.
+        Negative where noise may be too low. Also returns where it is that within parts: there the
+        averages are those of `steadied`.
         """
-        return self._at(frequency, self.within if any(self.steadied) else self.explained)
+        within = np.isfinite(self.within) & any(self.steadied)
+        share = np.where(within, self.within, self.explained)
+        return self._at(frequency, share), self._at(frequency, within.astype(np.float64)) > 0
 
     def _at(self, frequency: FloatArray, values: FloatArray) -> FloatArray:
         """Return values of bands at frequencies; 0 outside of the bands."""
@@ -429,7 +432,7 @@ def stability(
         changes=changes,
         added=added,
         explained=explained,
-        within=np.zeros_like(explained) if without is None else without.within,
+        within=np.full_like(explained, np.nan) if without is None else without.within,
         n_segments=parts.n_segments,
         disturbed=np.flatnonzero(out),
         excess=float(excess.max()),

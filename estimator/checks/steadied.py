@@ -35,6 +35,8 @@ from estimator.median import median
 from estimator.spectra.parts import Parts, grouped
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
+LEAST_BINS = 8
+"""Frequencies at a time at least: each needs both neighbours."""
 LEAST = 4
 """Averages of a part, per dimension of the motion: a quarter of them is spent."""
 APART = 4.0
@@ -108,7 +110,10 @@ def steadied(
     for number, inside in enumerate(insides if len(groups) > 1 else ()):
         some = places[(good & inside)[parts.bins[places]]]
         if len(some):
-            pieces = [_courses(found) for _, found in _regressions(parts, at, psd, some, groups)]
+            pieces = [
+                _courses(found, parts.bins[its])
+                for its, found in _regressions(parts, at, psd, some, groups)
+            ]
             left, moved, squares, motion = (np.sum(e, axis=0) for e in zip(*pieces, strict=True))
             loud = np.maximum(loud, motion / (q * len(some)))
             courses[number] = left @ fisher.covariance(squares[None])[0]
@@ -143,13 +148,15 @@ def _regressions(
     parts: Parts, at: Maximum, psd: FloatArray, places: IntArray, groups: Sequence[IntArray]
 ) -> Iterator[tuple[IntArray, Regression]]:
     """Yield few frequencies at a time, and the regressions of joined parts there."""
-    at_once = max(1, VALUES_AT_ONCE // (len(parts.each) * at.psi.shape[1] ** 2))
+    at_once = max(LEAST_BINS, VALUES_AT_ONCE // (len(parts.each) * at.psi.shape[1] ** 2))
     for some in np.array_split(places, -(-len(places) // at_once)) if len(places) else ():
         bins = parts.bins[some]
         yield some, regression(parts.joined(some, groups), at.take(bins), psd[bins])
 
 
-def _courses(found: Regression) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def _courses(
+    found: Regression, bins: IntArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return what courses of responses leave within parts, and how much they change.
 
     Both of shape (n_parts, n_channels), beside the motion: sums over frequencies. The first is less
@@ -177,7 +184,9 @@ def _courses(found: Regression) -> tuple[FloatArray, FloatArray, FloatArray, Flo
     D = (G[:, 2:] - G[:, :-2]) @ U[1:-1]
     edges = ((D @ across[:, 1:-1]) * D.conj()).sum(axis=3).real
     spread = np.einsum("kfab,kfba->kf", inverse, across).real[..., None] * own
-    left[:, 1:-1] += (edges - 2 * spread[:, 1:-1]) / 12
+    # kept bins may lie apart; the first and last of a piece have one neighbour
+    nearer = (2 / (bins[2:] - bins[:-2])) ** 2 * len(bins) / max(1, len(bins) - 2)
+    left[:, 1:-1] += (edges - 2 * spread[:, 1:-1]) / 12 * nearer[:, None]
     squares = (np.abs(found.projector) ** 2).sum(axis=0)
     loud = np.einsum("kfaa->k", across).real
     return left.sum(axis=1), (power[0] + power[1]).sum(axis=1), squares, loud

@@ -15,7 +15,9 @@ from estimator.checks.shared_motion import (
     moved,
     shared_motion,
 )
-from estimator.checks.stability import SegmentCourse
+from estimator.checks.stability import Scatter, SegmentCourse, Stability
+from estimator.checks.steadied import Steadied
+from estimator.checks.steadiness import ResponseChange
 from estimator.likelihood.goodness_of_fit import neighbour_correlation
 from estimator.spectra.parts import MOST, PartEnds, Parts, part_bins
 from estimator.spectra.welch import (
@@ -194,3 +196,37 @@ def test_a_sensor_that_leaves_its_place_is_named_and_a_noisy_one_is_not(snr: flo
         fading = course_of(rng, snr=snr, noise=noise, fade=0.02)
         assert moved(fading, DIMS, 340.0) == []
     assert moved(course_of(rng, snr=snr, away=0.5)[:30], DIMS, 28.0) == []  # too few
+
+
+def test_a_range_of_octaves_that_is_not_steadied_keeps_what_its_changes_explain() -> None:
+    quiet = Scatter(3, np.zeros((1, 2)), np.ones((1, 2)), np.zeros((1, 2)))
+    change = ResponseChange(0, None, False, 0.1, 0.001, 0.0, 0.0, 1e5, 10.0)
+    one = Stability(
+        low=np.array([0.1]),
+        high=np.array([1.0]),
+        parts=quiet,
+        runs=None,
+        inflations=np.ones(1),
+        changes=(change,),
+        added=np.array([0.1, 0.0]),
+        explained=np.array([[5.0, 0.0]]),
+        within=np.full((1, 2), np.nan),
+        n_segments=10,
+        disturbed=np.zeros(0, np.int64),
+        excess=0.0,
+        channel=0,
+    )
+    csm = np.zeros((1, 2, 2), np.complex128)
+    within = Steadied(csm, 10.0, np.zeros(0, np.int64), np.zeros((1, 2)))
+    other = replace(
+        one,
+        low=np.array([1.1]),
+        high=np.array([9.0]),
+        steadied=(within,),
+        within=np.array([[0.02, 0.0]]),
+    )
+    both = Stability.joined([one, other], 2)
+    assert both is not None
+    share, is_within = both.changed_at(np.array([0.5, 5.0]))
+    np.testing.assert_array_equal(share, [[5.0, 0.0], [0.02, 0.0]])
+    np.testing.assert_array_equal(is_within, [[False, False], [True, True]])
