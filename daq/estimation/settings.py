@@ -30,7 +30,7 @@ DIMENSIONS = 3
 """Of the motion of a floor."""
 AXIS_TOLERANCE, OF_KNOWN_LEAN = 1.0, 0.1
 """Degrees, rms, if nothing else is given: of any lean, and of what remains of a known one."""
-_NEEDED = {
+NEEDED = {
     "dimension": "maximum-likelihood",
     "gains": "two-channel",
     "shared_noise": "multi-part",
@@ -152,7 +152,7 @@ def with_changes(
         get_window(settings.window, _LONG_WINDOW)
     except EstimatorError as error:
         raise ConflictingOptionError(str(error), "window") from None
-    for name, needed in _NEEDED.items():
+    for name, needed in NEEDED.items():
         if name not in given or {needed, "all"} & set(settings.methods):
             continue
         if "methods" in given:

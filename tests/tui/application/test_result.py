@@ -18,6 +18,7 @@ from tests.tui.application.screen_text import assert_looks_as_before, screen_tex
 from tests.tui.application.test_app import NARROW, WIDE, ended, running, shown
 from tests.tui.example_snapshot import SETTINGS, ProgressCallback, demo_bench, made_snapshot
 from tui.application.app import HuddleApp
+from tui.application.forms.estimate import as_changes
 from tui.application.messages import ReferenceReady, SensorsNoted, StatusUpdated
 from tui.application.reference import reference_of
 from tui.application.state import RECORDINGS, RESULT, Reference
@@ -90,7 +91,8 @@ async def test_another_estimate_starts_from_the_settings_shown(told: ProgressCal
         await pilot.press("tab", *"4s", "enter")
         await app.workers.wait_for_complete()
         await shown(pilot, app)
-    assert told.told == ["about run.h5 {'segment': 4.0}"]
+    wanted = as_changes(SETTINGS) | {"segment": 4.0}
+    assert told.told == [f"about run.h5 {wanted}"]
 
 
 def test_the_reference_is_estimated_with_the_settings_of_what_is_shown(tmp_path: Path) -> None:

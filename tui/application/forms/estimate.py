@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import TYPE_CHECKING
 
 from daq.bench.estimate_settings import OPTIONS, from_text
+from daq.estimation.settings import NEEDED, Settings
 from tui.application.forms.form import Field, Form
-
-if TYPE_CHECKING:
-    from daq.estimation.settings import Settings
 
 FIELDS = ("methods", "segment", "overlap", "window", "detrend", "clocks", "band", "unit")
 
@@ -27,12 +24,12 @@ class SettingsForm(Form[Mapping[str, object]]):
     """
 
     def __init__(self, name: str, settings: Settings | None) -> None:
-        fields = [
+        self._settings = settings
+        asked = [
             Field(field, OPTIONS[field].key or field, placeholder=_placeholder(field, settings))
             for field in FIELDS
         ]
-        self._settings = settings
-        super().__init__(f"estimate {name} again", fields, does="estimates")
+        super().__init__(f"estimate {name} again", asked, does="estimates")
 
     def hint(self, name: str) -> str:
         """Return what a setting does."""
@@ -51,9 +48,10 @@ class SettingsForm(Form[Mapping[str, object]]):
     def submit(self) -> None:
         """Estimate with what was given."""
         given = {name: text for name in FIELDS if (text := self.value(name))}
-        kept = () if self._settings is None else self._settings.exclude
-        excluded = {"exclude": kept} if kept else {}
-        self.dismiss(excluded | {n: from_text(n, text) for n, text in given.items()})
+        shown = {} if self._settings is None else as_changes(self._settings)
+        if "methods" in given:  # options of one method alone do not fit others
+            shown = {name: value for name, value in shown.items() if name not in NEEDED}
+        self.dismiss(shown | {n: from_text(n, text) for n, text in given.items()})
 
 
 def as_changes(settings: Settings) -> dict[str, object]:
