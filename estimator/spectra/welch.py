@@ -187,13 +187,15 @@ class CrossSpectra:
                     self._keep(single)
         self.n_segments += len(starts)
 
-    def add_spectra(self, spectra: ComplexArray) -> None:
+    def add_spectra(self, spectra: ComplexArray, products: FloatArray | None = None) -> None:
         """Add segments by their spectra.
 
         Parameters
         ----------
         spectra : complex128, shape (n_segments, n_freqs, n_channels), contiguous
             Transforms of windowed samples without trend, in physical units.
+        products : float64, shape (n_freqs, 2 * n_channels, 2 * n_channels), optional
+            What `products` returned of the same spectra.
 
         Raises
         ------
@@ -207,10 +209,17 @@ class CrossSpectra:
             )
         if len(spectra) == 0:
             return
-        self._products.add(spectra)
+        self._products.add(spectra, products)
         if self._single is not None:
             self._single.add(spectra[:, self._single.bins])
         self.n_segments += len(spectra)
+
+    def products(self, spectra: ComplexArray) -> FloatArray | None:
+        """Return the sum of products of segments for `add_spectra`; threads may call it.
+
+        None where `add_spectra` does not use it: of one segment, and where sums are large.
+        """
+        return self._products.gram(spectra)
 
     def _keep(self, single: list[ComplexArray]) -> None:
         if self._single is not None:
@@ -460,26 +469,32 @@ class _Products:
         step = max(1, min(FREQUENCIES_PER_BLOCK, PRODUCT_VALUES // n_parts**2))
         self._pieces = [slice(low, low + step) for low in range(0, n_freqs, step)]
 
-    def add(self, spectra: ComplexArray) -> None:
-        """Add segments by their spectra, contiguous."""
-        if self._is_small:
-            self._add_small(spectra)
-            return
-        self._waiting.append(spectra.copy())
-        if sum(map(len, self._waiting)) >= TOGETHER:
-            self._add_waiting()
+    def gram(self, spectra: ComplexArray) -> FloatArray | None:
+        """Return the products of segments as a small sum keeps them; None where it does not."""
+        if not self._is_small or len(spectra) < 2:
+            return None
+        parts = spectra.view(np.float64)
+        found = np.empty((parts.shape[1], parts.shape[2], parts.shape[2]))
+        for some in self._pieces:
+            own = parts[:, some]
+            np.matmul(own.transpose(1, 2, 0), own.swapaxes(0, 1), out=found[some])
+        return found
 
-    def _add_small(self, spectra: ComplexArray) -> None:
-        if len(spectra) == 1:  # cheaper than the sum over real and imaginary parts
+    def add(self, spectra: ComplexArray, gram: FloatArray | None = None) -> None:
+        """Add segments by their spectra, contiguous, or by what `gram` returned of them."""
+        gram = self.gram(spectra) if gram is None else gram
+        if gram is not None:
+            if self._gram is None:
+                self._gram = np.zeros_like(gram)
+            self._gram += gram
+        elif self._is_small:  # of one segment: cheaper than of real and imaginary parts
             for some in self._pieces:
                 found = spectra[0, some]
                 self._total[some] += _packed(found[:, :, None] * found[:, None, :].conj())
-            return
-        parts = spectra.view(np.float64)
-        if self._gram is None:
-            self._gram = np.zeros((parts.shape[1], parts.shape[2], parts.shape[2]))
-        for some in self._pieces:
-            self._gram[some] += _gram(parts[:, some])
+        else:
+            self._waiting.append(spectra.copy())
+            if sum(map(len, self._waiting)) >= TOGETHER:
+                self._add_waiting()
 
     def _add_waiting(self) -> None:
         waiting, self._waiting = self._waiting, []
@@ -521,11 +536,6 @@ class _Products:
     def add_total(self, total: ComplexArray) -> None:
         """Add what `total` returned."""
         self._total += _packed(total)
-
-
-def _gram(parts: FloatArray) -> FloatArray:
-    """Return the sum over segments of products of (n_segments, n_freqs, n) real numbers."""
-    return np.asarray(np.matmul(parts.transpose(1, 2, 0), parts.swapaxes(0, 1)))
 
 
 def _packed(matrices: ComplexArray) -> FloatArray:

@@ -40,10 +40,13 @@ class OwnSpectra:
     spectra : complex128, shape (n_segments, n_freqs, n_channels)
     raw : float64, shape (n_samples, n_channels)
         Samples of the hops, each sensor's from the first segment on.
+    products : float64, optional
+        Sum over `spectra`, as `CrossSpectra.products` returns it.
     """
 
     spectra: NDArray[np.complex128]
     raw: FloatArray
+    products: FloatArray | None = None
 
     @classmethod
     def of(cls, sensors: list[OwnSamples], welch: WelchSettings) -> OwnSpectra | None:

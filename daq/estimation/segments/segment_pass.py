@@ -389,13 +389,14 @@ class Pass:
             if source is self.aligned and not on_grid:
                 found = self._own_spectra((first + np.arange(count)) * hop)
                 if found is not None:
-                    return found
+                    return replace(found, products=self._all.products(found.spectra))
             part = self._read(source, self.filters, first * hop, count)
             is_small = count * self.welch.segment_length * self.n_channels <= MOST_VALUES
             if live or not is_small or self.octaves is not None or self._undisturbed is not None:
                 return part
             # in this thread: the one that adds them is waited for
-            return replace(part, spectra=self._all.transforms(part.samples, np.arange(count) * hop))
+            spectra = self._all.transforms(part.samples, np.arange(count) * hop)
+            return replace(part, spectra=spectra, products=self._all.products(spectra))
 
         for (first, count), part in zip(pieces, read_ahead(read, pieces), strict=True):
             if isinstance(part, OwnSpectra):
@@ -564,10 +565,16 @@ class Pass:
         self._kept_at.add(first + starts)
         self._selected = None
 
-    def _take_whole(self, spectra: ComplexArray, begins: NDArray[np.int64]) -> None:
-        """Add segments by their spectra; they begin at grid samples `begins`."""
+    def _take_whole(
+        self,
+        spectra: ComplexArray,
+        begins: NDArray[np.int64],
+        products: FloatArray | None = None,
+    ) -> None:
+        """Add segments by their spectra and products; they begin at grid samples `begins`."""
         for some in by_part(self._all, (begins - self.reach) // self.welch.hop):
-            self._all.add_spectra(spectra[some])
+            taken = spectra[some]
+            self._all.add_spectra(taken, products if len(taken) == len(spectra) else None)
         self._kept_at.add(begins)
 
     def _take_samples(self, part: _Samples, first: int, count: int, *, together: bool) -> None:
@@ -592,8 +599,11 @@ class Pass:
             self.octaves.add(samples[new:], present[new:])
             self._fed = begin + len(samples)
         elif part.spectra is not None:
-            spectra = part.spectra if clean.all() else part.spectra[clean]
-            self._take_whole(spectra, begin + reach + starts)
+            begins = begin + reach + starts
+            if clean.all():
+                self._take_whole(part.spectra, begins, part.products)
+            else:
+                self._take_whole(part.spectra[clean], begins)
         else:
             self._take(samples, starts, begin + reach)
         self._n_taken += len(starts)
@@ -622,9 +632,10 @@ class Pass:
             chosen = self._touch_excluded(first * hop + starts, length)
             self.left_out[Reason.CHOSEN] += int(chosen.sum())
             self.left_out[Reason.CLIPPED] += int((~clean & ~chosen).sum())
-            spectra, starts = spectra[clean], starts[clean]
+            if not clean.all():
+                spectra, starts = spectra[clean], starts[clean]
         begins = first * hop + starts
-        self._take_whole(spectra, begins)
+        self._take_whole(spectra, begins, part.products if spectra is part.spectra else None)
         self._n_taken += len(spectra)
         self._taken_at.add(self._positions(np.arange(first, first + count)))
         some = _is_picked(begins // hop, self._every, again=True)
@@ -829,6 +840,8 @@ class _Samples:
     raw_kept: NDArray[np.bool_]
     spectra: ComplexArray | None = None
     """Of all segments, also those that are left out."""
+    products: FloatArray | None = None
+    """Sum over `spectra`, where `CrossSpectra` uses it."""
 
 
 def still_for_a_while(passes: Sequence[Pass], settings: Settings) -> dict[int, float]:

@@ -113,8 +113,9 @@ def test_the_result_does_not_depend_on_the_division_of_samples() -> None:
 def test_segments_may_be_transformed_before_they_are_added(window: str) -> None:
     samples, settings = np.asfortranarray(noise(5000, 3)), WelchSettings(RATE, 100, window=window)
     found, starts = CrossSpectra(settings, 3), np.arange(0, 4901, settings.hop)
-    for some in (starts[:0], starts[:70], starts[70:]):
-        found.add_spectra(found.transforms(samples, some))
+    for some in (starts[:0], starts[:70], starts[70:71], starts[71:]):
+        spectra = found.transforms(samples, some)
+        found.add_spectra(spectra, found.products(spectra))
     np.testing.assert_allclose(found.csm(), accumulated(samples, settings).csm(), rtol=1e-12)
 
 
