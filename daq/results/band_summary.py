@@ -223,6 +223,9 @@ class Spectrum:
             self._shares |= alike.most > MUCH_SHARED * np.nan_to_num(np.abs(noise.noise_psd))
         known = np.isfinite(noise.noise_psd)
         self._weight = np.where(known, self._width[:, None], 0.0)
+        self._anything = known & np.logical_or.reduce(
+            [np.isinf(each.share + each.above) for each in self._contributions] or [~known]
+        )
         self._bound: tuple[slice, FloatArray, FloatArray] = (slice(0, 0), np.empty(0), np.empty(0))
 
     def levels(self, edges: NDArray[np.int64]) -> Levels:
@@ -233,15 +236,34 @@ class Spectrum:
         edges : int64, shape (n_bands + 1,)
             Band b has bins ``edges[b]`` to ``edges[b + 1]``, excluded; increasing.
         """
-        noise, width, correlation = self._noise, self._width, self._correlation
-        found = band_levels(noise.noise_psd, noise.cumulants, edges, correlation, weights=width)
+        noise, correlation = self._noise, self._correlation
         first, rest, scatter = self._unpredicted(int(edges[0]), int(edges[-1]))
-        here = slice(first, first + len(rest))
+        begin, end = int(edges[0]), int(edges[-1])
+        here, edges = slice(begin, end), edges - begin
+        rest, scatter = rest[begin - first : end - first], scatter[:, begin - first : end - first]
         rest = np.where(self._shares[here], np.nan, rest)  # others predict noise that they share
-        bound = band_levels(rest, scatter, edges - first, correlation, weights=width[here])
-        parts = (e.in_bands(edges, self._weight, noise.noise_psd) for e in self._contributions)
-        unknown = (noise.flags[: edges[-1]] & Flag.UNIDENTIFIED) != 0
-        return Levels(found, tuple(parts), bound, np.logical_or.reduceat(unknown, edges[:-1]))
+        width, weight = self._width[here], self._weight[here]
+        bound = band_levels(rest, scatter, edges, correlation, weights=width)
+        psd, cumulants = noise.noise_psd[here], noise.cumulants[:, here]
+        parts = [each.at(here) for each in self._contributions]
+        below = self._below_bound(edges, here, rest)
+        if below.any():
+            psd, cumulants = np.where(below, np.minimum(psd, rest), psd), cumulants.copy()
+            cumulants[:, below] = scatter[:, below]
+            parts = [each.up_to(rest, below, psd) for each in parts]
+        found = band_levels(psd, cumulants, edges, correlation, weights=width)
+        widening = tuple(each.in_bands(edges, weight, psd) for each in parts)
+        unknown = (noise.flags[here] & Flag.UNIDENTIFIED) != 0
+        return Levels(found, widening, bound, np.logical_or.reduceat(unknown, edges[:-1]))
+
+    def _below_bound(self, edges: NDArray[np.int64], here: slice, bound: FloatArray) -> BoolArray:
+        """Return where nothing but the bound is known, in bands in which more is known elsewhere.
+
+        These bins cost a band their own share: their noise is between zero and the bound.
+        """
+        anything, sizes = self._anything[here], np.diff(edges)
+        known = np.logical_or.reduceat((self._weight[here] > 0) & ~anything, edges[:-1])
+        return np.asarray(anything & (bound > 0) & np.repeat(known, sizes, axis=0))
 
     def _unpredicted(self, begin: int, end: int) -> tuple[int, FloatArray, FloatArray]:
         """Return the bound at these bins or more, with the first of them."""

@@ -16,13 +16,13 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.levels.interval import NORMAL_95
-from estimator.types import FloatArray
+from estimator.types import BoolArray, FloatArray
 
 
 class Source(enum.StrEnum):
@@ -104,6 +104,24 @@ class Contribution:
             self.above[:, column] + of_share + above,
         )
 
+    def at(self, bins: slice) -> Contribution:
+        """Return the contribution at some bins."""
+        return replace(self, below=self.below[bins], above=self.above[bins], share=self.share[bins])
+
+    def up_to(self, bound: FloatArray, where: BoolArray, level: FloatArray) -> Contribution:
+        """Return the contribution from zero to a bound `where` it is infinite, and no other there.
+
+        `level` is the noise, at the bound at most.
+        """
+        anything = where & np.isinf(self.share + self.above)
+        below, above, share = (
+            np.where(anything, other, np.where(where, 0.0, own))
+            for own, other in (
+                (self.below, np.maximum(level, 0.0)), (self.above, bound - level), (self.share, 0.0)
+            )
+        )  # fmt: skip
+        return replace(self, below=below, above=above, share=share)
+
     def in_bands(
         self, edges: NDArray[np.int64], weight: FloatArray, psd: FloatArray
     ) -> Contribution:
@@ -111,7 +129,8 @@ class Contribution:
 
         Bins err together, so that offsets are averaged with weights, and shares with these and the
         noise; of arrays of shape (n_freqs, n_channels). The weight is 0 where the noise is not
-        known. Where nothing is known of a part of a band, nothing is known of the band.
+        known. Where nothing is known of a part of a band, nothing is known of the band: `up_to`
+        tells what is.
         """
         first, last, starts = int(edges[0]), int(edges[-1]), edges[:-1] - edges[0]
 

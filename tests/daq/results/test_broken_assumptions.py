@@ -82,3 +82,22 @@ def test_noise_that_two_channels_share_is_in_their_intervals() -> None:
     inside = held(snapshot, noise)
     assert inside[:, [0, 3]].all()
     assert inside.mean() >= 0.93
+
+
+def test_a_band_that_no_dimension_explains_costs_a_mean_its_own_share() -> None:
+    """Three motions of 10 to 14 Hz differ between six sensors; the mean is over 2 to 40 Hz."""
+    rng = np.random.default_rng(1)
+    n, frequency = N_SAMPLES // 3, np.fft.rfftfreq(N_SAMPLES // 3, 1 / RATE)
+    spectrum = np.fft.rfft(rng.standard_normal((n, 3)), axis=0)
+    spectrum[(frequency < 10) | (frequency > 14)] = 0
+    samples = 3 * np.fft.irfft(spectrum, axis=0) @ rng.standard_normal((3, 6))
+    samples += 30 * rng.standard_normal((n, 1)) + rng.standard_normal((n, 6))
+    recording = recording_of_arrays(
+        {f"s{i}": each[:, None] for i, each in enumerate(samples.T)}, RATE
+    )
+    result, true = Result(estimate([recording], SETTINGS), SETTINGS), 2 / RATE
+    for each in result.means(result.method, (11.0, 13.0)):
+        assert np.isneginf(each.low[0])  # what this is about
+    for each in result.means(result.method, (2.0, 40.0)):
+        assert 0.3 * true < each.low[0] < true < each.high[0] < 3 * true
+        assert np.isfinite(each.estimate[0])
