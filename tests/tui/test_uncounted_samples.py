@@ -12,8 +12,8 @@ from daq.results.sources import sources
 from tests.known_clocks import Scene, record, seconds_of
 from tui.application.test_view.details import details
 from tui.output.console import console
+from tui.page.table import Table
 from tui.report.contents import report_of
-from tui.report.parts import Table
 
 
 def test_samples_that_are_not_counted_are_events_of_the_result(tmp_path: Path) -> None:

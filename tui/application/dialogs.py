@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 from textual.binding import Binding, BindingType
 from textual.containers import VerticalScroll
@@ -13,6 +12,8 @@ from textual.screen import ModalScreen
 from textual.widgets import Input, Static
 
 from daq.results.vocabulary import STATE_MEANINGS
+from tui.page.blocks import KeyValues
+from tui.page.terminal import terminal_pairs
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -24,6 +25,7 @@ GLOBAL_KEYS = (
     ("ctrl+p", "all commands by name"),
     ("q", "quit, as Ctrl-C does; a recording continues, and is found again"),
 )
+KEY_STYLE = "bold #4cc9f0"
 COMMON = GLOBAL_KEYS[1:]
 """Without views."""
 WORDS = (
@@ -47,19 +49,10 @@ WORDS = (
 )
 
 
-def pairs(pairs: tuple[tuple[str, str], ...], style: str) -> Table:
-    """Return names and their meanings as two columns."""
-    table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
-    table.add_column(style=style, no_wrap=True, min_width=9)
-    table.add_column()
-    for name, meaning in pairs:
-        table.add_row(name, meaning)
-    return table
-
-
 def help_text(keys: tuple[tuple[str, str], ...]) -> RenderableType:
     """Return what each key does and what each word on the screen means."""
-    return Group(pairs((*keys, *GLOBAL_KEYS), "bold #4cc9f0"), "", pairs(WORDS, "bold"))
+    of_keys = terminal_pairs(KeyValues((*keys, *GLOBAL_KEYS)), KEY_STYLE)
+    return Group(of_keys, "", terminal_pairs(KeyValues(WORDS), "bold"))
 
 
 class TextScreen(ModalScreen[None]):

@@ -30,12 +30,14 @@ from tui.application.bench_view.sensors import (
     trace,
     width_of,
 )
-from tui.application.dialogs import COMMON, TextScreen, pairs
+from tui.application.dialogs import COMMON, KEY_STYLE, TextScreen
 from tui.application.forms.bench import BenchForm
 from tui.application.forms.form import Field, Form
 from tui.application.forms.sensor import PortForm, SensorForm, sensor_table
 from tui.application.themes import ThemedApp
 from tui.application.view import BAD, COMMON_KEYS, MUTED, KeyLine
+from tui.page.blocks import KeyValues
+from tui.page.terminal import terminal_pairs
 from tui.runs.first_bench import is_open, with_device, with_rate
 
 if TYPE_CHECKING:
@@ -462,7 +464,7 @@ def help_of_first_bench() -> RenderableType:
         " lights up. Three sensors make a bench; two need motion that changes. enter writes the"
         " bench file, and the application opens on it.",
         "",
-        pairs((*KEYS, *COMMON), "bold #4cc9f0"),
+        terminal_pairs(KeyValues((*KEYS, *COMMON)), KEY_STYLE),
     )
 
 

@@ -23,10 +23,10 @@ from tui.certificate.ledger import Entry, HeadSigner, Ledger
 from tui.certificate.verification import JSON_NAME, verified
 from tui.output.json_document import document
 from tui.output.json_values import json_text
+from tui.page.pdf import write_paper
 from tui.report.certificate import SPECIMEN, Issue, changes, missing
 from tui.report.contents import report_of
 from tui.report.evidence import invalidating
-from tui.report.paper import write_paper
 from tui.report.writing import write_content
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from daq.bench.masks.mask import Mask
     from daq.bench.model import Bench
-    from tui.report.parts import Report
+    from tui.page.blocks import Report
 
 
 class NotIssuedError(HuddleError, ValueError):

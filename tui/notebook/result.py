@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 def figure(result: results.Result, *, models: Sequence[Mask], width: float) -> Figure:
     """Return a figure with an axis for each channel, sensors below each other."""
     pyplot = load("matplotlib.pyplot")
+    from tui.page.drawing import look, stack, stack_height  # noqa: PLC0415
     from tui.report.figures.curves import noise_plots  # noqa: PLC0415 - loads matplotlib
-    from tui.report.figures.drawing import look, stack, stack_height  # noqa: PLC0415
 
     with look():
         plots = noise_plots(result, models)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from html import escape
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from rich.console import Console, RenderableType
@@ -12,7 +12,8 @@ from rich.text import Text
 from estimator.decision.verdict import Verdict
 from estimator.errors import BandError
 from tui.output.results import averages_line, result_table, result_title
-from tui.page.html import html_table
+from tui.page import html as page
+from tui.page.blocks import Paragraph, Part
 from tui.page.table import Table
 from tui.page.terminal import terminal_table
 from tui.wording.facts import brief
@@ -54,13 +55,12 @@ def _decision(result: Result) -> list[str]:
 def html(result: Result) -> str:
     """Return the table that ``huddle estimate`` prints, as HTML."""
     try:
-        title, table = result_title(result), result_table(result)
+        table = replace(result_table(result), title=result_title(result).plain)
     except BandError as error:
-        return f"<p>Self-noise: {escape(str(error))}</p>"
-    lines = (averages_line(result.snapshot), *(each.line for each in result.facts))
-    below = "".join(f"<p>{escape(line)}</p>" for line in lines)
-    above = "".join(f"<p>{escape(line)}</p>" for line in _decision(result))
-    return f"{above}{html_table(table, caption=title.plain)}{below}"
+        return page.html(Paragraph(f"Self-noise: {error}"))
+    below = (averages_line(result.snapshot), *(each.line for each in result.facts))
+    blocks: list[Part] = [*map(Paragraph, _decision(result)), table, *map(Paragraph, below)]
+    return "".join(page.html(each) for each in blocks)
 
 
 def band(

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from textwrap import fill
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.table import Table
 from rich.text import Text
 
 from daq.results.standing import PairCoherence, Stance, pair_coherence, stances
 from estimator.wording import listed, signed
-from tui.page import table as page
+from tui.page.table import Cell, Table
+from tui.page.terminal import terminal_table
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -33,22 +34,27 @@ _SMALL = 0.35
 
 def standing(result: Result, *, width: int) -> list[RenderableType]:
     """Return sketches of all axes and the coherence of all pairs; empty where none is known."""
-    found, coherence = stances(result.snapshot), pair_coherence(result)
+    found, coherence, means = (
+        stances(result.snapshot),
+        pair_coherence(result),
+        coherence_table(result),
+    )
     parts: list[RenderableType] = []
     if found:
         parts.append(Text("Axes of the sensors, seen from above", "bold"))
         per_row = max(1, width // (_WIDTH + 3))
         starts = range(0, len(found), per_row)
-        parts += [_row(found[first : first + per_row]) for first in starts]
+        rows = (_row(found[first : first + per_row]) for first in starts)
+        parts += [terminal_table(row, gap=3) for row in rows]
         parts.append(Text(caption(found)))
-    if coherence is not None:
+    if coherence is not None and means is not None:
         names = result.snapshot.sensor_names
         low, high = result.band
         parts += [
             Text(f"Coherence of pairs, mean over {low:.3g} to {high:.3g} Hz", "bold"),
-            _matrix(coherence.matrix, names),
+            terminal_table(means, wraps=False),
             Text("Coherence of pairs against frequency", "bold"),
-            _strips(coherence, names),
+            terminal_table(_strips(coherence, names), wraps=False, folded=("pair", "least")),
             Text(_legend()),
         ]
     return parts
@@ -111,7 +117,7 @@ def arrows(stance: Stance) -> list[Arrow]:
     return found
 
 
-def coherence_table(result: Result) -> page.Table | None:
+def coherence_table(result: Result) -> Table | None:
     """Return the mean coherence of all pairs over the band; None where none is known."""
     found, names = pair_coherence(result), result.snapshot.sensor_names
     if found is None:
@@ -120,17 +126,16 @@ def coherence_table(result: Result) -> page.Table | None:
         (name, *("" if n == row else _shown(float(value)) for n, value in enumerate(values)))
         for row, (name, values) in enumerate(zip(names, found.matrix, strict=True))
     )
-    return page.Table(("sensor", *names), tuple(rows))
+    return Table(("sensor", *names), tuple(rows))
 
 
 def _row(found: Sequence[Stance]) -> Table:
-    table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 3, 0, 0))
-    for _ in found:
-        table.add_column(width=_WIDTH)
-    table.add_row(*(Text(each.name, "bold") for each in found))
-    table.add_row(*(Text("\n".join(sketch(each)), no_wrap=True) for each in found))
-    table.add_row(*(Text(remark(each)) for each in found))
-    return table
+    rows = (
+        tuple(Cell(fill(each.name, _WIDTH), strong=True) for each in found),
+        tuple("\n".join(sketch(each)) for each in found),
+        tuple(fill(remark(each), _WIDTH) for each in found),
+    )
+    return Table(("",) * len(found), rows, left=frozenset(range(len(found))))
 
 
 def sketch(stance: Stance) -> list[str]:
@@ -156,19 +161,6 @@ def sketch(stance: Stance) -> list[str]:
     return ["".join(row) for row in rows]
 
 
-def _matrix(values: FloatArray, names: Sequence[str]) -> Table:
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for name in ("", *names):
-        table.add_column(Text(name), justify="right" if name else "left", no_wrap=True)
-    for number, name in enumerate(names):
-        cells = [
-            "" if other == number else _shown(float(values[number, other]))
-            for other in range(len(names))
-        ]
-        table.add_row(Text(name, "bold"), *cells)
-    return table
-
-
 def _shown(value: float) -> str:
     return "?" if math.isnan(value) else f"{_shade(value)} {value:.4f}"
 
@@ -179,17 +171,13 @@ def _shade(value: float) -> str:
 
 def _strips(found: PairCoherence, names: Sequence[str]) -> Table:
     """Return a row of shades for each pair, from the lowest to the highest frequency."""
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     low, high = (f"{found.frequency[end]:.3g} Hz" for end in (0, -1))
     gap = " " * max(1, found.frequency.size - len(low) - len(high))
-    table.add_column("pair")
-    table.add_column(f"{low}{gap}{high}", no_wrap=True)
-    table.add_column("least")
-    for (one, two), values in zip(found.pairs, found.value, strict=True):
-        table.add_row(
-            Text(f"{names[one]} {names[two]}"), "".join(map(_shade, values)), _least(found, values)
-        )
-    return table
+    rows = (
+        (f"{names[one]} {names[two]}", "".join(map(_shade, values)), _least(found, values))
+        for (one, two), values in zip(found.pairs, found.value, strict=True)
+    )
+    return Table.of(("pair", f"{low}{gap}{high}", "least"), rows)
 
 
 def _least(found: PairCoherence, values: FloatArray) -> str:

@@ -1,4 +1,4 @@
-"""Tables for terminals: the command line, the application, and texts of a notebook."""
+"""Blocks for terminals: the command line, the application, and texts of a notebook."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping
 import rich.table
 from rich.text import Text
 
+from tui.page.blocks import Items, KeyValues
 from tui.page.table import Cell, Table, Tone
 
 MUTED = "#9aa5b8"
@@ -66,6 +67,26 @@ def terminal_table(
 def screen_table(table: Table, *, gap: int = 2, folded: Collection[str] = ()) -> rich.table.Table:
     """Return a table as the application shows it: rows are lines."""
     return terminal_table(table, header_style=SCREEN_HEADER, gap=gap, wraps=False, folded=folded)
+
+
+def terminal_items(items: Items) -> rich.table.Table:
+    """Return entries behind their marks, in the colours of their meaning, or behind dots."""
+    made = rich.table.Table.grid(padding=(0, 1, 0, 0))
+    for each in items.entries:
+        made.add_row(
+            Text(each.mark or "·", STYLES[each.tone] if each.mark else MUTED), Text(each.text)
+        )
+    return made
+
+
+def terminal_pairs(pairs: KeyValues, style: str) -> rich.table.Table:
+    """Return names and their values as two columns."""
+    made = rich.table.Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
+    made.add_column(style=style, no_wrap=True, min_width=9)
+    made.add_column()
+    for name, value in pairs.rows:
+        made.add_row(name, Text(value))
+    return made
 
 
 def styled(cell: str) -> Text:

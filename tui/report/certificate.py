@@ -15,7 +15,8 @@ from daq.bench.tables.certificate import CertificateTable, Customer, Laboratory
 from daq.estimation.settings import Settings
 from daq.protocols.block import Quantity
 from daq.results.sources import Condition, Source, conditions
-from tui.report.parts import Facts, Paragraph, Part, Section, Table
+from tui.page.blocks import KeyValues, Paragraph, Part, Section
+from tui.page.table import Table
 from tui.wording.formatting import plain_number, utc_time
 
 if TYPE_CHECKING:
@@ -344,7 +345,7 @@ def parties_section(found: Sequence[Source], bench: Bench | None, issue: Issue |
     keys = {} if issue is not None else {e.what: e.key for e in missing(bench, found[0])}
     absent = [name for name, value in rows if value == _NONE]
     parts: tuple[Part, ...] = (
-        Facts(tuple(row for row in rows if row[1] != _NONE)),
+        KeyValues(tuple(row for row in rows if row[1] != _NONE)),
         *([Paragraph(f"Not given: {', '.join(absent)}.")] if absent else []),
         *(
             [Paragraph("Keys of the bench file: " + "; ".join(map(" = ".join, keys.items())) + ".")]

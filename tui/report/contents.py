@@ -15,10 +15,11 @@ from daq.results.decision.conformity import conformity, with_rule
 from estimator.errors import InsufficientDataError
 from estimator.wording import span
 from tui.output import calibration as shown
+from tui.page.blocks import KeyValues, Paragraph, Part, Report, Section, Signatures
+from tui.page.table import Table
 from tui.report import certificate, evidence
 from tui.report.noise import limits_section, noise_section, verdict
 from tui.report.parameters import parameters_section
-from tui.report.parts import Facts, Paragraph, Part, Report, Section, Signatures, Table
 from tui.report.uncertainty import uncertainty_section
 from tui.wording.formatting import is_known, local_time, utc_time
 
@@ -59,11 +60,11 @@ def calibration_section(result: Result) -> Section | None:
     return Section("Calibration", tuple(parts))
 
 
-def _certificates(found: Calibration, snapshot: Snapshot) -> Facts:
+def _certificates(found: Calibration, snapshot: Snapshot) -> KeyValues:
     """Return the certificates of the reference, a line each."""
     name = snapshot.sensor_names[found.reference]
     labels = [label for label in snapshot.channels if label.sensor == name]
-    return Facts(
+    return KeyValues(
         tuple(
             (
                 f"Certificate of {label.name}",
@@ -206,12 +207,12 @@ def _test_section(found: Sequence[Source]) -> Section:
         ("Location", first.location or "not given"),
         ("Report made by", f"huddle {version('huddle-bench')}"),
     ]
-    parts: list[Part] = [Facts(tuple(rows))]
+    parts: list[Part] = [KeyValues(tuple(rows))]
     for source in found:
         length = (source.last - source.started).total_seconds()
         size = f"{source.n_bytes / 1e6:.1f} MB, {_STATES[source.state]}"
         parts.append(
-            Facts(
+            KeyValues(
                 (
                     ("Recording", f"{source.path.name} ({size})"),
                     ("Started", utc_time(source.started)),
@@ -310,7 +311,10 @@ def _settings_section(result: Result) -> Section:
     }
     rows += [(f"[estimate] {key}", text) for key, (text, _) in options.items() if key not in same]
     defaults = ", ".join(f"{key} {text}" for key, text in same.items())
-    parts: list[Part] = [Facts(tuple(rows)), Paragraph(f"[estimate], as by default: {defaults}.")]
+    parts: list[Part] = [
+        KeyValues(tuple(rows)),
+        Paragraph(f"[estimate], as by default: {defaults}."),
+    ]
     if snapshot.octaves:
         parts.append(
             Table(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import groupby
 
 import numpy as np
@@ -27,24 +27,19 @@ from estimator.checks.band import BandDiagnosis
 from estimator.checks.relative_response import RelativeResponse
 from estimator.likelihood.goodness_of_fit import rejected_below
 from estimator.wording import several, span
-from tui.page.table import Cell
+from tui.page.blocks import Paragraph, Part, Section
+from tui.page.table import Cell, Table
 from tui.report.figures.drift import drift_plot
 from tui.report.figures.model_test import model_test_plot
 from tui.report.figures.signal import signal_plots
 from tui.report.figures.standing import standing_plots
-from tui.report.parts import Items, Paragraph, Part, Section, Table, Tone
-from tui.wording.facts import NOTHING_TO_DO, RANKS
+from tui.wording.facts import RANK_TONES, RANKS, fact_items
 from tui.wording.formatting import NOTHING, plain_number, probability, scientific, share, utc
 
 MOST_SPECTROGRAMS = 1
 """Channels that have spectrograms: each takes a tenth of the time of a report."""
 LISTED = 40
 """Most lines of the list of what happened; with more, those of one kind go together."""
-TONES: Mapping[Rank, Tone] = {
-    Rank.INVALIDATES: "bad",
-    Rank.DELAYS: "doubtful",
-    Rank.TO_KNOW: "plain",
-}
 _USUAL = {EventKind.STARTED, EventKind.CONNECTED, EventKind.STOPPED, EventKind.MARK}
 
 
@@ -283,26 +278,16 @@ def events_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
 
 def facts_section(facts: Sequence[Fact]) -> Section:
     """Return what is known of the test beyond its numbers, the worst first."""
-    items = tuple(
-        Paragraph(
-            f"{each.mark} {each}" if each.needs_action else str(each),
-            TONES[each.rank] if each.needs_action else "plain",
-        )
-        for each in facts
-    )
-    parts: list[Part] = [Items(items)] if items else []
-    if not any(each.needs_action for each in facts):
-        parts.insert(0, Paragraph(NOTHING_TO_DO, "good"))
     legend = ", ".join(
         f"{MARKS[rank]} {words}" for rank, words in RANKS.items() if rank is not Rank.TO_KNOW
     )
-    return Section("Facts", (*parts, Paragraph(f"{legend}.", "quiet")))
+    return Section("Facts", (fact_items(facts), Paragraph(f"{legend}.", "quiet")))
 
 
 def invalidating(facts: Sequence[Fact]) -> tuple[Paragraph, ...]:
     """Return the lines of facts that invalidate the result, for the first page."""
     return tuple(
-        Paragraph(each.line, TONES[each.rank] if each.needs_action else "doubtful")
+        Paragraph(each.line, RANK_TONES[each.rank] if each.needs_action else "doubtful")
         for each in facts
         if each.rank is Rank.INVALIDATES
     )

@@ -17,9 +17,9 @@ from daq.results.vocabulary import FLAG_WORDS, PARTNER_WORDS
 from estimator.decision.verdict import Verdict
 from estimator.self_noise.result import Flag
 from estimator.wording import span
-from tui.page.table import Cell
+from tui.page.blocks import Paragraph, Part, Section
+from tui.page.table import Cell, Table
 from tui.report.figures.curves import noise_plots
-from tui.report.parts import Paragraph, Part, Section, Table
 from tui.wording.formatting import (
     NOT_KNOWN,
     NOTHING,

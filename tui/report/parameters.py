@@ -17,8 +17,8 @@ from tui.output.noise_parameters import (
     sheet_table,
     term_table,
 )
-from tui.report.figures import drawing
-from tui.report.parts import Items, Paragraph, Part, Plot, Section, three_to_a_row
+from tui.page import drawing
+from tui.page.blocks import Items, Paragraph, Part, Plot, Section, three_to_a_row
 from tui.wording.formatting import power_of_ten
 
 if TYPE_CHECKING:

@@ -14,9 +14,10 @@ from daq.results.uncertainty_budget import STATED, Budget, band_budgets
 from daq.results.vocabulary import SOURCE_WORDS
 from estimator.levels.contributions import Source
 from estimator.wording import span
-from tui.report.figures import drawing
+from tui.page import drawing
+from tui.page.blocks import Paragraph, Part, Plot, Section, three_to_a_row
+from tui.page.table import Table
 from tui.report.figures.curves import logarithmic
-from tui.report.parts import Paragraph, Part, Plot, Section, Table, three_to_a_row
 from tui.wording.formatting import NOTHING, level, plain_number, scientific
 
 if TYPE_CHECKING:

@@ -8,16 +8,12 @@ from functools import cache
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from estimator.checks.advice import Rank
 from estimator.wording import clock_time, several
-from tui.page.html import class_of, html_table
-from tui.page.table import Table
+from tui.page.blocks import Paragraph, Part
+from tui.page.html import html
+from tui.page.table import tone_of
 from tui.wording.formatting import utc
 from tui.wording.verdict_text import TONES
-
-_RANKS = {Rank.INVALIDATES: "bad", Rank.DELAYS: "doubtful", Rank.TO_KNOW: ""}
-_WIDE = Markup('<div class="wide" tabindex="0" role="region" aria-label="{}">{}</div>')
-_LINE = Markup('<p class="{tone}">{text}</p>')
 
 
 @cache
@@ -31,11 +27,10 @@ def environment() -> Environment:
         lstrip_blocks=True,
     )
     made.filters |= {
+        "block": block,
         "clock_time": clock_time,
-        "rank_tone": _RANKS.get,
         "line": line,
         "several": several,
-        "table": table,
         "tone_of": lambda verdict: "" if verdict is None else TONES[verdict],
         "instant": instant,
         "utc": lambda ns: instant(datetime.fromtimestamp(ns / 1e9, UTC), text=utc(ns)),
@@ -58,12 +53,11 @@ def instant(at: datetime, form: str = "%H:%M:%S UTC", text: str = "") -> Markup:
     )
 
 
+def block(part: Part) -> Markup:
+    """Return a block as HTML."""
+    return Markup(html(part))  # noqa: S704 - it escapes all text
+
+
 def line(text: str) -> Markup:
     """Return a text of the application as a paragraph."""
-    return _LINE.format(tone=class_of(text), text=text)
-
-
-def table(made: Table) -> Markup:
-    """Return a table of the application, which scrolls where it is too wide."""
-    names = ", ".join(title for title in made.header if title.strip())
-    return _WIDE.format(names, Markup(html_table(made)))  # noqa: S704 - it escapes all text
+    return block(Paragraph(text, tone_of(text)))

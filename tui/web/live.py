@@ -46,6 +46,7 @@ from tui.service.status import status_lines
 from tui.web.chart import choice_of, drawn, with_models
 from tui.web.html import instant, page
 from tui.web.traces import Trace, traces
+from tui.wording.facts import RANK_TONES
 
 _LOGGER = logging.getLogger(__name__)
 LOOK = 1.0
@@ -348,7 +349,7 @@ def _of_estimate(state: State, result: Result) -> dict[str, str]:
         "now_estimate",
         # Without a verdict, what delays it is among the facts.
         advice="" if result.verdict is None else advice(result, choice),
-        facts=[each for each in result.facts if each.needs_action],
+        facts=[Cell(f.line, RANK_TONES[f.rank]) for f in result.facts if f.needs_action],
         band=of_band(result),
         noise=noise,
         clock=Cell("".join(parts), parts[-1].tone),

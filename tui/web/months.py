@@ -98,8 +98,8 @@ class Months:
         LookupError
             If there is no archive.
         """
+        from tui.page.drawing import look  # noqa: PLC0415
         from tui.report.figures.archive import days_figure, density_figure  # noqa: PLC0415
-        from tui.report.figures.drawing import look  # noqa: PLC0415
 
         found = self._answered()
         if found is None:

@@ -16,7 +16,7 @@ from tui.output.standing import arrows, caption, coherence_table, remark
 from tui.page.table import Table
 from tui.web.chart import choice_of
 from tui.web.live import WIDE, band_means, of_band
-from tui.wording.facts import NOTHING_TO_DO
+from tui.wording.facts import fact_items
 from tui.wording.verdict_text import Decision, limit_line
 
 
@@ -44,10 +44,13 @@ def about_test(state: State, settings_table: Mapping[str, Any]) -> dict[str, Any
         "comparison": ""
         if state.reference is None or differences is not None
         else "The two tests cannot be compared: no channel, method, unit or band in common.",
-        "facts": result.facts,
-        "nothing_to_do": NOTHING_TO_DO,
+        "facts": fact_items(result.facts),
         "limits": [] if verdict is None else [limit_line(each) for each in verdict.limits],
-        "settings": [(name, _value(value)) for name, value in settings_table.items()],
+        "settings": Table(
+            ("setting", "value"),
+            tuple((name, _value(value)) for name, value in settings_table.items()),
+            left=frozenset({0, 1}),
+        ),
     }
 
 

@@ -9,6 +9,8 @@ from daq.results.facts.recordings import NotInLiveEstimate
 from daq.results.facts.segments import NoSegmentUsable
 from estimator.checks.advice import Rank
 from estimator.wording import several
+from tui.page.blocks import Items, Paragraph
+from tui.page.table import Tone
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -20,9 +22,36 @@ RANKS: Mapping[Rank, str] = {
     Rank.DELAYS: "delays the result",
     Rank.TO_KNOW: "to know",
 }
+RANK_TONES: Mapping[Rank, Tone] = {
+    Rank.INVALIDATES: "bad",
+    Rank.DELAYS: "doubtful",
+    Rank.TO_KNOW: "quiet",
+}
 MOST_LINES = 3
 """Below a table."""
 NOTHING_TO_DO = "Nothing to do."
+
+
+def fact_items(facts: Sequence[Fact], *, is_open: bool = False, more: str = "") -> Items:
+    """Return facts in full, in their order; before them, whether nothing is to be done.
+
+    Parameters
+    ----------
+    facts : sequence of Fact
+    is_open : bool
+        Whether something is to be done beside the facts.
+    more : str
+        What follows the last.
+    """
+    entries = [
+        Paragraph(str(each), RANK_TONES[each.rank], each.mark)
+        if each.needs_action
+        else Paragraph(str(each))
+        for each in facts
+    ]
+    if not is_open and not any(each.needs_action for each in facts):
+        entries.insert(0, Paragraph(NOTHING_TO_DO, "good"))
+    return Items((*entries, *([Paragraph(more)] if more else [])))
 
 
 def why_no_estimate(result: Result) -> str:

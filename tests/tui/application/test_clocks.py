@@ -19,8 +19,9 @@ from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot
 from tui.application.test_view.clocks import clock_line, drift_lines, drift_title
 from tui.application.test_view.plot import TimeAxis
 from tui.commands.demo import compare
+from tui.page.blocks import Paragraph
+from tui.page.table import Table
 from tui.report.evidence import clocks_section
-from tui.report.parts import Paragraph, Table
 from tui.simulation.devices import scenario_of
 
 

@@ -257,7 +257,7 @@ async def test_the_palette_does_what_the_keys_do(tmp_path: Path) -> None:
 async def test_from_cables_to_a_specimen_of_the_certificate_in_few_keys(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tui.report.figures.drawing.draw", lambda *_, **__: None)
+    monkeypatch.setattr("tui.page.drawing.draw", lambda *_, **__: None)
     text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
     path = tmp_path / "bench.toml"
     keys: list[str] = []

@@ -15,7 +15,7 @@ from tests.tui.certificate.laboratory import Laboratory, laboratory
 def empty_figures() -> Iterator[None]:
     """Leave figures empty: curves take most of a certificate's time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tui.report.figures.drawing.draw", lambda *_, **__: None)
+        patch.setattr("tui.page.drawing.draw", lambda *_, **__: None)
         yield
 
 

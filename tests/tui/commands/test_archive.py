@@ -48,7 +48,8 @@ from tests.tui.thinned import thinned
 from tests.waiting import finish, wait_until
 from tui.commands.main import app
 from tui.output.archive.tables import course_table
-from tui.report.figures import archive, drawing
+from tui.page import drawing
+from tui.report.figures import archive
 from tui.report.figures.archive import days_figure, density_figure
 
 SCHEMA: dict[str, Any] = json.loads(

@@ -30,9 +30,9 @@ from tui.certificate.dcc import SI, _mean
 from tui.notebook import result as notebooks
 from tui.output.json_document import _band_means
 from tui.output.results import result_table
+from tui.page.table import Table
 from tui.page.terminal import terminal_table
 from tui.report.noise import noise_section
-from tui.report.parts import Table
 from tui.web.chart import _numbers
 
 BAND = (9.0, 11.0)  # within one third of an octave: a limit there is judged in one band

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from tui.output.plain_console import PlainConsole
-from tui.page.html import html_table
+from tui.page.html import html
 from tui.page.table import Cell, Table
 from tui.page.terminal import styled
 
@@ -23,8 +25,8 @@ def test_numbers_are_flush_right_in_the_terminal() -> None:
 
 
 def test_html_names_rows_and_has_the_tone_as_class() -> None:
-    shown = html_table(TABLE, caption="a & b")
-    assert "<caption>a &amp; b</caption>" in shown
+    shown = html(replace(TABLE, title="a & b"))
+    assert "<caption><span>a &amp; b</span></caption>" in shown
     assert '<th class="number" scope="col">noise, dB</th>' in shown
     row = '<tr><th scope="row">A &lt;b&gt;</th><td class="bad number" data-title="noise, dB">✗ +3.1'
     assert row in shown

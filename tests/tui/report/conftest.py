@@ -41,4 +41,4 @@ def paper(reported: Reported) -> PdfReader:
 @pytest.fixture
 def empty_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave figures empty, for tests of the rest: curves take most of a report's time."""
-    monkeypatch.setattr("tui.report.figures.drawing.draw", lambda *_, **__: None)
+    monkeypatch.setattr("tui.page.drawing.draw", lambda *_, **__: None)

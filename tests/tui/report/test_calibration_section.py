@@ -12,8 +12,9 @@ from daq.estimation.snapshot import Snapshot
 from daq.formats.arrays import recording_of_arrays
 from daq.results.result import Result
 from tui.output.calibration import share
+from tui.page.blocks import KeyValues, Paragraph
+from tui.page.table import Table
 from tui.report.contents import calibration_section
-from tui.report.parts import Facts, Paragraph, Table
 
 SETTINGS = Settings(segment=2.0, band=(1.0, 20.0))
 
@@ -51,7 +52,7 @@ def test_values_budgets_and_certificates_are_there() -> None:
     opening = section.parts[0]
     assert isinstance(opening, Paragraph)
     assert "against C (absolute, by its certificate)" in opening.text
-    (facts,) = (part for part in section.parts if isinstance(part, Facts))
+    (facts,) = (part for part in section.parts if isinstance(part, KeyValues))
     assert facts.rows[0] == (
         "Certificate of C.1",
         "1 counts per unit, U = 0.01 (k = 2), date not given, L-7",

@@ -20,11 +20,11 @@ from tests.tui.night_recording import HOSTILE, N_SAMPLES, RATE, record
 from tests.tui.report.written_report import Reported, Words, by_channel, tables, texts_of
 from tui.commands.main import app
 from tui.output.json_document import result_document
-from tui.page.table import Cell, tone_of
+from tui.page.blocks import Plot, Section
+from tui.page.table import Cell, Table, tone_of
 from tui.report.contents import by_sensor, report_of
 from tui.report.evidence import facts_section
 from tui.report.figures.drift import without_line
-from tui.report.parts import Plot, Section, Table
 
 
 def test_it_says_what_was_tested_on_what_by_whom_and_when(reported: Reported) -> None:

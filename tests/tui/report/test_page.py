@@ -12,7 +12,7 @@ import pytest
 
 from tests.tui.night_recording import HOSTILE
 from tests.tui.report.written_report import Reported, Words
-from tui.report.parts import Table
+from tui.page.table import Table
 
 if TYPE_CHECKING:
     from pathlib import Path

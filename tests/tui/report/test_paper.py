@@ -20,9 +20,10 @@ from daq.results.sources import sources
 from tests.tui.night_recording import RATE
 from tests.tui.report.written_report import Reported, Words, paper_of, texts_of
 from tui.commands.main import app
+from tui.page.blocks import KeyValues, Paragraph, Plot, Report, Section
+from tui.page.drawing import WIDTH
+from tui.page.table import Table
 from tui.report.contents import report_of
-from tui.report.figures.curves import WIDTH
-from tui.report.parts import Facts, Paragraph, Plot, Report, Section, Table
 from tui.report.writing import write
 
 
@@ -105,7 +106,7 @@ def test_signatures_are_not_alone_on_their_page(reported: Reported) -> None:
 
 def test_a_text_of_any_length_fits_on_pages(reported: Reported) -> None:
     long = Table(("what", "text"), (("a", "x" * 9000), ("b", "word " * 3000)), left=frozenset({1}))
-    section = Section("Long", (long, Paragraph("y" * 9000), Facts((("name", "z " * 9000),))))
+    section = Section("Long", (long, Paragraph("y" * 9000), KeyValues((("name", "z " * 9000),))))
     report = replace(reported.report, sections=(section, *reported.report.sections[-2:]))
     text = "".join(page.extract_text() for page in PdfReader(paper_of(report)).pages)
     assert text.count("…") == 4  # each is cut, and says so
@@ -202,7 +203,9 @@ def test_curves_of_three_and_four_points_are_drawn() -> None:
 def test_tables_of_the_annex_stand_side_by_side_where_they_fit() -> None:
     narrow = Table(("channel", "noise (dB)"), (("A.X", "-120.1"), ("A.Y", "-119.7")), title="Short")
     wide = Table(("what", "in words"), (("a", "word " * 30),), left=frozenset({0, 1}))
-    facts = Facts((("One", "first"), ("Two", "second"), ("Long", "word " * 60), ("Four", "last")))
+    facts = KeyValues(
+        (("One", "first"), ("Two", "second"), ("Long", "word " * 60), ("Four", "last"))
+    )
     parts = (narrow, narrow, wide, narrow, facts)
 
     def placed(*, is_annex: bool) -> dict[str, list[tuple[float, float]]]:

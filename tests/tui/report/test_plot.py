@@ -30,10 +30,10 @@ from estimator.self_noise.result import Flag
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
 from tests.tui.night_recording import record
 from tui.commands.main import app
-from tui.report.figures import drawing
+from tui.page import drawing
+from tui.page.blocks import Plot
 from tui.report.figures.curves import MODEL_RANGE_DB, noise_plots, write_figure
 from tui.report.figures.signal import signal_plots
-from tui.report.parts import Plot
 
 SNAPSHOT = made_snapshot()
 LIMIT = """

@@ -15,7 +15,8 @@ from daq.results.result import Result
 from daq.results.uncertainty_budget import band_budgets
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
 from tests.tui.report.written_report import Reported, by_channel, tables
-from tui.report.parts import Paragraph, Plot, Table
+from tui.page.blocks import Paragraph, Plot
+from tui.page.table import Table
 from tui.report.uncertainty import half_octaves, uncertainty_section
 
 

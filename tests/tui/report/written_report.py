@@ -12,9 +12,10 @@ from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Snapshot
 from daq.results.result import Result
 from daq.results.sources import sources
-from tui.report.paper import write_paper
-from tui.report.parts import Facts, Items, Paragraph, Part, Plot, Report, Table
-from tui.report.writing import page
+from tui.page.blocks import Items, KeyValues, Paragraph, Part, Plot, Report
+from tui.page.html_page import page
+from tui.page.pdf import write_paper
+from tui.page.table import Table
 
 ROOT = Path(__file__).parents[3]
 
@@ -72,7 +73,7 @@ def words_of(part: Part) -> list[str]:
             return [part.text]
         case Items():
             return [entry.text for entry in part.entries]
-        case Facts():
+        case KeyValues():
             return [word for row in part.rows for word in row]
         case Table():
             return [part.title, *part.header, *(word for row in part.rows for word in row)]

@@ -96,7 +96,7 @@ def test_a_test_has_verdict_table_picture_facts_and_settings(server: Server) -> 
     assert "B: 2 gaps, 131 samples missing" in text
     assert 'aria-label="B: turned 0.0°"' in text
     assert "Coherence of pairs, mean over 2–20 Hz" in text
-    assert '<th scope="row">segment</th><td>1.0</td>' in text
+    assert '<th scope="row">segment</th><td data-title="value">1.0</td>' in text
 
 
 def test_the_downloads_are_those_of_the_command(server: Server, folder: Path) -> None:
@@ -116,7 +116,7 @@ def test_certificates_of_a_test_are_read(
     server: Server, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Curves take most of a certificate's time.
-    monkeypatch.setattr("tui.report.figures.drawing.draw", lambda *_, **__: None)
+    monkeypatch.setattr("tui.page.drawing.draw", lambda *_, **__: None)
     recording = folder / "recordings" / "night.h5"
     assert "Certificate" not in server.visit().get("/tests/night.h5").text
     with Recording.open(recording) as opened:

@@ -6,21 +6,19 @@ import math
 from typing import TYPE_CHECKING
 
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from daq.results.comparison import Difference, compare
 from daq.results.facts.precision import TargetMissed
 from daq.results.vocabulary import PARTNER_WORDS
-from estimator.checks.advice import Rank
 from estimator.decision.verdict import Verdict
 from estimator.wording import percent, signed
 from tui.application.test_view.panels import alerts, known_to
 from tui.output.results import averages_line
 from tui.page import table as page
 from tui.page.table import Cell
-from tui.page.terminal import screen_table, styled
-from tui.wording.facts import NOTHING_TO_DO
+from tui.page.terminal import screen_table, styled, terminal_items
+from tui.wording.facts import fact_items
 from tui.wording.formatting import level, level_with_error
 from tui.wording.verdict_text import (
     MARKS,
@@ -39,7 +37,6 @@ if TYPE_CHECKING:
     from tui.application.state import State
 
 MUTED, BAD = "#9aa5b8", "bold #ff6b6b"
-_STYLES_OF_RANKS = {Rank.INVALIDATES: BAD, Rank.DELAYS: "yellow", Rank.TO_KNOW: MUTED}
 WIDE = 110  # columns from which there is room for what can be missed
 
 
@@ -60,23 +57,11 @@ def result(state: State, *, width: int) -> RenderableType:
         each for each in found.facts if found.verdict is None or not isinstance(each, TargetMissed)
     ]
     is_open = found.verdict is not None and found.verdict.verdict is not Verdict.PASS
-    if not is_open and not any(each.needs_action for each in facts):
-        parts.append(item(NOTHING_TO_DO))
-    parts += [
-        item(str(each), each.mark, _STYLES_OF_RANKS[each.rank] if each.needs_action else MUTED)
-        for each in facts
-    ]
-    parts.append(item(averages_line(snapshot)))
+    of_averages = averages_line(snapshot)
+    parts.append(terminal_items(fact_items(facts, is_open=is_open, more=of_averages)))
     if path is not None:
         parts += ["", Text.assemble(("recording  ", MUTED), str(path.resolve()))]
     return Group(*parts)
-
-
-def item(text: str, mark: str = "·", style: str = "#9aa5b8") -> Table:
-    """Return a paragraph of a list behind a mark."""
-    table = Table.grid(padding=(0, 1, 0, 0))
-    table.add_row(Text(mark, style), Text(text))
-    return table
 
 
 def _verdict(result: Result) -> Iterator[Text]:
@@ -99,7 +84,7 @@ def _verdict(result: Result) -> Iterator[Text]:
         yield Text(f"✓ {known_to(result.precision())}", "green")
 
 
-def _channels(state: State, result: Result, *, width: int) -> Table:
+def _channels(state: State, result: Result, *, width: int) -> RenderableType:
     snapshot = result.snapshot
     method, band = next(iter(snapshot.results)), result.band
     data, cov, alone = result.data, result.covs_of(method), result.alone

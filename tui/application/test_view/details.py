@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from daq.protocols.block import EventKind
@@ -15,14 +14,13 @@ from daq.results.sources import LoggedEvent, uncounted_events, with_uncounted
 from estimator.wording import clock_time
 from tui.application.test_view.panels import grouped, state
 from tui.output.diagnosis import details as diagnosis_details
-from tui.page import table as page
-from tui.page.table import Cell
+from tui.page.table import Cell, Table, Tone
 from tui.page.terminal import screen_table
 from tui.wording.formatting import utc
 
 LATEST_EVENTS = 200
 MUTED, HEADER, BAD = "#9aa5b8", "bold #4cc9f0", "bold #ff6b6b"
-_STYLES = {str(EventKind.MARK): "bold #f4a261", str(EventKind.UNCOUNTED): BAD}
+_TONES: Mapping[str, Tone] = {EventKind.MARK: "doubtful", EventKind.UNCOUNTED: "bad"}
 
 
 def details(now: RecordingStatus, result: Result | None, *, trouble: str) -> RenderableType:
@@ -39,7 +37,7 @@ def details(now: RecordingStatus, result: Result | None, *, trouble: str) -> Ren
     return Group(*parts)
 
 
-def _sensors(now: RecordingStatus) -> Table:
+def _sensors(now: RecordingStatus) -> RenderableType:
     rows = (
         (
             *(Cell(sensor.name, strong=True), state(sensor), grouped(sensor.n_gaps)),
@@ -50,7 +48,7 @@ def _sensors(now: RecordingStatus) -> Table:
         for sensor in now.sensors
     )
     names = ("sensor", "state", "gaps", "missing", "clipped", "port")
-    return screen_table(page.Table.of(names, rows), folded=("port",))
+    return screen_table(Table.of(names, rows), folded=("port",))
 
 
 def _segments(result: Result) -> Text:
@@ -64,23 +62,25 @@ def _segments(result: Result) -> Text:
     return Text(text)
 
 
-def _events(now: RecordingStatus, found: Sequence[LoggedEvent]) -> Table:
+def _events(now: RecordingStatus, found: Sequence[LoggedEvent]) -> RenderableType:
     """Return what was recorded, and what the estimate found: that in place of what it had."""
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_header=False)
-    table.add_column(justify="right", style=MUTED, no_wrap=True)
-    for _ in range(2):
-        table.add_column(no_wrap=True)
-    table.add_column(overflow="fold")
     recorded = [
         LoggedEvent(event.received.utc_ns, event.sensor, event.kind, event.text)
         for event in now.events
     ]
     every = with_uncounted(recorded, found)
     shown = every[-LATEST_EVENTS:]
-    for event in reversed(shown):
-        at = (event.utc_ns - now.started_utc_ns) * 1e-9
-        style = _STYLES.get(event.kind, "")
-        table.add_row(clock_time(at), Text(event.sensor), Text(event.kind, style), Text(event.text))
+    rows = [
+        (
+            Cell(clock_time((event.utc_ns - now.started_utc_ns) * 1e-9), "quiet"),
+            event.sensor,
+            Cell(event.kind, _TONES.get(event.kind, "plain"), strong=event.kind in _TONES),
+            event.text,
+        )
+        for event in reversed(shown)
+    ]
     if len(shown) < len(every):
-        table.add_row("", "", "", f"and {len(every) - len(shown)} before")
-    return table
+        rows.append((Cell(""), "", Cell(""), f"and {len(every) - len(shown)} before"))
+    return screen_table(
+        Table.of(("after", "sensor", "event", "remark"), rows, right={"after"}), folded=("remark",)
+    )

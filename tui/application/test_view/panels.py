@@ -15,10 +15,10 @@ from daq.results.decision.end import NOT_KNOWN_FROM, Goal
 from daq.results.facts.methods import WITHOUT_ESTIMATE
 from daq.results.facts.recordings import SensorsSimulated, facts_of_sensors
 from daq.results.vocabulary import FLAG_WORDS, PARTNER_WORDS
-from estimator.checks.advice import Rank
 from estimator.wording import clock_time, percent, several
 from tui.page.table import Cell, Table, Tone
 from tui.page.terminal import styled
+from tui.wording.facts import RANK_TONES
 from tui.wording.formatting import level_with_error
 from tui.wording.verdict_text import headline, how_long, in_tone
 
@@ -34,11 +34,6 @@ if TYPE_CHECKING:
 
 MUTED = "#9aa5b8"
 _NUMBERS = ("Hz", "samples", "gaps")
-RANK_TONES: Mapping[Rank, Tone] = {
-    Rank.INVALIDATES: "bad",
-    Rank.DELAYS: "doubtful",
-    Rank.TO_KNOW: "quiet",
-}
 MIN_BAR = 6  # cells
 
 

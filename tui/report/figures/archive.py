@@ -22,7 +22,7 @@ from daq.bench.units import levels_db
 from daq.whole_file import write_whole
 from estimator.wording import span
 from tui.output.archive.tables import day_text
-from tui.report.figures import drawing
+from tui.page import drawing
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

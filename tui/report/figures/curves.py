@@ -20,9 +20,9 @@ from daq.whole_file import write_whole
 from estimator.errors import InsufficientDataError
 from estimator.levels.bands import log_edges
 from estimator.self_noise.result import Flag, SelfNoise
-from tui.report.figures import drawing
-from tui.report.figures.drawing import look, stack, stack_height
-from tui.report.parts import Plot
+from tui.page import drawing
+from tui.page.blocks import Plot
+from tui.page.drawing import WIDTH, look, stack, stack_height
 from tui.wording.formatting import power_of_ten
 
 if TYPE_CHECKING:
@@ -43,8 +43,6 @@ if TYPE_CHECKING:
 POINTS = 240
 """Most points of a curve: more than print resolves. Each is a mean over its share of the axis."""
 NOISE_HEIGHT = 1.45
-WIDTH = 7.1
-"""Of a plot in inches: that of A4 between its margins."""
 KEY_COLUMN = 1.2
 """Width of an entry of the key, in inches."""
 MODEL_RANGE_DB = 60.0

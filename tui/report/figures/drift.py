@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from daq.results.clock_effect import lags
-from tui.report.figures import drawing
-from tui.report.parts import Plot
+from tui.page import drawing
+from tui.page.blocks import Plot
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -13,9 +13,9 @@ from scipy import special
 from estimator.levels.bands import log_edges
 from estimator.likelihood.goodness_of_fit import REJECT, neighbour_correlation
 from estimator.spectra.windows import get_window
-from tui.report.figures import drawing
+from tui.page import drawing
+from tui.page.blocks import Plot
 from tui.report.figures.curves import centres, logarithmic
-from tui.report.parts import Plot
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,8 +12,8 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from daq.protocols.block import EventKind
 from daq.results.signal import CLIPPED, EXCLUDED, GAP, Mark, Signal, Spectrogram, Trace, Waveforms
-from tui.report.figures import drawing
-from tui.report.parts import Plot
+from tui.page import drawing
+from tui.page.blocks import Plot
 from tui.wording.signal import extent, moment, time_ticks, title
 
 if TYPE_CHECKING:

@@ -12,9 +12,9 @@ from matplotlib.ticker import FuncFormatter, NullLocator
 
 from daq.results.standing import PairCoherence, Stance, pair_coherence, stances
 from tui.output.standing import arrows, caption, remark
-from tui.report.figures import drawing
+from tui.page import drawing
+from tui.page.blocks import Plot
 from tui.report.figures.curves import logarithmic
-from tui.report.parts import Plot
 from tui.wording.formatting import power_of_ten
 
 if TYPE_CHECKING:

@@ -32,7 +32,7 @@ def history_figure(found: Sequence[Series]) -> Figure:
     """Return a picture with a panel for each sensor and band, and lines where noise has changed."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - takes a second
 
-    from tui.report.figures.drawing import look  # noqa: PLC0415
+    from tui.page.drawing import look  # noqa: PLC0415
 
     panels: dict[tuple[str, float, float, str], list[Series]] = {}
     for series in found:

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.backend_bases import GraphicsContextBase, RendererBase
 from matplotlib.path import Path
 
-from tui.report.figures import drawing
+from tui.page import drawing
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.text import Text
     from matplotlib.transforms import Transform
 
-    from tui.report.parts import Plot
+    from tui.page.blocks import Plot
 
 POINTS = 72
 """In an inch. A figure of as many dots per inch is drawn in points."""

@@ -20,10 +20,10 @@ import matplotlib as mpl
 from fpdf import FPDF, FontFace, TextStyle
 from fpdf.enums import TableBordersLayout, WrapMode, XPos, YPos
 
-from tui.page.table import Cell, tone_of
-from tui.report.figures import drawing, on_paper
-from tui.report.figures.curves import WIDTH as INNER
-from tui.report.parts import Facts, Items, Paragraph, Part, Plot, Report, Signatures, Table, Tone
+from tui.page import drawing, drawing_on_pdf
+from tui.page.blocks import Items, KeyValues, Paragraph, Part, Plot, Report, Signatures
+from tui.page.drawing import WIDTH as INNER
+from tui.page.table import Cell, Table, Tone, tone_of
 
 MARGIN, TOP, BOTTOM = 0.58, 0.5, 0.65
 TITLE, VERDICT = 17.0, 10.0
@@ -259,7 +259,7 @@ class _Paper(FPDF):
     @part.register
     def _(self, part: Paragraph) -> None:
         size = self.sizes.small if part.tone == "quiet" else self.sizes.text
-        self.lines(part.text, size, part.tone)
+        self.lines(part.marked, size, part.tone)
         self.ln(0.4 * self.sizes.part)
 
     @part.register
@@ -270,11 +270,11 @@ class _Paper(FPDF):
                 self.add_page()
             self._style(size, entry.tone)
             self.text(MARGIN + 0.02, self.y + 0.85 * self._line, "•")
-            self.lines(entry.text, size, entry.tone, indent=0.14)
+            self.lines(entry.marked, size, entry.tone, indent=0.14)
             self.ln(0.03)
 
     @part.register
-    def _(self, part: Facts) -> None:
+    def _(self, part: KeyValues) -> None:
         size, names = self.sizes.text, self.sizes.names
         for pair, wide in self._facts(part):
             if self.will_page_break(max(self._facts_height(row, wide) for row in pair)):
@@ -302,9 +302,9 @@ class _Paper(FPDF):
         if part.title:
             left = self.l_margin - MARGIN
             self.lines(part.title, self.sizes.text, bold=True, indent=left, width=left + width)
-        page = on_paper.Page(self, _FAMILY, self._out)
+        page = drawing_on_pdf.Page(self, _FAMILY, self._out)
         with self._marked_sequence(alt_text=part.alt):
-            on_paper.draw(part, page, left=self.l_margin, top=self.y, width=width)
+            drawing_on_pdf.draw(part, page, left=self.l_margin, top=self.y, width=width)
         self.set_xy(MARGIN, self.y + drawing.height_of(part))
 
     @part.register
@@ -404,10 +404,10 @@ class _Paper(FPDF):
         self._style(sizes.text)
         match part:
             case Paragraph():
-                return 0.4 * sizes.part + line * self._n_lines(part.text, INNER)
+                return 0.4 * sizes.part + line * self._n_lines(part.marked, INNER)
             case Items():
-                return sum(0.03 + line * self._n_lines(e.text, INNER) for e in part.entries)
-            case Facts():
+                return sum(0.03 + line * self._n_lines(e.marked, INNER) for e in part.entries)
+            case KeyValues():
                 return 0.8 * sizes.part + sum(
                     max(self._facts_height(row, wide) for row in pair)
                     for pair, wide in self._facts(part)
@@ -437,7 +437,7 @@ class _Paper(FPDF):
         """Return the height of a line of text."""
         return self.sizes.text * self.sizes.line / 72
 
-    def _facts(self, part: Facts) -> Iterator[tuple[list[tuple[str, str]], float]]:
+    def _facts(self, part: KeyValues) -> Iterator[tuple[list[tuple[str, str]], float]]:
         """Yield facts that stand side by side, with their width; a long one stands alone."""
         n = self.sizes.columns
         wide = (INNER - GUTTER * (n - 1)) / n

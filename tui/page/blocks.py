@@ -1,7 +1,7 @@
-"""What a report consists of, whatever it is written on.
+"""What outputs consist of, on whatever they are written.
 
-`contents` makes sections of these parts out of an estimate and its recordings; `page` writes them
-as HTML and `paper` as PDF, so both say the same. All text is plain: who writes it escapes it.
+A renderer each writes these blocks on terminals, as HTML and as PDF, so all say the same. All text
+is plain: who writes it escapes it.
 """
 
 from __future__ import annotations
@@ -9,23 +9,26 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
-from tui.page import table as page
+from tui.page.table import Table, Tone
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from matplotlib.axes import Axes
 
-Tone: TypeAlias = page.Tone
-Table: TypeAlias = page.Table
-
 
 @dataclass(frozen=True, slots=True)
 class Paragraph:
-    """A few sentences."""
+    """A few sentences, perhaps behind a mark."""
 
     text: str
     tone: Tone = "plain"
+    mark: str = ""
+
+    @property
+    def marked(self) -> str:
+        """The text behind its mark."""
+        return f"{self.mark} {self.text}" if self.mark else self.text
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +39,8 @@ class Items:
 
 
 @dataclass(frozen=True, slots=True)
-class Facts:
-    """Names and what they are, a line each."""
+class KeyValues:
+    """Names and their values, a line each."""
 
     rows: tuple[tuple[str, str], ...]
 
@@ -94,7 +97,7 @@ class Signatures:
     labels: tuple[str, ...]
 
 
-Part: TypeAlias = Paragraph | Items | Facts | Table | Plot | Signatures
+Part: TypeAlias = Paragraph | Items | KeyValues | Table | Plot | Signatures
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,12 +1,15 @@
-"""How plots of a report look, on whatever they are drawn: colours, letters, and places of axes.
+"""How plots look, on whatever they are drawn: colours, letters, and places of axes.
 
 Axes are placed by inches, so a plot looks alike in a page of its own and in the middle of another.
 """
 
 from __future__ import annotations
 
+import io
+import re
 import warnings
 from contextlib import contextmanager
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
@@ -17,13 +20,42 @@ if TYPE_CHECKING:
 
     from matplotlib.artist import Artist
 
-    from tui.report.parts import Plot
+    from tui.page.blocks import Plot
 
+WIDTH = 7.1
+"""Of a plot in inches: that of A4 between its margins."""
 INK, GRID = "#20262d", "#d8dde2"
 DATA, NOISE, LIMIT, NOTHING = "#8b949e", "#0b62a8", "#c2321f", "#c7b98a"
 QUANTISATION, MODEL = "#7d6a58", "#4f5861"
 LINES = ("#0b62a9", "#d1661f", "#2f8f4e", "#8c4fb0", "#b3272c", "#7d6a57", "#c4579b", "#4d8f9b")
 """Of several things in one plot; each colour of its own, so that a page can replace it."""
+LIGHT = {
+    "ink": INK,
+    "grid": GRID,
+    "data": DATA,
+    "noise": NOISE,
+    "limit": LIMIT,
+    "nothing": NOTHING,
+    "quantisation": QUANTISATION,
+    "model": MODEL,
+    **{f"line{number}": colour for number, colour in enumerate(LINES)},
+}
+_DARK_LINES = (
+    "#6cb6ff", "#f0a06a", "#6fd08c", "#c79be8", "#ff8d88", "#c4b09a", "#f09ad0", "#86cfd9",
+)  # fmt: skip
+DARK = {
+    "ink": "#e3e8ee",
+    "grid": "#2c343d",
+    "data": "#78838f",
+    "noise": "#6cb6fe",
+    "limit": "#ff7566",
+    "nothing": "#6d6240",
+    "quantisation": "#b8a48e",
+    "model": "#aab4be",
+    **{f"line{number}": colour for number, colour in enumerate(_DARK_LINES)},
+}
+"""Colours that a page replaces by those for a light or a dark screen."""
+_REFERENCE = re.compile(r'(?:url\(#|href="#)([^")]+)')
 
 DASHES = ((4, 1.2), (1.2, 1.2), (6, 1.2, 1.2, 1.2), (6, 1.2, 1.2, 1.2, 1.2, 1.2))
 """Of lines that are told apart without colour."""
@@ -159,3 +191,24 @@ def _room_for_title(plot: Plot) -> float:
 
 def _above(plot: Plot) -> float:
     return TOP + plot.key_rows * KEY_ROW + (TITLE if plot.titled else 0.0)
+
+
+def svg(plot: Plot, prefix: str) -> str:
+    """Return a plot as SVG whose colours are those of the page, with names of its own."""
+    with look():
+        text = io.StringIO()
+        # no date: the same recording gives the same page
+        nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+        alone(plot, WIDTH).savefig(text, format="svg", metadata=nothing)
+    made = text.getvalue()
+    made = made[made.index("<svg") :]
+    used = set(_REFERENCE.findall(made))
+    made = re.sub(
+        r' id="([^"]*)"', lambda m: f' id="{prefix}{m[1]}"' if m[1] in used else "", made
+    )  # names in one page differ
+    made = _REFERENCE.sub(lambda m: m[0].replace(f"#{m[1]}", f"#{prefix}{m[1]}"), made)
+    for name, colour in LIGHT.items():
+        made = made.replace(colour, f"var(--{name})")
+    box = re.search(r'viewBox="[^"]*"', made)
+    opening = f'<svg {box[0] if box else ""} role="img" aria-label="{escape(plot.alt)}">'
+    return opening + made[made.index(">") + 1 :]
