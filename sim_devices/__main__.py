@@ -13,7 +13,7 @@ from sim_devices.server.launch import start
 def main(arguments: list[str]) -> int:
     """Serve every device of a specification until standard input is closed."""
     if len(arguments) != 1:
-        print(__doc__, file=sys.stderr)
+        print("usage: python -m sim_devices SPEC.json", file=sys.stderr)
         return 2
     try:
         spec = json.loads(Path(arguments[0]).read_text(encoding="utf-8"))

@@ -2,11 +2,11 @@
 
 It has no clock and no event loop; the recorder calls it from its writing thread.
 
-Devices that repeat their readings for long are found while a run goes on. Rows are kept for some
-seconds at intervals, and judged as in a check list
-(``estimator.checks.count_limits.share_of_repeats``, which who runs the recorder gives: the recorder
-knows no estimator). Readings that repeat three times in a row
-are repeated for good: a quiet channel is not named by chance.
+During the run, :class:`RepeatedRows` finds devices that repeat their readings. Rows are kept for
+some seconds at intervals, and judged as in a check list, by
+``estimator.checks.count_limits.share_of_repeats``. The caller passes this function, since the
+recorder does not import the estimator. A fault is reported after three judgments in a row, so that
+a quiet channel is not named by chance.
 """
 
 from __future__ import annotations
@@ -228,7 +228,7 @@ class BlockWriter:
     speed : float
         Of the host's clock against real time.
     share_of_repeats : callable, optional
-        See :class:`daq.recorder.block_writer.RepeatedRows`; default: repeats are not looked for.
+        See :class:`RepeatedRows`; default: repeats are not looked for.
     """
 
     def __init__(

@@ -1,14 +1,12 @@
 """Keeps the device on one port connected until the run ends.
 
 Connects, reads, and forwards the driver's items. Reports late and lost sensors. After a loss it
-reconnects, with a delay that grows from attempt to attempt. Items are validated
-(:mod:`daq.recorder.connection`) and keep the sample indices of their session;
-:mod:`daq.recorder.sample_index` converts these to indices of the recording.
+reconnects, with a delay that grows from attempt to attempt. Items keep the sample indices of their
+session; :mod:`daq.recorder.sample_index` converts these to indices of the recording.
 
-Validates the items of drivers, so that an error in one driver does not affect other devices.
-
-Drivers may come from any package. A block that the file cannot hold would end the whole recording.
-Validation ends only the session of its port, with an error that names the fault.
+Items are validated, since drivers may come from any package, and a block that the file cannot hold
+would end the whole recording. An invalid item ends only the session of its port, with an error that
+names the fault.
 """
 
 from __future__ import annotations

@@ -1,13 +1,12 @@
 """One sensor of an open recording: its committed samples, blocks and gaps.
 
 A long recording has millions of blocks. Rows stay in the file and are read on demand. Only the
-newest rows and the clipped stretches are
-kept in memory, since they are needed repeatedly.
+newest rows and the clipped stretches are kept in memory, since they are needed repeatedly.
 
 Many small chunks of a dataset are read together, also from several threads. HDF5 takes longer to
-fetch a small chunk than to read it. So where a file is closed, the raw chunks
-are located once, and read from the file as they are, many at a time. Checksums are of blocks, so
-whoever reads them finds out what is damaged.
+fetch a small chunk than to read it. So where a file is closed, the raw chunks are located once, and
+read from the file as they are, many at a time. Checksums are of blocks, so the reader of a block
+finds any damage.
 """
 
 from __future__ import annotations

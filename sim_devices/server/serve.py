@@ -287,9 +287,7 @@ class TcpPort(DevicePort):
         self.address = f"{self._scheme}://127.0.0.1:{self._server.sockets[0].getsockname()[1]}"
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        for _ in range(
-            TURNS
-        ):  # a client that connects again may be accepted before its end is read
+        for _ in range(TURNS):  # a client may connect again before its end is read
             if self._writer is not None:
                 await asyncio.sleep(TURN)
         if self._writer is not None or self._down:

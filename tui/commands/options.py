@@ -69,8 +69,10 @@ log_file : FILE
 
 # ruff: noqa: PLC0415 - what sets up logging is imported when a command runs
 
+import ast
 import inspect
 import re
+import sys
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
@@ -149,9 +151,17 @@ class _Described(NamedTuple):
     text: str | None = None
 
 
-def _sections(docstring: str | None) -> tuple[str, dict[str, str]]:
+def _docstring(of: Any) -> str:  # noqa: ANN401 - a function, or a module
+    """Return a docstring; from the source, if Python was started with -OO."""
+    if sys.flags.optimize < 2:
+        return of.__doc__ or ""
+    source: Any = ast.parse(inspect.getsource(of))
+    return ast.get_docstring(source if inspect.ismodule(of) else source.body[0]) or ""
+
+
+def _sections(docstring: str) -> tuple[str, dict[str, str]]:
     """Return a docstring as far as its first section, and the sections by their titles."""
-    text, *sections = _SECTION.split(inspect.cleandoc(docstring or ""))
+    text, *sections = _SECTION.split(inspect.cleandoc(docstring))
     bodies = (each.strip() for each in sections[1::2])
     return text.strip(), dict(zip(sections[::2], bodies, strict=True))
 
@@ -170,9 +180,9 @@ def _described(sections: dict[str, str]) -> dict[str, _Described]:
 
 def declared(function: Callable[..., None]) -> tuple[Callable[..., None], str, Guide]:
     """Return a command as typer takes it, its help as far as the first section, and its guide."""
-    text, sections = _sections(function.__doc__)
+    text, sections = _sections(_docstring(function))
     lines, worked = (sections.pop(title, "") for title in ("Examples", "Worked example"))
-    described = _described(_sections(__doc__)[1]) | _described(sections)
+    described = _described(_sections(_docstring(sys.modules[__name__]))[1]) | _described(sections)
     signature = inspect.signature(function, eval_str=True)
     taken = [_declared(each, described) for each in signature.parameters.values()]
 

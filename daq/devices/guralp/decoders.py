@@ -1,9 +1,7 @@
 """Decoders of GCF over a serial line with block recovery, and from Scream servers.
 
-Both pass blocks to :class:`~daq.devices.guralp.decoders.Streams`, and whether missing blocks may
-still arrive.
-
-GCF streams joined into sensors by time, for every kind of link.
+Both pass blocks to :class:`Streams`, and whether missing blocks may still arrive. It joins GCF
+streams into sensors by time, for every kind of link.
 
 Theory of operation
 -------------------

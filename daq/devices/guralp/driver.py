@@ -14,10 +14,9 @@ serial, ``socket://``        frames with block recovery (``link = "serial"``)
 
 One port may serve several sensors, each with its own streams.
 
-Links that transport GCF blocks: a serial line, a Scream server over TCP or UDP.
-
-A link receives and decodes bytes, and sends what the other end needs: replies to blocks on a serial
-line, requests for packets lost over UDP. The settings of the bench file are those of the link.
+A link (a serial line, or a Scream server over TCP or UDP) receives and decodes bytes. It sends
+replies to blocks on a serial line, and requests for packets lost over UDP. The settings of the
+bench file are those of the link.
 """
 
 from __future__ import annotations

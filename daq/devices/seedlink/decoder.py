@@ -11,7 +11,7 @@ Records arrive late, and out of order between channels. A hole in all streams of
 for ``hold`` seconds, then becomes a gap of exact length. The decoder continues over reconnections:
 :attr:`SeedLinkDecoder.last` has the last packet of each station, and repeated samples are dropped.
 
-miniSEED records, read and written by libmseed (pymseed).
+miniSEED records are read and written by libmseed (pymseed).
 """
 
 from __future__ import annotations

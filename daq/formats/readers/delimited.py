@@ -18,19 +18,19 @@
   phones add to three axes.
 - An empty cell or ``nan`` makes a gap.
 
-Times as loggers write them, exact to the last decimal.
+Layout
+------
+Encoding, delimiter, decimal sign, header, units and first row are found from the text. The rows of
+samples are found first: rows of equally many cells, all of which are numbers, times or empty. The
+row before them names the columns; a row of units may lie between. Lines before these, and lines
+that begin with ``#``, are a preamble.
 
-The sampling rate and the gaps behind time stamps that jitter.
-
-A line through all stamps gives the rate: the median step, or the mean one, is off by the jitter, by
-gaps, or by the resolution of the stamps. A gap moves all stamps after it; a stamp that is late
-moves itself. So at every step that is too long, the stamps before and after are compared.
-
-How a delimited text is written: encoding, delimiter, decimal sign, header, units, first row.
-
-The rows of samples are found first: rows of equally many cells, all of which are numbers, times or
-empty. The row before them names the columns; a row of units may lie between. What comes before, and
-lines that begin with ``#``, is a preamble.
+Times
+-----
+Times are read exactly, to the last decimal. Time stamps may jitter. A line through all stamps gives
+the sampling rate: the median step, or the mean one, is off by the jitter, by gaps, or by the
+resolution of the stamps. A gap moves all stamps after it; a late stamp moves only itself. So at
+every step that is too long, the stamps before and after are compared.
 """
 
 from __future__ import annotations

@@ -78,6 +78,13 @@ def test_every_command_has_help_with_examples(name: str) -> None:
     assert f"huddle {name} " in text or f"huddle {name}\n" in text
 
 
+def test_help_is_whole_where_python_drops_docstrings() -> None:
+    run = [sys.executable, "-OO", "-m", "huddle", "run", "--help-all"]
+    shown = subprocess.run(run, capture_output=True, text=True, check=True).stdout
+    assert "huddle run lab.toml --duration 3h" in shown
+    assert "Record even where the check list fails" in " ".join(shown.split())
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_shows_what_is_needed_first_and_help_all_the_rest(name: str) -> None:
     short, whole = huddle(name, "--help"), huddle(name, "--help-all")
