@@ -320,9 +320,15 @@ class StretchPass(Pass):
         for some in self._by_stretch(first + starts):
             super()._take(samples, starts[some], first)
 
-    def _take_whole(self, spectra: ComplexArray, begins: NDArray[np.int64]) -> None:
+    def _take_whole(
+        self,
+        spectra: ComplexArray,
+        begins: NDArray[np.int64],
+        products: FloatArray | None = None,
+    ) -> None:
         for some in self._by_stretch(begins):
-            super()._take_whole(spectra[some], begins[some])
+            own = products if some.all() else None
+            super()._take_whole(spectra[some], begins[some], own)
 
     def _by_stretch(self, begins: NDArray[np.int64]) -> Iterator[NDArray[np.bool_]]:
         """Yield which segments belong to each stretch, and end the one before."""
