@@ -411,7 +411,7 @@ def _search(
     q, sensor, n = found.n_factors, found.sensor, len(where)
     penalty = found.penalty if found.penalty.any() else None
     root = given.start(with_motion=bool(q) or penalty is not None)
-    begin = np.asarray(np.linalg.inv(root), np.complex128)
+    begin = _inverse(root, sensor)
     best = _scaled(given.whitened(root, None, q, np.arange(n)))
     iterations, decrement = np.ones(n, np.int64), np.full(n, np.inf)
     held = np.zeros((n, len(sensor)), np.bool_)
@@ -428,8 +428,8 @@ def _search(
         )
         size[going], axes[going], decrement[going], held[going] = step
         going = going[(decrement[going] >= DECREMENT) & (iterations[going] < most)]
-        longer = _with_sizes(axes[going], np.sqrt(size[going]))
-        trial = given.whitened(best.root[going] @ longer, best.eigenvectors[going], q, going)
+        root = _stretched(best.root[going], axes[going], np.sqrt(size[going]), sensor)
+        trial = given.whitened(root, best.eigenvectors[going], q, going)
         iterations[going] += 1
         gain = best.discrepancy[going] - trial.discrepancy
         if penalty is not None:
@@ -441,8 +441,9 @@ def _search(
         damping[going] = np.where(better, less, np.maximum(before * _DAMPED, _DAMPING))
         going = going[(~better & (damping[going] < _MOST)) | (gain > 0)]
     sure = (decrement < DECREMENT) & (np.abs(size - 1).max(axis=1) < _LAST_STEP)
-    final = best.root @ _with_sizes(axes, np.where(sure[:, None], np.sqrt(size), 1.0))
-    of_sensor = np.stack([held[:, sensor == i].any(axis=1) for i in range(sensor[-1] + 1)], axis=1)
+    final = _stretched(best.root, axes, np.where(sure[:, None], np.sqrt(size), 1.0), sensor)
+    first = np.flatnonzero(np.diff(sensor, prepend=-1))
+    of_sensor = np.logical_or.reduceat(held, first, axis=1)
     for name, values in (
         *_of_noise(best, final, sensor),
         ("discrepancy", best.discrepancy),
@@ -455,8 +456,43 @@ def _search(
         getattr(found, name)[where] = values
 
 
+def are_single(sensor: IntArray) -> bool:
+    """Whether every sensor has one channel, so that all noise is diagonal."""
+    return int(sensor[-1]) + 1 == len(sensor)
+
+
 def _with_sizes(axes: ComplexArray, size: FloatArray) -> ComplexArray:
     return np.asarray((axes * size[:, None, :]) @ _adjoint(axes))
+
+
+def _stretched(
+    root: ComplexArray, axes: ComplexArray, size: FloatArray, sensor: IntArray
+) -> ComplexArray:
+    """Return a root of the noise with other sizes along its axes."""
+    return root * size[:, None, :] if are_single(sensor) else root @ _with_sizes(axes, size)
+
+
+def _inverse(root: ComplexArray, sensor: IntArray) -> ComplexArray:
+    """Return the inverse of a root of the noise."""
+    if not are_single(sensor):
+        return np.asarray(np.linalg.inv(root), np.complex128)
+    i, found = np.arange(len(sensor)), np.zeros_like(root)
+    found[:, i, i] = 1 / root[:, i, i]
+    return found
+
+
+def _log_determinant(root: ComplexArray, sensor: IntArray) -> FloatArray:
+    if not are_single(sensor):
+        return np.asarray(np.linalg.slogdet(root)[1], np.float64)
+    return np.asarray(np.log(np.abs(np.einsum("fii->fi", root))).sum(axis=1))
+
+
+def _between(root: ComplexArray, matrix: ComplexArray, sensor: IntArray) -> ComplexArray:
+    """Return ``V* M V``."""
+    if not are_single(sensor):
+        return np.asarray(_adjoint(root) @ matrix @ root)
+    size = np.einsum("fii->fi", root).real
+    return np.asarray(matrix * (size[:, :, None] * size[:, None, :]))
 
 
 def _of_noise(
@@ -502,22 +538,20 @@ def scoring(
     if penalty is not None:
         toward[:, i, i] -= np.log(np.abs(at.root[:, i, i]) ** 2) @ penalty
     change = _solved(_damped(U, sensor, damping, penalty), toward[:, a, b])
-    if len(a) == p:
-        size = 1 + change.real
-        axes = np.broadcast_to(np.eye(p, dtype=np.complex128), toward.shape).copy()
-    else:
-        size, axes = axes_of(change + (a == b), np.full((n, p), -np.inf), sensor)
+    size, axes = axes_of(change + (a == b), np.full((n, p), -np.inf), sensor)
     low = np.full((n, p), _LEAST)
     doubtful = np.flatnonzero(held.any(axis=1) | (size < _LEAST).any(axis=1))
     fixed = np.zeros((n, p), np.bool_)
     if len(doubtful):
-        turned = begin[doubtful] @ at.root[doubtful]
-        for number in range(int(sensor[-1]) + 1):
-            of_one = np.flatnonzero(sensor == number)
-            block = turned[:, of_one[:, None], of_one]
-            least = np.linalg.eigvalsh(block @ _adjoint(block))[:, :1]
-            least = np.minimum(BOUNDARY / np.maximum(least, 1e-300), 1.0)
-            low[doubtful[:, None], of_one] = np.where(least > BOUNDARY / _FALLING, least, _LEAST)
+        least = np.abs(np.einsum("fii,fii->fi", begin[doubtful], at.root[doubtful])) ** 2
+        if not are_single(sensor):
+            turned = begin[doubtful] @ at.root[doubtful]
+            for number in range(int(sensor[-1]) + 1):
+                of_one = np.flatnonzero(sensor == number)
+                block = turned[:, of_one[:, None], of_one]
+                least[:, of_one] = np.linalg.eigvalsh(block @ _adjoint(block))[:, :1]
+        least = np.minimum(BOUNDARY / np.maximum(least, 1e-300), 1.0)
+        low[doubtful] = np.where(least > BOUNDARY / _FALLING, least, _LEAST)
         near = 1 + (low - 1) / (1 + damping[:, None])
         size[doubtful], axes[doubtful], fixed[doubtful] = _bounded(
             size[doubtful],
@@ -529,8 +563,11 @@ def scoring(
             sensor=sensor,
             penalty=penalty,
         )
-    toward *= sensor[:, None] == sensor
-    decrement = np.einsum("fij,fij->f", _with_sizes(axes, size - 1).conj(), toward).real
+    if are_single(sensor):
+        decrement = np.einsum("fi,fii->f", size - 1, toward).real
+    else:
+        toward *= sensor[:, None] == sensor
+        decrement = np.einsum("fij,fij->f", _with_sizes(axes, size - 1).conj(), toward).real
     falling = (fixed & (low != _LEAST) & (low < _AT_BOUND)).any(axis=1)
     decrement = np.where(falling, np.maximum(decrement, DECREMENT), decrement)
     return size, axes, decrement, fixed
@@ -574,7 +611,7 @@ def _bounded(
 
     One that is held although it would rise is let go again.
     """
-    a, b = pairs(sensor)
+    single, (a, b) = are_single(sensor), pairs(sensor)
     diagonal = np.flatnonzero(a == b)
     size, frame = size.copy(), np.broadcast_to(np.eye(size.shape[1]), axes.shape).astype(complex)
     axes, held = axes.copy(), np.zeros(size.shape, np.bool_)
@@ -585,9 +622,10 @@ def _bounded(
         if not len(some):
             break
         held[some] |= below[some]
-        frame[some] = turn = frame[some] @ axes[some]  # in it directions are coordinates
-        J = _damped(_adjoint(turn) @ U[some], sensor, damping[some], penalty)
-        wanted = (_adjoint(turn) @ toward[some] @ turn)[:, a, b]
+        turn = frame[some] if single else frame[some] @ axes[some]
+        frame[some] = turn  # in it directions are coordinates
+        J = _damped(U[some] if single else _adjoint(turn) @ U[some], sensor, damping[some], penalty)
+        wanted = (toward[some] if single else _between(turn, toward[some], sensor))[:, a, b]
         fixed = held[some][:, a] | held[some][:, b]
         value = np.where(held[some][:, a] & (a == b), low[some][:, a] - 1, 0.0)
         beside = np.where(fixed, value, wanted - (J @ value[:, :, None])[:, :, 0])
@@ -601,7 +639,7 @@ def _bounded(
             change + (a == b), np.full(held[some].shape, -np.inf), sensor
         )
         held[some] = (np.abs(axes[some]) ** 2 * held[some][:, :, None]).sum(axis=1) > 0.5
-    return np.maximum(size, low), frame @ axes, held
+    return np.maximum(size, low), frame if single else frame @ axes, held
 
 
 class _Given:
@@ -615,7 +653,7 @@ class _Given:
 
     def __init__(self, matrix: ComplexArray, precision: ComplexArray, sensor: IntArray) -> None:
         self.matrix, self.precision = matrix, precision
-        self._within = sensor[:, None] == sensor
+        self._sensor, self._within = sensor, sensor[:, None] == sensor
         self._log_determinant = np.linalg.slogdet(matrix)[1] if matrix.shape[1] > _FEW else None
 
     def start(self, *, with_motion: bool) -> ComplexArray:
@@ -633,14 +671,14 @@ class _Given:
         """Whiten some matrices by N = V V*; `guess` has nearly the factors' directions."""
         if self._log_determinant is None:
             return self._diagonalised(root, q, rows)
-        back = np.asarray(np.linalg.inv(root), np.complex128)
-        white = back @ _rows(self.matrix, rows) @ _adjoint(back)
+        back = _adjoint(_inverse(root, self._sensor))
+        white = _between(back, _rows(self.matrix, rows), self._sensor)
         w, u, good = leading(white, q, guess)
-        precision = _rows(self.precision, rows) @ root
-        good &= np.einsum("fai,fai->fi", root.conj(), precision).real.min(axis=1) > _NEARLY_ONE
+        precision = _between(root, _rows(self.precision, rows), self._sensor)
+        good &= np.einsum("fii->fi", precision).real.min(axis=1) > _NEARLY_ONE
         moving = w > 1
         trace = np.einsum("fii->f", white).real
-        log_determinant = self._log_determinant[rows] - 2 * np.linalg.slogdet(root)[1]
+        log_determinant = self._log_determinant[rows] - 2 * _log_determinant(root, self._sensor)
         taken = np.where(moving, w - np.log(np.where(moving, w, 1.0)) - 1, 0.0).sum(axis=1)
         white = white - (u * w[:, None, :]) @ _adjoint(u)
         point = Point(root, trace - log_determinant - root.shape[1] - taken, w, u, white)
@@ -655,7 +693,7 @@ class _Given:
         In it the residual eigenvalues are the large ones, and so keep their precision for strong
         motion and for little noise.
         """
-        inner = _adjoint(root) @ _rows(self.precision, rows) @ root
+        inner = _between(root, _rows(self.precision, rows), self._sensor)
         inverse, u = np.linalg.eigh((inner + _adjoint(inner)) / 2)
         w = 1 / np.maximum(inverse, 1e-18 * inverse[:, -1:])
         left = (np.arange(w.shape[1]) >= q) | (w <= 1)
