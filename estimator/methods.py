@@ -104,16 +104,26 @@ def self_noise(
             f"real of shape {is_real.shape} and type {is_real.dtype}, expected bool of"
             f" ({len(csm)},)"
         )
-    found = known
-    if found is None:
-        if blocks is not None and method == "maximum-likelihood":
-            options["matrices"] = False  # the engine has them
-        found = METHODS[method](csm, dims=dims, n_effective=n_effective, correct=correct, **options)
-        if is_real.any():
-            # half the degrees of freedom: a coefficient of a real series has no imaginary part
-            scale = np.where(is_real, np.array([[2.0], [4.0], [8.0]]), 1.0)[:, :, None]
-            found = SelfNoise.of(method, found.noise_psd, scale * found.cumulants, found.flags)
-    if blocks is not None and method in {"three-sensor", "maximum-likelihood"}:
+    n_dims = _dimensions(options.get("n_factors"), dims, len(csm))
+    by_engine = blocks is not None and method in {"three-sensor", "maximum-likelihood"}
+    found, last = known, False
+    if found is None and by_engine and method == "maximum-likelihood":
+        options["matrices"] = False  # the engine has them
+        last = _only_where_asked(csm, dims, n_dims)
+    if last:
+        unknown = np.full((4, *csm.shape[:2]), np.nan)
+        found = SelfNoise.of(method, unknown[0], unknown[1:], np.zeros(csm.shape[:2], np.int64))
+
+    def by_method() -> SelfNoise:
+        itself = METHODS[method](
+            csm, dims=dims, n_effective=n_effective, correct=correct, **options
+        )
+        # half the degrees of freedom: a coefficient of a real series has no imaginary part
+        scale = np.where(is_real, np.array([[2.0], [4.0], [8.0]]), 1.0)[:, :, None]
+        return SelfNoise.of(method, itself.noise_psd, scale * itself.cumulants, itself.flags)
+
+    found = found or by_method()
+    if by_engine:
         every = np.arange(len(dims))[None] if groups is None else groups
         # With counts, for without them NumPy imports its masked arrays.
         for group in np.unique(every, axis=0, return_counts=True)[0]:
@@ -121,15 +131,36 @@ def self_noise(
             found = _with_neighbours(
                 found,
                 csm,
-                np.where(here, blocks, -1),
-                _dimensions(options.get("n_factors"), dims, len(csm)),
+                np.where(here, -1 if blocks is None else blocks, -1),
+                n_dims,
                 dims=dims,
                 group=group,
                 n_effective=n_effective,
                 correct=correct,
                 correlation=np.ones(1) if correlation is None else correlation,
             )
+    if last:
+        options["where"] = ~np.isfinite(found.noise_psd).all(axis=1)
+        here, itself = options["where"][:, None], by_method()
+        found = SelfNoise.of(
+            method,
+            np.where(here, itself.noise_psd, found.noise_psd),
+            np.where(here, itself.cumulants, found.cumulants),
+            np.where(here, itself.flags, found.flags),
+        )
     return found
+
+
+def _only_where_asked(csm: ComplexArray, dims: tuple[int, ...], n_dims: IntArray) -> bool:
+    """Whether the likelihood of a frequency says nothing of others, nor of what the engine needs.
+
+    It finds channels without a counterpart, and fits of usual dimensions are the prior of further
+    ones.
+    """
+    if len(set(dims)) > 1 or n_dims.max(initial=0) > max(dims):
+        return False
+    faults = Flag.DEAD_CHANNEL | Flag.DUPLICATE
+    return not (coherency(csm, dims).flags & faults).any()
 
 
 def _dimensions(n_factors: int | IntArray | None, dims: tuple[int, ...], n_freqs: int) -> IntArray:

@@ -229,6 +229,7 @@ def maximum_likelihood(
     noise_spread: float = NOISE_SPREAD,
     matrices: bool = True,
     maxima: Maxima | None = None,
+    where: BoolArray | None = None,
 ) -> SelfNoise:
     """Return the self-noise PSD of every channel of three or more collocated sensors.
 
@@ -261,6 +262,8 @@ def maximum_likelihood(
         independent.
     maxima : Maxima, optional
         Fits of the same matrices, to share.
+    where : bool, shape (n_freqs,), optional
+        Frequencies that are estimated; NaN at others. Default: all.
 
     Returns
     -------
@@ -319,11 +322,12 @@ def maximum_likelihood(
     flags = given.flags.copy()
     flags[few] |= np.where(absent[few], 0, Flag.NO_COUNTERPART)
     with_matrices = _with_matrices(alive, factors, dims) & matrices
+    wanted = ~few if where is None else ~few & where
     # ascending: usual fits come first, and give the prior
     for q, blocked in sorted(
-        {*zip(factors[~few].tolist(), with_matrices[~few].tolist(), strict=True)}
+        {*zip(factors[wanted].tolist(), with_matrices[wanted].tolist(), strict=True)}
     ):
-        rows = np.flatnonzero((factors == q) & (with_matrices == blocked) & ~few)
+        rows = np.flatnonzero((factors == q) & (with_matrices == blocked) & wanted)
         fit: _Fit
         if q <= max(dims):
             fit = partial(
