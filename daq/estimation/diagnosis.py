@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,7 @@ from estimator.checks.stability import SegmentCourse, Stability
 from estimator.errors import InsufficientDataError
 from estimator.likelihood.factor_analysis import Maxima
 from estimator.median import median
+from estimator.records import dataclass
 from estimator.responses.equalisation import leakage_advice
 from estimator.self_noise.result import SelfNoise
 from estimator.spectra.multiresolution import Band

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +28,7 @@ from daq.estimation.snapshot_diagnostics import (
 )
 from estimator.errors import InsufficientDataError
 from estimator.methods import self_noise
+from estimator.records import dataclass
 from estimator.responses.edge_leakage import (
     band_shares,
     channel_responses,

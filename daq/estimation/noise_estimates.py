@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,6 +29,7 @@ from estimator.likelihood.factor_analysis import Maxima
 from estimator.likelihood.goodness_of_fit import neighbour_correlation
 from estimator.median import median
 from estimator.methods import METHODS, self_noise
+from estimator.records import dataclass
 from estimator.self_noise.result import Flag, SelfNoise, combined, joined
 from estimator.spectra.multiresolution import Band, MultiResolution
 from estimator.spectra.parts import Parts

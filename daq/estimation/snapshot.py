@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from daq.recording.interface import ReadableSensor
 from daq.recording.sensor_state import STATE_AFTER
 from estimator.checks.advice import Names
 from estimator.errors import InsufficientDataError
-from estimator.records import Hertz, Seconds, Share
+from estimator.records import Hertz, Seconds, Share, dataclass
 from estimator.self_noise.result import SelfNoise
 from estimator.spectra.multiresolution import Band
 from estimator.spectra.parts import Parts

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.checks.advice import Untested
 from estimator.checks.count_limits import CountLimits
+from estimator.records import dataclass
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

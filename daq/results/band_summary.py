@@ -9,7 +9,7 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 
 import numpy as np
@@ -30,6 +30,7 @@ from estimator.levels.bands import (
 from estimator.levels.contributions import Contribution, Source, by_chance, deviation, widened
 from estimator.levels.interval import NORMAL_95, interval, unpredicted, unpredicted_by_one
 from estimator.median import median_of_columns
+from estimator.records import dataclass
 from estimator.self_noise.result import Flag, SelfNoise
 from estimator.spectra.windows import get_window
 from estimator.types import BoolArray, FloatArray

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +15,7 @@ from estimator.errors import InsufficientDataError
 from estimator.levels.bands import band_edges
 from estimator.levels.contributions import by_chance
 from estimator.levels.interval import NORMAL_95
+from estimator.records import dataclass
 
 if TYPE_CHECKING:
     from daq.bench.model import Bench, DataSheet

@@ -6,7 +6,6 @@ one states. So each is derived here, when it is first asked for, and kept.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -15,6 +14,7 @@ from daq.results.clock_effect import effect_by_sensor
 from daq.results.decision.end import remaining
 from daq.results.decision.verdict import facts_of_verdict
 from daq.results.facts.all_facts import facts_of, ranked
+from estimator.records import dataclass
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
@@ -15,6 +14,7 @@ from daq.protocols.block import READING_INTERVAL_NS, EventKind, Quantity, Readin
 from daq.recording.reader import Recording
 from daq.recording.signing import signed_by
 from daq.recording.storage.locking import is_being_written
+from estimator.records import dataclass
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -15,6 +14,7 @@ from daq.results.result import Result
 from estimator.checks.shared_motion import CanonicalCoherence
 from estimator.errors import EstimatorError
 from estimator.levels.bands import log_edges
+from estimator.records import dataclass
 from estimator.self_noise.coherency import coherency, own_channels
 from estimator.types import FloatArray
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from statistics import NormalDist
 
 import numpy as np
@@ -26,7 +26,7 @@ from daq.estimation.snapshot import ChannelLabel
 from daq.results.band_summary import Estimate, Levels
 from estimator.levels.bands import band_edges, third_octaves
 from estimator.levels.interval import NORMAL_95
-from estimator.records import NOT_IN_JSON
+from estimator.records import NOT_IN_JSON, dataclass
 from estimator.types import FloatArray
 
 STATED = 1e6

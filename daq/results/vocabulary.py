@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 from daq.clocks.clock_model import ClockSource, ClockState
 from daq.recording.sensor_state import SensorState
 from daq.results.band_summary import WithoutPartner
 from estimator.checks.sensitivities import Cause
 from estimator.levels.contributions import Source
+from estimator.records import dataclass
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
 

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import ClassVar, Self
 
-from estimator.records import Record, record
+from estimator.records import Record, dataclass, record
 from estimator.wording import Words, listed, several, span
 
 

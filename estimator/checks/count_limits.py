@@ -19,11 +19,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import field, fields
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+
+from estimator.records import dataclass
 
 FloatArray = NDArray[np.float64]
 

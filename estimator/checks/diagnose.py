@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -49,6 +49,7 @@ from estimator.likelihood.goodness_of_fit import (
 )
 from estimator.likelihood.maximum_likelihood import standard_error
 from estimator.median import median_of_columns
+from estimator.records import dataclass
 from estimator.self_noise.coherency import (
     Coherency,
     Presence,

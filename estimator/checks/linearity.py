@@ -14,12 +14,13 @@ frequencies, and however loud the segments are.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.levels.pooled import blocks_of
+from estimator.records import dataclass
 from estimator.spectra.welch import WelchSettings
 from estimator.spectra.windows import get_window
 from estimator.types import ComplexArray, FloatArray, IntArray

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -26,7 +26,7 @@ from estimator.checks.shared_motion import (
 )
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.levels.interval import worth
-from estimator.records import Hertz, Seconds
+from estimator.records import Hertz, Seconds, dataclass
 from estimator.self_noise.coherency import (
     Coherency,
     blocks,

@@ -9,11 +9,11 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from estimator.checks.relative_response import RelativeResponse
+from estimator.records import dataclass
 from estimator.types import FloatArray
 
 TOLERANCE = 0.05

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import reduce
 from itertools import combinations
 from operator import add
@@ -21,6 +21,7 @@ from estimator.likelihood.factor_analysis import Maximum
 from estimator.likelihood.goodness_of_fit import REJECT, upper_tail
 from estimator.likelihood.score_test import Scores, pair_scores, shift, usable
 from estimator.median import median
+from estimator.records import dataclass
 from estimator.self_noise.three_sensor import three_sensor
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 

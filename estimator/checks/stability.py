@@ -13,7 +13,7 @@ import math
 import operator
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from itertools import combinations
 
 import numpy as np
@@ -39,7 +39,7 @@ from estimator.likelihood.factor_analysis import Maximum
 from estimator.likelihood.goodness_of_fit import critical_value
 from estimator.likelihood.score_test import usable
 from estimator.median import median
-from estimator.records import NOT_IN_JSON
+from estimator.records import NOT_IN_JSON, dataclass
 from estimator.spectra.parts import Parts, grouped
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 

@@ -24,7 +24,6 @@ frequency, by the coefficients of the regression less what their scatter adds.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -32,6 +31,7 @@ from estimator.checks.steadiness import VALUES_AT_ONCE, Regression, regression
 from estimator.likelihood import fisher
 from estimator.likelihood.factor_analysis import Maximum
 from estimator.median import median
+from estimator.records import dataclass
 from estimator.spectra.parts import Parts, grouped
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 

@@ -22,12 +22,12 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from estimator.likelihood import fisher
 from estimator.likelihood.factor_analysis import Maximum
+from estimator.records import dataclass
 from estimator.spectra.parts import Divided
 from estimator.types import BoolArray, ComplexArray, FloatArray
 

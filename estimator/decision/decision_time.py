@@ -14,13 +14,13 @@ fails where one is above.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 
 from estimator.decision.verdict import Prediction
 from estimator.levels.interval import interval
+from estimator.records import dataclass
 from estimator.types import BoolArray, FloatArray
 
 LIKELY = 0.4

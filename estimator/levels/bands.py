@@ -12,13 +12,12 @@ the same correlation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.errors import BandError
 from estimator.levels.interval import NORMAL_95, interval
+from estimator.records import dataclass
 from estimator.types import FloatArray
 
 BANDS_PER_OCTAVE = 3

@@ -16,12 +16,13 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.levels.interval import NORMAL_95
+from estimator.records import dataclass
 from estimator.types import BoolArray, FloatArray
 
 

@@ -28,7 +28,6 @@ mean of its bins; so are its cumulants with powers of the weights (`estimator.le
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -46,6 +45,7 @@ from estimator.levels.noise_matrices import (
     white,
 )
 from estimator.median import median
+from estimator.records import dataclass
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 _Array = TypeVar("_Array", "FloatArray", "ComplexArray")

@@ -37,13 +37,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from estimator.errors import InsufficientDataError
 from estimator.levels.interval import NORMAL_95
 from estimator.likelihood.goodness_of_fit import digamma, trigamma, upper_tail
+from estimator.records import dataclass
 from estimator.self_noise.result import Refusal
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 

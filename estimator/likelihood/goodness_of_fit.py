@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cache
 
 import numpy as np
@@ -20,6 +20,7 @@ import numpy as np
 from estimator.errors import InsufficientDataError
 from estimator.likelihood import fisher
 from estimator.likelihood.factor_analysis import Maximum
+from estimator.records import dataclass
 from estimator.self_noise.coherency import check_averages
 from estimator.spectra.windows import get_window
 from estimator.types import BoolArray, FloatArray

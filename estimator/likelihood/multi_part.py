@@ -13,13 +13,14 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from estimator.levels.interval import CERTAIN, NORMAL_95, interval, unpredicted, worth
 from estimator.levels.pooled import blocks_of
 from estimator.likelihood.changing_motion import STEADINESS, BandNoise, band_noise
+from estimator.records import dataclass
 from estimator.self_noise.result import Flag, Refusal, SelfNoise, joined
 from estimator.spectra.parts import Parts, grouped, joined_parts
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray

@@ -17,7 +17,7 @@ separates the pairs.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from itertools import combinations
 
@@ -27,6 +27,7 @@ from estimator.levels.noise_matrices import coupling_beside
 from estimator.levels.noise_matrices import pairs as elements
 from estimator.likelihood import fisher
 from estimator.likelihood.factor_analysis import Maximum
+from estimator.records import dataclass
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 MAX_BINS = 4

@@ -8,7 +8,6 @@ The pairs are those with which, one noise matrix for both, a dimension less expl
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import reduce
 from itertools import combinations
 from typing import Any, TypeAlias
@@ -18,6 +17,7 @@ import numpy as np
 from estimator.levels.noise_matrices import apart
 from estimator.likelihood.goodness_of_fit import BandTest
 from estimator.median import median
+from estimator.records import dataclass
 from estimator.types import ComplexArray, FloatArray, IntArray
 
 Pair: TypeAlias = tuple[int, int]

@@ -13,14 +13,14 @@ estimates. The estimate is not clipped: negative values count like the others.
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass, field
+from dataclasses import field
 from itertools import pairwise
 
 import numpy as np
 
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.median import median
-from estimator.records import NOT_IN_JSON
+from estimator.records import NOT_IN_JSON, dataclass
 from estimator.types import BoolArray, FloatArray, IntArray
 
 MIN_BINS = 24

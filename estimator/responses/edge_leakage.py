@@ -17,11 +17,11 @@ mean is taken, with weights ``|S_yz|² / S_zz``: their predictions may have any 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from estimator.likelihood.dimension import bands
+from estimator.records import dataclass
 from estimator.self_noise.coherency import BLOCK_BYTES, blocks, check_dims, own_channels
 from estimator.types import BoolArray, ComplexArray, FloatArray
 

@@ -10,11 +10,11 @@ channels did not exist.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from estimator.errors import InsufficientDataError, InvalidMatrixError
+from estimator.records import dataclass
 from estimator.self_noise.result import Flag, SelfNoise
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from estimator.levels.interval import interval
+from estimator.records import dataclass
 from estimator.types import FloatArray, IntArray
 
 

@@ -35,13 +35,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.levels.interval import cumulants, moments
+from estimator.records import dataclass
 from estimator.self_noise.coherency import (
     Coherency,
     check_averages,

@@ -10,12 +10,11 @@ divided by it, so that the truncation causes no bias.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from estimator.errors import EstimatorError
 from estimator.median import median
+from estimator.records import dataclass
 from estimator.types import ComplexArray, FloatArray
 
 MAX_AMPLIFICATION = 100.0

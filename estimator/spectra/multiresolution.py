@@ -16,13 +16,14 @@ Segments that only some channels have count for these channels, as in
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cache
 from itertools import takewhile
 
 import numpy as np
 
 from estimator.errors import EstimatorError, InsufficientDataError
+from estimator.records import dataclass
 from estimator.spectra.channel_sets import ChannelSets
 from estimator.spectra.parts import Part, PartEnds, Parts, by_part
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra

@@ -12,11 +12,12 @@ costs a pass no product. In float64 the difference is as exact as the sum.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 
+from estimator.records import dataclass
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 MOST = 24

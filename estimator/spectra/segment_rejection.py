@@ -21,12 +21,12 @@ from __future__ import annotations
 import enum
 from collections import Counter, deque
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 
 from estimator.errors import EstimatorError
 from estimator.median import median
+from estimator.records import dataclass
 from estimator.spectra.parts import PartEnds
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window

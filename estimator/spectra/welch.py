@@ -15,13 +15,14 @@ import io
 import json
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.errors import EstimatorError, InsufficientDataError
+from estimator.records import dataclass
 from estimator.spectra.parts import Part, PartEnds
 from estimator.spectra.windows import effective_averages, get_window
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray

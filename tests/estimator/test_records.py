@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import copy
 import pickle
-from dataclasses import FrozenInstanceError, dataclass, fields, is_dataclass, replace
-from typing import ClassVar
+from dataclasses import FrozenInstanceError, dataclass, field, fields, is_dataclass, replace
+from typing import Any, ClassVar
 
 import pytest
 
+from estimator import records
 from estimator.records import Record, record
 
 
@@ -65,3 +66,23 @@ def test_a_record_cannot_be_changed() -> None:
 def test_fields_are_complete_and_known(values: dict[str, float], message: str) -> None:
     with pytest.raises(TypeError, match=message):
         _Special(**values)  # type: ignore[arg-type]  # what is tested
+
+
+@pytest.mark.parametrize("eq", [True, False])
+def test_the_stand_in_makes_what_dataclasses_makes(eq: bool) -> None:
+    class Plain:
+        level: int
+        own: list[int] = field(default_factory=list, init=False, repr=False)
+        sensors: tuple[int, ...] = ()
+
+    kinds: list[Any] = [
+        make(frozen=True, slots=True, eq=eq)(type("Plain", (), dict(Plain.__dict__)))
+        for make in (records.dataclass, dataclass)
+    ]
+    made: list[Any] = [kind(1, (2,)) for kind in kinds]
+    assert len(set(map(repr, made))) == 1
+    assert [one == type(one)(1, (2,)) for one in made] == [eq, eq]
+    assert [replace(one, level=3).level for one in made] == [3, 3]
+    for kind in kinds:
+        with pytest.raises(TypeError):
+            kind(1, (2,), 3)

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from daq.foreign_files import import_command, is_foreign
+from estimator.records import dataclass
 from tui.commands.options import DetailsOption, command, with_estimate_options
 from tui.output.console import (
     STANDARD_OUTPUT,

@@ -75,7 +75,6 @@ import re
 import sys
 from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass
 from functools import partial, wraps
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeAlias, TypeVar, get_args
@@ -85,6 +84,7 @@ from typer.models import ParameterInfo
 
 from daq.bench.durations import parse_duration
 from daq.bench.estimate_settings import OPTIONS, default_text, from_text
+from estimator.records import dataclass
 from tui.output.logs.options import LogFormat, LogLevel
 
 ESTIMATE_PANEL = "Estimate (defaults come from the bench file)"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from textwrap import fill
 from typing import TYPE_CHECKING
 
@@ -11,6 +10,7 @@ import numpy as np
 from rich.text import Text
 
 from daq.results.standing import PairCoherence, Stance, pair_coherence, stances
+from estimator.records import dataclass
 from estimator.wording import listed, signed
 from tui.page.table import Cell, Table
 from tui.page.terminal import terminal_table

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal, Self
+
+from estimator.records import dataclass
 
 Tone = Literal["plain", "good", "bad", "doubtful", "quiet"]
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from daq.results.decision.end import Goal, Remaining
 from daq.results.decision.facts import LimitUndecided, WrongSensitivity
 from daq.results.decision.verdict import LimitResult, TestVerdict, facts_of_verdict
 from estimator.decision.verdict import REMOVED_BY_TIME, Verdict
+from estimator.records import dataclass
 from estimator.wording import listed, percent, roughly, several, signed
 from tui.page.table import Cell, Tone
 from tui.wording.facts import NOTHING_TO_DO

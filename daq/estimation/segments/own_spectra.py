@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from daq.clocks.grid import OwnSamples
 from daq.estimation.segments.flatline import stands_still
 from daq.estimation.settings import Settings
+from estimator.records import dataclass
 from estimator.spectra.shifted_windows import order_of, shifted_spectra
 from estimator.spectra.welch import WelchSettings, trends
 

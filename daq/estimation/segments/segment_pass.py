@@ -7,7 +7,7 @@ import math
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
 from typing import TypeVar
 
@@ -25,6 +25,7 @@ from daq.estimation.segments.own_spectra import OwnSpectra, need_samples_of_grid
 from daq.estimation.segments.stated_times import agree, compare
 from daq.estimation.settings import Settings
 from daq.recording.interface import ReadableRecording, at_rates, created_at
+from estimator.records import dataclass
 from estimator.spectra.channel_sets import ChannelSets
 from estimator.spectra.equaliser import Equaliser
 from estimator.spectra.multiresolution import MultiResolution

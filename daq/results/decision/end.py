@@ -6,10 +6,10 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from estimator.decision.verdict import Verdict
+from estimator.records import dataclass
 
 if TYPE_CHECKING:
     from daq.bench.end_condition import EndCondition

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import field
 
 from daq.bench.units import decibels
 from daq.results.decision.facts import LimitNotJudged, LimitUndecided, WrongSensitivity
@@ -12,7 +12,7 @@ from daq.results.facts.fact import Fact
 from estimator.checks.advice import Rank
 from estimator.decision.decision_time import INTERVAL_FACTOR
 from estimator.decision.verdict import Obstacle, Prediction, Verdict
-from estimator.records import Hertz
+from estimator.records import Hertz, dataclass
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import ClassVar
 
 import numpy as np
@@ -13,7 +13,7 @@ from daq.estimation.snapshot import Snapshot
 from daq.results.facts.fact import Fact
 from daq.results.vocabulary import REASONS
 from estimator.checks.advice import Rank
-from estimator.records import Hertz, Seconds, Share, record
+from estimator.records import Hertz, Seconds, Share, dataclass, record
 from estimator.spectra.segment_rejection import Reason
 from estimator.wording import Words, listed, percent, several, span
 
