@@ -8,7 +8,7 @@ then further factors of the same model.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from estimator.likelihood.maximum_likelihood import standard_error
 from estimator.likelihood.prior import expected_noise, kinds, maximise_expecting
 from estimator.likelihood.shared_by_two import SHARING, SharedByTwo, local_shares
 from estimator.median import median
-from estimator.records import Hertz
+from estimator.records import Hertz, dataclass
 from estimator.self_noise.coherency import (
     Presence,
     check_averages,
@@ -56,6 +56,9 @@ FIRST_LOOK = 8
 """Dimensions are tried at every so many frequencies first; there the test often rejects them."""
 HOPELESS = 1e-12
 """p value of the first look that all other frequencies would hardly outweigh."""
+LOOK_STEPS, BEYOND_DOUBT = 4, 2.0
+"""Steps of its fits of fewer dimensions than usual, of which a wrong model needs ten times more;
+and by what the statistic is divided that is then hopeless. It is up to 1.3 times the last one."""
 
 
 OVERFIT = 1.15
@@ -88,7 +91,8 @@ class BandDimension:
     test : BandTest
         Test of the chosen dimension.
     tried : tuple of BandTest
-        Tests of 0, 1, … `n_factors` factors; of fewer frequencies where these reject them clearly.
+        Tests of 0, 1, … `n_factors` factors; where a first look rejects them clearly, of fewer
+        frequencies and steps.
     cov : float
         Median c.o.v. of the noise at one frequency with `n_factors`; infinite if they leave the
         noise undetermined.
@@ -446,10 +450,15 @@ class _Search:
         self._n_effective = n_effective
         self._expected = 1 / psd  # in units of the coherency matrix
 
-    def fit(self, q: int, some: list[int], *, every: int = 1) -> _Fit:
-        """Maximise the likelihood of q factors in these bands, at every so many frequencies."""
+    def fit(self, q: int, some: list[int], *, every: int = 1, most: int | None = None) -> _Fit:
+        """Maximise the likelihood of q factors in these bands, at every so many frequencies.
+
+        In `most` steps, where that is stated.
+        """
         rows = np.flatnonzero(np.isin(self._number, some))[every // 2 :: every]
-        if q <= self._usual:
+        if most is not None:
+            maximum = maximise(self._matrix[rows], q, most=most)
+        elif q <= self._usual:
             maximum = self._maxima.maximise(self._matrix[rows], q)
         else:
             maximum = maximise_expecting(
@@ -517,12 +526,18 @@ class _Search:
         self, q: int, some: list[int], stride: dict[int, int], neighbours: FloatArray
     ) -> dict[int, goodness_of_fit.BandTest]:
         """Return the tests of bands that few of their frequencies reject beyond doubt."""
-        look, found = self.fit(q, some, every=FIRST_LOOK), {}
-        for b in some:
-            distant = neighbours[FIRST_LOOK * stride[b] - 1 :: FIRST_LOOK * stride[b]]
-            test = goodness_of_fit.pool(look.test, look.number == b, neighbours=distant)
-            if test.p_value < HOPELESS:
-                found[b] = test
+        found: dict[int, goodness_of_fit.BandTest] = {}
+        few = ((LOOK_STEPS, BEYOND_DOUBT),) if q < self._usual else ()
+        for most, beyond in (*few, (None, 1.0)):
+            left = [b for b in some if b not in found]
+            if not left:
+                break
+            look = self.fit(q, left, every=FIRST_LOOK, most=most)
+            for b in left:
+                distant = neighbours[FIRST_LOOK * stride[b] - 1 :: FIRST_LOOK * stride[b]]
+                test = goodness_of_fit.pool(look.test, look.number == b, neighbours=distant)
+                if goodness_of_fit.deflated(test, beyond).p_value < HOPELESS:
+                    found[b] = test
         return found
 
     def sensor_test(
