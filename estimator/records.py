@@ -63,6 +63,8 @@ class Record:
         named |= {repr(each): each for each in placed}
         if named:
             raise TypeError(f"{type(self).__name__} has no {', '.join(named)}")
+        if check := getattr(self, "__post_init__", None):
+            check()
 
     def __setattr__(self, name: str, value: object) -> NoReturn:
         raise FrozenInstanceError(f"cannot assign to field {name!r}")

@@ -75,6 +75,10 @@ def test_the_stand_in_makes_what_dataclasses_makes(eq: bool) -> None:
         own: list[int] = field(default_factory=list, init=False, repr=False)
         sensors: tuple[int, ...] = ()
 
+        def __post_init__(self) -> None:
+            if self.level < 0:
+                raise ValueError("level")
+
     kinds: list[Any] = [
         make(frozen=True, slots=True, eq=eq)(type("Plain", (), dict(Plain.__dict__)))
         for make in (records.dataclass, dataclass)
@@ -86,3 +90,5 @@ def test_the_stand_in_makes_what_dataclasses_makes(eq: bool) -> None:
     for kind in kinds:
         with pytest.raises(TypeError):
             kind(1, (2,), 3)
+        with pytest.raises(ValueError, match="level"):
+            kind(-1)
