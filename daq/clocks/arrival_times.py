@@ -675,7 +675,9 @@ class ArrivalTimes:
         index, late, epoch, scatter = self._earliest(left, node)
         variance = np.zeros(len(index))
         is_placed = np.ones(len(anchors), np.bool_)
+        still = np.empty(0)
         if measured is not None:
+            still = measured.index[np.isnan(measured.seconds)]
             arrived = (index, late, epoch)
             is_placed, rows = self._with_delays(slope, anchors, measured, arrived, unplaced)
             index, late, epoch, variance = rows
@@ -685,7 +687,7 @@ class ArrivalTimes:
             variance=variance,
             from_samples=variance > 0,
             restarts=np.diff(epoch, prepend=epoch[:1]) > 0,
-            counts=_counts(index, variance > 0),
+            counts=_counts(index, variance > 0, still),
         )
         hidden = step / math.sqrt(12) * math.sqrt(max(beat / node, 1.0))
         smoothed = smooth(observations, least_noise=max(hidden, scatter))
@@ -694,13 +696,13 @@ class ArrivalTimes:
         if not refined:  # nothing checks the line within the time of one observation
             unchecked = max(hidden, 2 * scatter) / len(index)
             residual = math.hypot(residual, smoothed.wander, unchecked)
+        seen = observations.from_samples
         if refined and unplaced is None:
-            seen = observations.from_samples
             poor = self._poorly_known(epoch, smoothed.std, seen)
             if poor.any():  # arrivals alone know them; the others need not suffer from it
                 return self._filtered(sensor, slope, anchors, measured, poor)
-        known_to = float(np.sqrt(np.mean(smoothed.std**2)))
-        if refined and known_to > _WELL_KNOWN / self.sampling_rate:  # the samples hardly know
+        known_to = float(np.sqrt(np.mean(smoothed.std[seen] ** 2))) if refined else 0.0
+        if known_to > _WELL_KNOWN / self.sampling_rate:  # the samples hardly know
             return self._filtered(sensor, slope, anchors, None)
         curve = smoothed.lateness + (smoothed.constant if refined else 0.0)
         epochs, late_seen = [], late
@@ -728,7 +730,6 @@ class ArrivalTimes:
             n_epochs=len(epochs),
             refined=refined,
         )
-        seen = observations.from_samples
         off_by, by_arrivals = (
             (late_seen - curve)[seen],
             _share_of_arrivals(variance, smoothed.noise),
@@ -756,15 +757,18 @@ def _at_most(late_by: FloatArray, variance: FloatArray) -> float:
     return math.sqrt(max(excess, 0.0) + error)  # every second segment overlaps with the one before
 
 
-def _counts(index: FloatArray, from_samples: BoolArray) -> BoolArray:
+def _counts(index: FloatArray, from_samples: BoolArray, still: FloatArray) -> BoolArray:
     """Return where the error of a clock counts: at measured delays, and at arrivals far from them.
 
     A delay is that of half a segment before and after, which clocks hardly leave between delays.
+    Nor does it count about samples `still`, the middles of segments without motion, and before.
     """
     at = index[from_samples]
     if len(at) < 2:
         return np.ones(len(index), np.bool_)
     half = _HALF * np.diff(at).min()
+    index = np.maximum(index, min(still[0], at[0]) if len(still) else 0)
+    at = np.sort(np.concatenate([at, still]))
     after = np.searchsorted(at, index)
     before = index - at[np.maximum(after - 1, 0)]
     apart = np.minimum(np.abs(before), np.abs(at[np.minimum(after, len(at) - 1)] - index))

@@ -37,9 +37,9 @@ class MeasuredDelays:
     index : float64, shape (n,)
         (Fractional) sample indices, increasing.
     seconds : float64, shape (n,)
-        When they were taken.
+        When they were taken; NaN where there was no motion to measure it from.
     std : float64, shape (n,)
-        Standard deviation of `seconds`.
+        Standard deviation of `seconds`; infinite if unknown.
     restarts : int64, shape (n_restarts,)
         Samples at which the clock that was measured against restarts.
     """

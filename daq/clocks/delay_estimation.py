@@ -13,10 +13,10 @@ signal have no weight. The maximum is searched for on a grid and refined by Newt
 variance is ``κ / (2 s² Σ ω² (P X_0)^H R^-1 P X_0)``, where κ accounts for the correlation of
 neighbouring frequencies by the window, and s is the share of the sum that is not noise of P.
 
-P is averaged over segments after correction of their delays. The first batch of segments does this
-by iteration and thereby defines a frame; later batches are measured in that frame, so that the
-delays of a recording are comparable. The frame's own delay is the one for which P is closest to
-real.
+P is averaged over segments after correction of their delays. The first batch of segments with
+motion does this by iteration and thereby defines a frame; later batches are measured in that frame,
+so that the delays of a recording are comparable. The frame's own delay is the one for which P is
+closest to real.
 
 The reference is the first sensor, unless another sensor shares the motion with more sensors.
 """
@@ -110,6 +110,8 @@ class DelayEstimator:
     n_candidates: int = REFERENCES
     hop: int = 0
     is_wide: bool = False
+    has_tried: bool = field(default=False, init=False)
+    """Whether any batch was large enough to define the frame, with motion in it or without."""
     _reference: int = 0
     _frames: dict[int, _Frame] = field(default_factory=dict)
 
@@ -121,7 +123,7 @@ class DelayEstimator:
 
     @property
     def has_frame(self) -> bool:
-        """Whether a batch has defined the frame."""
+        """Whether a batch with motion has defined the frame."""
         return bool(self._frames)
 
     @property
@@ -154,8 +156,9 @@ class DelayEstimator:
         -------
         delays, std : float64, shape (n_segments, n_sensors)
             In s; positive if the sensor lags the reference, whose delays are zero. NaN and infinity
-            if the coherent motion is too weak. Where `is_wide`, the deviation is NaN where the
-            motion is strong, and the sensor does not follow it.
+            if the coherent motion is too weak, infinity if any of several delays is likely. Where
+            `is_wide`, the deviation is NaN where the motion is strong, and the sensor does not
+            follow it.
         """
         if not self._is_enough(len(starts)):
             return self._unknown(len(starts))
@@ -174,8 +177,13 @@ class DelayEstimator:
         used = spectra[:, 1 : len(self.omega) + 1].swapaxes(0, 1)
         return self._measured([np.ascontiguousarray(used[:, :, one]) for one in self.columns])
 
+    @property
+    def fewest(self) -> int:
+        """Minimum number of segments of the next batch."""
+        return 1 if self.has_frame else self.min_segments
+
     def _is_enough(self, n_segments: int) -> bool:
-        return n_segments >= (1 if self.has_frame else self.min_segments)
+        return n_segments >= self.fewest
 
     def _unknown(self, n_segments: int) -> tuple[FloatArray, FloatArray]:
         shape = (n_segments, len(self.columns))
@@ -192,8 +200,11 @@ class DelayEstimator:
                 for number, frame in self._frames.items()
             }
         else:
+            self.has_tried = True
             self._reference, found = self._with_reference(sensors)
             x0 = sensors[self._reference]
+            if not any(np.isfinite(spread).any() for _, spread in found.values()):
+                return delays, std
         delays[:, self._reference] = std[:, self._reference] = 0.0
         for number, (tau, spread) in found.items():
             frame, xj = self._frames.get(number), sensors[number]
@@ -208,7 +219,7 @@ class DelayEstimator:
                     self._frames[number] = new
                 else:
                     frame.add(new)
-            delays[:, number], std[:, number] = np.where(known, tau, np.nan), spread
+            delays[:, number], std[:, number] = tau, spread
         return delays, std
 
     def _with_reference(
@@ -240,14 +251,18 @@ class DelayEstimator:
         `power` is the sum of the products of x0.
         """
         tau, spread = np.zeros(x0.shape[1]), np.full(x0.shape[1], np.inf)
+        if not self._moves(_Frame.of(x0, xj, power)):
+            return tau + np.nan, spread
         is_last = False
         for number in range(_FIRST_ITERATIONS):
             before, frame = tau, _Frame.of(x0, self._advanced(xj, tau), power)
             # At first P is a mean over unknown delays, and its peaks are low.
             tau, spread = self._delays(frame, x0, xj, doubt_cycles=is_last)
+            is_still = np.isnan(tau)
             tau = np.where(np.isfinite(spread), tau, 0.0)
             tau -= tau.mean()
             if is_last:
+                tau[is_still] = np.nan
                 break
             settled = bool((np.abs(tau - before) <= _SETTLED * spread).all())
             is_last = settled or number == _FIRST_ITERATIONS - 2
@@ -315,9 +330,7 @@ class DelayEstimator:
         kappa = len(w2) * float(w2 @ w2) / float(w2.sum()) ** 2
         total = energy.sum(axis=0)
         informative = omega**2 @ energy
-        # The share of P's noise, which predicts nothing: d0 dj / n, over R of fewer averages.
-        n, d0, dj = frame.n_segments, x0.shape[2], xj.shape[2]
-        spurious = d0 * dj / n * float(omega @ omega) * self._inflation(n, d0, dj)
+        spurious = self._spurious(frame)
         with np.errstate(divide="ignore", invalid="ignore"):
             share = np.maximum(1 - spurious / informative.mean(), 0.0)
             std = np.sqrt(kappa / (2 * informative)) / share
@@ -344,15 +357,29 @@ class DelayEstimator:
             met = (crossed * _turn(omega, tau)).real.sum(axis=0)
             known |= far & (met > _MET * total)
         std = np.where(known, std, np.inf)
+        tau = np.where(known | (2 * meant / kappa > _SIGNIFICANT), tau, np.nan)
         return tau, np.where(far & ~known & (met <= _MET * meant), np.nan, std)
 
-    def _inflation(self, n: int, d0: int, dj: int) -> float:
-        """Return the mean of ``R^-1`` of n segments over that of a known R (complex Wishart)."""
-        w = self.window
+    def _moves(self, frame: _Frame) -> bool:
+        """Return whether more of the segments of a frame is predicted than noise predicts of P."""
+        response, left = _prediction(frame)
+        predicted = response @ frame.crossed.conj().transpose(0, 2, 1)
+        energy = np.trace(np.linalg.solve(left, predicted), axis1=1, axis2=2).real
+        mean = float(self.omega**2 @ energy) / frame.n_segments
+        return mean * (1 - _BEYOND) > self._spurious(frame)
+
+    def _spurious(self, frame: _Frame) -> float:
+        """Return the share of P's noise, which predicts nothing, in what `omega`² weights.
+
+        ``d0 dj / n``, times the mean of ``R^-1`` over that of a known R (complex Wishart).
+        """
+        w, n = self.window, frame.n_segments
+        dj, d0 = frame.crossed.shape[1:]
         lags = range(self.hop, len(w), self.hop) if self.hop else ()
         shared = sum(float(w[:-lag] @ w[lag:]) ** 2 for lag in lags)
         left = n / (1 + 2 * shared / float(w @ w) ** 2) - d0 - dj
-        return (n - d0) / left if left > 0 else math.inf
+        inflation = (n - d0) / left if left > 0 else math.inf
+        return float(d0 * dj / n * float(self.omega @ self.omega) * inflation)
 
     def _highest(self, crossed: ComplexArray) -> FloatArray:
         """Return the τ of the highest peak of every column, up to half a segment away."""

@@ -56,13 +56,13 @@ class DelayMeasurement:
     def fewest(self) -> int:
         """Segments to take together so that delays can be measured, some of them with gaps."""
         wanted = self._is_wanted and bool(self._aligned.measurable)
-        needed = wanted and (self._meter is None or not self._meter.has_frame)
+        needed = wanted and (self._meter is None or not self._meter.has_tried)
         return 2 * MIN_SEGMENTS * max(self._aligned.dims) if needed else 0
 
     @property
     def awaited(self) -> int:
         """Segments with which delays could be measured first; 0 where they are, or need not be."""
-        return 0 if self._meter is None or self._meter.has_frame else self._meter.min_segments
+        return 0 if self._meter is None or self._meter.has_tried else self._meter.min_segments
 
     def measure(
         self, samples: FloatArray, starts: IntArray, begin: IntArray, *, together: bool
@@ -81,12 +81,13 @@ class DelayMeasurement:
         meter = self._wanted_meter()
         if meter is None:
             return
-        if not (together and meter.has_frame):
+        if not meter.has_tried or (meter.has_frame and not together):
             self._learn(samples, starts, begin)
             return
         self._held.append((samples, starts, begin))
         n_values = sum(each.size for each, _, _ in self._held)
-        if sum(len(rows) for _, rows, _ in self._held) >= _HELD or n_values >= _HELD_VALUES:
+        fewest = max(_HELD, meter.fewest)
+        if sum(len(rows) for _, rows, _ in self._held) >= fewest or n_values >= _HELD_VALUES:
             self.learn_held()
 
     def measure_spectra(self, spectra: NDArray[np.complex128], begin: IntArray) -> None:
