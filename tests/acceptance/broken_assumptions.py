@@ -476,7 +476,7 @@ KINDS: Mapping[str, Kind] = {
     "noise of a sensor 1.5 times as high from the middle on": Kind(_noise_step(1.5)),
     "noise of a sensor doubles slowly": Kind(_noise_ramp),
     "gusts below 5 Hz in the noise of all": Kind(_gusty, NOISE, names_sensor=False),
-    "30 spikes in one channel": Kind(_spikes, NOISE),
+    "30 spikes in one channel": Kind(_spikes, (*NOISE, "DisturbedSegments")),
     "two channels of two sensors share half of their noise": Kind(
         _shared(1.0), ("SharedNoise",), names_sensor=False
     ),

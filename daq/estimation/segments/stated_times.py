@@ -197,30 +197,48 @@ def _drifts(
     most: float,
     longest: float,
 ) -> tuple[dict[int, float], int]:
-    """Return `drift_of` sensors, and that against which, in pieces of `longest` s at most."""
+    """Return `drift_of` sensors, and that against which, in pieces of `longest` s at most.
+
+    Unless that is known, it is the sensor against which fewest drift: the one that is off itself
+    drifts against all others.
+    """
     pieces = _Pieces(aligned, welch, sensors, most=most, longest=longest)
     first = pieces.begin()
-    rest = np.linspace(0, pieces.total - 1, _SPREAD).astype(np.int64)
-    found = [*first, *pieces.measure(np.setdiff1d(rest, pieces.first))] if first else []
+    found = pieces.spread(first) if first else []
     none = np.empty(0), np.empty((0, len(sensors))), np.empty((0, len(sensors)))
     at, delays, std = map(np.concatenate, zip(none, *found, strict=True))
     order = np.argsort(at)
     at, delays, std = at[order] / welch.sampling_rate, delays[order], std[order]
-    is_reference = (std == 0).all(axis=0) & (len(at) > 0)
     duration = (pieces.end - pieces.start) / welch.sampling_rate
-    drift = {}
-    for column, number in enumerate(sensors):
-        clock, mine = aligned.clocks[number], (at, delays[:, column], std[:, column])
-        nominal = clock.ppm == clock.wander_ppm == 0
-        drift[number] = drift_of(
-            *mine, nominal=nominal, duration=duration, sampling_rate=welch.sampling_rate
-        )
-        stepped = aligned.stepped(number)  # which of the times are right, the motion says
-        if stepped and not math.isinf(drift[number]):
-            drift[number] = float(np.fmax(drift[number], stepped))
-        if is_reference[column]:
-            drift[number] = 0.0
-    return drift, sensors[int(np.argmax(is_reference))]
+
+    def against(reference: int) -> dict[int, float]:
+        drift = {}
+        for column, number in enumerate(sensors):
+            clock = aligned.clocks[number]
+            drift[number] = drift_of(
+                at,
+                delays[:, column] - delays[:, reference],
+                np.hypot(std[:, column], std[:, reference]),
+                nominal=clock.ppm == clock.wander_ppm == 0,
+                duration=duration,
+                sampling_rate=welch.sampling_rate,
+            )
+            stepped = aligned.stepped(number)  # which of the times are right, the motion says
+            if stepped and not math.isinf(drift[number]):
+                drift[number] = float(np.fmax(drift[number], stepped))
+        return drift | ({sensors[reference]: 0.0} if len(at) else {})
+
+    def off(drift: dict[int, float]) -> int:
+        return sum(each != 0 for each in drift.values())
+
+    reference = int(np.argmax((std == 0).all(axis=0)))  # that they were measured against
+    drift = against(reference)
+    if off(drift) > 1 and aligned.stated_reference is None:
+        others = {n: against(n) for n in range(len(sensors)) if n != reference}
+        best = min(others, key=lambda n: off(others[n]))
+        if off(others[best]) < off(drift):
+            reference, drift = best, others[best]
+    return drift, sensors[reference]
 
 
 def drift_of(
@@ -256,7 +274,8 @@ def drift_of(
     at, delays, std = at[known], delays[known], std[known]
     if len(at) < 2 * _PARTS:
         return math.nan
-    part = np.minimum((at - at[0]) / (at[-1] - at[0]) * _PARTS, _PARTS - 1).astype(np.int64)
+    n_parts = min(_PARTS, len(at) // _FEWEST)
+    part = np.minimum((at - at[0]) / (at[-1] - at[0]) * n_parts, n_parts - 1).astype(np.int64)
     used = np.unique(part)
     middle = np.zeros(_PARTS)
     middle[used] = [median(delays[part == each]) for each in used]
@@ -271,7 +290,7 @@ def drift_of(
     false = away > _FALSE * np.maximum(spread[part], std)
     agrees = away <= _FALSE * spread[part]
     agrees &= np.bincount(part[agrees], minlength=_PARTS)[part] >= _FEWEST
-    if np.mean(false) > _MOST_FALSE or np.count_nonzero(agrees) < 2 * _PARTS:
+    if np.mean(false) > _MOST_FALSE or np.count_nonzero(agrees) < 2 * n_parts:
         return math.nan
     at, delays, part = at[agrees], delays[agrees], part[agrees]
     n = np.bincount(part, minlength=_PARTS)
@@ -363,6 +382,19 @@ class _Pieces:
             if any(np.isfinite(std).any(axis=0).sum() > 1 for _, _, std in found):
                 return found  # one is the reference
         return []
+
+    def spread(self, first: list[Delays]) -> list[Delays]:
+        """Return delays of the first pieces and of others; more where motion is short."""
+        found, measured, low, high = first, self.first, 0, self.total - 1
+        while True:
+            new = np.setdiff1d(np.linspace(low, high, _SPREAD).astype(np.int64), measured)
+            found, measured = [*found, *self.measure(new)], np.union1d(measured, new)
+            # one with a delay is the reference
+            moving = [at[np.isfinite(std).sum(axis=1) > 1] for at, _, std in found]
+            place = (np.concatenate(moving) - self.start) / self._welch.hop - 1
+            if np.ptp(place) > (high - low) / 2 or not len(new):
+                return found
+            low, high = round(place.min()), round(place.max())
 
     def measure(self, numbers: IntArray, *, at_once: int = 0) -> list[Delays]:
         """Return grid positions, delays and their standard deviations of pieces that are usable."""

@@ -91,6 +91,13 @@ def test_sensors_whose_stated_times_drift_are_aligned_by_the_motion(
     assert fact.corrected == pytest.approx({"b": 138e-6, "c": 276e-6}, rel=0.05)
 
 
+def test_the_sensor_that_drifts_against_all_others_is_named(tmp_path: Path) -> None:
+    snapshot = estimate([write(tmp_path / "r.h5", huddle(1e4, (2.0, 0.0, 0.0)))], SETTINGS)
+    (fact,) = clock_facts(snapshot)
+    assert fact.reference == "b"
+    assert fact.corrected == pytest.approx({"a": 276e-6}, rel=0.05)
+
+
 def test_drift_is_found_where_every_segment_has_a_gap(tmp_path: Path) -> None:
     sensors = huddle(1e4, PPM)
     sensors["b"].gaps = tuple((first, first + 5) for first in range(40, 24_000, 250))
@@ -101,12 +108,17 @@ def test_drift_is_found_where_every_segment_has_a_gap(tmp_path: Path) -> None:
     assert snapshot.clocks[2].corrected == pytest.approx(drift, rel=0.1)
 
 
-def test_a_beginning_without_motion_does_not_hide_a_drift(tmp_path: Path) -> None:
+@pytest.mark.parametrize("first", [8000, 18_000])
+def test_a_beginning_without_motion_does_not_hide_a_drift(tmp_path: Path, first: int) -> None:
     sensors, noise = huddle(1e4, PPM), np.random.default_rng(2)
     for sensor in sensors.values():
-        sensor.counts[:8000] = noise.integers(-10, 10, (8000, 1))
+        sensor.counts[:first] = noise.integers(-10, 10, (first, 1))
     snapshot = estimate([write(tmp_path / "r.h5", sensors)], SETTINGS)
-    assert snapshot.clocks[2].corrected > 1e-4
+    assert snapshot.clocks[2].corrected > 5e-5
+    assert all(clock.residual < 2e-5 for clock in snapshot.clocks)
+    found = snapshot.results["three-sensor"]
+    ratio = found.noise_psd[BAND].mean(axis=0) / (1e12 * NOISE)
+    assert ratio == pytest.approx(1 - first / (SECONDS * RATE), rel=0.1)  # it is nearly zero first
 
 
 def test_a_first_sensor_without_the_motion_is_not_the_reference(tmp_path: Path) -> None:
