@@ -239,7 +239,7 @@ class Ledger:
         found = [each for each in known if each.runs == runs and each.state != "void"]
         return found[-1] if found else None
 
-    def certified(self, path: Path, run_id: str, root: str) -> tuple[str, str]:
+    def certified(self, path: Path, run_id: str, root: str) -> tuple[Entry | None, str]:
         """Return the last certificate of a recording, and how the recording contradicts one.
 
         Parameters
@@ -250,21 +250,22 @@ class Ledger:
 
         Returns
         -------
-        name, problem : str
-            Empty without a certificate, and if nothing is wrong.
+        entry : Entry or None
+        problem : str
+            Empty if nothing is wrong.
         """
-        last = ""
+        last = None
         for entry in self.entries():
             if entry.state == "void":
                 continue
             if run_id in entry.runs:
-                last = entry.name
+                last = entry
                 known = entry.roots.get(run_id, "")
                 sha256 = next(each for _, run, each in entry.recordings if run == run_id)
                 if root != known if known else _sha256(path) != sha256:
                     return last, f"changed since certificate {entry.name} was issued"
             elif path.name in {file for file, _, _ in entry.recordings}:
-                return "", f"exchanged: certificate {entry.name} is of another run of this name"
+                return None, f"exchanged: certificate {entry.name} is of another run of this name"
         return last, ""
 
     def publish(

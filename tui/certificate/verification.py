@@ -104,8 +104,10 @@ def verified(
         names: list[str] = []
         if state == "intact":
             for ledger in ledgers_of(path, folders):
-                name, wrong = ledger.certified(path, *own)
-                names += [name] if name else []
+                entry, wrong = ledger.certified(path, *own)
+                if entry is not None:
+                    names.append(entry.name)
+                    wrong = wrong or "; ".join(_head(ledger, entry, "")[1])
                 state = wrong or state
         if state == "intact":
             state = problem(path, *own, public=key) or state

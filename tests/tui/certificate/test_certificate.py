@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import os
@@ -186,6 +187,13 @@ def test_a_revision_says_what_it_replaces_and_what_changed(copied: Laboratory) -
     text = text_of(copied.certificate(1))
     for word in ("revision 1", "Replaces revision 0", "finer bins", "segment 1 s → 2 s"):
         assert "".join(word.split()) in text
+    tree = etree.fromstring(PdfReader(copied.certificate(1)).attachments[NAME][0])
+    (of_dcc,) = tree.xpath("//dcc:previousReport", namespaces=NAMESPACES)
+    sha256 = hashlib.sha256(before).hexdigest()
+    number = copied.certificate().stem.removesuffix("-r0")
+    assert of_dcc.xpath("string()").split() == (
+        f"finer bins {number}, revision 0 SHA-256 {sha256}".split()
+    )
     listed = CliRunner().invoke(app, ["issues", str(copied.recording), "--json", "-"])
     states = [each["state"] for each in json.loads(listed.stdout)["certificates"]]
     assert states == ["replaced", "issued"]

@@ -331,6 +331,23 @@ def test_a_forgery_is_named(
     assert "signed by" not in said
 
 
+@pytest.mark.parametrize(
+    ("forge", "words"),
+    [
+        (another_authoriser, "is not signed with key"),
+        (rows_under_the_heads, "not the one that was"),
+    ],
+)
+def test_recordings_are_not_certified_by_a_ledger_without_its_signature(
+    forged: Signed, forge: Callable[[Signed], None], words: str
+) -> None:
+    assert forged.lab.verify(forged.lab.recording)[0] == 0
+    forge(forged)
+    code, said = forged.lab.verify(forged.lab.recording)
+    assert code == 3, said
+    assert words in said
+
+
 def test_a_ledger_that_was_cut_short_hides_no_revision(forged: Signed) -> None:
     """The file of the later revision is still there, or its signature is."""
     truncated(forged)
