@@ -37,6 +37,21 @@ def test_a_file_replaces_an_earlier_one_and_keeps_its_permissions(tmp_path: Path
     assert names_in(tmp_path) == ["link", "r.json"]
 
 
+def test_a_file_is_synced_before_it_replaces_another_and_its_folder_after(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, synced, sync = tmp_path / "r.json", [], os.fsync
+    write_whole(path, b"one")
+
+    def seen(descriptor: int) -> None:
+        synced.append((stat.S_ISDIR(os.fstat(descriptor).st_mode), path.read_bytes()))
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", seen)
+    write_whole(path, b"two")
+    assert synced == [(False, b"one"), (True, b"two")]
+
+
 def test_a_file_that_the_disk_refuses_leaves_the_earlier_one(tmp_path: Path) -> None:
     path = tmp_path / "r.json"
     write_whole(path, b"one")

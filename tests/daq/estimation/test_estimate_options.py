@@ -12,17 +12,19 @@ import pytest
 
 from daq.bench.channel import Channel
 from daq.errors import CannotAlignError
+from daq.estimation.contributions import contributions
 from daq.estimation.diagnosis import vertical_channel
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError, Snapshot
 from daq.protocols.block import BlockFlag
-from daq.results.facts.channels import ChannelsWrap, ReadingsRepeat
+from daq.results.facts.channels import ChannelsStoodStill, ChannelsWrap, ReadingsRepeat
 from daq.results.result import Result
 from estimator.checks.advice import Rank, Untested
 from estimator.checks.advice_on_sensors import Gain, SwappedChannels
 from estimator.checks.advice_on_signals import Copies, NoSharedMotion, NoSignal
 from estimator.errors import InsufficientDataError
+from estimator.levels.contributions import Source
 from estimator.methods import Flag, self_noise
 from estimator.spectra.segment_rejection import Reason
 from estimator.spectra.welch import CrossSpectra, WelchSettings
@@ -141,6 +143,22 @@ def test_what_was_followed_ends_as_the_estimate_from_the_file(
     (one,), (other,) = live.results.values(), offline.results.values()
     np.testing.assert_allclose(one.noise_psd, other.noise_psd, rtol=1e-9)
     np.testing.assert_allclose(one.cov, other.cov, rtol=1e-9)
+
+
+def test_a_channel_that_stands_still_for_a_while_counts_as_faulty(tmp_path: Path) -> None:
+    sensors = bench()
+    sensors["b"].counts[4000:7000, 1] = 17
+    settings = replace(SETTINGS, reject=False)
+    found = estimate([write(tmp_path / "r.h5", sensors)], settings)
+    assert found.diagnostics.stood_still == {4: pytest.approx(30, abs=1)}
+    result = Result(found, settings)
+    (fact,) = (each for each in result.facts if isinstance(each, ChannelsStoodStill))
+    assert (fact.rank, fact.channels) == (Rank.INVALIDATES, (found.channels[4].name,))
+    parts = contributions(found, next(iter(found.results)))
+    (faulty,) = (each for each in parts if each.source is Source.FAULTY)
+    assert np.flatnonzero(np.isinf(faulty.below).all(axis=0)).tolist() == [4]
+    gains = [each for each in found.diagnostics.advice if isinstance(each, Gain)]
+    assert not gains  # it stood still: its sensitivity is not wrong
 
 
 def test_clipped_blocks_are_left_out_unless_that_is_turned_off(tmp_path: Path) -> None:

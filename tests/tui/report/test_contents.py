@@ -50,6 +50,23 @@ def test_noise_is_that_of_the_estimate(reported: Reported) -> None:
     assert rows[f"{HOSTILE}.Y"][1:3] == ("no signal", "?")
 
 
+def test_each_cell_of_the_noise_is_that_of_its_channel(reported: Reported) -> None:
+    def db(value: float, digits: int = 2) -> str:
+        return f"{10 * np.log10(value):.{digits}f}".replace("-", "−")
+
+    table, *_ = tables(reported.report, "Self-noise")
+    result, rows = reported.result, list(by_channel(table).values())
+    covs = result.covs_of("three-sensor")
+    for column, own in enumerate(result.means("three-sensor")[:7]):  # the last channel is dead
+        (mean,), (low,), (high,), (spread,) = own.mean, own.low, own.high, own.spread
+        data = float(result.data[column])
+        assert rows[column][1:4] == (db(data, 1), db(mean), f"{db(low)} … {db(high)}")
+        assert rows[column][4] == f"{1e5 * mean**0.5:.2f}×10⁻⁵"
+        numbers = f"{covs[column]:.3f}", f"{spread / mean:.3f}", db((data - mean) / mean, 1)
+        assert rows[column][5:] == numbers
+    assert 0 < spread / mean < covs[column] < 0.5
+
+
 @pytest.mark.usefixtures("empty_figures")
 def test_limits_are_judged_with_their_margin(reported: Reported, tmp_path: Path) -> None:
     text = reported.report.verdict.text
