@@ -85,6 +85,13 @@ def test_only_what_time_removes_is_predicted() -> None:
     assert prediction(found, [], quantile=QUANTILE, elapsed=100.0) is not None  # a pass, not sure
 
 
+def test_the_margin_of_a_level_below_zero_is_in_standard_deviations() -> None:
+    scatter = np.stack([np.full(3, 0.04), np.full(3, 0.5), np.zeros(3)])
+    margin = comparison(-0.5, -0.1, cumulants=scatter).margins().margin
+    assert margin[2] == pytest.approx((1 + 0.3) / 0.2)
+    assert margin[0] == pytest.approx(math.log(10))
+
+
 def test_nothing_is_known_of_the_margins_of_ends_that_are_infinite() -> None:
     low, high = np.full(3, -math.inf), np.full(3, math.inf)
     known = comparison(0.5, 2.0, outer_low=low, outer_high=high)

@@ -18,6 +18,7 @@ from daq.results.decision.conformity import (
     QUANTILES,
     Statement,
     conformity,
+    distribution,
     risk_above,
     risk_of_item,
     stated,
@@ -53,8 +54,9 @@ def db(value: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
 def test_the_rules_are_those_of_ilac_g8(
     rule: Rule, r: float, level: float, expected: Statement
 ) -> None:
-    """With an interval from 1 dB below to 2 dB above the level, and a limit of 0 dB."""
-    found = stated(rule, r, db(level), low=db(level - 1), high=db(level + 2), limit=LIMIT)
+    """With an interval from 1 dB below to 2 dB above the level, and a limit of −90 dB."""
+    value, low, high = (db(each - 90) for each in (level, level - 1, level + 2))
+    found = stated(rule, r, value, low=low, high=high, limit=db(-90))
     assert found is expected
 
 
@@ -164,12 +166,15 @@ def test_an_uncertain_sensitivity_widens_the_interval_and_takes_the_pass(tmp_pat
     snapshot = estimate([recording], settings)
     with Recording.open(recording) as opened:
         bench = opened.bench
-    found = {}
+    found, scatter = {}, []
     for own in (0.01, 0.25):
         known = judged_with(snapshot, KnownSensitivity(own=own, is_certified=True))
         verdict = Result(known, settings, bench).verdict
         assert verdict is not None
         found[own] = verdict.limits[0]
+        levels = Result(known, settings).spectrum("three-sensor").levels(np.array([5, 9, 20]))
+        scatter.append(distribution(levels))
+    np.testing.assert_array_equal(*scatter)  # the sensitivity is common to all bands
     assert found[0.01].verdict is Verdict.PASS
     assert found[0.25].verdict is Verdict.NOT_DECIDED
     assert found[0.25].obstacle is Obstacle.SPANS_LIMIT

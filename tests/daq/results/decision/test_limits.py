@@ -13,7 +13,7 @@ from daq.bench.loading import parse
 from daq.estimation.contributions import contributions
 from daq.estimation.snapshot import Snapshot
 from daq.estimation.snapshot_diagnostics import Synchronisation
-from daq.results.decision.verdict import LimitResult
+from daq.results.decision.verdict import LimitResult, TestVerdict
 from daq.results.result import Result
 from estimator.checks.advice import Rank
 from estimator.checks.advice_on_model import ModelMisfit
@@ -52,6 +52,29 @@ def test_what_is_not_known_well_enough_neither_passes_nor_fails() -> None:
     assert found.verdict is Verdict.NOT_DECIDED
     assert found.having(Verdict.FAIL) == []
     assert Obstacle.SPANS_LIMIT in found.obstacles
+
+
+@pytest.mark.parametrize(
+    ("verdict", "limit", "sure"),
+    [
+        (Verdict.PASS, 1.24, False),
+        (Verdict.PASS, 1.26, True),
+        (Verdict.FAIL, 0.76, False),
+        (Verdict.FAIL, 0.74, True),
+        (Verdict.NOT_DECIDED, 0.74, False),
+        (Verdict.NOT_DECIDED, 1.26, False),
+    ],
+)
+def test_a_verdict_is_sure_beside_an_interval_a_quarter_wider(
+    verdict: Verdict, limit: float, *, sure: bool
+) -> None:
+    """All channels must pass surely; one that fails surely is enough."""
+    made = verdict_on(made_snapshot(), 12e-12).limits[0]
+    one = replace(made, verdict=verdict, noise_psd=1.0, low=0.8, high=1.2, limit_psd=limit)
+    assert one.is_sure is sure
+    assert TestVerdict(verdict, (one,)).is_sure is sure
+    two = TestVerdict(verdict, (one, replace(one, limit_psd=1.0)))
+    assert two.is_sure is (sure and verdict is Verdict.FAIL)
 
 
 def test_too_few_averages_decide_nothing() -> None:

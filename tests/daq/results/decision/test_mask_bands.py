@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from daq.bench.loading import parse
+from daq.results.decision.limits import mask_psd
 from daq.results.result import Result
 from estimator.decision.comparison import mask_edges
 from estimator.decision.verdict import Obstacle, Verdict
 from estimator.self_noise.result import SelfNoise
-from tests.daq.results.decision.benches import MASK, verdict_on
+from tests.daq.results.decision.benches import MASK, bench_with, verdict_on
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
 from tui.wording.verdict_text import not_judged
 
@@ -56,6 +57,38 @@ def test_a_mask_is_judged_in_a_notch_narrower_than_a_band(psd: str, verdict: Ver
     assert found.verdict is verdict
     if verdict is Verdict.FAIL:
         assert all(15.9 < each.frequency < 17.1 for each in found.having(Verdict.FAIL))
+
+
+@pytest.mark.parametrize(("slope", "divided"), [(-15.0, True), (-14.0, False)])
+def test_the_point_of_a_mask_divides_a_band_where_it_bends_by_a_factor_of_two(
+    slope: float, *, divided: bool
+) -> None:
+    """Beside the straight line from the first to the last frequency of the band."""
+    spectrum = np.linspace(0.0, 100.0, 201)
+    mask = np.maximum(spectrum / 41, 1.0) ** slope
+    edges = mask_edges(spectrum, mask, np.array([1.0, 41.0, 90.0]), known=(0.0, np.inf))
+    assert (82 in edges) is divided
+
+
+def test_a_band_of_one_frequency_is_named_by_it() -> None:
+    text = MASK.format(psd=12e-12, more="").replace("[1.0, 30.0]", "[1.0, 2.0]")
+    bench = parse(resources.files("tui.resources").joinpath("bench.toml").read_text("utf-8") + text)
+    found = Result(made_snapshot(), SETTINGS, bench).verdict
+    assert found is not None
+    assert {each.frequency for each in found.limits} <= {1.0, 1.5, 2.0}
+
+
+def test_a_mask_is_in_the_unit_of_its_own_channel() -> None:
+    """Another channel of the bench file has another unit."""
+    bench = bench_with(12e-12)
+    first, *others = bench.sensors
+    channels = [replace(each, unit="m/s") for each in first.channels]
+    bench = bench.model_copy(
+        update={"sensors": [first.model_copy(update={"channels": channels}), *others]}
+    )
+    label = made_snapshot().channels[3]
+    psd = mask_psd(bench, bench.limits[0], label, np.array([1.0, 10.0]))
+    np.testing.assert_allclose(psd, 12e-12)
 
 
 def test_a_mask_is_in_the_unit_of_the_bench_file() -> None:

@@ -11,7 +11,9 @@ from scipy.spatial.transform import Rotation
 from daq.estimation.snapshot import Snapshot
 from daq.results.decision.verdict import TestVerdict
 from daq.results.result import Result
+from daq.results.vocabulary import CAUSES
 from estimator.checks.relative_response import relative_response
+from estimator.checks.sensitivities import Cause
 from estimator.decision.verdict import Obstacle, Verdict
 from estimator.methods import self_noise
 from tests.daq.results.decision.benches import bench_with
@@ -94,6 +96,9 @@ def test_the_verdict_names_sensor_factor_and_cause() -> None:
     assert [each.channels for each in found.sensitivities] == [("C.X", "C.Y", "C.Z")]
     assert found.sensitivities[0].gain == pytest.approx(0.3, rel=0.02)
     assert found.sensitivities[0].against == ("A", "B")
+    assert "(" not in found.sensitivities[0].line
+    by_gravity = replace(found.sensitivities[0], cause=Cause.GRAVITY)
+    assert f"({CAUSES[Cause.GRAVITY]})" in by_gravity.line
     # Neither of both sensitivities passes here, or fails there: the verdict does not depend on it.
     assert verdict_of(snapshot, NOISE * 20).verdict is Verdict.PASS
     assert {each.verdict for each in verdict_of(snapshot, NOISE / 40).limits} == {Verdict.FAIL}
