@@ -59,6 +59,12 @@ def signed(value: float, spec: str) -> str:
     return f"{value:{spec}}".replace("-", "−")
 
 
+def measured(value: float, half: float, digits: int) -> str:
+    """Return a number with the half-width of its interval where that is known."""
+    reach = f" ±{half:.{digits}f}" if math.isfinite(half) else ""
+    return f"{signed(value, f'.{digits}f')}{reach}" if math.isfinite(value) else "?"
+
+
 def several(count: int, one: str, more: str | None = None) -> str:
     """Return a count with its noun."""
     return f"{count:,} {one if count == 1 else more or one + 's'}".replace(",", "\u202f")

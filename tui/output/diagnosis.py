@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 from rich.text import Text
 
 from estimator.spectra.segment_rejection import Reason
-from estimator.wording import degrees, ratio, signed
+from estimator.wording import ratio, signed
 from tui.page.table import Table
 from tui.page.terminal import terminal_table
 from tui.wording.facts import RANKS
+from tui.wording.formatting import response_cells
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -45,7 +46,10 @@ def details(snapshot: Snapshot, facts: Sequence[Fact]) -> list[RenderableType]:
     parts: list[RenderableType] = [_heading("Common motion by band"), _bands(found), Text(_LEGEND)]
     if found.responses:
         pairs = _pairs(found, snapshot.sensor_names)
-        parts += [_heading("Orientation, gain and delay of the sensors"), pairs]
+        parts += [
+            _heading("Orientation, gain and delay of the sensors, with 95 % intervals"),
+            pairs,
+        ]
     if snapshot.octaves:
         parts += [_heading("Segments of each octave"), _octaves(snapshot)]
     names = snapshot.names
@@ -113,15 +117,18 @@ def _repeatability(found: Stability, names: Names) -> tuple[str, rich.table.Tabl
 
 
 def _pairs(found: Diagnosis, names: Sequence[str]) -> rich.table.Table:
-    columns = ("sensors", "rotation", "horizontal", "±", "gains", "delay", "not orthogonal")
-    rows = (
-        (
-            f"{names[pair.first]} → {names[pair.second]}",
-            *map(degrees, (pair.rotation_deg, pair.horizontal_deg, pair.angle_error_deg)),
-            " ".join(f"{gain:.4f}" for gain in pair.gains),
-            "?" if math.isnan(pair.delay) else f"{signed(pair.delay * 1e6, '.1f')} µs",
-            f"{pair.nonorthogonality_deg:.2f}°",
-        )
-        for pair in found.responses
+    columns = (
+        "sensors",
+        "rotation (°)",
+        "horizontal (°)",
+        "gains",
+        "delay (µs)",
+        "not orthogonal (°)",
     )
+    rows: list[tuple[str, ...]] = []
+    for pair in found.responses:
+        angles, turned, gains, delay, skew = response_cells(pair)
+        who = f"{names[pair.first]} → {names[pair.second]}"
+        rows.append((who, angles, turned, gains[0], delay, skew))
+        rows += [("", "", "", gain) for gain in gains[1:]]
     return _table(*columns, rows=rows)

@@ -34,7 +34,15 @@ from tui.report.figures.model_test import model_test_plot
 from tui.report.figures.signal import signal_plots
 from tui.report.figures.standing import standing_plots
 from tui.wording.facts import RANK_TONES, RANKS, fact_items
-from tui.wording.formatting import NOTHING, plain_number, probability, scientific, share, utc
+from tui.wording.formatting import (
+    NOTHING,
+    plain_number,
+    probability,
+    response_cells,
+    scientific,
+    share,
+    utc,
+)
 
 MOST_SPECTROGRAMS = 1
 """Channels that have spectrograms: each takes a tenth of the time of a report."""
@@ -138,21 +146,12 @@ def alignment_section(result: Result) -> Section:
     shown = [response for response in found if response.first == reference]
     rows = []
     for response in shown:
-        error = plain_number(response.angle_error_deg, ".3f")
-        rows.append(
-            (
-                names[response.second],
-                f"{plain_number(response.rotation_deg, '.3f')}",
-                f"{plain_number(response.horizontal_deg, '.3f')}",
-                f"±{error}" if error != NOTHING else NOTHING,
-                " / ".join(plain_number(gain, ".4f") for gain in response.gains),
-                plain_number(response.nonorthogonality_deg, ".2f"),
-                plain_number(response.delay * 1e6, ".1f"),
-                "?" if response.is_ambiguous else _reversed(snapshot, response) or "none",
-            )
-        )
+        rotation, horizontal, gains, delay, skew = response_cells(response)
+        polarity = "?" if response.is_ambiguous else _reversed(snapshot, response) or "none"
+        sensor = names[response.second]
+        rows.append((sensor, rotation, horizontal, " / ".join(gains), skew, delay, polarity))
     header = (
-        "sensor", "rotation (°)", "in the horizontal (°)", "standard error (°)", "gains",
+        "sensor", "rotation (°)", "in the horizontal (°)", "gains",
         "not orthogonal (°)", "delay (µs)", "reversed",
     )  # fmt: skip
     missing = [
@@ -164,10 +163,11 @@ def alignment_section(result: Result) -> Section:
         Paragraph(
             f"Against sensor {names[reference]}, from the common motion at "
             f"{span(min(r.low for r in shown), max(r.high for r in shown))}. Gains are of like "
-            f"channels. Rotation alone does not bias a {ANY_AXES} estimate.",
+            "channels; ± is half of a 95 % interval. Rotation alone does not bias a "
+            f"{ANY_AXES} estimate.",
             "quiet",
         ),
-        Table(header, tuple(rows), left=frozenset({0, 7})),
+        Table(header, tuple(rows), left=frozenset({0, 6})),
     ]
     parts += standing_plots(result)
     if missing:

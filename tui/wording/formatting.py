@@ -7,12 +7,14 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from daq.bench.units import decibels
-from estimator.wording import several, signed, span
+from estimator.levels.interval import NORMAL_95
+from estimator.wording import measured, several, signed, span
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from daq.bench.model import Bench
+    from estimator.checks.relative_response import RelativeResponse
 
 
 ONE_SIDED = 1.1
@@ -152,6 +154,23 @@ def plain_number(value: float, form: str) -> str:
         return NOTHING
     text = format(value, form)
     return text.replace("-", "−") if text.strip("+-0.") else text.lstrip("-")
+
+
+def response_cells(pair: RelativeResponse) -> tuple[str, str, list[str], str, str]:
+    """Return rotation, horizontal angle, gains, delay and skew with their 95 % half-widths.
+
+    Angles are in degrees, the delay in microseconds.
+    """
+    return (
+        measured(pair.rotation_deg, NORMAL_95 * pair.rotation_error_deg, 3),
+        measured(pair.horizontal_deg, NORMAL_95 * pair.angle_error_deg, 3),
+        [
+            measured(gain, NORMAL_95 * error, 4)
+            for gain, error in zip(pair.gains.tolist(), pair.gain_errors.tolist(), strict=True)
+        ],
+        measured(1e6 * pair.delay, 1e6 * NORMAL_95 * pair.delay_error, 1),
+        measured(pair.nonorthogonality_deg, NORMAL_95 * pair.nonorthogonality_error_deg, 2),
+    )
 
 
 def share(value: float) -> str:

@@ -18,7 +18,7 @@ from estimator.errors import BandError
 from estimator.levels.contributions import Source
 from estimator.levels.interval import NORMAL_95
 from estimator.records import Degrees, Seconds, record
-from estimator.wording import Words, listed, percent, roughly, signed, span
+from estimator.wording import Words, listed, measured, percent, roughly, span
 
 _TWO = 2  # sensors
 
@@ -53,10 +53,10 @@ class PairCompared(Fact):
         first, second = self.sensors
         gains = zip(self.gains, self.gain_errors, strict=True)
         parts = [
-            ("gain " + ", ".join(_measured(*each, 4) for each in gains), self.gains[0]),
-            (f"rotation {_measured(self.rotation, self.rotation_error, 3)}°", self.rotation),
-            (f"delay {_measured(1e6 * self.delay, 1e6 * self.delay_error, 2)} µs", self.delay),
-            (f"coherence {_measured(self.coherence, self.coherence_error, 4)}", self.coherence),
+            ("gain " + ", ".join(_within(*each, 4) for each in gains), self.gains[0]),
+            (f"rotation {_within(self.rotation, self.rotation_error, 3)}°", self.rotation),
+            (f"delay {_within(1e6 * self.delay, 1e6 * self.delay_error, 2)} µs", self.delay),
+            (f"coherence {_within(self.coherence, self.coherence_error, 4)}", self.coherence),
         ]
         known = ", ".join(text for text, value in parts if math.isfinite(value))
         where = "" if self.band is None else f" at {span(*self.band)}"
@@ -113,10 +113,8 @@ class TargetMissed(Fact):
         return Words(f"{text}: record for {long} in all", f"{text}.", f"Record for {long} in all.")
 
 
-def _measured(value: float, error: float, digits: int) -> str:
-    """Return a number with the half-width of its 95 % interval."""
-    reach = f" ±{NORMAL_95 * error:.{digits}f}" if math.isfinite(error) else ""
-    return f"{signed(value, f'.{digits}f')}{reach}"
+def _within(value: float, error: float, digits: int) -> str:
+    return measured(value, NORMAL_95 * error, digits)
 
 
 def _compared(estimate: Estimate) -> Iterator[PairCompared]:
