@@ -47,10 +47,10 @@ def scene(
     length = n_parts * segments * HOP + HOP
     steps = np.sort(rng.integers(0, length, rng.integers(n_parts, 3 * n_parts)))
     stretch = np.searchsorted(steps, np.arange(length), side="right")
-    motion = rng.standard_normal((length, d)) * np.sqrt(snr * np.array([1.0, 0.5, 2.0][:d]))
-    decades: np.ndarray = np.zeros(length)
+    motion = _white(rng, length, d) * np.sqrt(snr * np.array([1.0, 0.5, 2.0][:d], np.float32))
+    decades: np.ndarray = np.zeros(length, np.float32)
     if change == "loud":
-        decades = 4.0 * (np.arange(length) < length // 3)
+        decades[: length // 3] = 4.0
     elif change == "shape":
         edges = [0, *steps.tolist(), length]
         for first, last in itertools.pairwise(edges):
@@ -61,11 +61,16 @@ def scene(
             motion[first:last] = shaped / np.sqrt(power)
     else:
         db = 6.0 if change == "axis" else float(change)
-        decades = db / 10 * rng.standard_normal(len(steps) + 1)[stretch]
+        decades = (db / 10 * _white(rng, len(steps) + 1))[stretch]
     still = np.zeros(d, bool)
     still[1:2] = change == "axis"
-    motion *= np.where(still, 1.0, 10 ** (decades[:, None] / 2))
+    motion[:, ~still] *= 10 ** (decades[:, None] / 2)
     return Scene(motion, decades, n_parts)
+
+
+def _white(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    """Return white noise, in single precision: 1e-14 of the power of the loudest motion."""
+    return rng.standard_normal(shape, np.float32)
 
 
 def felt(
@@ -76,8 +81,10 @@ def felt(
     turn_of_bin = np.exp(-2j * np.pi * np.arange(SEGMENT // 2 + 1) / SEGMENT)[:, None, None]
     for number in range(sensors):
         turn = rng.uniform(0.8, 1.2) * np.linalg.qr(rng.standard_normal((d, d)))[0]
-        x, own = at.motion @ turn.T, tap * (number > 0)
-        found.append(x + own * np.roll(x, 1, axis=0))
+        x, own = at.motion @ turn.T.astype(np.float32), tap * (number > 0)
+        if own:
+            x[1:] += np.float32(own) * x[:-1]
+        found.append(x)
         response.append(turn * (1 + own * turn_of_bin))
     return np.concatenate(found, axis=1), np.concatenate(response, axis=1)
 
@@ -96,23 +103,28 @@ def noise_of(rng: np.random.Generator, kind: str) -> np.ndarray:
 
 
 def averages_of(
-    x: np.ndarray, n_parts: int, *, segment: int = SEGMENT, rate: float = RATE
+    x: np.ndarray,
+    n_parts: int,
+    *,
+    segment: int = SEGMENT,
+    rate: float = RATE,
+    bins: slice = slice(None),
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return matrices of parts (n_parts, n_freqs, p, p) in power a Hz, and their averages."""
     hop = segment // 2
     n_segments = (len(x) - segment) // hop + 1
-    window = np.hanning(segment + 1)[:-1]
+    window = np.hanning(segment + 1)[:-1].astype(x.dtype)
     rows = np.lib.stride_tricks.sliding_window_view(x, segment, axis=0)[::hop]
-    spectra = np.fft.rfft((rows - rows.mean(axis=-1, keepdims=True)) * window)
+    spectra = np.fft.rfft((rows - rows.mean(axis=-1, keepdims=True)) * window)[..., bins]
     bounds = np.linspace(0, n_segments, n_parts + 1).astype(int)
     found = []
     for a, b in itertools.pairwise(bounds):
         part = np.ascontiguousarray(spectra[a:b].transpose(2, 1, 0))
         found.append(part @ part.conj().swapaxes(1, 2) / (b - a))
-    scale = 2 / (rate * np.sum(window**2))
+    scale = 2 / (rate * float(np.sum(window**2)))
     known = get_window("hann", segment)
     each = [effective_averages(known, hop, int(count)) for count in np.diff(bounds)]
-    return np.stack(found) * scale, np.array(each)
+    return np.stack(found).astype(complex) * scale, np.array(each)
 
 
 def gain(size: float, course: str) -> Callable[..., None]:
@@ -168,11 +180,11 @@ def found_in(
     at = scene(rng, d, change, snr, n=n, n_parts=n_parts)
     motion, response = felt(rng, at, sensors, 0.01 if change == "loud" else 0.1)
     matrix = noise_of(rng, kind)
-    noise = rng.standard_normal(motion.shape) @ np.linalg.cholesky(matrix).T
+    noise = _white(rng, *motion.shape) @ np.linalg.cholesky(matrix).T.astype(np.float32)
     if fault is not None:
         fault(at, motion, noise, slice(0, d))
-    csm, averages = averages_of(motion + noise, n_parts)
-    csm, response = csm[:, bins], response[bins]
+    csm, averages = averages_of(motion + noise, n_parts, bins=bins)
+    response = response[bins]
     n_freqs = csm.shape[1]
     (block,) = multi_part(
         csm,

@@ -116,7 +116,7 @@ SOURCE_WORDS: Mapping[Source, str] = {
     Source.ROUNDING: "matrices in single precision",
     Source.CHANGES: "a response that changed",
     Source.PARTS: "what parts of the recording contradict",
-    Source.GAINS: "gains that may follow the loudness",
+    Source.GAINS: "gains or noise that may follow the loudness",
     Source.STEADY_MOTION: "motion that does not tell noise from motion",
     Source.LINEARITY: "squares and cubes of the motion",
     Source.COUNTS: "rounding that channels share",

@@ -46,7 +46,7 @@ class Source(enum.StrEnum):
     ROUNDING = "rounding"
     """Cross-spectra were kept in single precision, as fine as their largest part: the motion."""
     GAINS = "gains"
-    """Gains may follow the loudness of the motion, by which two sensors tell noise from it."""
+    """Gains or noise may follow the loudness of the motion, which tells noise from motion."""
     STEADY_MOTION = "steady-motion"
     """Motion that changes does not identify the noise of two sensors: it is below a bound."""
     PARTS = "parts"

@@ -24,7 +24,9 @@ and T goes in closed form in every bin: with ``P = sum n G``, ``Q = sum n (1 - G
 
 J is zero in a direction of motion that does not change: nothing tells noise from motion there, and
 the channels concerned are *not identified*. The scatter of M looks like changes of the motion. So
-intervals take G times ``(n - q) / n``, without bias, and R less what this scatter adds at most.
+G is taken times ``(n - q) / n`` and R with ``q sum M / K``, which leaves J without bias; whether a
+channel is identified takes R less what this scatter adds at most. The score has the information of
+the scattering M, J_raw: few averages cost ``sqrt(J_raw / J)`` of the bound in width.
 
 The method assumes that noise, gains and directions are steady. A gain that follows the loudness of
 the motion shifts the levels, and no test sees it where there are two levels of loudness only: the
@@ -51,6 +53,9 @@ STEADINESS = 1e-3
 """Relative change of a gain a decade of loudness (power of the motion), by default."""
 MOST = 1.5
 """Half-width, over the bound that needs no model, beyond which a level is not identified."""
+SUSPECT = 2.0
+"""Standard deviations from which a gain, or noise, that seems to follow the loudness widens the
+interval by what it does to the level."""
 STANDS_OUT = 4.0
 """Standard deviations by which the contrasts of a part stand out that is left out."""
 LEAVE = 3
@@ -77,7 +82,8 @@ class BandNoise:
     cumulants : float64, shape (3, n_channels)
         Of the level, by the scatter of the averages (`estimator.levels.interval.interval`).
     lever : float64, shape (n_channels,)
-        Shift of the level by gains that follow the loudness as much as is allowed for.
+        Shift of the level by gains that follow the loudness as much as is allowed for, and by a
+        gain or noise that seems to follow it.
     bound : float64, shape (n_channels,)
         What the other sensors do not predict.
     refusal : tuple of Refusal or None, length n_channels
@@ -555,18 +561,19 @@ def _estimate(
     level = np.einsum("ii->i", point.noise).real + theta[diagonal]
     slopes = _slopes(point, parts, model, of_level, projector)
     n_sensors = model.sensor[-1] + 1
+    follows, seen = _follows(slopes, parts)
     lever = steadiness * np.sqrt((slopes.shift[:, :n_sensors] ** 2).sum(axis=1))
+    seems = (np.abs(slopes.shift * seen) * (np.abs(follows) > SUSPECT)).max(axis=1)
 
-    # intervals: unbiased inverse of the motion, and less its scatter, which looks like change
+    # intervals: unbiased inverse of the motion, in products with its own part, too
     unbiased = ((parts.n - q) / parts.n)[:, None, None]
     inverse = np.asarray(point.inverse * unbiased, np.complex128)
     p, cross, r = _sums(point.motion, parts.weight, inverse)
     scatter = q * point.motion.sum(axis=1)
     freedom = 2 * q * q * max(len(parts.n) - 1, 1) / (q + 1)
-    worth = n_freqs / parts.alike
-    beyond = _quantile(freedom * worth) - 1
+    beyond = _quantile(freedom * n_freqs / parts.alike) - 1
     certain = _left(p, cross, r, beyond * scatter)
-    usual = _left(p, cross, r, np.sqrt(2 / (freedom * worth)) * scatter)
+    usual = _left(p, cross, r, -scatter / len(parts.n))
     raw = _sums(point.motion, parts.weight, point.inverse)
     variance = _left(*raw) + usual - _left(p, cross, r)
     determined = _determined(point.mixed_part(certain) + contrasts, diagonal)
@@ -601,7 +608,7 @@ def _estimate(
     return BandNoise(
         level=np.where(identified, level, np.nan) * power,
         cumulants=cumulants * power ** np.array([[2], [3], [4]]),
-        lever=lever * power,
+        lever=(lever + seems) * power,
         bound=bound * power,
         refusal=refusal,
         noise=point.noise * unit[:, None] * unit,
@@ -612,7 +619,7 @@ def _estimate(
         of_responses=of_responses,
         change=_change(point, parts, q),
         still=_still(point, q),
-        follows=_follows(slopes, parts),
+        follows=follows.reshape(2, -1),
     )
 
 
@@ -700,10 +707,11 @@ def _still(point: _Point, q: int) -> int:
     return int(np.argmax((share / share.sum(axis=1, keepdims=True)).mean(axis=0)))
 
 
-def _follows(slopes: _Slopes, parts: _Parts) -> FloatArray:
+def _follows(slopes: _Slopes, parts: _Parts) -> tuple[FloatArray, FloatArray]:
+    """Return each slope in standard deviations, and its size."""
     own = np.diag(slopes.information)
-    scatter = np.sqrt(parts.alike * np.where(own > 0, own, np.inf))
-    return np.asarray((slopes.score / scatter).reshape(2, -1))
+    own = np.where(own > 0, own, np.inf)
+    return slopes.score / np.sqrt(parts.alike * own), slopes.score / own
 
 
 def _sandwich(information: FloatArray, variance: FloatArray, diagonal: list[int]) -> FloatArray:

@@ -19,7 +19,7 @@ import numpy as np
 
 from estimator.levels.interval import CERTAIN, NORMAL_95, interval, unpredicted, worth
 from estimator.levels.pooled import blocks_of
-from estimator.likelihood.changing_motion import STEADINESS, BandNoise, band_noise
+from estimator.likelihood.changing_motion import MOST, STEADINESS, BandNoise, band_noise
 from estimator.records import dataclass
 from estimator.self_noise.result import Flag, Refusal, SelfNoise, joined
 from estimator.spectra.parts import Parts, grouped, joined_parts
@@ -111,8 +111,8 @@ class MultiPart:
     noise : SelfNoise
         Flag UNIDENTIFIED where the value is a bound.
     lever : float64, shape (n_freqs, n_channels)
-        By how much gains that follow the loudness, within the stated steadiness, may shift the
-        noise either way, in unit**2/Hz; zero where the value is a bound.
+        By how much gains within the stated steadiness, and what seems to follow the loudness, may
+        shift the noise either way, in unit**2/Hz; zero where the value is a bound.
     blocks : tuple of PartBlock
     frequency : float64, shape (n_freqs,)
         Hz.
@@ -125,6 +125,11 @@ class MultiPart:
     blocks: tuple[PartBlock, ...]
     frequency: FloatArray
     steadiness: float
+
+    @property
+    def fits(self) -> bool:
+        """Whether no block contradicts steady noise and steady responses."""
+        return all(DOES_NOT_FIT.isdisjoint(block.refusal) for block in self.blocks)
 
     def at(self, frequency: FloatArray) -> MultiPart:
         """Return the same at more frequencies: each has the noise of the nearest one below.
@@ -363,7 +368,7 @@ def beside(
         if not found.blocks or found.blocks[0].found is None:
             continue
         pair = None
-        if len(dims) == LEAST_SENSORS and not DOES_NOT_FIT.isdisjoint(found.blocks[0].refusal):
+        if len(dims) == LEAST_SENSORS and not found.fits:
             found, pair = _with_a_pair(found, of_block)
         (block,) = found.blocks
         has = np.array([why is None for why in block.refusal])
@@ -484,4 +489,8 @@ def _refusals(found: BandNoise) -> tuple[Refusal | None, ...]:
         cause = Refusal.GAIN_FOLLOWS if by_gain > by_noise else Refusal.NOISE_FOLLOWS
     elif found.p_value < REJECTED:
         cause = Refusal.MISFIT
-    return tuple(why or cause for why in found.refusal)
+    too_wide = found.lever > MOST * found.bound
+    return tuple(
+        why or cause or (Refusal.WIDE if wide else None)
+        for why, wide in zip(found.refusal, too_wide, strict=True)
+    )
