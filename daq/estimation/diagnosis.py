@@ -113,9 +113,16 @@ class Findings:
             shares = [each.explained / psd[:, each.column] for each in nonlinear]
         explained = max(float(median(each[each > 0])) for each in shares)
         most = np.maximum.reduceat(steady.added, np.cumsum([0, *dims[:-1]]))
-        changes = tuple(each for each in steady.changes if most[each.sensor] > explained)
-        left = {each.sensor for each in changes}
-        own = np.repeat([number in left for number in range(len(dims))], dims)
+        left = {each.sensor for each in steady.changes if most[each.sensor] > explained}
+        return self.with_changes(left, dims)
+
+    def with_changes(self, sensors: Collection[int], dims: tuple[int, ...]) -> Findings:
+        """Return findings in which responses of some sensors only change."""
+        whole, steady = self.diagnosis, self.stability
+        if whole is None or steady is None:
+            return self
+        changes = tuple(each for each in steady.changes if each.sensor in sensors)
+        own = np.repeat([number in sensors for number in range(len(dims))], dims)
         steady = replace(
             steady,
             changes=changes,
@@ -123,12 +130,12 @@ class Findings:
             explained=np.where(own, steady.explained, 0.0),
             steadied=steady.steadied if changes else (),
         )
-        advice = (
+        advice = tuple(
             each
             for each in whole.advice
-            if not isinstance(each, ResponseChanges) or left.issuperset(each.sensors)
+            if not isinstance(each, ResponseChanges) or set(sensors).issuperset(each.sensors)
         )
-        return replace(self, diagnosis=replace(whole, advice=tuple(advice), stability=steady))
+        return replace(self, diagnosis=replace(whole, advice=advice, stability=steady))
 
     def beside_clocks(self, clocks: Sequence[ClockState]) -> Findings:
         """Return findings without changes that clocks explain, which drift or are unchecked.

@@ -404,8 +404,10 @@ class SnapshotBuilder:
         first, dims, within = self._findings, passes[0].aligned.dims, bands
         psd = np.concatenate([np.diagonal(b.csm, axis1=1, axis2=2).real for b in bands])
         estimates = beside_changes(estimates, bands, self._settings, dims)
-        if estimates.beside is not None and estimates.beside.pairs:
-            self._findings = first.of_all_segments()  # shared noise looks like such changes
+        stated = estimates.multi_part if self._pairs else None
+        found = () if estimates.beside is None else estimates.beside.pairs
+        if found or (stated is not None and stated.fits):
+            self._findings = first.with_changes((), dims)  # shared noise looks like such changes
             return bands, estimates
         for _ in range(ROUNDS):
             steady = self._findings.stability

@@ -21,6 +21,8 @@ from daq.results.facts.changes import (
 from daq.results.facts.model import FewSensors
 from daq.results.facts.precision import PairCompared
 from daq.results.result import Result
+from estimator.checks.advice import Advice
+from estimator.checks.advice_on_noise import ResponseChanges
 from estimator.self_noise.result import Flag, Refusal
 
 RATE, SECONDS = 50.0, 1500
@@ -143,12 +145,21 @@ def test_noise_that_two_of_three_sensors_share_is_found_and_given() -> None:
     assert not part.is_known
     assert abs(part.share - 0.5) < 4 * part.share_error < 0.3
     assert len(differ.channels) == 3
+    assert not changes_of(plain)
     stated = replace(SETTINGS, shared_noise=(("A", "B"),))
     snapshot = estimated(sensors, stated)
     assert all(holds(snapshot, "multi-part", total, stated))
     (known,) = (f for f in Result(snapshot, stated).facts if isinstance(f, NoisePartShared))
     assert known.is_known
     assert abs(known.share - 0.5) < 4 * known.share_error < 0.3
+    assert not changes_of(snapshot)
+
+
+def changes_of(snapshot: Snapshot) -> list[Advice]:
+    """Return the findings of gains that change: shared noise looks like one."""
+    diagnosis = snapshot.diagnostics.diagnosis
+    assert diagnosis is not None
+    return [each for each in diagnosis.advice if isinstance(each, ResponseChanges)]
 
 
 def test_motion_that_changes_lowers_the_scatter_of_three_sensors() -> None:
