@@ -338,7 +338,7 @@ class FirstBenchScreen(Screen[None]):
         if (name := self._open()) is not None:
             return f"{name}: state its sensitivity (enter)"
         n = len(self._bench.sensors)
-        more = {1: "; its noise takes more", 2: "; two need motion that changes"}.get(n, "")
+        more = {1: "; its noise takes more", 2: " need changing motion"}.get(n, "")
         return f"{several(n, 'sensor')}{more} · tap one: its row lights up · enter goes on"
 
     # --------------------------------------------------------------------- editing

@@ -192,7 +192,13 @@ async def test_two_sensors_are_a_bench_and_what_they_need_is_said(tmp_path: Path
     app = FirstBenchApp(controls)
     async with app.run_test(size=SIZES["small"]) as pilot:
         await until(pilot, controls.is_shown.is_set)
-        await until(pilot, lambda: "two need motion that changes" in screen_text(app))
+        await until(
+            pilot,
+            lambda: (
+                "2 sensors need changing motion · tap one: its row lights up · enter goes on"
+                in screen_text(app)
+            ),
+        )
         await pilot.press("enter", "enter")
         await until(pilot, lambda: app.return_value is not None)
     assert len(load(path).sensors) == 2
