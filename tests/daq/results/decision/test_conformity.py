@@ -174,7 +174,7 @@ def test_an_uncertain_sensitivity_widens_the_interval_and_takes_the_pass(tmp_pat
         found[own] = verdict.limits[0]
         levels = Result(known, settings).spectrum("three-sensor").levels(np.array([5, 9, 20]))
         scatter.append(distribution(levels))
-    np.testing.assert_array_equal(*scatter)  # the sensitivity is common to all bands
+    np.testing.assert_array_equal(scatter[0], scatter[1])  # the sensitivity is common to all bands
     assert found[0.01].verdict is Verdict.PASS
     assert found[0.25].verdict is Verdict.NOT_DECIDED
     assert found[0.25].obstacle is Obstacle.SPANS_LIMIT
