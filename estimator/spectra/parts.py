@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Protocol
 
 import numpy as np
@@ -25,6 +26,12 @@ MOST = 24
 VALUES = 2_500_000
 """Values of all parts at most: 20 MB. Of more frequencies or channels, some are left out."""
 LEAST_BINS = 48
+
+
+@cache
+def lower_triangle(n: int) -> BoolArray:
+    """Return which elements of a matrix are in its lower triangle; made once, for it takes long."""
+    return np.tri(n, dtype=np.bool_)
 
 
 def part_bins(n_freqs: int, n_channels: int) -> IntArray:
@@ -163,7 +170,7 @@ class Parts:
         return replace(found, csm=self._unpacked(found.csm.real, some))
 
     def _unpacked(self, packed: FloatArray, some: slice | IntArray) -> ComplexArray:
-        turned, lower = packed.swapaxes(2, 3), np.tri(packed.shape[-1], dtype=np.bool_)
+        turned, lower = packed.swapaxes(2, 3), lower_triangle(packed.shape[-1])
         found = np.empty(packed.shape, np.complex128)
         found.real = np.where(lower, packed, turned)
         found.imag = np.where(lower, -turned, packed)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.records import dataclass
-from estimator.spectra.parts import Part, PartEnds
+from estimator.spectra.parts import Part, PartEnds, lower_triangle
 from estimator.spectra.windows import effective_averages, get_window
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
@@ -541,15 +541,14 @@ class _Products:
 
 def _packed(matrices: ComplexArray) -> FloatArray:
     """Return real parts of the lower triangles, with imaginary parts of the upper ones."""
-    lower = np.tri(matrices.shape[1], dtype=np.bool_)
-    return np.where(lower, matrices.real, matrices.imag)
+    return np.where(lower_triangle(matrices.shape[1]), matrices.real, matrices.imag)
 
 
 def _add_gram(total: FloatArray, gram: FloatArray) -> None:
     """Add products of complex numbers, given those of their real and imaginary parts."""
     real = gram[:, ::2, ::2] + gram[:, 1::2, 1::2]
     imag = gram[:, 1::2, ::2] - gram[:, ::2, 1::2]
-    total += np.where(np.tri(total.shape[1], dtype=np.bool_), real, imag)
+    total += np.where(lower_triangle(total.shape[1]), real, imag)
 
 
 def _segments(samples: FloatArray, rows: IntArray, length: int) -> FloatArray:
