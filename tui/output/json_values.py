@@ -13,6 +13,9 @@ from pydantic_core import to_json
 from estimator.records import json_key
 from estimator.types import FloatArray
 
+LISTED = 1 << 16
+"""Numbers of an array up to which all become lists at once: each row by itself takes longer."""
+
 
 def plain(value: Any, *, array: Callable[[Any], Any] = np.ndarray.tolist) -> Any:  # noqa: ANN401
     """Return any result as what JSON knows: fields under the names that they declare.
@@ -40,8 +43,8 @@ def plain(value: Any, *, array: Callable[[Any], Any] = np.ndarray.tolist) -> Any
 def json_text(document: Any) -> str:  # noqa: ANN401 - any result
     """Return a result as one line of JSON; numbers that are not finite become null.
 
-    Every number is read back as it was. Arrays become lists row by row: of many sensors, lists take
-    more memory than all else.
+    Every number is read back as it was. Large arrays become lists row by row: of many sensors,
+    lists take more memory than all else.
 
     Raises
     ------
@@ -53,4 +56,5 @@ def json_text(document: Any) -> str:  # noqa: ANN401 - any result
 
 
 def _by_row(values: FloatArray) -> list[Any]:
-    return list(values) if values.ndim > 1 else values.tolist()
+    is_large = values.ndim > 1 and values.size > LISTED
+    return list(values) if is_large else values.tolist()
