@@ -66,7 +66,7 @@ class Point:
     eigenvectors: ComplexArray
     rest: ComplexArray
 
-    def take(self, index: IntArray | BoolArray) -> Point:
+    def take(self, index: IntArray | BoolArray | slice) -> Point:
         """Return the same for some frequencies only."""
         return Point(*(getattr(self, each.name)[index] for each in fields(self)))
 
@@ -418,15 +418,16 @@ def _search(
     size, axes = np.ones((n, len(sensor))), np.zeros(best.root.shape, np.complex128)
     damping, going = np.zeros(n), np.arange(n)
     while len(going):
+        some = slice(None) if len(going) == n else going  # without copies
         step = scoring(
-            best.take(going),
-            begin[going],
-            held[going],
-            damping[going],
+            best.take(some),
+            begin[some],
+            held[some],
+            damping[some],
             sensor=sensor,
             penalty=penalty,
         )
-        size[going], axes[going], decrement[going], held[going] = step
+        size[some], axes[some], decrement[some], held[some] = step
         going = going[(decrement[going] >= DECREMENT) & (iterations[going] < most)]
         root = _stretched(best.root[going], axes[going], np.sqrt(size[going]), sensor)
         trial = given.whitened(root, best.eigenvectors[going], q, going)
@@ -534,10 +535,11 @@ def scoring(
     rest = at.rest
     if not moving.all():
         rest = rest + (u * np.where(moving, 0.0, w)[:, None, :]) @ _adjoint(u)
-    toward, i = rest - _beside(U), np.arange(p)
+    beside, i = _beside(U), np.arange(p)
+    toward = rest - beside
     if penalty is not None:
         toward[:, i, i] -= np.log(np.abs(at.root[:, i, i]) ** 2) @ penalty
-    change = _solved(_damped(U, sensor, damping, penalty), toward[:, a, b])
+    change = _solved(_damped(U, beside, sensor, damping, penalty), toward[:, a, b])
     size, axes = axes_of(change + (a == b), np.full((n, p), -np.inf), sensor)
     low = np.full((n, p), _LEAST)
     doubtful = np.flatnonzero(held.any(axis=1) | (size < _LEAST).any(axis=1))
@@ -557,6 +559,7 @@ def scoring(
             size[doubtful],
             axes[doubtful],
             U[doubtful],
+            beside[doubtful],
             toward[doubtful],
             low=near[doubtful],
             damping=damping[doubtful],
@@ -584,13 +587,19 @@ def _solved(J: ComplexArray | FloatArray, wanted: ComplexArray) -> ComplexArray:
 
 
 def _damped(
-    U: ComplexArray, sensor: IntArray, damping: FloatArray, penalty: FloatArray | None
+    U: ComplexArray,
+    beside: ComplexArray,
+    sensor: IntArray,
+    damping: FloatArray,
+    penalty: FloatArray | None,
 ) -> ComplexArray | FloatArray:
     """Return the information on the noise, with more on its diagonal (Marquardt 1963)."""
-    whole = coupling_beside(U, sensor)
-    J: ComplexArray | FloatArray = whole
-    if J.shape[1] == len(sensor):
-        J = whole.real.copy() if penalty is None else whole.real + penalty
+    J: ComplexArray | FloatArray
+    if are_single(sensor):
+        J = beside.real**2 + beside.imag**2
+        J += 0.0 if penalty is None else penalty
+    else:
+        J = coupling_beside(U, sensor)
     i = np.arange(J.shape[1])
     J[:, i, i] *= 1 + damping[:, None]
     return J
@@ -600,6 +609,7 @@ def _bounded(
     size: FloatArray,
     axes: ComplexArray,
     U: ComplexArray,
+    beside: ComplexArray,
     toward: ComplexArray,
     *,
     low: FloatArray,
@@ -622,15 +632,17 @@ def _bounded(
         if not len(some):
             break
         held[some] |= below[some]
-        turn = frame[some] if single else frame[some] @ axes[some]
-        frame[some] = turn  # in it directions are coordinates
-        J = _damped(U[some] if single else _adjoint(turn) @ U[some], sensor, damping[some], penalty)
-        wanted = (toward[some] if single else _between(turn, toward[some], sensor))[:, a, b]
+        own, wanted = U[some], toward[some]
+        if not single:
+            frame[some] = turn = frame[some] @ axes[some]  # in it directions are coordinates
+            own, wanted = _adjoint(turn) @ own, _between(turn, wanted, sensor)
+        J = _damped(own, beside[some], sensor, damping[some], penalty)
+        wanted = wanted[:, a, b]
         fixed = held[some][:, a] | held[some][:, b]
         value = np.where(held[some][:, a] & (a == b), low[some][:, a] - 1, 0.0)
-        beside = np.where(fixed, value, wanted - (J @ value[:, :, None])[:, :, 0])
+        free = np.where(fixed, value, wanted - (J @ value[:, :, None])[:, :, 0])
         alone = np.where(fixed[:, :, None] | fixed[:, None], np.eye(len(a)) * fixed[:, None], J)
-        change = _solved(alone, beside)
+        change = _solved(alone, free)
         rise = (wanted - (J @ change[:, :, None])[:, :, 0])[:, diagonal].real * held[some]
         most = rise.max(axis=1, keepdims=True)
         let_go[some] = most[:, 0] > DECREMENT
