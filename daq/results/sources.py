@@ -130,8 +130,10 @@ class Source:
         return self.recording.bench
 
 
-def sources(paths: Sequence[str | Path]) -> tuple[Source, ...]:
+def sources(paths: Sequence[str | Path | Recording]) -> tuple[Source, ...]:
     """Read what recordings, and those that continue them, say; growing ones up to now.
+
+    Of one that is open, and complete, what it said when it was opened.
 
     Raises
     ------
@@ -139,7 +141,10 @@ def sources(paths: Sequence[str | Path]) -> tuple[Source, ...]:
         If one cannot be read.
     """
     with contextlib.ExitStack() as opened:
-        recordings = [opened.enter_context(Recording.open(path)) for path in paths]
+        recordings = [
+            each if isinstance(each, Recording) else opened.enter_context(Recording.open(each))
+            for each in paths
+        ]
         for recording in tuple(recordings):
             following = continuations(recording, recordings)
             recordings.extend(map(opened.enter_context, following))
