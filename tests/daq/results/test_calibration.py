@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.special import stdtrit
 from typer.testing import CliRunner
 
 from daq.bench.channel import Certificate, Channel
@@ -245,9 +246,11 @@ def test_a_budget_adds_squares_and_weighs_degrees_of_freedom() -> None:
     assert budget.expanded == pytest.approx(200 * 0.05 * budget.k)
 
 
-@pytest.mark.parametrize(("dof", "expected"), [(5, 2.571), (10, 2.228), (30, 2.042), (1e9, 1.960)])
-def test_coverage_factors_are_those_of_the_tables(dof: float, expected: float) -> None:
-    assert student_quantile(0.975, dof) == pytest.approx(expected, rel=3e-3)
+@pytest.mark.parametrize("probability", [0.84, 0.975, 0.9995])
+@pytest.mark.parametrize("dof", [0.5, 2, 2.5, 5, 30.9, 999, 1e3, 1e6])
+def test_coverage_factors_are_those_of_scipy(dof: float, probability: float) -> None:
+    expected = stdtrit(max(dof, 2), probability)
+    assert student_quantile(probability, dof) == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.ticker import LogLocator, NullLocator
-from scipy import special
 
 from estimator.levels.bands import log_edges
-from estimator.likelihood.goodness_of_fit import REJECT, neighbour_correlation
+from estimator.likelihood.goodness_of_fit import REJECT, critical_value, neighbour_correlation
 from estimator.spectra.windows import get_window
 from tui.page import drawing
 from tui.page.blocks import Plot
@@ -51,7 +50,7 @@ def model_test_plot(result: Result) -> Plot | None:
         pairs = np.maximum(n - np.arange(1, len(r) + 1), 0)
         spread = 1 + 2 * float(pairs @ r**2) / n  # as estimator.likelihood.goodness_of_fit.pool
         ratio[number] = float(statistic[inside][known[inside]].sum()) / total
-        limit[number] = special.chdtri(total / spread, REJECT) * spread / total
+        limit[number] = critical_value(total / spread, REJECT) * spread / total
     if not count.any():
         return None
     centre = centres(snapshot.frequency, edges)
