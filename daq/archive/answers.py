@@ -32,12 +32,12 @@ from daq.archive import spectra_file
 from daq.archive.averages import Average, Estimator, converted
 from daq.archive.changes import Course, courses
 from daq.archive.density import MIN_BINS, Density
-from daq.archive.index import ROLLUP, Entry
+from daq.archive.index import ROLLUP, IndexEntry
 from daq.archive.plan import settings_document
 from daq.archive.rollup import (
+    DailyLevels,
     Grid,
     Rollup,
-    Series,
     levels_of,
     month_of,
     rolled_up,
@@ -71,7 +71,7 @@ class Years:
     Parameters
     ----------
     store : Store
-    entries : sequence of Entry
+    entries : sequence of IndexEntry
         In order of time; the units of the first are those of all totals.
     settings : Settings
         Of the noise.
@@ -84,7 +84,7 @@ class Years:
     def __init__(
         self,
         store: Store,
-        entries: Sequence[Entry],
+        entries: Sequence[IndexEntry],
         settings: Settings,
         *,
         zone: tzinfo,
@@ -100,7 +100,7 @@ class Years:
         self.problems: list[str] = []
         self.damaged: set[str] = set()
         """Runs of which a month is left out."""
-        self._months: dict[str, list[Entry]] = {}
+        self._months: dict[str, list[IndexEntry]] = {}
         for entry in entries:
             for month in entry.months:
                 self._months.setdefault(month, []).append(entry)
@@ -228,11 +228,11 @@ class Years:
             hours=plan.stretch == "hour",
         )
 
-    def is_rounded(self, entry: Entry) -> bool:
+    def is_rounded(self, entry: IndexEntry) -> bool:
         """Whether the sum of a recording's matrices is one of single precision."""
         return entry.daily or (entry.single and not self._own)
 
-    def _summary(self, entry: Entry, month: str) -> spectra_file.Summary:
+    def _summary(self, entry: IndexEntry, month: str) -> spectra_file.Summary:
         """Return the summary of a recording, its total in the units of the archive."""
         described = entry.described
         with spectra_file.SpectraFile(entry.path) as file:
@@ -249,14 +249,14 @@ class Years:
         return replace(found, total=converted(found.total, response))
 
 
-def read_series(file: h5py.File, grid: Grid, spans: Sequence[slice]) -> Series:
+def read_series(file: h5py.File, grid: Grid, spans: Sequence[slice]) -> DailyLevels:
     """Return the series of bands in a year: those that the file has, or made of its months."""
     if SERIES not in file:  # of an older version
         return series_of(_months_of(file), grid, spans)
     kept: dict[str, Any] = {name: values[...] for name, values in file[SERIES].items()}
     if file[SERIES].attrs["spans"] != _text_of(spans):
         kept |= levels_of(_months_of(file), grid, spans)
-    return Series(**kept)
+    return DailyLevels(**kept)
 
 
 def _months_of(file: h5py.File) -> list[h5py.Group]:
@@ -315,7 +315,7 @@ FALSE_ALARM = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Levels:
+class AnsweredLevels:
     """Mean noise PSD in bands, in unit²/Hz, each array of shape (…, n_bands, n_channels)."""
 
     mean: FloatArray
@@ -339,7 +339,7 @@ class Answer:
     days_utc_ns : int64, shape (n_days,)
         Beginnings of days of UTC.
     n_segments : int64, shape (n_days,)
-    levels : Levels
+    levels : AnsweredLevels
         Of shape (n_days, n_bands, n_channels).
     courses : tuple of Course
         Changes, drift and contrasts of each series: bands times channels, a band after another.
@@ -364,7 +364,7 @@ class Answer:
     bands: tuple[tuple[float, float], ...]
     days_utc_ns: IntArray
     n_segments: IntArray
-    levels: Levels
+    levels: AnsweredLevels
     courses: tuple[Course, ...]
     false_alarm: float
     density: Density
@@ -384,7 +384,7 @@ class Answer:
 @one_blas_thread()
 def answer(
     store: Store,
-    entries: Sequence[Entry],
+    entries: Sequence[IndexEntry],
     settings: Settings,
     *,
     zone: tzinfo = UTC,
@@ -396,7 +396,7 @@ def answer(
     Parameters
     ----------
     store : Store
-    entries : sequence of Entry
+    entries : sequence of IndexEntry
         In order of time.
     settings : Settings
         Those of the archive's plan, but for what does not shape spectra. Where they change the
@@ -451,7 +451,7 @@ def answer(
         raise ArchiveError("\n".join(years.problems))
     snapshot = every.snapshot(pooled, diagnose=True)
     days = tally.of_all("days")
-    levels = Levels(*(tally.of_all(each.name) for each in fields(Levels)))
+    levels = AnsweredLevels(*(tally.of_all(each.name) for each in fields(AnsweredLevels)))
     n_series = levels.mean.shape[1] * levels.mean.shape[2]
     mean, spread = (each.reshape(-1, n_series) for each in (levels.mean, levels.spread))
     parts = {day: (n, total.reshape(3, n_series)) for day, (n, total) in tally.local.items()}
@@ -483,7 +483,7 @@ class _Tally:
             band if grid.has(band) else grid.ends(span)
             for band, span in zip(bands, self.spans, strict=True)
         )
-        self.series: list[Series] = []
+        self.series: list[DailyLevels] = []
         self.noise: list[Density] = []
         self.recorded: list[Density] = []
         self.local: dict[int, tuple[FloatArray, FloatArray]] = {}
@@ -503,7 +503,7 @@ class _Tally:
             self.local[day] = before + n_segments[row], total + weighted[row]
 
     def of_all(self, name: str) -> NDArray[Any]:
-        """Return a field of `Series` of all years."""
+        """Return a field of `DailyLevels` of all years."""
         return np.concatenate([getattr(each, name) for each in self.series])
 
 

@@ -105,7 +105,7 @@ class Course:
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class StraightLine:
     """A level with a constant drift, in natural logarithms of power.
 
     Attributes
@@ -434,7 +434,7 @@ def _changes(
     return found
 
 
-def _step(one: Line, two: Line, day: float) -> Interval:
+def _step(one: StraightLine, two: StraightLine, day: float) -> Interval:
     """Return by how much one line is above that of the segment before on a day, in dB."""
     (before, variance), (after, further) = one.on(day), two.on(day)
     middle = after - before
@@ -442,7 +442,9 @@ def _step(one: Line, two: Line, day: float) -> Interval:
     return Interval(*(_DB * each for each in (middle, middle - half, middle + half)))
 
 
-def line(at: FloatArray, level: FloatArray, spread: FloatArray, days: Days | None = None) -> Line:
+def line(
+    at: FloatArray, level: FloatArray, spread: FloatArray, days: Days | None = None
+) -> StraightLine:
     """Fit a line to a series.
 
     Parameters
@@ -456,7 +458,7 @@ def line(at: FloatArray, level: FloatArray, spread: FloatArray, days: Days | Non
 
     Returns
     -------
-    Line
+    StraightLine
         A constant where days are too few for a slope.
 
     Notes
@@ -474,7 +476,7 @@ def line(at: FloatArray, level: FloatArray, spread: FloatArray, days: Days | Non
     """
     n = len(level)
     if n == 0:
-        return Line()
+        return StraightLine()
     if in_decibels := _in_decibels(level, spread):
         y, s = np.log(level), spread / level
         weight = s**-2
@@ -500,12 +502,12 @@ def line(at: FloatArray, level: FloatArray, spread: FloatArray, days: Days | Non
     of_slope = _variance(weight * ahead / square, left, s, scatter) if drifts else 0.0
     if in_decibels:
         middle = math.exp(mean + slope * (float(at.mean()) - centre))
-        return Line(middle, centre, mean, of_mean, slope, of_slope, freedom, drifts)
+        return StraightLine(middle, centre, mean, of_mean, slope, of_slope, freedom, drifts)
     if mean <= CERTAIN * math.sqrt(float(np.sum((weight * s) ** 2))) / float(weight.sum()):
-        return Line(mean)
+        return StraightLine(mean)
     middle = mean + slope * (float(at.mean()) - centre)
     in_logarithms = of_mean / mean**2, slope / mean, of_slope / mean**2
-    return Line(middle, centre, math.log(mean), *in_logarithms, freedom, drifts)
+    return StraightLine(middle, centre, math.log(mean), *in_logarithms, freedom, drifts)
 
 
 def _variance(share: FloatArray, left: FloatArray, s: FloatArray, scatter: float) -> float:

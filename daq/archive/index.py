@@ -38,7 +38,7 @@ PLAIN = ("usable", "elapsed", "residual", "rounded", "simulated")
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class IndexEntry:
     """One recording of an archive: its file, and what that says."""
 
     path: Path
@@ -116,7 +116,7 @@ class Index:
                 (self._folder / FILE).unlink(missing_ok=True)
                 self._write()
 
-    def get(self, path: Path) -> Entry | None:
+    def get(self, path: Path) -> IndexEntry | None:
         """Return a file's entry; None if it is not known, or has changed."""
         try:
             about = path.stat()
@@ -135,11 +135,11 @@ class Index:
                 not_understood=tuple(found.pop("not_understood")),
                 **{name: found.pop(name) for name in PLAIN},
             )
-            return Entry(path, described, **found)
+            return IndexEntry(path, described, **found)
         except (OSError, AttributeError, KeyError, ValueError, TypeError):
             return None
 
-    def put(self, entry: Entry) -> None:
+    def put(self, entry: IndexEntry) -> None:
         """Keep an entry."""
         described, about = entry.described, entry.path.stat()
         channels = json.dumps(

@@ -391,7 +391,7 @@ class Rollup:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Series:
+class DailyLevels:
     """Levels of bands by day: what most answers show.
 
     Attributes
@@ -419,7 +419,7 @@ class Series:
     part_noise: FloatArray
 
 
-def series_of(months: Sequence[h5py.Group], grid: Grid, spans: Sequence[slice]) -> Series:
+def series_of(months: Sequence[h5py.Group], grid: Grid, spans: Sequence[slice]) -> DailyLevels:
     """Return the series of bands.
 
     Parameters
@@ -435,11 +435,11 @@ def series_of(months: Sequence[h5py.Group], grid: Grid, spans: Sequence[slice]) 
         name: np.concatenate([month[name][...] for month in months]) for name in names
     }
     made["noise"] = np.concatenate([month["levels"][MEAN] for month in months])
-    return Series(**made, **levels_of(months, grid, spans))
+    return DailyLevels(**made, **levels_of(months, grid, spans))
 
 
 def levels_of(months: Sequence[h5py.Group], grid: Grid, spans: Sequence[slice]) -> dict[str, Any]:
-    """Return the fields of `Series` that are of bands; no other fine bands are read."""
+    """Return the fields of `DailyLevels` that are of bands; no other fine bands are read."""
     fine = slice(min(each.start for each in spans), max(each.stop for each in spans))
     spans = [slice(each.start - fine.start, each.stop - fine.start) for each in spans]
     grid = grid.within(fine)

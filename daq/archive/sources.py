@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
-from daq.archive.index import Entry
+from daq.archive.index import IndexEntry
 from daq.archive.store import FOLDER, PLAN_FILE
 from daq.archive.task import origin_of
 from daq.errors import HuddleError, RecordingError, WrongArchiveError
@@ -108,7 +108,7 @@ def _is_waveforms(source: str) -> bool:
         raise RecordingError(str(error)) from error
 
 
-def sort(paths: Sequence[Path], entries: Iterable[Entry]) -> Sorted:
+def sort(paths: Sequence[Path], entries: Iterable[IndexEntry]) -> Sorted:
     """Sort recordings by whether the archive has them as they are now."""
     known = {entry.described.origin.run_id: entry.described.origin for entry in entries}
     by_path = {(o.path, o.n_bytes, o.modified_ns) for o in known.values()}

@@ -24,7 +24,7 @@ from daq.archive.plan import Plan, settings_document
 from daq.archive.spectra_file import DAY_NS
 from daq.archive.store import PLAN_FILE, Store
 from daq.archive.task import Outcome, Task, software_version
-from daq.archive.waveforms import Day, Reading, States, Station, responses_on, without_channels
+from daq.archive.waveforms import Day, FileReading, States, Station, responses_on, without_channels
 from daq.errors import ImportFormatError, WrongArchiveError, WrongSettingError
 from daq.estimation.settings import Settings
 
@@ -40,7 +40,7 @@ def archives_in(folder: Path) -> list[Path]:
     return sorted(path.parent for path in folder.glob(f"*/{PLAN_FILE}"))
 
 
-def check_responses(stations: Iterable[Station], reading: Reading) -> None:
+def check_responses(stations: Iterable[Station], reading: FileReading) -> None:
     """Refuse, before any work, responses that lack a channel of a station.
 
     A channel needs a response on the first day or on the last one: days without are named later.
@@ -76,7 +76,7 @@ def begun(
     settings: Settings,
     stretch: str,
     *,
-    reading: Reading,
+    reading: FileReading,
     run: Run,
     check: Callable[[Plan], object],
 ) -> tuple[dict[str, Store], list[str]]:
@@ -91,7 +91,7 @@ def begun(
         Of new archives.
     stretch : str
         ``hour`` or ``day``, of new archives.
-    reading : Reading
+    reading : FileReading
     run : callable
         Carries out tasks.
     check : callable
@@ -155,7 +155,7 @@ def begun(
 
 
 @dataclass(slots=True)
-class Work:
+class StationDays:
     """Days to take into the archives of stations.
 
     Attributes
@@ -181,7 +181,7 @@ class Work:
         """Bytes of files by the source of a task."""
         return {_label(n, day): size for n, days in self.days.items() for day, size, _ in days}
 
-    def tasks(self, stores: Mapping[str, Store], reading: Reading) -> Iterator[Task]:
+    def tasks(self, stores: Mapping[str, Store], reading: FileReading) -> Iterator[Task]:
         """Yield a task for each day: the first ones of all stations, then the second ones."""
         software = software_version()
         plans = {name: store.plan.to_json() for name, store in stores.items()}
@@ -197,7 +197,9 @@ class Work:
                 yield Task(_label(name, day), str(target), plans[name], software, text)
 
 
-def work(stations: Iterable[Station], stores: Mapping[str, Store], reading: Reading) -> Work:
+def work(
+    stations: Iterable[Station], stores: Mapping[str, Store], reading: FileReading
+) -> StationDays:
     """Sort days by whether the archives have them as their files and responses are now.
 
     Without responses, those that an archive was made with stay.
@@ -207,7 +209,7 @@ def work(stations: Iterable[Station], stores: Mapping[str, Store], reading: Read
     ImportFormatError
         If responses cannot be read.
     """
-    found, responses = Work(), reading.responses
+    found, responses = StationDays(), reading.responses
     for station in stations:
         store = stores.get(station.name)
         if store is None:

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from daq.archive.index import ROLLUP, Entry, Index
+from daq.archive.index import ROLLUP, Index, IndexEntry
 from daq.archive.plan import Plan
 from daq.archive.spectra_file import DAY_NS, SpectraFile, thin
 from daq.errors import ArchiveError, WrongArchiveError
@@ -120,7 +120,7 @@ class Store:
         found = [*self.folder.glob("*.h5"), *self.folder.glob("[0-9][0-9][0-9][0-9]/*.h5")]
         return sorted((p for p in found if not p.name.startswith((".", ROLLUP))), key=str)
 
-    def entries(self) -> tuple[tuple[Entry, ...], tuple[str, ...]]:
+    def entries(self) -> tuple[tuple[IndexEntry, ...], tuple[str, ...]]:
         """Return the recordings of the archive in order of time, and a message for each bad file.
 
         Raises
@@ -136,7 +136,7 @@ class Store:
                     try:
                         with SpectraFile(path) as file:
                             self._check(file)
-                            entry = Entry.of(file)
+                            entry = IndexEntry.of(file)
                     except WrongArchiveError:
                         raise
                     except ArchiveError as error:

@@ -52,7 +52,7 @@ _LEAST_SENSORS = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class FileReading:
     """How days are read from files.
 
     Attributes
@@ -108,7 +108,7 @@ class Day:
         return datetime.fromtimestamp(self.begin_ns // _NS_PER_S, UTC)
 
     def document(
-        self, channels: Iterable[tuple[str, str]], reading: Reading, responses: str = ""
+        self, channels: Iterable[tuple[str, str]], reading: FileReading, responses: str = ""
     ) -> str:
         """Return as JSON what a task needs to open the day; `responses` is `responses_on`."""
         return json.dumps(
@@ -143,7 +143,7 @@ class Station:
 
 
 @dataclass(slots=True)
-class Found:
+class FoundFiles:
     """What files hold.
 
     Attributes
@@ -261,10 +261,10 @@ class _Listing:
                 return name
         return ".".join(sensor.split(".")[:2])
 
-    def found(self, problems: list[str]) -> Found:
+    def found(self, problems: list[str]) -> FoundFiles:
         """Return stations with days in the span of time that is wanted."""
         start, end = self._selection.start_ns, self._selection.end_ns
-        found = Found(problems=problems)
+        found = FoundFiles(problems=problems)
         for name, by_number in sorted(self._stations.items()):
             days = [
                 day
@@ -290,7 +290,7 @@ def stations_in(
     groups: Sequence[tuple[str, str]],
     known: Contents,
     segment: float,
-) -> Found:
+) -> FoundFiles:
     """Return stations and days of waveform files.
 
     Parameters

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from daq.bench.channel import Channel
 from daq.clocks.clock_model import ClockSource, ClockState, nominal
 from daq.clocks.device_utc import UtcRate
-from daq.clocks.grid import SNAP, Grid, OwnSamples, grid_rate, joint_start, late_by, start_of
+from daq.clocks.grid import SNAP, CommonGrid, OwnSamples, grid_rate, joint_start, late_by, start_of
 from daq.clocks.quantiles import median
 from daq.clocks.resampling import USABLE
 from daq.clocks.sensor_reader import SensorSource, main_columns
@@ -290,7 +290,7 @@ class AlignedRecording:
         created = recording.created_at
         self._origin = (created.monotonic_ns, created.utc_ns)
         self._set_at = (0, 0)
-        self._grid: Grid | None = None
+        self._grid: CommonGrid | None = None
         self._apart = False  # whether the grid has times without some sensors
         self.n_settings = 0  # of the clocks, so far
         self._end = math.inf
@@ -354,7 +354,7 @@ class AlignedRecording:
         last = min(n_available, math.floor(end * self.sampling_rate + SNAP) + 1)
         return (first, last) if first < last else (0, n_available)
 
-    def _ends(self, grid: Grid) -> list[float]:
+    def _ends(self, grid: CommonGrid) -> list[float]:
         """Return until when each sensor has samples on the grid, in s."""
         return [
             source.known_clock.end - (0.0 if grid.has(source) else grid.reach(source))
@@ -653,10 +653,12 @@ class AlignedRecording:
     def _lay_grid(self) -> None:
         begin, self._end = self._limits
         self._apart = False
-        self._grid = Grid.laid(self._sources, self.sampling_rate, wanted=begin)
+        self._grid = CommonGrid.laid(self._sources, self.sampling_rate, wanted=begin)
         if not self.measurable:  # delays are measured where all sensors have samples
             self._apart = True
-            self._grid = Grid.laid(self._sources, self.sampling_rate, wanted=begin, apart=True)
+            self._grid = CommonGrid.laid(
+                self._sources, self.sampling_rate, wanted=begin, apart=True
+            )
 
     def read(self, start: int, stop: int, *, is_final: bool = True) -> tuple[FloatArray, BoolArray]:
         """Return grid samples `start` to `stop` (not included).

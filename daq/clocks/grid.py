@@ -30,7 +30,7 @@ SNAP = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Grid:
+class CommonGrid:
     """Instants at one rate.
 
     Attributes
@@ -56,7 +56,7 @@ class Grid:
         *,
         wanted: float,
         apart: bool = False,
-    ) -> Grid:
+    ) -> CommonGrid:
         """Return the grid from the start of all sensors on, or from `wanted` (s) if later.
 
         Channels of a sensor often begin some samples apart: it starts with the last of them.
@@ -233,14 +233,14 @@ class OwnSamples:
 
     @classmethod
     def of(
-        cls, source: SensorSource, grid: Grid, begins: NDArray[np.int64], length: int
+        cls, source: SensorSource, grid: CommonGrid, begins: NDArray[np.int64], length: int
     ) -> OwnSamples | None:
         """Return the segments that begin at grid samples `begins`; None where they are not whole.
 
         Parameters
         ----------
         source : SensorSource
-        grid : Grid
+        grid : CommonGrid
         begins : int64, shape (n_segments,)
             Increasing.
         length : int

@@ -55,7 +55,7 @@ def time_tolerance_ns(sampling_rate: float) -> float:
 
 
 @dataclass(frozen=True)
-class Run:
+class ChannelRun:
     """Contiguous pieces of one channel.
 
     Attributes
@@ -139,7 +139,7 @@ class Run:
 
 def runs_of(
     where: str, pieces: Iterable[Piece], sampling_rate: float, overlap: Overlap, cache: PartCache
-) -> list[Run]:
+) -> list[ChannelRun]:
     """Return the runs of a channel, by time.
 
     Parameters
@@ -166,7 +166,9 @@ def runs_of(
         else:
             runs.append([piece])
     return [
-        Run(run, np.concatenate([[0], np.cumsum([p.n_samples for p in run])]), sampling_rate, cache)
+        ChannelRun(
+            run, np.concatenate([[0], np.cumsum([p.n_samples for p in run])]), sampling_rate, cache
+        )
         for run in runs
     ]
 
@@ -245,8 +247,8 @@ _CONTINUES = 0.5  # of a sample
 class Column:
     """One channel on the rows of a sensor, from `run` moved by whole `rows`, or resampled."""
 
-    run: Run
-    reference: Run
+    run: ChannelRun
+    reference: ChannelRun
     shift: int | None
 
     @property
@@ -392,7 +394,7 @@ def assembled(
     return ForeignSensor(name, tuple(channels), rate, stretches, source, tuple(units))
 
 
-def _stretches(of_channel: Sequence[Sequence[Run]], rate: float) -> Iterator[Stretch]:
+def _stretches(of_channel: Sequence[Sequence[ChannelRun]], rate: float) -> Iterator[Stretch]:
     """Yield the rows of a sensor: those of its first channel that has samples at a time."""
     interval = NS_PER_S / rate
     starts = [[run.start_ns for run in runs] for runs in of_channel]
@@ -427,7 +429,7 @@ def _stretches(of_channel: Sequence[Sequence[Run]], rate: float) -> Iterator[Str
             at = min([reference.pieces[-1].end_ns + 1, *sooner])
 
 
-def _number(runs: Sequence[Run], at: float) -> int:
+def _number(runs: Sequence[ChannelRun], at: float) -> int:
     """Return the number of the first run that ends at a time or later."""
     return bisect_left(runs, at, key=lambda run: run.pieces[-1].end_ns)
 
@@ -441,9 +443,9 @@ def _continued(before: Stretch, stretch: Stretch, rate: float) -> Stretch:
 
 
 def _stretch(
-    of_channel: Sequence[Sequence[Run]],
+    of_channel: Sequence[Sequence[ChannelRun]],
     starts: Sequence[Sequence[int]],
-    reference: Run,
+    reference: ChannelRun,
     rate: float,
     rows: tuple[int, int],
 ) -> Stretch:
@@ -471,7 +473,7 @@ def _stretch(
     )
 
 
-def _column(run: Run, reference: Run, rate: float) -> Column:
+def _column(run: ChannelRun, reference: ChannelRun, rate: float) -> Column:
     moving = Column(run, reference, None)
     if run is reference:
         return Column(run, reference, 0)

@@ -74,7 +74,7 @@ class Stretch:
 
 
 @dataclass(frozen=True, slots=True)
-class Calibration:
+class ForeignCalibration:
     """What a file says of one of its channels.
 
     Attributes
@@ -95,7 +95,9 @@ class Calibration:
     serial_number: str = ""
 
     @classmethod
-    def of_count(cls, size: float, unit: str, origin: str, **rest: str) -> Calibration | None:
+    def of_count(
+        cls, size: float, unit: str, origin: str, **rest: str
+    ) -> ForeignCalibration | None:
         """Return the calibration by which a count is `size` units; None if that is no number."""
         if not math.isfinite(size) or size == 0 or not math.isfinite(1 / size):
             return None
@@ -116,7 +118,7 @@ class ForeignSensor:
     stretches: tuple[Stretch, ...]
     source: str
     units: tuple[str, ...] = ()
-    calibrations: tuple[Calibration | None, ...] = ()
+    calibrations: tuple[ForeignCalibration | None, ...] = ()
 
     @property
     def absent(self) -> NDArray[np.int64]:

@@ -59,7 +59,7 @@ _CODE = re.compile(r"^[A-Z0-9]{3}$")
 
 
 @dataclass(frozen=True, slots=True)
-class Codes:
+class FdsnCodes:
     """Network, station, location and channel of the FDSN."""
 
     network: str
@@ -72,14 +72,14 @@ class Codes:
 class Exported:
     """What was written: codes by "sensor.channel", and the numbers of samples and gaps."""
 
-    codes: Mapping[str, Codes]
+    codes: Mapping[str, FdsnCodes]
     n_samples: int
     n_gaps: int
 
 
-def codes_of(sensors: Sequence[SensorRecord]) -> dict[tuple[str, str], Codes]:
+def codes_of(sensors: Sequence[SensorRecord]) -> dict[tuple[str, str], FdsnCodes]:
     """Return codes for each sensor and channel, all different."""
-    found: dict[tuple[str, str], Codes] = {}
+    found: dict[tuple[str, str], FdsnCodes] = {}
     stations: set[str] = set()
     for sensor in sensors:
         named = _NAMES.match(sensor.name)
@@ -97,7 +97,7 @@ def codes_of(sensors: Sequence[SensorRecord]) -> dict[tuple[str, str], Codes]:
                 last = re.sub("[^A-Z0-9]", "", channel.name.upper())[-1:] or "1"
                 code = band + _INSTRUMENTS.get(channel.unit, "H") + last
             taken.add(code := _unused(code, taken, 3))
-            found[sensor.name, channel.name] = Codes(network, station, location, code)
+            found[sensor.name, channel.name] = FdsnCodes(network, station, location, code)
     return found
 
 
@@ -253,7 +253,7 @@ def _ends(times: NDArray[np.int64], blocks: NDArray[np.void], rate: float) -> ND
 def _records(
     obspy: Any,  # noqa: ANN401 - ObsPy has no types
     sensor: SensorRecord,
-    codes: Mapping[tuple[str, str], Codes],
+    codes: Mapping[tuple[str, str], FdsnCodes],
     *,
     rows: tuple[int, int],
     start_ns: int,
@@ -324,7 +324,7 @@ def _encodable(samples: NDArray[Any], name: str) -> tuple[NDArray[Any], str]:
 def _inventory(
     obspy: Any,  # noqa: ANN401 - ObsPy has no types
     recording: Recording,
-    codes: Mapping[tuple[str, str], Codes],
+    codes: Mapping[tuple[str, str], FdsnCodes],
     spans: Mapping[str, tuple[int, int]],
 ) -> Any:  # noqa: ANN401
     from obspy.core import inventory as parts  # noqa: PLC0415 - an extra

@@ -17,13 +17,13 @@ from typing import Protocol, TypeAlias
 
 from daq.errors import ImportFormatError
 from daq.formats.assembly import SAME_RATE, Overlap, assembled
-from daq.formats.foreign_sensor import FIRST_DATE_NS, Calibration, ForeignSensor
+from daq.formats.foreign_sensor import FIRST_DATE_NS, ForeignCalibration, ForeignSensor
 from daq.formats.readers.delimited import read_delimited
 from daq.formats.readers.miniseed import is_miniseed, miniseed_parts
 from daq.formats.readers.npz import read_mat, read_npz
 from daq.formats.readers.vibration import read_uff, read_wav, tdms_parts
 from daq.formats.readers.waveforms import waveform_parts
-from daq.formats.traces import FilePart, Part, PartCache, Piece, Trace, pieces_of, traces_of
+from daq.formats.traces import FilePart, PartCache, Piece, Trace, TracePart, pieces_of, traces_of
 
 Progress: TypeAlias = Callable[[str], None]
 WholeFile: TypeAlias = Callable[[Path, float | None], Sequence[ForeignSensor]]
@@ -33,7 +33,7 @@ _N_FIELDS = 7
 _NS_PER_S = 1_000_000_000
 
 
-class Codes(Protocol):
+class WantedCodes(Protocol):
     """Which files are wanted; patterns of codes, and UTC in ns."""
 
     @property
@@ -57,7 +57,7 @@ class Codes(Protocol):
         """UTC of the end, if there is one."""
 
 
-def sds_files(url: str, codes: Codes) -> Iterator[Path]:
+def sds_files(url: str, codes: WantedCodes) -> Iterator[Path]:
     """Yield the waveform files of an archive by channel and day.
 
     Raises
@@ -68,7 +68,7 @@ def sds_files(url: str, codes: Codes) -> Iterator[Path]:
     yield from (path for *_, path in sds_days(url, codes))
 
 
-def sds_days(url: str, codes: Codes) -> list[tuple[str, datetime, Path]]:
+def sds_days(url: str, codes: WantedCodes) -> list[tuple[str, datetime, Path]]:
     """Return channel, as ``NET.STA.LOC.CHA``, day and file of an archive, by channel and day.
 
     The files of the day before `codes.start_ns` are among them: their last record may reach it.
@@ -113,7 +113,9 @@ _ASCII = b"TIMESERIES "
 """With which the texts of data centres begin, SLIST and TSPAIR."""
 
 
-def parts_of(path: Path, sampling_rate: float | None = None, columns: str = "") -> Iterator[Part]:
+def parts_of(
+    path: Path, sampling_rate: float | None = None, columns: str = ""
+) -> Iterator[TracePart]:
     """Yield the parts of a file.
 
     Parameters
@@ -287,7 +289,7 @@ def _files(sources: Sequence[str | Path], selection: Selection) -> Iterable[Path
             yield Path(source)
 
 
-def _parts(path: Path, sampling_rate: float | None, columns: str) -> Iterator[Part]:
+def _parts(path: Path, sampling_rate: float | None, columns: str) -> Iterator[TracePart]:
     if path.is_dir():
         raise ImportFormatError(
             f"{path}: a folder; expected files, or sds://{path} for an archive of day files"
@@ -318,7 +320,7 @@ class _Index:
         self._selection = selection
         self._pieces: dict[str, dict[str, list[Piece]]] = {}
         self._units: dict[tuple[str, str], str] = {}
-        self._calibrations: dict[tuple[str, str], Calibration | None] = {}
+        self._calibrations: dict[tuple[str, str], ForeignCalibration | None] = {}
         self._coded: set[str] = set()
         self.left_aside: dict[str, str] = {}
 
@@ -339,7 +341,7 @@ class _Index:
         )
         return 2 * sum(largest)
 
-    def add(self, part: Part, cache: PartCache, order: int, problems: list[str]) -> None:
+    def add(self, part: TracePart, cache: PartCache, order: int, problems: list[str]) -> None:
         """Take a part; what cannot be read of it is a problem."""
         try:
             traces = cache.traces(part)
@@ -442,13 +444,13 @@ class _Index:
         return piece if last - first == piece.n_samples else piece.cut(first, last)
 
 
-def _calibrated(calibration: Calibration | None) -> str:
+def _calibrated(calibration: ForeignCalibration | None) -> str:
     if calibration is None:
         return "no calibration"
     return f"{calibration.sensitivity:g} counts per {calibration.unit}"
 
 
-def sensors_of_parts(parts: Iterable[Part]) -> tuple[ForeignSensor, ...]:
+def sensors_of_parts(parts: Iterable[TracePart]) -> tuple[ForeignSensor, ...]:
     """Return the sensors of parts that are in memory.
 
     Raises

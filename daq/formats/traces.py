@@ -2,7 +2,7 @@
 
 Theory of operation
 -------------------
-A reader divides a file into parts (:class:`Part`): a megabyte of miniSEED, or a whole file of
+A reader divides a file into parts (:class:`TracePart`): a megabyte of miniSEED, or a whole file of
 another format. A part is loaded as traces, one for each channel and contiguous stretch. Every part
 is loaded once to learn what it holds; that leaves a :class:`Piece` for each run of finite samples,
 without the samples. They are loaded again when a row is read. :class:`PartCache` keeps the parts
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.errors import ImportFormatError
-from daq.formats.foreign_sensor import NS_PER_S, Calibration, ForeignSensor
+from daq.formats.foreign_sensor import NS_PER_S, ForeignCalibration, ForeignSensor
 
 Samples: TypeAlias = NDArray[Any]
 
@@ -49,7 +49,7 @@ class Trace:
         UTC of the last sample, if the file states that too; its clock may run off its rate.
     fdsn : bool
         Whether the channel has a code of the FDSN, which tells what it measures.
-    calibration : Calibration, optional
+    calibration : ForeignCalibration, optional
         What the file says a count is.
     """
 
@@ -61,10 +61,10 @@ class Trace:
     unit: str = ""
     end_ns: int | None = None
     fdsn: bool = False
-    calibration: Calibration | None = None
+    calibration: ForeignCalibration | None = None
 
 
-class Part(Protocol):
+class TracePart(Protocol):
     """Some traces of a file."""
 
     @property
@@ -77,7 +77,7 @@ class Part(Protocol):
     def reaches(self, start_ns: int | None, end_ns: int | None) -> bool:
         """Whether it may have samples between two instants of UTC; it is not loaded for that."""
 
-    def split(self) -> Sequence[Part]:
+    def split(self) -> Sequence[TracePart]:
         """Return smaller parts, of which some may be sound; nothing if there are none."""
 
 
@@ -97,7 +97,7 @@ class LoadedPart:
         del start_ns, end_ns
         return True
 
-    def split(self) -> Sequence[Part]:
+    def split(self) -> Sequence[TracePart]:
         """Return nothing: it is read as a whole."""
         return ()
 
@@ -123,7 +123,7 @@ class FilePart:
         del start_ns, end_ns
         return True
 
-    def split(self) -> Sequence[Part]:
+    def split(self) -> Sequence[TracePart]:
         """Return nothing: it is read as a whole."""
         return ()
 
@@ -163,7 +163,7 @@ def traces_of(sensors: Iterable[ForeignSensor]) -> list[Trace]:
 class Piece:
     """Finite samples of one channel in one part; `order` is that of the files as given."""
 
-    part: Part
+    part: TracePart
     number: int
     first: int
     n_samples: int
@@ -202,9 +202,9 @@ class PartCache:
         self._n_bytes = n_bytes
         self._held = 0
         self._lock = threading.Lock()
-        self._parts: OrderedDict[int, tuple[Part, Sequence[Trace], int]] = OrderedDict()
+        self._parts: OrderedDict[int, tuple[TracePart, Sequence[Trace], int]] = OrderedDict()
 
-    def traces(self, part: Part) -> Sequence[Trace]:
+    def traces(self, part: TracePart) -> Sequence[Trace]:
         """Return the traces of a part.
 
         Raises
@@ -219,7 +219,7 @@ class PartCache:
         """Hold at least so many bytes: what is read together, or every row would load it again."""
         self._n_bytes = max(self._n_bytes, min(n_bytes, MOST_CACHE_BYTES))
 
-    def _traces(self, part: Part) -> Sequence[Trace]:
+    def _traces(self, part: TracePart) -> Sequence[Trace]:
         known = self._parts.get(id(part))
         if known is not None:
             self._parts.move_to_end(id(part))
@@ -252,7 +252,9 @@ class PartCache:
         )
 
 
-def pieces_of(part: Part, traces: Sequence[Trace], order: int) -> Iterator[tuple[Trace, Piece]]:
+def pieces_of(
+    part: TracePart, traces: Sequence[Trace], order: int
+) -> Iterator[tuple[Trace, Piece]]:
     """Yield each trace with each of its runs of finite samples."""
     for number, trace in enumerate(traces):
         n_samples = len(trace.samples)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from daq.archive.stations import Run
-    from daq.archive.waveforms import Found, Reading
+    from daq.archive.waveforms import FileReading, FoundFiles
     from daq.formats.sources import Selection
 
 
@@ -225,7 +225,7 @@ def _reading(
     file_overlap: str,
     response: Sequence[Path] | None,
     response_for: Sequence[str] | None,
-) -> tuple[Selection, Reading]:
+) -> tuple[Selection, FileReading]:
     """Return which days and channels are wanted, and how they are read."""
     from tui.commands.import_ import assigned, selected
     from tui.runs.archives import reading_of
@@ -251,7 +251,7 @@ def _group(text: str) -> tuple[str, str]:
     return name, pattern
 
 
-def _nothing(folder: Path, found: Found | None) -> typer.BadParameter:
+def _nothing(folder: Path, found: FoundFiles | None) -> typer.BadParameter:
     """Return the error where there is nothing to take."""
     text = "no miniSEED files found for these codes and times; check the folder, --start and --end"
     if found is None:

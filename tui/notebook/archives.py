@@ -16,7 +16,7 @@ from daq.archive.execution import carried_out
 from daq.archive.plan import STRETCHES
 from daq.archive.sources import are_waveforms, folder_for
 from daq.archive.store import Store
-from daq.archive.waveforms import Found, Reading
+from daq.archive.waveforms import FileReading, FoundFiles
 from daq.errors import ArchiveError, WrongSettingError
 from daq.estimation.settings import Settings, check_fit
 from daq.formats.assembly import Overlap
@@ -227,7 +227,7 @@ def _check_one(names: Iterable[str]) -> None:
         )
 
 
-def _reading(response: object, overlap: Overlap) -> Reading:
+def _reading(response: object, overlap: Overlap) -> FileReading:
     some, assigned = response_sources(response)
     for each in (*some, *(path for _, path in assigned)):
         if not isinstance(each, Path):
@@ -238,7 +238,7 @@ def _reading(response: object, overlap: Overlap) -> Reading:
     return reading_of(some, assigned, overlap)
 
 
-def _nothing(folder: Path, found: Found | None) -> ArchiveError:
+def _nothing(folder: Path, found: FoundFiles | None) -> ArchiveError:
     """Return the error where there is nothing to take."""
     text = "no miniSEED files found for these channels and times"
     if found is None:

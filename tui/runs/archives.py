@@ -12,7 +12,7 @@ from daq.archive.plan import Plan
 from daq.archive.sources import recordings_in, sort
 from daq.archive.store import Store
 from daq.archive.task import Outcome
-from daq.archive.waveforms import Contents, Found, Reading, stations_in
+from daq.archive.waveforms import Contents, FileReading, FoundFiles, stations_in
 from daq.errors import ArchiveError
 from daq.estimation.settings import Settings
 from daq.formats.assembly import Overlap
@@ -22,10 +22,10 @@ from estimator.wording import several
 
 def reading_of(
     responses: Iterable[Path], assigned: Iterable[tuple[str, Path]], overlap: Overlap
-) -> Reading:
+) -> FileReading:
     """Return how days are read: by processes that may have another working folder."""
     pairs = tuple((pattern, str(path.resolve())) for pattern, path in assigned)
-    return Reading(tuple(str(path.resolve()) for path in responses), pairs, overlap)
+    return FileReading(tuple(str(path.resolve()) for path in responses), pairs, overlap)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class Filling:
     stretch: str | None
     run: stations.Run
     check: Callable[[Plan], object]
-    refuse: Callable[[Found | None], Exception]
+    refuse: Callable[[FoundFiles | None], Exception]
     say: Callable[[str], object] = lambda _: None
     watched: Callable[[Iterable[Outcome], Mapping[str, int], str], Iterable[Outcome]] = (
         lambda outcomes, *_: outcomes
@@ -108,7 +108,7 @@ class Filling:
         selection: Selection,
         settings: Settings,
         groups: Sequence[tuple[str, str]],
-    ) -> tuple[Found, Contents]:
+    ) -> tuple[FoundFiles, Contents]:
         """Return the stations of waveform files, and what the headers of these say."""
         known, segment = Contents(self.folder), settings.segment
         found = stations_in(sources, selection, groups=groups, known=known, segment=segment)
@@ -117,7 +117,7 @@ class Filling:
         return found, known
 
     def by_days(
-        self, found: Found, known: Contents, settings: Settings, reading: Reading
+        self, found: FoundFiles, known: Contents, settings: Settings, reading: FileReading
     ) -> tuple[dict[str, Store], list[str]]:
         """Take new days of stations; return their archives by name, and what failed."""
         stations.check_responses(found.stations, reading)
@@ -137,7 +137,9 @@ class Filling:
         stores = dict(sorted(stores.items()))
         return stores, [*failures, *self._days(found, stores, reading)]
 
-    def _days(self, found: Found, stores: Mapping[str, Store], reading: Reading) -> Iterator[str]:
+    def _days(
+        self, found: FoundFiles, stores: Mapping[str, Store], reading: FileReading
+    ) -> Iterator[str]:
         """Take the days that are new; yield a message for each that failed."""
         with ExitStack() as stack:
             n_unfinished = sum(stack.enter_context(each.writing()) for each in stores.values())

@@ -374,7 +374,7 @@ _REPEATED = 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class Grid:
+class RowTimes:
     """Where rows lie in time.
 
     Attributes
@@ -392,7 +392,7 @@ class Grid:
     left_out: list[tuple[int, int]]
 
 
-def grid_of(times: NDArray[np.int64], sampling_rate: float | None) -> Grid:
+def grid_of(times: NDArray[np.int64], sampling_rate: float | None) -> RowTimes:
     """Find the rate and the gaps.
 
     Parameters
@@ -437,7 +437,7 @@ def grid_of(times: NDArray[np.int64], sampling_rate: float | None) -> Grid:
         start = times[rows[first]] if exact else times[0] + round(line)
         starts.append((int(rows[first]), int(start)))
     begins: list[int] = np.flatnonzero(missing).tolist() if coarse else []
-    return Grid(rate, starts, [(int(rows[k - 1]), int(rows[k])) for k in begins])
+    return RowTimes(rate, starts, [(int(rows[k - 1]), int(rows[k])) for k in begins])
 
 
 def _unbroken(missing: NDArray[np.int64]) -> list[tuple[int, int]]:

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from daq.errors import ImportFormatError
-from daq.formats.foreign_sensor import NS_PER_S, Calibration, ForeignSensor, finite_stretches
+from daq.formats.foreign_sensor import NS_PER_S, ForeignCalibration, ForeignSensor, finite_stretches
 from daq.formats.readers.packages import load
 from daq.formats.traces import Trace
 
@@ -179,7 +179,7 @@ def _trace(function: dict[str, Any], length: float) -> Trace:
             unit = quantity
         elif quantity and length > 0:
             origin = f"data type of UFF 58, with {length:g} length units in a metre of UFF 164"
-            calibration = Calibration(length, quantity, origin)
+            calibration = ForeignCalibration(length, quantity, origin)
     after = round(float(function.get("abscissa_min") or 0) * NS_PER_S)
     return Trace(
         sensor=name,

@@ -22,7 +22,7 @@ import numpy as np
 
 from daq.bench.units import STANDARD_GRAVITY
 from daq.errors import ImportFormatError
-from daq.formats.foreign_sensor import Calibration
+from daq.formats.foreign_sensor import ForeignCalibration
 from daq.formats.readers.packages import load
 from daq.formats.traces import FilePart, LoadedPart, Trace
 
@@ -186,12 +186,12 @@ def _unit(stats: Any) -> str:  # noqa: ANN401 - ObsPy has no types
     return {0: "m", 1: "m/s", 2: "m/s²"}.get(-1 if found is None else found, "")
 
 
-def _calibration(stats: Any) -> Calibration | None:  # noqa: ANN401 - ObsPy has no types
+def _calibration(stats: Any) -> ForeignCalibration | None:  # noqa: ANN401 - ObsPy has no types
     """Return what the header of a trace says a count is; None where that is unknown."""
     kind = str(stats.get("_format", ""))
     found = None
     if kind == "KNET":
-        found = Calibration.of_count(float(stats.calib), "m/s²", "scale factor of K-NET")
+        found = ForeignCalibration.of_count(float(stats.calib), "m/s²", "scale factor of K-NET")
     elif kind == "KINEMETRICS_EVT":
         found = _kinemetrics(stats.kinemetrics_evt)
     elif kind == "GSE2":
@@ -200,7 +200,7 @@ def _calibration(stats: Any) -> Calibration | None:  # noqa: ANN401 - ObsPy has 
         stacked = str(stats.seg2.get("STACK", "1")).strip()
         origin = "descaling factor of SEG-2, at the receiver"
         origin += "" if stacked in {"", "1"} else f"; a stack of {stacked}"
-        found = Calibration.of_count(1e-3 * float(stats.calib), "V", origin)
+        found = ForeignCalibration.of_count(1e-3 * float(stats.calib), "V", origin)
     elif kind == "REFTEK130":
         found = _reftek(stats.reftek130)
     elif kind == "SAC" and float(stats.sac.get("scale", 1.0)) not in {0.0, 1.0}:
@@ -208,11 +208,11 @@ def _calibration(stats: Any) -> Calibration | None:  # noqa: ANN401 - ObsPy has 
             f"SCALE {float(stats.sac.scale):g} of SAC not taken: counts per unit, or units per"
             " count; expected --response or --bench"
         )
-        found = Calibration(1.0, "counts", origin)
+        found = ForeignCalibration(1.0, "counts", origin)
     return found
 
 
-def _reftek(header: Any) -> Calibration | None:  # noqa: ANN401 - see above
+def _reftek(header: Any) -> ForeignCalibration | None:  # noqa: ANN401 - see above
     """Return V of a count, from the bit weight at unity gain; at others files do not agree."""
     number = int(header.channel_number)
     weight = str(header.channel_true_bit_weights[number] or "").split()
@@ -222,15 +222,15 @@ def _reftek(header: Any) -> Calibration | None:  # noqa: ANN401 - see above
         size = float(weight[0]) * _VOLTS[weight[1].lower()]
     except (KeyError, ValueError):
         return None
-    return Calibration.of_count(size, "V", "bit weight of RefTek 130, at the digitizer")
+    return ForeignCalibration.of_count(size, "V", "bit weight of RefTek 130, at the digitizer")
 
 
-def _kinemetrics(header: Any) -> Calibration | None:  # noqa: ANN401 - see above
+def _kinemetrics(header: Any) -> ForeignCalibration | None:  # noqa: ANN401 - see above
     """Return m/s² of a count, from V of full scale (23 bits and sign) and V per g of the sensor."""
     full_scale, per_g = float(header.chan_fullscale), float(header.chan_sensitivity)
     if not full_scale or not per_g:
         return None
-    return Calibration.of_count(
+    return ForeignCalibration.of_count(
         full_scale / _EVT_FULL_SCALE / per_g * STANDARD_GRAVITY,
         "m/s²",
         "full scale and sensitivity of Kinemetrics EVT",
@@ -239,7 +239,7 @@ def _kinemetrics(header: Any) -> Calibration | None:  # noqa: ANN401 - see above
     )
 
 
-def _gse2(calib: float, period: float, model: str) -> Calibration | None:
+def _gse2(calib: float, period: float, model: str) -> ForeignCalibration | None:
     """Return the calibration of nm in a count at a period; 1 at 1 s is what writers put by default.
 
     In velocity: what seismometers are flat in.
@@ -248,4 +248,4 @@ def _gse2(calib: float, period: float, model: str) -> Calibration | None:
         return None
     origin = f"CALIB of GSE2, known at {period:g} s and taken as flat in velocity"
     velocity = 1e-9 * calib * 2 * math.pi / period
-    return Calibration.of_count(velocity, "m/s", origin, model=model.strip())
+    return ForeignCalibration.of_count(velocity, "m/s", origin, model=model.strip())

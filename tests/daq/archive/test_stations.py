@@ -19,7 +19,7 @@ from daq.archive.spectra_file import SpectraFile
 from daq.archive.stations import Run, archives_in, begun, summaries, work
 from daq.archive.store import Store
 from daq.archive.task import Outcome, Task
-from daq.archive.waveforms import FILE, Contents, Found, Reading, stations_in
+from daq.archive.waveforms import FILE, Contents, FileReading, FoundFiles, stations_in
 from daq.errors import ImportFormatError, WrongArchiveError, WrongSettingError
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
@@ -29,7 +29,7 @@ from tests.daq.archive.day_files import DAY_NS, FIRST_NS, ROWS, SETTINGS, append
 from tests.daq.archive.months import assert_same, record
 
 HOUR_NS = 3600 * 10**9
-PLAIN = Reading()
+PLAIN = FileReading()
 
 
 def found_in(
@@ -37,7 +37,7 @@ def found_in(
     store: Path,
     selection: Selection | None = None,
     groups: Sequence[tuple[str, str]] = (),
-) -> Found:
+) -> FoundFiles:
     """Return the stations of files."""
     known = Contents(store)
     found = stations_in(
@@ -65,7 +65,7 @@ def fill(
     settings: Settings = SETTINGS,
     selection: Selection | None = None,
     groups: Sequence[tuple[str, str]] = (),
-    reading: Reading = PLAIN,
+    reading: FileReading = PLAIN,
 ) -> tuple[dict[str, Store], int, list[str]]:
     """Take new days; returns the archives, how many days were new, and failures."""
     found = found_in(source, store, selection, groups)
@@ -205,7 +205,7 @@ def test_what_is_wrong_is_said_before_there_is_a_folder(sds: Path, tmp_path: Pat
         raise WrongSettingError(plan.sensors[0][1][0][1])
 
     stations = found_in(f"sds://{sds}", tmp_path).stations
-    about = {"reading": Reading(), "run": in_processes(1)}
+    about = {"reading": FileReading(), "run": in_processes(1)}
     with pytest.raises(WrongSettingError, match="counts"):
         begun(tmp_path, stations, SETTINGS, "hour", check=refuse, **about)  # type: ignore[arg-type]  # of several types
     wrong = replace(SETTINGS, segment=7200.0)
@@ -260,7 +260,7 @@ def test_a_response_may_change_at_midnight(tmp_path: Path) -> None:
     inventory.networks[0].stations[0].code = "ABC"
     inventory.networks[0].stations[0].channels = epochs
     inventory.write(str(xml), "STATIONXML")
-    reading = Reading(response=(str(xml),))
+    reading = FileReading(response=(str(xml),))
     stores, n_days, failures = fill(f"sds://{root}", tmp_path / "store", reading=reading)
     assert (n_days, failures) == (2, [])
     before, after = (

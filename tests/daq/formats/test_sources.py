@@ -20,7 +20,7 @@ from daq.formats.memory import RecordingInMemory, SensorInMemory
 from daq.formats.readers import miniseed
 from daq.formats.readers.miniseed import MiniSeedPart
 from daq.formats.sources import Selection, open_sources, sensors_of_parts
-from daq.formats.traces import LoadedPart, Part, PartCache, Trace
+from daq.formats.traces import LoadedPart, PartCache, Trace, TracePart
 from daq.protocols.block import HostTime
 from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
@@ -329,7 +329,7 @@ def test_parts_outside_of_the_span_are_not_loaded(
 
 
 def test_a_cache_makes_room_for_what_is_read_together() -> None:
-    loads: list[Part] = []
+    loads: list[TracePart] = []
 
     class Counted(LoadedPart):
         def load(self) -> Sequence[Trace]:
@@ -361,7 +361,7 @@ def test_parts_that_were_read_are_dropped_again() -> None:
         def reaches(self, start_ns: int | None, end_ns: int | None) -> bool:
             return start_ns == end_ns
 
-        def split(self) -> list[Part]:
+        def split(self) -> list[TracePart]:
             return []
 
     large = [Large(str(number)) for number in range(40)]
