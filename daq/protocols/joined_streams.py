@@ -50,7 +50,7 @@ MAX_PENDING = 64
 """Default for the number of records that a stream may be ahead of the others."""
 
 
-class Record(Protocol):
+class StreamRecord(Protocol):
     """Contiguous samples of one stream."""
 
     @property
@@ -108,7 +108,7 @@ class _Step:
 class _Doubtful:
     """A record of which the next one shows whether samples are missing, or the clock was set."""
 
-    record: Record
+    record: StreamRecord
     came: HostTime
     in_turn: bool | None
 
@@ -128,28 +128,28 @@ class _Stream:
         self.doubtful: _Doubtful | None = None
         self.pace = Pace(float(rate))
         self._shifted = 0
-        self._seen: deque[Record] = deque()
+        self._seen: deque[StreamRecord] = deque()
         self._n_seen = 0
         self._base = (0, 0)  # index and time from which on the rate is measured
 
-    def ahead(self, record: Record) -> float:
+    def ahead(self, record: StreamRecord) -> float:
         """Return by how many samples a record begins after the end."""
         return float((record.start_ns - self.end_ns) * self.rate / _NS)
 
-    def continues(self, record: Record) -> bool:
+    def continues(self, record: StreamRecord) -> bool:
         """Return whether a record begins where the stream ends, but for the drift of its clock."""
         return self.end is not None and abs(self.ahead(record)) < self.tolerance(record)
 
-    def follows(self, record: Record, before: Record) -> bool:
+    def follows(self, record: StreamRecord, before: StreamRecord) -> bool:
         """Return whether a record begins where another one ends."""
         ahead = (record.start_ns - before.start_ns) * self.rate / _NS - len(before.counts)
         return abs(float(ahead)) < self.tolerance(record)
 
-    def tolerance(self, record: Record) -> float:
+    def tolerance(self, record: StreamRecord) -> float:
         """Return by how many samples the stated time of a record may differ from the count."""
         return max(0.5, _RATE_OFF * len(record.counts))
 
-    def repeats(self, record: Record) -> bool | None:
+    def repeats(self, record: StreamRecord) -> bool | None:
         """Return whether the samples received for the times of a record are equal to its own.
 
         None if none were received for these times.
@@ -165,7 +165,9 @@ class _Stream:
                 found = True
         return found
 
-    def keep(self, record: Record, index: int, *, taken_to: int | None, flags: BlockFlag) -> None:
+    def keep(
+        self, record: StreamRecord, index: int, *, taken_to: int | None, flags: BlockFlag
+    ) -> None:
         """Add a record at an index; discard samples already pending or before ``taken_to``."""
         self._seen.append(record)
         self._n_seen += len(record.counts)
@@ -274,7 +276,9 @@ class JoinedStreams:
         streams = self._streams.values()
         return any(len(stream.pending) > self._max_pending // 2 for stream in streams)
 
-    def add(self, record: Record, at: HostTime, *, in_turn: bool | None = None) -> Iterator[Event]:
+    def add(
+        self, record: StreamRecord, at: HostTime, *, in_turn: bool | None = None
+    ) -> Iterator[Event]:
         """Add a record of one of the streams.
 
         `in_turn`: whether the number of its packet follows the one before; None without numbers.
@@ -301,7 +305,7 @@ class JoinedStreams:
                 yield from self._decide(stream, doubtful, doubtful.record, at)
 
     def _place(
-        self, stream: _Stream, record: Record, at: HostTime, *, in_turn: bool | None
+        self, stream: _Stream, record: StreamRecord, at: HostTime, *, in_turn: bool | None
     ) -> Iterator[Event]:
         doubtful = stream.doubtful
         if doubtful is not None:
@@ -333,7 +337,7 @@ class JoinedStreams:
             self._keep(stream, doubtful.record, stream.end or 0, doubtful.came)
 
     def _decide(
-        self, stream: _Stream, doubtful: _Doubtful, record: Record, at: HostTime
+        self, stream: _Stream, doubtful: _Doubtful, record: StreamRecord, at: HostTime
     ) -> Iterator[Event]:
         """Place the doubtful record, or drop it, by the next one."""
         before, end, pace = doubtful.record, stream.end or 0, stream.pace
@@ -376,7 +380,7 @@ class JoinedStreams:
     def _keep(
         self,
         stream: _Stream,
-        record: Record,
+        record: StreamRecord,
         index: int,
         at: HostTime,
         flags: BlockFlag = BlockFlag.NONE,
@@ -384,7 +388,7 @@ class JoinedStreams:
         stream.keep(record, index, taken_to=self._taken_to, flags=flags)
         stream.arrived(at)
 
-    def _by_others(self, stream: _Stream, record: Record) -> int:
+    def _by_others(self, stream: _Stream, record: StreamRecord) -> int:
         """Return the index of a record after missing ones.
 
         Long after the end of its own stream, those of the others know it better.
@@ -403,7 +407,7 @@ class JoinedStreams:
         stream.n_steps = nearest.n_steps
         return (nearest.end or 0) + round(nearest.ahead(record))
 
-    def _at_known_step(self, stream: _Stream, record: Record) -> int | None:
+    def _at_known_step(self, stream: _Stream, record: StreamRecord) -> int | None:
         """Return how many samples are missing before a record behind a step of another stream.
 
         None if it is before the step, or there is none.
@@ -418,7 +422,7 @@ class JoinedStreams:
         stream.n_steps += 1
         return max(0, round(rest))
 
-    def _stepped(self, stream: _Stream, record: Record, missing: int, at: HostTime) -> Event:
+    def _stepped(self, stream: _Stream, record: StreamRecord, missing: int, at: HostTime) -> Event:
         """Take a step of the device's clock, seen in one stream."""
         size_ns = record.start_ns - stream.end_ns - round(missing * _NS / stream.rate)
         self._steps.append(_Step(stream.end or 0, size_ns))

@@ -40,7 +40,7 @@ REPEATED = 1024
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class FrameRun:
     """Rows ``start`` to ``stop`` of the given frames, without a gap."""
 
     start: int
@@ -74,7 +74,7 @@ class SampleCounter:
         self._pace = Pace(sampling_rate)
         self._resumed = False
 
-    def place(self, counters: NDArray[np.integer[Any]], at: HostTime) -> tuple[list[Run], int]:
+    def place(self, counters: NDArray[np.integer[Any]], at: HostTime) -> tuple[list[FrameRun], int]:
         """Assign a sample index to each frame.
 
         Parameters
@@ -86,7 +86,7 @@ class SampleCounter:
 
         Returns
         -------
-        runs : list of Run
+        runs : list of FrameRun
             In order; they contain all frames but repetitions.
         n_repeated : int
             Number of repeated frames.
@@ -98,7 +98,7 @@ class SampleCounter:
             self._pace.take(counters.size - 1, at)
         latest = self._pace.late(0, at) * self._rate
         slack = (SLACK + self._doubt(at)) * self._rate
-        runs: list[Run] = []
+        runs: list[FrameRun] = []
         n_repeated = row = 0
         while row < counters.size:
             step = (int(counters[row]) - self._count) % self.modulus
@@ -116,7 +116,7 @@ class SampleCounter:
                 self._base = int(counters[row]) - index
                 self._pace.restart()
             missing = index - self._next
-            runs.append(Run(row, stop, index, index + self._base, missing, restarted))
+            runs.append(FrameRun(row, stop, index, index + self._base, missing, restarted))
             self._next = index + stop - row
             self._resumed = False
             self._count = int(counters[stop - 1])

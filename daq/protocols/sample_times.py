@@ -46,7 +46,7 @@ _WHOLE = 0.1  # samples that lost packets may be off a multiple of their length
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class SamplePlace:
     """Position of samples.
 
     Attributes
@@ -132,7 +132,7 @@ class SampleTimes:
         resolution_ns: int,
         n_behind: int = 0,
         is_damaged: bool = False,
-    ) -> Place:
+    ) -> SamplePlace:
         """Return the position of samples.
 
         Parameters
@@ -169,18 +169,18 @@ class SampleTimes:
         off = self._off(time_ns)
         if round(off) > 0 or off < -0.5 - width:
             self._doubtful = samples
-            return Place("doubtful")
+            return SamplePlace("doubtful")
         self._n_seen += 1
         self._offset = (self._offset or 0.0) + max(GAIN, 1 / self._n_seen) * off
         return self._take(samples)
 
-    def settle(self) -> Place | None:
+    def settle(self) -> SamplePlace | None:
         """Return the position of the doubtful samples, if any: nothing follows them."""
         doubtful, self._doubtful = self._doubtful, None
         if doubtful is None:
             return None
         late = self._pace.late(self._set_at + self._next + doubtful.n - 1, doubtful.at)
-        return Place("before", self._pace.lost(late), is_exact=False)
+        return SamplePlace("before", self._pace.lost(late), is_exact=False)
 
     def _fills(self, samples: _Samples, doubtful: _Samples, width: float) -> bool:
         """Return whether samples continue the count, overtaken by the doubtful ones."""
@@ -190,18 +190,18 @@ class SampleTimes:
 
     def _decided(
         self, doubtful: _Samples, samples: _Samples, width: float, *, is_damaged: bool
-    ) -> Place:
+    ) -> SamplePlace:
         """Return what the next samples say of the doubtful ones."""
         off = self._off(doubtful.time_ns)
         if abs(off) < 0.5:  # overtaken samples came before
             self._take(doubtful)
-            return Place("before")
+            return SamplePlace("before")
         step_ns = samples.time_ns - doubtful.time_ns
         waited_ns = samples.at.monotonic_ns - doubtful.at.monotonic_ns
         ahead = step_ns * 1e-9 * self._rate - doubtful.n
         goes_on = ahead > -0.5 - width and step_ns <= waited_ns + SLACK_NS + doubtful.n / self._rate
         if not goes_on and not (step_ns == 0 and width > 0.5):
-            return Place("damaged")
+            return SamplePlace("damaged")
         count = self._set_at + self._next + doubtful.n - 1
         late = self._pace.late(count + doubtful.n_behind, doubtful.at)
         last = count + samples.n + samples.n_behind
@@ -217,12 +217,12 @@ class SampleTimes:
             self._holes.append((self._time_of_next(), doubtful.time_ns))
             self._next += missing
             self._take(doubtful)
-            return Place("before", missing, is_exact=width <= 0.5 and shown)
+            return SamplePlace("before", missing, is_exact=width <= 0.5 and shown)
         missing = self._pace.lost(late)
         self._set_at += self._next + missing
         self._begin(doubtful.time_ns, width)
         self._take(doubtful)
-        return Place("before", missing, is_exact=not missing, is_reset=True)
+        return SamplePlace("before", missing, is_exact=not missing, is_reset=True)
 
     def _are_frequent(self, now_ns: int) -> bool:
         """Return whether steps forward are frequent: samples are lost, for no clock is set so."""
@@ -252,7 +252,7 @@ class SampleTimes:
         self._offset = 0.0 if width <= 1 else None
         self._holes.clear()
 
-    def _take(self, samples: _Samples) -> Place:
+    def _take(self, samples: _Samples) -> SamplePlace:
         self._next += samples.n
         self._latest_ns = samples.time_ns
-        return Place("next")
+        return SamplePlace("next")

@@ -16,7 +16,7 @@ import numpy as np
 
 from daq.devices.modbus import rtu
 from daq.devices.modbus.fifo_protocol import FIFO_REGISTER, MAX_WORDS, RATE_REGISTER
-from daq.devices.modbus.rtu import Request, RequestFinder
+from daq.devices.modbus.rtu import RequestFinder, RtuRequest
 from sim_devices.devices.interface import NEVER, DeviceSpec, Endpoint, Line, Samples, Source, whole
 
 TURNAROUND = 0.001
@@ -78,7 +78,7 @@ class FifoDevice(Endpoint):
 
     # --- registers ---------------------------------------------------------------------------
 
-    def _answer(self, request: Request) -> bytes:
+    def _answer(self, request: RtuRequest) -> bytes:
         function = request.function
         if function == rtu.WRITE_SINGLE and request.address == RATE_REGISTER:
             if not LOWEST_RATE <= request.value <= HIGHEST_RATE:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from daq.devices.labjack import registers as reg
 from daq.devices.labjack.packets import MAX_SAMPLES, Packet, encode_packet, encode_response
-from daq.devices.labjack.registers import Adu, AduFinder, Read
+from daq.devices.labjack.registers import Adu, AduFinder, ReadAt
 from daq.devices.labjack.stream import (
     AUTO_RECOVER_ACTIVE,
     AUTO_RECOVER_END,
@@ -300,7 +300,7 @@ class LabJack:
         if function == reg.FEEDBACK:
             values = b""
             for command in reg.decode_feedback(pdu):
-                if isinstance(command, Read):
+                if isinstance(command, ReadAt):
                     values += self._read(command.address, command.n_registers, now)
                 else:
                     self._write(command.address, command.values, now)
@@ -448,7 +448,7 @@ class LabJack:
         return encode_response(packet, n_registers=n_registers)
 
 
-def _t8_calibrations() -> list[reg.Calibration]:
+def _t8_calibrations() -> list[reg.RangeCalibration]:
     """Return the calibrations of a T8 with a small error in each input."""
     nominal = reg.nominal_t8_calibrations()
     per_input = len(reg.T8_RANGES)

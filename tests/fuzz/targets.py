@@ -27,7 +27,7 @@ from daq.devices.modbus import rtu
 from daq.devices.modbus.fifo_protocol import FifoDecoder
 from daq.devices.modbus.registers_protocol import RegisterDecoder, RegisterMap
 from daq.devices.seedlink import packets as seedlink
-from daq.devices.seedlink.decoder import SeedLinkDecoder, Selection, WaveRecord, encode_record
+from daq.devices.seedlink.decoder import SeedLinkDecoder, StreamSelection, WaveRecord, encode_record
 from daq.devices.text.decoder import TextDecoder
 from daq.devices.text.format import RASPBERRY_SHAKE, TextFormat
 from daq.protocols.block import Block, Event, HostTime
@@ -261,7 +261,10 @@ def _seedlink_target(version: seedlink.Version) -> Callable[[bytes], None]:
         """Packets of one station; after another connection those of a second one."""
         stations = {"A": "A", "B": "B"}
         decoder = SeedLinkDecoder(
-            {name: Selection("XX", one, (("*", "HNZ"),), 1) for name, one in stations.items()},
+            {
+                name: StreamSelection("XX", one, (("*", "HNZ"),), 1)
+                for name, one in stations.items()
+            },
             dict.fromkeys(stations, np.dtype(np.int32)),
             hold=5.0,
         )

@@ -37,7 +37,7 @@ from daq.protocols.block import (
     ReadingTimes,
 )
 from daq.protocols.errors import several
-from daq.protocols.sample_counter import Run, SampleCounter
+from daq.protocols.sample_counter import FrameRun, SampleCounter
 
 OctetArray: TypeAlias = NDArray[np.uint8]
 BoolArray: TypeAlias = NDArray[np.bool_]
@@ -217,7 +217,7 @@ class BurstDecoder:
             self._counts["repeated"] += repeated
         else:  # without COUNT, the skipped bytes are the only estimate of the missing frames
             lost = self._lost_frames
-            runs = [Run(0, frames.size, self._next + lost, missing=lost)]
+            runs = [FrameRun(0, frames.size, self._next + lost, missing=lost)]
             self._next, self._lost_frames = runs[0].first_sample + frames.size, 0
         counts = np.empty((frames.size, len(self._fields)), np.int32)
         for column, field in enumerate(self._fields):
@@ -230,7 +230,7 @@ class BurstDecoder:
             found.append(self._block(run, counts[run.start : run.stop], at))
         return found
 
-    def _block(self, run: Run, counts: NDArray[np.int32], at: HostTime) -> Block:
+    def _block(self, run: FrameRun, counts: NDArray[np.int32], at: HostTime) -> Block:
         flags, reason = BlockFlag.NONE, ""
         if run.restarted or not self._started:
             flags |= BlockFlag.CLOCK_RESTART

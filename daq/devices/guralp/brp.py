@@ -93,7 +93,7 @@ class NumberingRestarted:
 
 
 @dataclass(frozen=True, slots=True)
-class Reply:
+class BrpReply:
     """An acknowledgement (``sequence`` None) or a refusal, as the digitizer receives it."""
 
     raw_stream_id: bytes
@@ -108,7 +108,7 @@ def encode_frame(sequence: int, block: bytes) -> bytes:
     return body + struct.pack(">H", sum(body) % 65536)
 
 
-def encode_reply(reply: Reply) -> bytes:
+def encode_reply(reply: BrpReply) -> bytes:
     """Encode an acknowledgement or a refusal."""
     low, rest = reply.raw_stream_id[3], reply.raw_stream_id[2::-1]
     if reply.sequence is None:
@@ -116,9 +116,9 @@ def encode_reply(reply: Reply) -> bytes:
     return bytes((_REFUSE, low, reply.sequence % 256)) + rest
 
 
-def decode_replies(buffer: bytearray) -> list[Reply]:
+def decode_replies(buffer: bytearray) -> list[BrpReply]:
     """Decode and remove complete replies from ``buffer``; discard bytes that begin none."""
-    replies: list[Reply] = []
+    replies: list[BrpReply] = []
     while True:
         while buffer and buffer[0] not in (_ACKNOWLEDGE, _REFUSE):
             del buffer[0]
@@ -127,7 +127,7 @@ def decode_replies(buffer: bytearray) -> list[Reply]:
         kind, low, number, *rest = bytes(buffer[:_REPLY_SIZE])
         del buffer[:_REPLY_SIZE]
         raw = bytes((*reversed(rest), low))
-        replies.append(Reply(raw, number if kind == _REFUSE else None))
+        replies.append(BrpReply(raw, number if kind == _REFUSE else None))
 
 
 class _Scanner:
@@ -262,7 +262,7 @@ class Receiver:
 
     def _reply(self, sequence: int | None) -> None:
         if self._raw_stream_id is not None and len(self._to_send) < HISTORY * _REPLY_SIZE:
-            self._to_send += encode_reply(Reply(self._raw_stream_id, sequence))
+            self._to_send += encode_reply(BrpReply(self._raw_stream_id, sequence))
 
 
 @dataclass(slots=True)

@@ -131,7 +131,7 @@ class IioSession(interface.Session):
 
     iiod: _Iiod
     sensor: Sensor
-    device: protocol.Device
+    device: protocol.IioDevice
     inputs: tuple[str, ...]
     information: tuple[interface.DeviceInformation, ...]
     patience: float
@@ -324,7 +324,7 @@ class IioDriver(interface.Driver[IioSettings]):
 
 
 async def _set_rate(
-    iiod: _Iiod, device: protocol.Device, channel: str, sensor: Sensor, label: str
+    iiod: _Iiod, device: protocol.IioDevice, channel: str, sensor: Sensor, label: str
 ) -> float | None:
     """Set the sampling rate, and return what the device has then."""
     of_channel = next(one for one in device.elements if one.channel == channel).attributes
@@ -347,8 +347,8 @@ async def _set_rate(
 
 
 def _device(
-    devices: Sequence[protocol.Device], settings: IioSettings, label: str
-) -> protocol.Device:
+    devices: Sequence[protocol.IioDevice], settings: IioSettings, label: str
+) -> protocol.IioDevice:
     buffered = [one for one in devices if one.elements]
     wanted = settings.device
     found = [one for one in buffered if not wanted or wanted in {one.id, one.name}]
@@ -362,7 +362,7 @@ def _device(
 
 
 def _inputs(
-    device: protocol.Device, settings: IioSettings, sensor: Sensor, label: str
+    device: protocol.IioDevice, settings: IioSettings, sensor: Sensor, label: str
 ) -> tuple[str, ...]:
     names = [one.channel for one in device.elements if one.channel != protocol.TIMESTAMP]
     inputs = settings.inputs or tuple(names[: len(sensor.channels)])

@@ -71,7 +71,7 @@ class ScanElement:
 
 
 @dataclass(frozen=True, slots=True)
-class Device:
+class IioDevice:
     """One device of a context."""
 
     id: str
@@ -82,7 +82,7 @@ class Device:
     """Attributes of the channel `TEMPERATURE`."""
 
 
-def parse_context(text: bytes) -> list[Device]:
+def parse_context(text: bytes) -> list[IioDevice]:
     """Return the devices of a context.
 
     Raises
@@ -113,7 +113,7 @@ def parse_context(text: bytes) -> list[Device]:
         attributes = tuple(one.get("name", "") for one in device.findall("attribute"))
         found = tuple(sorted(elements, key=lambda one: one.index))
         ids = device.get("id", ""), device.get("name", "")
-        devices.append(Device(*ids, found, attributes, of_temperature))
+        devices.append(IioDevice(*ids, found, attributes, of_temperature))
     return devices
 
 

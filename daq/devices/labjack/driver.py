@@ -40,7 +40,7 @@ from daq.devices import interface, port_rules
 from daq.devices.labjack import registers as reg
 from daq.devices.labjack import stream as labjack
 from daq.devices.labjack.packets import MAX_CR_SAMPLES, MAX_SAMPLES, decode_response
-from daq.devices.labjack.registers import Adu, AduFinder, Calibration, Command, Read, Write
+from daq.devices.labjack.registers import Adu, AduFinder, Command, RangeCalibration, ReadAt, WriteAt
 from daq.devices.labjack.stream import StreamDecoder
 from daq.devices.port_rules import port_label
 from daq.errors import BenchFileError, DeviceError, FileFault, NoAnswerError, WrongDeviceError
@@ -163,7 +163,7 @@ class Registers:
         self._transaction = (self._transaction + 1) % 65536
         request = Adu(self._transaction, 255, reg.encode_feedback(commands))
         await self._stream.write(reg.encode_adu(request))
-        size = sum(2 * c.n_registers for c in commands if isinstance(c, Read))
+        size = sum(2 * c.n_registers for c in commands if isinstance(c, ReadAt))
         try:
             async with asyncio.timeout(reply_within):
                 while True:
@@ -187,13 +187,13 @@ class Registers:
     async def reason(self) -> str:
         """Return the device's reason for its last refusal, as text; empty if unknown."""
         with contextlib.suppress(RemoteProtocolError):
-            values, _ = await self.exchange(Read(reg.LAST_ERROR_DETAIL, 1))
+            values, _ = await self.exchange(ReadAt(reg.LAST_ERROR_DETAIL, 1))
             return f", reason {int.from_bytes(values, 'big')}"
         return ""
 
     async def real(self, address: int) -> float:
         """Read a FLOAT32."""
-        values = await self.do(f"reading register {address}", Read(address, 2))
+        values = await self.do(f"reading register {address}", ReadAt(address, 2))
         return float(struct.unpack(">f", values)[0])
 
     async def stop_stream(self) -> None:
@@ -202,14 +202,14 @@ class Registers:
             await self.exchange(long(reg.STREAM_ENABLE, 0))
 
 
-def long(address: int, value: int) -> Write:
+def long(address: int, value: int) -> WriteAt:
     """Return the command that writes a UINT32."""
-    return Write(address, value.to_bytes(4, "big"))
+    return WriteAt(address, value.to_bytes(4, "big"))
 
 
-def real(address: int, value: float) -> Write:
+def real(address: int, value: float) -> WriteAt:
     """Return the command that writes a FLOAT32."""
-    return Write(address, struct.pack(">f", value))
+    return WriteAt(address, struct.pack(">f", value))
 
 
 def exact(rate: float) -> float:
@@ -260,11 +260,11 @@ async def identify(
     """
     values = await registers.do(
         "identifying",
-        Read(reg.TEST, 2),
-        Read(reg.PRODUCT_ID, 2),
-        Read(reg.FIRMWARE_VERSION, 2),
-        Read(reg.SERIAL_NUMBER, 2),
-        Read(reg.TEMPERATURE_DEVICE_K, 2),
+        ReadAt(reg.TEST, 2),
+        ReadAt(reg.PRODUCT_ID, 2),
+        ReadAt(reg.FIRMWARE_VERSION, 2),
+        ReadAt(reg.SERIAL_NUMBER, 2),
+        ReadAt(reg.TEMPERATURE_DEVICE_K, 2),
     )
     test, product_id, firmware, serial, kelvin = struct.unpack(">IffIf", values)
     product = PRODUCTS.get(product_id)
@@ -309,14 +309,14 @@ class Uptime:
 async def read_uptime(registers: Registers) -> Uptime | None:
     """Read the timer that reveals a restart; return None if the device has none."""
     with contextlib.suppress(RemoteProtocolError):
-        values, at = await registers.exchange(Read(reg.SYSTEM_TIMER_20HZ, 2))
+        values, at = await registers.exchange(ReadAt(reg.SYSTEM_TIMER_20HZ, 2))
         return Uptime(int.from_bytes(values, "big"), at)
     return None
 
 
 async def read_temperature(registers: Registers) -> tuple[float, HostTime]:
     """Return the temperature of the device in °C, and when it was read."""
-    values, at = await registers.exchange(Read(reg.TEMPERATURE_DEVICE_K, 2))
+    values, at = await registers.exchange(ReadAt(reg.TEMPERATURE_DEVICE_K, 2))
     (kelvin,) = struct.unpack(">f", values)
     return celsius_of(kelvin), at
 
@@ -342,7 +342,7 @@ async def set_inputs(
     for number, other in zip(numbers, negative, strict=True):
         commands: list[Command] = [real(reg.AIN_RANGE + 2 * number, range_of(settings, product))]
         if product == "T7":  # each input of a T8 has its own negative terminal
-            commands.append(Write(reg.AIN_NEGATIVE_CHANNEL + number, other.to_bytes(2, "big")))
+            commands.append(WriteAt(reg.AIN_NEGATIVE_CHANNEL + number, other.to_bytes(2, "big")))
         await registers.do(f"setting AIN{number}", *commands)
 
 
@@ -399,7 +399,9 @@ async def set_stream(
     )
     for start in range(0, len(stream.scan_list), 32):
         values = b"".join(a.to_bytes(4, "big") for a in stream.scan_list[start : start + 32])
-        await registers.do("setting the scan list", Write(reg.STREAM_SCANLIST + 2 * start, values))
+        await registers.do(
+            "setting the scan list", WriteAt(reg.STREAM_SCANLIST + 2 * start, values)
+        )
     if product == "T7":
         return exact(await registers.real(reg.STREAM_SCANRATE_HZ))
     # A T8 reports its rate only while it streams; these samples are discarded.
@@ -412,13 +414,13 @@ async def set_stream(
 
 async def read_calibrations(
     registers: Registers, numbers: tuple[int, ...], settings: LabJackSettings, product: str
-) -> tuple[Calibration, ...]:
+) -> tuple[RangeCalibration, ...]:
     """Return the calibration of each of a sensor's inputs in their range, from the flash."""
     if product == "T7":
         flash = await registers.do(
             "reading the calibration",
             long(reg.FLASH_READ_POINTER, reg.CALIBRATION_ADDRESS),
-            Read(reg.FLASH_READ, 2 * reg.N_CALIBRATION_VALUES),
+            ReadAt(reg.FLASH_READ, 2 * reg.N_CALIBRATION_VALUES),
         )
         gain = RANGES[product].index(range_of(settings, product))
         return (reg.decode_calibrations(flash)[gain],) * len(numbers)
@@ -431,7 +433,7 @@ async def read_calibrations(
                         reg.FLASH_READ_POINTER,
                         reg.t8_calibration_address(number, range_of(settings, product)),
                     ),
-                    Read(reg.FLASH_READ, 8),
+                    ReadAt(reg.FLASH_READ, 8),
                 )
             )
             for number in numbers
@@ -440,7 +442,7 @@ async def read_calibrations(
 
 
 def details_of(
-    range_: float, inputs: tuple[int, ...], calibrations: tuple[Calibration, ...]
+    range_: float, inputs: tuple[int, ...], calibrations: tuple[RangeCalibration, ...]
 ) -> dict[str, str]:
     """Return the range and the calibration of a sensor's inputs, as names and texts."""
     names = [f"AIN{number}" for number in inputs]
@@ -551,7 +553,7 @@ class LabJackSession(interface.Session):
         """
         with contextlib.suppress(RemoteProtocolError):
             try:
-                values, _ = await self.registers.exchange(Read(reg.STREAM_ENABLE, 2))
+                values, _ = await self.registers.exchange(ReadAt(reg.STREAM_ENABLE, 2))
             except NoAnswerError:
                 return
             if not int.from_bytes(values, "big"):
@@ -559,7 +561,7 @@ class LabJackSession(interface.Session):
 
     async def _by_command(self) -> AsyncGenerator[list[Block | Event]]:
         await self._start()
-        read = Read(reg.STREAM_DATA_CR, 4 + MAX_CR_SAMPLES)
+        read = ReadAt(reg.STREAM_DATA_CR, 4 + MAX_CR_SAMPLES)
         while True:
             try:
                 # No time limit: the samples in a late reply are not sent again.

@@ -113,7 +113,7 @@ def _slow_rate(wanted: float) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Read:
+class ReadAt:
     """Part of a feedback frame: read registers."""
 
     address: int
@@ -121,14 +121,14 @@ class Read:
 
 
 @dataclass(frozen=True, slots=True)
-class Write:
+class WriteAt:
     """Part of a feedback frame: write registers."""
 
     address: int
     values: bytes
 
 
-Command: TypeAlias = Read | Write
+Command: TypeAlias = ReadAt | WriteAt
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +183,7 @@ def encode_feedback(commands: Sequence[Command]) -> bytes:
     """Encode a request of function 76."""
     pdu = bytes((FEEDBACK,))
     for command in commands:
-        if isinstance(command, Read):
+        if isinstance(command, ReadAt):
             pdu += struct.pack(">BHB", 0, command.address, command.n_registers)
         else:
             pdu += struct.pack(">BHB", 1, command.address, len(command.values) // 2)
@@ -207,12 +207,12 @@ def decode_feedback(pdu: bytes) -> list[Command]:
         kind, address, n_registers = struct.unpack_from(">BHB", pdu, at)
         at += 4
         if not kind:
-            commands.append(Read(address, n_registers))
+            commands.append(ReadAt(address, n_registers))
             continue
         values = pdu[at : at + 2 * n_registers]
         if len(values) != 2 * n_registers:
             raise RemoteProtocolError(f"{len(values)} bytes to write to {n_registers} registers")
-        commands.append(Write(address, values))
+        commands.append(WriteAt(address, values))
         at += len(values)
     return commands
 
@@ -239,7 +239,7 @@ def feedback_values(pdu: bytes, expected_bytes: int) -> bytes:
 
 
 @dataclass(frozen=True, slots=True)
-class Calibration:
+class RangeCalibration:
     """Conversion from counts of one range to volts."""
 
     positive_slope: float = 3.158058e-4
@@ -271,16 +271,18 @@ def t8_calibration_address(number: int, range_: float) -> int:
     return T8_CALIBRATION_ADDRESS + T8_CALIBRATION_HEADER + 4 * _SET * index
 
 
-def nominal_t8_calibrations() -> tuple[Calibration, ...]:
+def nominal_t8_calibrations() -> tuple[RangeCalibration, ...]:
     """Return the nominal calibration of every input and range of a T8.
 
     Assumed: a stream holds the upper 16 of the converter's 24 bits, with 0 V in their middle.
     """
-    at_input = tuple(Calibration(span / 32768, -span / 32768, 32768.0, -span) for span in T8_SPANS)
+    at_input = tuple(
+        RangeCalibration(span / 32768, -span / 32768, 32768.0, -span) for span in T8_SPANS
+    )
     return at_input * T8_INPUTS
 
 
-def encode_t8_calibrations(calibrations: Sequence[Calibration]) -> bytes:
+def encode_t8_calibrations(calibrations: Sequence[RangeCalibration]) -> bytes:
     """Encode the flash of a T8, from its header to the last input."""
     sets = [
         struct.pack(f">{_SET}f", one.positive_slope, one.negative_slope, one.center, one.offset)
@@ -289,23 +291,23 @@ def encode_t8_calibrations(calibrations: Sequence[Calibration]) -> bytes:
     return bytes(T8_CALIBRATION_HEADER) + b"".join(sets)
 
 
-def decode_calibration(flash: bytes) -> Calibration:
+def decode_calibration(flash: bytes) -> RangeCalibration:
     """Decode one calibration of four values."""
     if len(flash) != 4 * _SET:
         raise RemoteProtocolError(f"{len(flash)} bytes of calibration; expected {4 * _SET}")
-    return Calibration(*struct.unpack(f">{_SET}f", flash))
+    return RangeCalibration(*struct.unpack(f">{_SET}f", flash))
 
 
-def nominal_calibrations() -> tuple[Calibration, ...]:
+def nominal_calibrations() -> tuple[RangeCalibration, ...]:
     """Return the nominal calibration of the eight converters and gains."""
     at_gain = tuple(
-        Calibration(3.158058e-4 / gain, -3.158058e-4 / gain, 33523.0, -10.58695 / gain)
+        RangeCalibration(3.158058e-4 / gain, -3.158058e-4 / gain, 33523.0, -10.58695 / gain)
         for gain in GAINS.values()
     )
     return at_gain * 2
 
 
-def encode_calibrations(calibrations: Sequence[Calibration]) -> bytes:
+def encode_calibrations(calibrations: Sequence[RangeCalibration]) -> bytes:
     """Encode the flash of a T7: eight calibrations, then nominal values for the rest."""
     values = [
         value
@@ -316,9 +318,9 @@ def encode_calibrations(calibrations: Sequence[Calibration]) -> bytes:
     return struct.pack(f">{N_CALIBRATION_VALUES}f", *values)
 
 
-def decode_calibrations(flash: bytes) -> tuple[Calibration, ...]:
+def decode_calibrations(flash: bytes) -> tuple[RangeCalibration, ...]:
     """Decode the eight calibrations of a T7 from its flash."""
     if len(flash) < 4 * 32:
         raise RemoteProtocolError(f"{len(flash)} bytes of calibration; expected 128 or more")
     values = np.frombuffer(flash[: 4 * 32], ">f4").reshape(8, 4).tolist()
-    return tuple(Calibration(*row) for row in values)
+    return tuple(RangeCalibration(*row) for row in values)

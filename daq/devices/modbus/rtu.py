@@ -82,7 +82,7 @@ def write_request(unit: int, address: int, value: int) -> bytes:
 
 
 @dataclass(frozen=True, slots=True)
-class Reply:
+class RtuReply:
     """A reply: the bytes after the function code, or an exception."""
 
     payload: bytes
@@ -160,7 +160,7 @@ class ReplyFinder:
         self._size = 0
         self._buffer.clear()
 
-    def receive(self, received: bytes) -> Reply | None:
+    def receive(self, received: bytes) -> RtuReply | None:
         """Decode bytes, cut anywhere; return the reply once it is complete."""
         if not self.waiting:
             return None
@@ -187,8 +187,8 @@ class ReplyFinder:
                 if is_whole(frame) and self._fits(frame):
                     self.cancel()
                     if function & 0x80:
-                        return Reply(b"", frame[2])
-                    return Reply(frame[2:-2])
+                        return RtuReply(b"", frame[2])
+                    return RtuReply(frame[2:-2])
             here += 1
         else:
             here = len(buffer)
@@ -259,7 +259,7 @@ def _find_message(heard: bytes) -> bytes | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class RtuRequest:
     """A request received by a server."""
 
     function: int
@@ -277,10 +277,10 @@ class RequestFinder:
         self._unit = unit
         self._buffer = bytearray()
 
-    def receive(self, received: bytes) -> list[Request]:
+    def receive(self, received: bytes) -> list[RtuRequest]:
         """Decode bytes, cut anywhere; return the completed requests."""
         self._buffer += received
-        found: list[Request] = []
+        found: list[RtuRequest] = []
         while len(self._buffer) >= 8:
             size = 9 + self._buffer[6] if self._buffer[1] == WRITE_MULTIPLE else 8
             frame = bytes(self._buffer[:size])
@@ -292,7 +292,7 @@ class RequestFinder:
             del self._buffer[:size]
             if frame[0] == self._unit:
                 function, address, value = struct.unpack_from(">BHH", frame, 1)
-                found.append(Request(function, address, value, frame[7:-2]))
+                found.append(RtuRequest(function, address, value, frame[7:-2]))
         return found
 
 

@@ -131,7 +131,7 @@ that one stream may then be ahead of the others."""
 
 
 @dataclass(frozen=True, slots=True)
-class Selection:
+class StreamSelection:
     """Selection of the streams of a sensor.
 
     Attributes
@@ -197,7 +197,7 @@ def _component(stream_id: str) -> tuple[int, str]:
 class _Sensor:
     """One sensor: its streams if decided, else its kept records."""
 
-    def __init__(self, name: str, selection: Selection, dtype: np.dtype[np.generic]) -> None:
+    def __init__(self, name: str, selection: StreamSelection, dtype: np.dtype[np.generic]) -> None:
         self.name = name
         self.selection = selection
         self.joined: JoinedStreams | None = None
@@ -283,7 +283,7 @@ class SeedLinkDecoder:
 
     Parameters
     ----------
-    selections : mapping of str to Selection
+    selections : mapping of str to StreamSelection
         Selection of each sensor.
     dtypes : mapping of str to dtype
         Type of the counts of each sensor.
@@ -293,7 +293,7 @@ class SeedLinkDecoder:
 
     def __init__(
         self,
-        selections: Mapping[str, Selection],
+        selections: Mapping[str, StreamSelection],
         dtypes: Mapping[str, np.dtype[np.generic]],
         *,
         hold: float,

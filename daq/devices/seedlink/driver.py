@@ -29,7 +29,7 @@ from pydantic import Field, PositiveFloat, Strict
 from daq.devices.interface import DeviceInformation, Driver, DriverSettings, Session
 from daq.devices.port_rules import host_of, port_label
 from daq.devices.seedlink import packets
-from daq.devices.seedlink.decoder import SeedLinkDecoder, Selection
+from daq.devices.seedlink.decoder import SeedLinkDecoder, StreamSelection
 from daq.devices.shared_port import Presence
 from daq.errors import (
     DeviceError,
@@ -121,7 +121,7 @@ class SeedLinkSettings(DriverSettings, strict=True):
             raise sensor.fault("settings.credentials", expected, str(path))
         return words
 
-    def selection(self, sensor: Sensor) -> Selection:
+    def selection(self, sensor: Sensor) -> StreamSelection:
         """Return the selection of the sensor's streams; raise BenchFileError if invalid."""
         n_channels = len(sensor.channels)
         codes = self.channels or tuple(channel.name for channel in sensor.channels)
@@ -134,7 +134,7 @@ class SeedLinkSettings(DriverSettings, strict=True):
             raise sensor.fault("settings.channels", expected, list(codes))
         patterns = tuple((self.location, code) for code in codes)
         rate = sensor.sampling_rate
-        return Selection(self.network, self.station, patterns, n_channels, rate)
+        return StreamSelection(self.network, self.station, patterns, n_channels, rate)
 
 
 @dataclass(eq=False)
@@ -298,7 +298,7 @@ class _Planned:
     """Settings of one server in the bench file."""
 
     settings: dict[str, SeedLinkSettings]
-    selections: dict[str, Selection]
+    selections: dict[str, StreamSelection]
     address: tuple[str, int]
 
 
@@ -365,7 +365,7 @@ class _Server:
 
     async def choose(
         self,
-        selections: Mapping[str, Selection],
+        selections: Mapping[str, StreamSelection],
         last: Mapping[str, tuple[int, int]],
         *,
         wanted: str = "",
@@ -395,7 +395,9 @@ class _Server:
             self.rest = self._buffer, self._at
         return {name: str(error) for name, error in refused.items()}
 
-    async def _choose(self, chosen: Sequence[Selection], last: tuple[int, int] | None) -> None:
+    async def _choose(
+        self, chosen: Sequence[StreamSelection], last: tuple[int, int] | None
+    ) -> None:
         """Select one station and its channels."""
         one = chosen[0]
         await self._ask(packets.station_command(self.version, one.network, one.station))

@@ -68,7 +68,7 @@ from daq.protocols.block import (
 )
 from daq.protocols.errors import RemoteProtocolError, shortened
 from daq.protocols.sample_counter import SampleCounter
-from daq.protocols.sample_times import LATE_NS, Place, SampleTimes
+from daq.protocols.sample_times import LATE_NS, SamplePlace, SampleTimes
 
 PATIENCE = 2
 MAX_WAITING = 64
@@ -440,7 +440,7 @@ class TextDecoder:
         if groups and self._doubtful is None:
             self._times.arrived(groups[-1].received)
 
-    def _place(self, group: Group, n_behind: int) -> Place:
+    def _place(self, group: Group, n_behind: int) -> SamplePlace:
         return self._times.place(
             group.time_ns,
             len(group.counts),
@@ -450,7 +450,7 @@ class TextDecoder:
             is_damaged=self._n_unreadable > self._n_explained,
         )
 
-    def _decided(self, place: Place, at: HostTime) -> Iterator[Block | Event]:
+    def _decided(self, place: SamplePlace, at: HostTime) -> Iterator[Block | Event]:
         """Yield the doubtful group, or an event if it was damaged."""
         group, self._doubtful = self._doubtful, None
         if group is None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from daq.bench.channel import Channel
-from daq.devices.seedlink.decoder import SeedLinkDecoder, Selection
+from daq.devices.seedlink.decoder import SeedLinkDecoder, StreamSelection
 from daq.devices.text.decoder import TextDecoder
 from daq.devices.text.format import RASPBERRY_SHAKE, TextFormat
 from daq.errors import CannotAlignError
@@ -114,7 +114,7 @@ def test_noise_is_right_where_clocks_of_digitizers_are_set(
     for name, samples in zip("ABC", counts(3, round(SECONDS * RATE)), strict=True):
         digitizer = Digitizer(SECONDS, RATE, steps=steps.get(name, ()), seed=ord(name))
         digitizer.samples = samples
-        chosen = Selection("XX", "STA", tuple(("*", code) for code in CODES), 3)
+        chosen = StreamSelection("XX", "STA", tuple(("*", code) for code in CODES), 3)
         decoder = SeedLinkDecoder({name: chosen}, {name: np.dtype(np.int32)}, hold=10.0)
         for sent in digitizer.records():
             items += decoder.receive(seedlink(sent, RATE, sent.number), arrival(sent.arrival))

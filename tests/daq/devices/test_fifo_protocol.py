@@ -15,7 +15,7 @@ from pymodbus.framer.rtu import FramerRTU
 
 from daq.devices.modbus import rtu
 from daq.devices.modbus.fifo_protocol import MAX_WORDS, FifoDecoder, Header
-from daq.devices.modbus.rtu import ReplyFinder, Request, RequestFinder
+from daq.devices.modbus.rtu import ReplyFinder, RequestFinder, RtuRequest
 from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, HostTime
 
 RATE = 7812.0
@@ -56,7 +56,7 @@ def test_requests_and_replies() -> None:
     line = rtu.read_request(1, 2, 4) + rtu.read_request(9, 2, 4) + rtu.write_request(1, 1, 7812)
     line += rtu.encode(1, bytes.fromhex("10 0000 0002 04 01020304"))
     found = [r for byte in b"\xff" + line for r in finder.receive(bytes([byte]))]
-    assert found == [Request(4, 2, 4), Request(6, 1, 7812), Request(16, 0, 2, b"\1\2\3\4")]
+    assert found == [RtuRequest(4, 2, 4), RtuRequest(6, 1, 7812), RtuRequest(16, 0, 2, b"\1\2\3\4")]
 
 
 @pytest.mark.parametrize("step", [1, 3, 100])
@@ -130,7 +130,7 @@ def test_any_bytes_are_accepted_at_both_ends(data: bytes) -> None:
     server.receive(data)
     assert len(server._buffer) <= rtu.MAX_FRAME  # noqa: SLF001 -- memory stays bounded
     request = rtu.read_request(1, 2, 1)
-    assert Request(4, 2, 1) in server.receive(bytes(300) + request * 40)
+    assert RtuRequest(4, 2, 1) in server.receive(bytes(300) + request * 40)
 
 
 # --- the FIFO --------------------------------------------------------------------------------

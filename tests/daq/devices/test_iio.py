@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.devices.iio.driver import IioSession
-from daq.devices.iio.protocol import Device, ScanElement, ScanLayout
+from daq.devices.iio.protocol import IioDevice, ScanElement, ScanLayout
 from daq.devices.interface import DeviceInformation
 from daq.devices.registry import driver_type
 from daq.errors import WrongDeviceError
@@ -95,7 +95,7 @@ def decoded(
     session = IioSession(
         cast("Any", None),  # nothing is read
         one,
-        Device("iio:device0", "x", ELEMENTS, ()),
+        IioDevice("iio:device0", "x", ELEMENTS, ()),
         ("accel_x",),
         information=(DeviceInformation("A", sampling_rate=RATE),),
         patience=1.0,

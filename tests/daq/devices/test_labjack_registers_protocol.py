@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 
 from daq.devices.labjack import registers
 from daq.devices.labjack.packets import decode_response
-from daq.devices.labjack.registers import Adu, AduFinder, Calibration, Read, Write
+from daq.devices.labjack.registers import Adu, AduFinder, RangeCalibration, ReadAt, WriteAt
 from daq.protocols.errors import RemoteProtocolError
 
 
 def test_feedback_of_the_datasheet() -> None:
     """Writes 4990 = 1 and reads it back, as clients start a stream."""
-    commands: list[registers.Command] = [Write(4990, b"\0\0\0\1"), Read(4990, 2)]
+    commands: list[registers.Command] = [WriteAt(4990, b"\0\0\0\1"), ReadAt(4990, 2)]
     pdu = registers.encode_feedback(commands)
     assert pdu == bytes.fromhex("4c 01137e02 00000001 00137e02".replace(" ", ""))
     assert registers.decode_feedback(pdu) == commands
@@ -61,7 +61,7 @@ def test_calibration() -> None:
     assert high_speed.positive_slope == pytest.approx(3.158058e-4, rel=1e-6)
     volts = high_speed.volts([33523, 33524, 33522, 0, 65535])
     np.testing.assert_allclose(volts, [0, 3.158e-4, -3.158e-4, -10.5868, 10.1096], rtol=1e-4)
-    own = (Calibration(1e-3, -2e-3, 30000.0, -1.0), *registers.nominal_calibrations()[1:])
+    own = (RangeCalibration(1e-3, -2e-3, 30000.0, -1.0), *registers.nominal_calibrations()[1:])
     found = registers.decode_calibrations(registers.encode_calibrations(own))[0]
     np.testing.assert_allclose(found.volts([30001, 29999]), [1e-3, -2e-3], rtol=1e-6)
 

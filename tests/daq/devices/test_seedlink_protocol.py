@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from daq.devices.seedlink import packets
 from daq.devices.seedlink.decoder import (
     SeedLinkDecoder,
-    Selection,
+    StreamSelection,
     WaveRecord,
     decode_record,
     encode_record,
@@ -55,7 +55,7 @@ def turn(k: int, version: Version = 3) -> bytes:
 
 
 def decoder(*, hold: float = 5.0, patterns: tuple[str, ...] = ("HN?",)) -> SeedLinkDecoder:
-    chosen = Selection("XX", "STA", tuple(("*", p) for p in patterns), 3)
+    chosen = StreamSelection("XX", "STA", tuple(("*", p) for p in patterns), 3)
     return SeedLinkDecoder({"A": chosen}, {"A": np.dtype(np.int32)}, hold=hold)
 
 

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from daq.devices.guralp.decoders import ScreamDecoder
-from daq.devices.seedlink.decoder import SeedLinkDecoder, Selection
+from daq.devices.seedlink.decoder import SeedLinkDecoder, StreamSelection
 from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
 from daq.recorder.sample_index import SampleIndexer
 from tests.peers.digitizer import CODES, START, Digitizer, Sent, scream, seedlink
@@ -31,7 +31,7 @@ def arrival(sent: Sent) -> HostTime:
 def by_seedlink(
     digitizer: Digitizer, *, numbers: Callable[[int], int] = lambda n: n, hold: float = 10.0
 ) -> list[Any]:
-    chosen = Selection("XX", "STA", tuple(("*", code) for code in CODES), 3)
+    chosen = StreamSelection("XX", "STA", tuple(("*", code) for code in CODES), 3)
     decoder = SeedLinkDecoder({"A": chosen}, {"A": np.dtype(np.int32)}, hold=hold)
     found: list[Any] = []
     for sent in digitizer.records():
@@ -157,7 +157,7 @@ def test_a_busy_link_makes_no_gap_and_no_epoch(seed: int) -> None:
 def test_records_sent_again_are_recorded_once() -> None:
     """After a reconnection: 30 s of records in a burst, with the numbers that they had."""
     digitizer = Digitizer()
-    chosen = Selection("XX", "STA", tuple(("*", code) for code in CODES), 3)
+    chosen = StreamSelection("XX", "STA", tuple(("*", code) for code in CODES), 3)
     decoder = SeedLinkDecoder({"A": chosen}, {"A": np.dtype(np.int32)}, hold=10.0)
     found: list[Any] = []
     records = digitizer.records()

@@ -42,12 +42,12 @@ def test_the_frame_of_the_specification_is_decoded() -> None:
 
 def test_the_replies_of_the_specification_are_encoded() -> None:
     raw = gcf.encode_id("DEMOZ2").to_bytes(4, "big")
-    acknowledged = brp.encode_reply(brp.Reply(raw, None))
+    acknowledged = brp.encode_reply(brp.BrpReply(raw, None))
     assert acknowledged == bytes((1, raw[3], 0, raw[2], raw[1], raw[0]))
-    refused = brp.encode_reply(brp.Reply(raw, 0xFE))
+    refused = brp.encode_reply(brp.BrpReply(raw, 0xFE))
     assert refused == bytes((2, raw[3], 0xFE, raw[2], raw[1], raw[0]))
     buffer = bytearray(b"\x55noise" + acknowledged + refused + acknowledged[:3])
-    assert brp.decode_replies(buffer) == [brp.Reply(raw, None), brp.Reply(raw, 0xFE)]
+    assert brp.decode_replies(buffer) == [brp.BrpReply(raw, None), brp.BrpReply(raw, 0xFE)]
     assert buffer == acknowledged[:3]
 
 
