@@ -29,7 +29,7 @@ from daq.bench.response import PolesZeros, Response
 from daq.bench.sensitivity import REFERENCE_TEMPERATURE
 from daq.bench.tables import unattended
 from daq.bench.tables.certificate import CertificateTable, Customer, Laboratory
-from daq.bench.tables.fields import Duration, Name, Number, PositiveNumber, Table
+from daq.bench.tables.fields import BenchTable, Duration, Name, Number, PositiveNumber
 from daq.bench.tables.toml_text import to_toml
 from daq.bench.units import DensityUnit
 from daq.errors import ABSENT, BenchFileError, FileFault
@@ -37,7 +37,7 @@ from daq.errors import ABSENT, BenchFileError, FileFault
 Day: TypeAlias = dt.date
 
 
-class ChannelCertificateTable(Table):
+class ChannelCertificateTable(BenchTable):
     """The table of a channel's certificate, from which a `Certificate` is made."""
 
     value: Number = Field(description="sensitivity in counts per unit, not zero")
@@ -84,7 +84,7 @@ def _pair_to_complex(value: object) -> object:
 ComplexNumber = Annotated[complex, BeforeValidator(_pair_to_complex)]
 
 
-class PolesZerosTable(Table):
+class PolesZerosTable(BenchTable):
     """The table of a channel's poles and zeros, from which `PolesZeros` are made."""
 
     zeros: tuple[ComplexNumber, ...] = Field((), description="zeros in rad/s")
@@ -111,7 +111,7 @@ def _table_of_response(response: PolesZeros | Response | None) -> object:
     return PolesZerosTable.model_construct(**asdict(response)).model_dump(exclude_defaults=True)
 
 
-class ChannelTable(Table):
+class ChannelTable(BenchTable):
     """The table of a channel, from which a `Channel` is made."""
 
     name: Name = Field(description="the channel's name")
@@ -158,7 +158,7 @@ def _table_of_channel(channel: Channel) -> dict[str, Any]:
 CheckedChannel = Annotated[
     InstanceOf[Channel], BeforeValidator(_channel), PlainSerializer(_table_of_channel)
 ]
-TABLES: dict[type, type[Table]] = {
+TABLES: dict[type, type[BenchTable]] = {
     Channel: ChannelTable,
     PolesZeros: PolesZerosTable,
     Certificate: ChannelCertificateTable,
@@ -178,7 +178,7 @@ def _range(value: tuple[float, float]) -> tuple[float, float]:
     return value
 
 
-class DataSheet(Table):
+class DataSheet(BenchTable):
     """What a sensor's data sheet states of its noise."""
 
     unit: str | None = None
@@ -215,7 +215,7 @@ class DataSheet(Table):
         return self
 
 
-class Sensor(Table):
+class Sensor(BenchTable):
     """One sensor with its digitizer, at one port."""
 
     name: Name = Field(description="the sensor's name")
@@ -255,7 +255,7 @@ _ESTIMATE_FIELDS: dict[str, Any] = {
     key: (Annotated[Any, BeforeValidator(OPTIONS[name].check)], None)
     for key, name in table_keys().items()
 }
-EstimateTable = create_model("EstimateTable", __base__=Table, **_ESTIMATE_FIELDS)
+EstimateTable = create_model("EstimateTable", __base__=BenchTable, **_ESTIMATE_FIELDS)
 """The ``[estimate]`` table, each key with the check of its option."""
 TABLES[EstimateSettings] = EstimateTable
 
@@ -284,7 +284,7 @@ def _until(value: str) -> str:
     return end.text
 
 
-class RecordingSettings(Table):
+class RecordingSettings(BenchTable):
     """Where recordings go, and for how long."""
 
     directory: Path = Path("recordings")
@@ -299,7 +299,7 @@ class RecordingSettings(Table):
     """Whether a calibration report is written beside each recording, and as what."""
 
 
-class Limit(Table):
+class Limit(BenchTable):
     """A noise mask for pass or fail: the noise PSD's upper bound, straight in log-log between."""
 
     name: Name = Field(description="the limit's name")
@@ -350,7 +350,7 @@ class Limit(Table):
         return Mask(self.name, None if unit is None else unit.unit, self.frequency, psd)
 
 
-class Bench(Table):
+class Bench(BenchTable):
     """A bench: what one bench file describes."""
 
     name: Name = Field(description="the bench's name")

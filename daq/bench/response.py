@@ -63,7 +63,7 @@ class PolesZeros:
 
 
 @dataclass(frozen=True, slots=True)
-class Gain:
+class GainStage:
     """A stage that is the same at all frequencies."""
 
     kind: ClassVar[str] = "gain"
@@ -188,9 +188,9 @@ class Measured:
         return np.asarray(size * np.exp(1j * values[..., 1]))
 
 
-Stage: TypeAlias = Gain | AnalogPolesZeros | DigitalPolesZeros | Fir | Iir | Measured
+Stage: TypeAlias = GainStage | AnalogPolesZeros | DigitalPolesZeros | Fir | Iir | Measured
 _KINDS: dict[str, type[Any]] = {
-    each.kind: each for each in (Gain, AnalogPolesZeros, DigitalPolesZeros, Fir, Iir, Measured)
+    each.kind: each for each in (GainStage, AnalogPolesZeros, DigitalPolesZeros, Fir, Iir, Measured)
 }
 _COMPLEX = ("zeros", "poles")
 
@@ -251,7 +251,7 @@ class Response:
         value = np.ones_like(frequency, dtype=np.complex128)
         for stage in self.stages:
             value = value * stage.factor
-            if not isinstance(stage, Gain):
+            if not isinstance(stage, GainStage):
                 value = value * stage.shape(frequency)
         return value
 

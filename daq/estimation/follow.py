@@ -101,7 +101,7 @@ class Observer(Protocol):
         ...
 
 
-class Recorder(Protocol):
+class WritingProcess(Protocol):
     """The process that writes the recording, as whoever started it knows it."""
 
     @property
@@ -123,7 +123,7 @@ def follow(
     settings: Settings | None,
     observer: Observer,
     *,
-    recorder: Recorder | None = None,
+    recorder: WritingProcess | None = None,
     cancelled: threading.Event | None = None,
     states_every: float | None = STATUS_INTERVAL,
     growth: float = 0.0,
@@ -141,7 +141,7 @@ def follow(
     settings : Settings, optional
         Those of the bench in the recording, if not given.
     observer : Observer
-    recorder : Recorder, optional
+    recorder : WritingProcess, optional
         The process that writes the recording. If not given, it runs as long as it holds the lock
         of the file. Without such locks (Windows) it is asked over its control channel, once no
         sample has come for `silence` seconds.
@@ -185,7 +185,7 @@ def follow(
         [recording], settings, diagnosis_share=share * of_diagnoses, live=not whole
     ) as estimation:
 
-        def seen(recording: Recording) -> tuple[Recorder, _Sensors | None]:
+        def seen(recording: Recording) -> tuple[WritingProcess, _Sensors | None]:
             watched = None if states_every is None else _Sensors(recording, observer, first, look)
             return recorder or _RemoteRecorder(recording, cancelled, silence), watched
 

@@ -13,7 +13,7 @@ from daq.bench.units import conversion
 from daq.errors import WrongSettingError
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
-from daq.estimation.snapshot import RejectedSegment, RoundedAlike
+from daq.estimation.snapshot import RejectedSegment, SharedRounding
 from daq.recording.interface import ReadableRecording
 from estimator.checks.counts import shared_rounding
 from estimator.errors import InsufficientDataError
@@ -431,7 +431,7 @@ def rounded_alike(
     *,
     rates: Mapping[str, float],
     passes: Sequence[Pass],
-) -> RoundedAlike:
+) -> SharedRounding:
     """Return what like channels share of their rounding, and what it does to their noise.
 
     `rates` are those of sensors that count in whole numbers.
@@ -448,7 +448,7 @@ def rounded_alike(
     found = shared_rounding(csm, frequency, counts=counts, sensor=sensor, means=means)
     with np.errstate(divide="ignore", invalid="ignore"):
         most, lacking = (psd / np.abs(counts) ** 2 for psd in found)
-    return RoundedAlike(
+    return SharedRounding(
         np.where(np.isfinite(most), most, 0.0), np.where(np.isfinite(lacking), lacking, 0.0)
     )
 

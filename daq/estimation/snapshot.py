@@ -167,7 +167,7 @@ class Bridged:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RoundedAlike:
+class SharedRounding:
     """The rounding to counts that channels of several sensors share.
 
     Attributes
@@ -241,7 +241,7 @@ class Snapshot:
     quantisation_psd : float64, shape (n_freqs, n_channels), or None
         Noise of counting in whole numbers, in unit**2/Hz; NaN for channels that do not. Of a
         finished estimate.
-    rounded_alike : RoundedAlike or None
+    rounded_alike : SharedRounding or None
         What channels of several sensors share of it. Of a finished estimate.
     nonlinear : tuple of NonlinearChannel
         Channels that are not linear, the one with the largest evidence first. Of a finished
@@ -295,7 +295,7 @@ class Snapshot:
     diagnostics: SnapshotDiagnostics = field(default_factory=SnapshotDiagnostics)
     no_segment: NoSegment | None = None
     quantisation_psd: FloatArray | None = None
-    rounded_alike: RoundedAlike | None = None
+    rounded_alike: SharedRounding | None = None
     nonlinear: tuple[NonlinearChannel, ...] = ()
     linearised: bool = False
     bridged: Bridged | None = None

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daq.bench.response import AnalogPolesZeros, Fir, Gain, Iir, Measured, Response, Stage
+from daq.bench.response import AnalogPolesZeros, Fir, GainStage, Iir, Measured, Response, Stage
 from daq.clocks.arrival_times import ArrivalTimes
 from daq.errors import RecordingError
 from daq.formats.foreign_sensor import NS_PER_S
@@ -435,7 +435,7 @@ def _file_stage(
     about: dict[str, Any] = {"stage_sequence_number": 0, "stage_gain": factor} | dict.fromkeys(
         ("stage_gain_frequency", "input_units", "output_units")
     )
-    if isinstance(stage, Gain):
+    if isinstance(stage, GainStage):
         return module.ResponseStage(**about)
     if isinstance(stage, Measured):
         values = zip(stage.frequencies, stage.amplitudes, np.degrees(stage.phases), strict=True)

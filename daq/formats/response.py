@@ -28,7 +28,7 @@ from daq.bench.response import (
     AnalogPolesZeros,
     DigitalPolesZeros,
     Fir,
-    Gain,
+    GainStage,
     Iir,
     Measured,
     Response,
@@ -630,7 +630,7 @@ def whole_response(epochs: Sequence[_Epoch]) -> ChannelResponse:
     if all(raw.stage_gain is None for raw in raws):
         if len(stated) > 1 or stated[0] is None or not stated[0].value:
             raise ImportFormatError(f"{where}: expected a gain for every stage, or a sensitivity")
-        stages.append(Gain(float(stated[0].value)))
+        stages.append(GainStage(float(stated[0].value)))
         notes.append("no stage has a gain; its stated sensitivity is used")
     shape = _normalised(where, stages, frequency, raws)
     sensitivity = shape.sensitivity
@@ -727,14 +727,14 @@ def _stage(
     elif kind == "ResponseListResponseStage":
         stage = _measured(raw, gain)
     elif kind == "PolynomialResponseStage":
-        stage = Gain(gain / _slope([float(each) for each in raw.coefficients]))
+        stage = GainStage(gain / _slope([float(each) for each in raw.coefficients]))
     elif kind == "FIRResponseStage":
         coefficients = [float(each) for each in raw.coefficients]
         stage = _fir(raw, coefficients, str(raw.symmetry).lower(), given)
     elif kind == "CoefficientsTypeResponseStage":
         stage = _coefficients(raw, given)
     elif kind == "ResponseStage":
-        stage = Gain(gain)
+        stage = GainStage(gain)
     else:
         raise ValueError(f"a {kind.removesuffix('ResponseStage')} stage, which is not understood")
     return stage
@@ -807,7 +807,7 @@ def _fir(
     given: _Given,
 ) -> Stage:
     if not stated:
-        return Gain(given.gain)
+        return GainStage(given.gain)
     if symmetry not in {"none", "odd", "even"}:
         raise ValueError(f"a filter of symmetry {symmetry!r}; expected NONE, ODD or EVEN")
     coefficients = np.array(stated)
@@ -822,7 +822,7 @@ def _fir(
             coefficients = coefficients[: (len(coefficients) + 1) // 2]
     if len(coefficients) == 1 and symmetry == "odd":
         is_scaled = given.at != given.frequency
-        return Gain(given.gain * (1.0 if is_scaled else float(coefficients[0])))
+        return GainStage(given.gain * (1.0 if is_scaled else float(coefficients[0])))
     correction = float(raw.decimation_correction or 0.0) if symmetry == "none" else 0.0
     known: Any = symmetry
     shape = Fir(1.0, tuple(coefficients.tolist()), known, given.known_rate, correction)

@@ -34,7 +34,7 @@ PARTNERS = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CommonMotion:
+class RelativeResponses:
     """Relative responses of the sensors of a bench.
 
     Attributes
@@ -49,7 +49,7 @@ class CommonMotion:
     responses: tuple[RelativeResponse, ...]
 
     @classmethod
-    def of(cls, sensors: Sequence[SensorPreview]) -> CommonMotion:
+    def of(cls, sensors: Sequence[SensorPreview]) -> RelativeResponses:
         """Return what sensors with enough samples show of each other."""
         sensors = tuple(sensors)
         series = _aligned(sensors)

@@ -22,7 +22,7 @@ from daq.devices.text.format import MessageFinder
 from daq.devices.text.guess import guess_settings
 from daq.errors import DeviceError, NoAnswerError, NotConnectedError, WrongDeviceError
 from daq.host_clock import HostClock
-from daq.preflight.findings import CheckRow, Outcome
+from daq.preflight.findings import CheckOutcome, CheckRow
 from daq.preflight.preflight import check_list
 from daq.preflight.preview import LENGTH, SensorPreview, arrivals
 from daq.protocols.block import Block, BlockFlag, DeviceItem, Event
@@ -191,7 +191,7 @@ class Examination:
     @property
     def failures(self) -> tuple[CheckRow, ...]:
         """The rows that keep a test from starting."""
-        return tuple(row for row in self.rows if row.outcome is Outcome.FAILED)
+        return tuple(row for row in self.rows if row.outcome is CheckOutcome.FAILED)
 
 
 async def examine(

@@ -27,7 +27,7 @@ class Check(enum.StrEnum):
     DISK = "disk"
 
 
-class Outcome(enum.StrEnum):
+class CheckOutcome(enum.StrEnum):
     """What a row of the list says."""
 
     PASSED = "passed"
@@ -108,7 +108,7 @@ class Problem(enum.StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class CheckFinding:
     """One problem of one sensor, or of one of its channels.
 
     Attributes
@@ -147,14 +147,16 @@ class CheckRow:
     """One row of the list: a check that passed, or one finding of it."""
 
     check: Check
-    finding: Finding | None = None
+    finding: CheckFinding | None = None
 
     @property
-    def outcome(self) -> Outcome:
+    def outcome(self) -> CheckOutcome:
         """What the row says."""
         if self.finding is None:
-            return Outcome.PASSED
-        return Outcome.NOT_CHECKED if self.finding.problem in UNDECIDED else Outcome.FAILED
+            return CheckOutcome.PASSED
+        return (
+            CheckOutcome.NOT_CHECKED if self.finding.problem in UNDECIDED else CheckOutcome.FAILED
+        )
 
 
 UNDECIDED = frozenset(list(Problem)[list(Problem).index(Problem.OFFSET) :])

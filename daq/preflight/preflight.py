@@ -20,8 +20,8 @@ import numpy as np
 from daq.bench.units import STANDARD_GRAVITY, in_acceleration, order_of
 from daq.devices.registry import driver_type
 from daq.errors import WrongDeviceError
-from daq.preflight.common_motion import MIN_RATE, CommonMotion, main_samples, to_acceleration
-from daq.preflight.findings import Check, CheckRow, Finding, Problem
+from daq.preflight.common_motion import MIN_RATE, RelativeResponses, main_samples, to_acceleration
+from daq.preflight.findings import Check, CheckFinding, CheckRow, Problem
 from daq.recorder.device_identity import check_identity
 from estimator.checks.sensitivities import wrong_gains
 
@@ -47,7 +47,7 @@ SOME_CORRELATION = 0.5
 """Correlation with another sensor from which on a sensor shares motion."""
 
 
-def gravity(each: SensorPreview) -> Iterator[Finding]:
+def gravity(each: SensorPreview) -> Iterator[CheckFinding]:
     """Yield an offset, and a vertical channel that does not feel gravity where another one does."""
     channels, means = each.sensor.channels, each.samples.mean(axis=0)
     factors = [in_acceleration(channel.unit) for channel in channels]
@@ -63,14 +63,14 @@ def gravity(each: SensorPreview) -> Iterator[Finding]:
     is_whole = len(main) >= 3
     too_little = is_whole and MIN_OFFSET < most < STANDARD_GRAVITY - MIN_OFFSET
     if too_little or most > STANDARD_GRAVITY + MIN_OFFSET:
-        yield Finding(Problem.OFFSET, each.sensor.name, value=most)
+        yield CheckFinding(Problem.OFFSET, each.sensor.name, value=most)
         return
     up = [n for n in main if _is_vertical(channels[n])]
     strongest = main[int(np.argmax(np.abs(felt)))]
     is_elsewhere = np.abs(felt).max() > ALONG * most and up not in ([], [strongest])
     if is_whole and most > MIN_OFFSET and is_elsewhere:
         both = f"{channels[up[0]].name} and {channels[strongest].name}"
-        yield Finding(Problem.SWAPPED, each.sensor.name, both)
+        yield CheckFinding(Problem.SWAPPED, each.sensor.name, both)
 
 
 def _is_vertical(channel: Channel) -> bool:
@@ -104,26 +104,26 @@ def strongest_correlations(able: Sequence[SensorPreview]) -> NDArray[np.float64]
     return strongest
 
 
-def alone(able: Sequence[SensorPreview]) -> Iterator[Finding]:
+def alone(able: Sequence[SensorPreview]) -> Iterator[CheckFinding]:
     """Yield the sensors that share no motion where others do, and those of which that is unsure."""
     if len(able) < 3:
-        yield Finding(Problem.TOO_FEW_SENSORS)
+        yield CheckFinding(Problem.TOO_FEW_SENSORS)
         return
     strongest = strongest_correlations(able)
     for i, each in enumerate(able):
         others = np.delete(np.delete(strongest, i, 0), i, 1)
         most = float(strongest[i].max())
         if most < LOW_CORRELATION and others.max() >= HIGH_CORRELATION:
-            yield Finding(Problem.ALONE, each.sensor.name, value=most)
+            yield CheckFinding(Problem.ALONE, each.sensor.name, value=most)
         elif most < SOME_CORRELATION:
-            yield Finding(Problem.NOT_COMPARABLE, each.sensor.name)
+            yield CheckFinding(Problem.NOT_COMPARABLE, each.sensor.name)
 
 
-def wrong_polarity(motion: CommonMotion) -> Iterator[Finding]:
+def wrong_polarity(motion: RelativeResponses) -> Iterator[CheckFinding]:
     """Yield the sensors whose motion is a reflection of that of all others, which agree."""
     places = range(len(motion.sensors))
     if len(places) < 3:
-        yield Finding(Problem.TOO_FEW_SENSORS)
+        yield CheckFinding(Problem.TOO_FEW_SENSORS)
         return
     turns = {(i, j): motion.turn(i, j) for i in places for j in places if i != j}
     hands = {
@@ -134,7 +134,7 @@ def wrong_polarity(motion: CommonMotion) -> Iterator[Finding]:
         each = motion.sensors[j]
         seen = [turn for i in places if i != j and (turn := turns[i, j]) is not None]
         if not seen:
-            yield Finding(Problem.NOT_COMPARABLE, each.sensor.name)
+            yield CheckFinding(Problem.NOT_COMPARABLE, each.sensor.name)
             continue
         if len(seen) < 2 or not all(hands[i, j] <= 0 for i in places if i != j):
             continue
@@ -143,7 +143,7 @@ def wrong_polarity(motion: CommonMotion) -> Iterator[Finding]:
             yield _what_is_reflected(each, seen)
 
 
-def _what_is_reflected(each: SensorPreview, seen: Sequence[NDArray[np.float64]]) -> Finding:
+def _what_is_reflected(each: SensorPreview, seen: Sequence[NDArray[np.float64]]) -> CheckFinding:
     """Return which channels have traded places, or which one is reversed.
 
     That is what is seen where the sensors point alike. Where they do not, only the reflection is.
@@ -155,12 +155,12 @@ def _what_is_reflected(each: SensorPreview, seen: Sequence[NDArray[np.float64]])
         order = list(range(d))
         order[a], order[b] = b, a
         if all(turn[range(d), order].min() > ALONG for turn in seen):
-            return Finding(Problem.SWAPPED, name, f"{names[a]} and {names[b]}")
+            return CheckFinding(Problem.SWAPPED, name, f"{names[a]} and {names[b]}")
     for c in range(d):
         signs = np.where(np.arange(d) == c, -1, 1)
         if all((np.diag(turn) * signs).min() > ALONG for turn in seen):
-            return Finding(Problem.REVERSED, name, names[c])
-    return Finding(Problem.REFLECTED, name)
+            return CheckFinding(Problem.REVERSED, name, names[c])
+    return CheckFinding(Problem.REFLECTED, name)
 
 
 def _slow(each: SensorPreview, end_ns: int) -> NDArray[np.float64]:
@@ -246,13 +246,13 @@ def check_list(
     heard = [each for each in sensors if not each.trouble and len(each.samples)]
     able = [each for each in heard if _has_enough(each)]
     fast = [each for each in able if each.sensor.sampling_rate >= MIN_RATE]
-    motion = CommonMotion.of(
+    motion = RelativeResponses.of(
         [each for each in fast if (np.ptp(main_samples(each), axis=0) > 0).all()]
     )
     waiting = [_of(Problem.TOO_FEW_SAMPLES, each) for each in heard if each not in able]
     slow = [_of(Problem.TOO_SLOW, each) for each in able if each not in fast]
     at_rest = [one for each in able for one in gravity(each)]
-    found: dict[Check, list[Finding]] = {
+    found: dict[Check, list[CheckFinding]] = {
         Check.PORTS: [one for each in sensors for one in _port(each)],
         Check.IDENTITY: [one for each in sensors for one in _identity(each)],
         Check.RATES: [one for each in heard for one in _rate(each)],
@@ -288,7 +288,7 @@ def check_list(
         ]
         found = {check: several for check, several in found.items() if check not in moot}
         found[Check.PORTS] += [
-            Finding(Problem.LEFT_OUT, each.sensor.name, text=", ".join(moot))
+            CheckFinding(Problem.LEFT_OUT, each.sensor.name, text=", ".join(moot))
             for each in sensors
             if each not in heard
         ]
@@ -301,7 +301,9 @@ def check_list(
     )
 
 
-def _together(found: Sequence[Finding], sensors: Sequence[SensorPreview]) -> Iterator[Finding]:
+def _together(
+    found: Sequence[CheckFinding], sensors: Sequence[SensorPreview]
+) -> Iterator[CheckFinding]:
     """Yield findings, those of all channels of a sensor as one: one cause, one row."""
     for each in found:
         main = [
@@ -329,8 +331,8 @@ def _together(found: Sequence[Finding], sensors: Sequence[SensorPreview]) -> Ite
             yield replace(each, channel="", value=float(np.median(values)))
 
 
-def _of(problem: Problem, each: SensorPreview, value: float = math.nan) -> Finding:
-    return Finding(problem, each.sensor.name, value=value)
+def _of(problem: Problem, each: SensorPreview, value: float = math.nan) -> CheckFinding:
+    return CheckFinding(problem, each.sensor.name, value=value)
 
 
 def _has_enough(each: SensorPreview) -> bool:
@@ -347,25 +349,25 @@ def _is_wrong_device(each: SensorPreview) -> bool:
     return False
 
 
-def _port(each: SensorPreview) -> Iterator[Finding]:
+def _port(each: SensorPreview) -> Iterator[CheckFinding]:
     if each.trouble and not _is_wrong_device(each):
-        yield Finding(Problem.TROUBLE, each.sensor.name, text=each.trouble)
+        yield CheckFinding(Problem.TROUBLE, each.sensor.name, text=each.trouble)
     elif len(each.samples) == 0 and not each.trouble:
         yield _of(Problem.NO_SAMPLES, each)
 
 
-def _identity(each: SensorPreview) -> Iterator[Finding]:
+def _identity(each: SensorPreview) -> Iterator[CheckFinding]:
     if each.information is None:
         return  # a problem of the port
     if _is_wrong_device(each):
-        yield Finding(Problem.WRONG_DEVICE, each.sensor.name, text=each.trouble)
+        yield CheckFinding(Problem.WRONG_DEVICE, each.sensor.name, text=each.trouble)
     elif not each.information.serial_number:
         yield _of(Problem.NO_SERIAL_NUMBER, each)
     elif not each.sensor.serial_number:
         yield _of(Problem.NOT_IN_FILE, each)
 
 
-def _rate(each: SensorPreview) -> Iterator[Finding]:
+def _rate(each: SensorPreview) -> Iterator[CheckFinding]:
     rate, n_samples = each.sensor.sampling_rate, len(each.samples)
     if each.trouble or not n_samples:
         yield _of(Problem.TOO_FEW_SAMPLES, each)
@@ -395,7 +397,7 @@ def _is_off(each: SensorPreview) -> bool:
     return each.arrival_scatter <= UNEVEN and abs(off) > max(CLOCK_ERROR, SIGNIFICANCE * error)
 
 
-def _clock(each: SensorPreview) -> Iterator[Finding]:
+def _clock(each: SensorPreview) -> Iterator[CheckFinding]:
     if each.measured_rate is None or each.arrival_scatter > UNEVEN:
         yield _of(Problem.UNEVEN, each, each.arrival_scatter)
         return
@@ -406,25 +408,25 @@ def _clock(each: SensorPreview) -> Iterator[Finding]:
         yield _of(Problem.UNEVEN, each, each.arrival_scatter)
 
 
-def _dead(each: SensorPreview) -> Iterator[Finding]:
+def _dead(each: SensorPreview) -> Iterator[CheckFinding]:
     for channel, values in zip(each.sensor.channels, each.samples.T, strict=True):
         if not channel.auxiliary and np.ptp(values) == 0:
-            yield Finding(Problem.DEAD, each.sensor.name, channel.name)
+            yield CheckFinding(Problem.DEAD, each.sensor.name, channel.name)
 
 
-def _repeats(each: SensorPreview) -> Iterator[Finding]:
+def _repeats(each: SensorPreview) -> Iterator[CheckFinding]:
     rate = each.sensor.sampling_rate
     for share in set(each.limits.repeated.values()):
         yield replace(_of(Problem.REPEATS, each, (1 - share) * rate), wanted=rate)
 
 
-def _levels(each: SensorPreview) -> Iterator[Finding]:
+def _levels(each: SensorPreview) -> Iterator[CheckFinding]:
     names = [channel.name for channel in each.sensor.channels]
     for column, wrap in each.limits.wrapped.items():
-        yield Finding(Problem.WRAPPING, each.sensor.name, names[column], value=wrap.bits)
+        yield CheckFinding(Problem.WRAPPING, each.sensor.name, names[column], value=wrap.bits)
     for column, codes in each.limits.codes.items():
         if codes.stuck_bits or codes.n_missing:
-            yield Finding(Problem.STUCK_BIT, each.sensor.name, names[column], value=codes.bits)
+            yield CheckFinding(Problem.STUCK_BIT, each.sensor.name, names[column], value=codes.bits)
     if each.is_clipping:
         yield _of(Problem.CLIPPING, each)
         return
@@ -447,10 +449,10 @@ def _levels(each: SensorPreview) -> Iterator[Finding]:
             scale = 1.0 if own is None or of_sheet is None else own / of_sheet
             share = max(share, most * scale / sheet.full_scale)
         if share > NEAR:
-            yield Finding(Problem.NEAR_FULL_SCALE, each.sensor.name, channel.name, value=share)
+            yield CheckFinding(Problem.NEAR_FULL_SCALE, each.sensor.name, channel.name, value=share)
 
 
-def _hum(able: Sequence[SensorPreview]) -> Iterator[Finding]:
+def _hum(able: Sequence[SensorPreview]) -> Iterator[CheckFinding]:
     """Yield channels that hum more than the other sensors; hum of all may be motion."""
     yield from (_of(Problem.TOO_SLOW, e) for e in able if e.sensor.sampling_rate <= 2 * min(MAINS))
     fast = [each for each in able if each.sensor.sampling_rate > 2 * min(MAINS)]
@@ -465,7 +467,7 @@ def _hum(able: Sequence[SensorPreview]) -> Iterator[Finding]:
             for place in np.flatnonzero(share > HUM_SHARE).tolist():
                 is_more = bool(others) and power[place] > HUM_RATIO * float(np.median(others))
                 problem = Problem.HUM if is_more else Problem.COMMON_HUM
-                yield Finding(problem, each.sensor.name, main[place], value=mains)
+                yield CheckFinding(problem, each.sensor.name, main[place], value=mains)
 
 
 def _at_mains(each: SensorPreview, mains: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -485,9 +487,9 @@ def _at_mains(each: SensorPreview, mains: float) -> tuple[NDArray[np.float64], N
     return near * factor * (rate / len(values)), share
 
 
-def _sensitivities(motion: CommonMotion) -> Iterator[Finding]:
+def _sensitivities(motion: RelativeResponses) -> Iterator[CheckFinding]:
     if len(motion.sensors) < 3:
-        yield Finding(Problem.TOO_FEW_SENSORS)
+        yield CheckFinding(Problem.TOO_FEW_SENSORS)
         return
     compared = {place for each in motion.responses for place in (each.first, each.second)}
     for place, each in enumerate(motion.sensors):
@@ -501,7 +503,7 @@ def _sensitivities(motion: CommonMotion) -> Iterator[Finding]:
     ]
     for gain in wrong_gains(motion.responses, motion.dims):
         sensor, channel = names[gain.channel]
-        yield Finding(
+        yield CheckFinding(
             Problem.SENSITIVITY,
             sensor,
             channel,
@@ -511,7 +513,7 @@ def _sensitivities(motion: CommonMotion) -> Iterator[Finding]:
         )
 
 
-def _disk(bench: Bench, duration: float | None) -> Iterator[Finding]:
+def _disk(bench: Bench, duration: float | None) -> Iterator[CheckFinding]:
     """Yield a finding where the disk has no room; the folder need not exist yet."""
     seconds = duration or bench.recording.duration or OPEN_END
     wanted = sum(
@@ -524,7 +526,7 @@ def _disk(bench: Bench, duration: float | None) -> Iterator[Finding]:
     try:
         free = shutil.disk_usage(folder).free
     except OSError:
-        yield Finding(Problem.DISK_UNKNOWN)
+        yield CheckFinding(Problem.DISK_UNKNOWN)
         return
     if free < wanted:
-        yield Finding(Problem.DISK_FULL, value=free, wanted=wanted)
+        yield CheckFinding(Problem.DISK_FULL, value=free, wanted=wanted)

@@ -43,7 +43,7 @@ class _Timex(ctypes.Structure):
 
 
 @dataclass(frozen=True, slots=True)
-class ClockState:
+class KernelClock:
     """The kernel's knowledge of the system's clock.
 
     Attributes
@@ -74,7 +74,7 @@ class ClockState:
         )
 
 
-def clock_state() -> ClockState | None:
+def clock_state() -> KernelClock | None:
     """Return the state of the system's clock; None if the system does not tell."""
     if sys.platform != "linux":
         return None
@@ -86,7 +86,7 @@ def clock_state() -> ClockState | None:
     if reply < 0:
         return None
     unit = 1e-9 if timex.status & _NANOSECONDS else 1e-6
-    return ClockState(
+    return KernelClock(
         reply != _TIME_ERROR, timex.offset * unit, timex.esterror * 1e-6, timex.maxerror * 1e-6
     )
 
@@ -108,7 +108,7 @@ class ClockWatch:
         self,
         clock: HostClock,
         *,
-        state: Callable[[], ClockState | None] = clock_state,
+        state: Callable[[], KernelClock | None] = clock_state,
     ) -> None:
         self._clock, self._state = clock, state
         self._ahead = 0.0

@@ -31,7 +31,7 @@ THIRD = 2 ** (1 / 6)
 """Half a third of an octave: a density is the mean over so much to either side."""
 
 
-class Quantity(enum.StrEnum):
+class SheetQuantity(enum.StrEnum):
     """What a data sheet states."""
 
     NOISE_DENSITY = "noise-density"
@@ -42,7 +42,7 @@ class Quantity(enum.StrEnum):
     """In dB, of a sine of full scale above the noise in a band."""
 
 
-class Outcome(enum.StrEnum):
+class SheetOutcome(enum.StrEnum):
     """A measured value beside the data sheet's."""
 
     MEETS = "meets"
@@ -56,22 +56,22 @@ class Outcome(enum.StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class SheetComparison:
     """One value of a data sheet.
 
     Attributes
     ----------
-    quantity : Quantity
+    quantity : SheetQuantity
     low_hz, high_hz : float
         Band in which it was measured.
     unit : str
         Of the values.
     stated, measured, low, high : float
         Of the data sheet, of the estimate, and its 95 % interval.
-    outcome : Outcome
+    outcome : SheetOutcome
     """
 
-    quantity: Quantity
+    quantity: SheetQuantity
     low_hz: float
     high_hz: float
     unit: str
@@ -79,11 +79,11 @@ class Comparison:
     measured: float
     low: float
     high: float
-    outcome: Outcome
+    outcome: SheetOutcome
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ChannelNoise:
+class ChannelParameters:
     """The noise of one channel as parameters.
 
     Attributes
@@ -97,7 +97,7 @@ class ChannelNoise:
         Mean over the band, in unit**2/Hz; NaN where samples are not whole numbers.
     quantisation_share : float
         Of the mean noise in the band; NaN where either is not known.
-    comparisons : tuple of Comparison
+    comparisons : tuple of SheetComparison
         With the data sheet in the bench file.
     """
 
@@ -107,10 +107,12 @@ class ChannelNoise:
     refused: str
     quantisation_psd: float
     quantisation_share: float
-    comparisons: tuple[Comparison, ...]
+    comparisons: tuple[SheetComparison, ...]
 
 
-def noise_parameters(estimate: Estimate, bench: Bench | None = None) -> tuple[ChannelNoise, ...]:
+def noise_parameters(
+    estimate: Estimate, bench: Bench | None = None
+) -> tuple[ChannelParameters, ...]:
     """Return the noise of every channel as parameters, by the method that judges.
 
     They are fitted to the whole usable spectrum: slopes show over decades, not in a band. None of
@@ -142,7 +144,7 @@ def noise_parameters(estimate: Estimate, bench: Bench | None = None) -> tuple[Ch
             refused = str(error)
         sheet = _data_sheet(bench, label)
         found.append(
-            ChannelNoise(
+            ChannelParameters(
                 label,
                 parameters,
                 allan,
@@ -217,7 +219,7 @@ def _compared(
     *,
     spectrum: Spectrum,
     column: int,
-) -> list[Comparison]:
+) -> list[SheetComparison]:
     unit = canonical(sheet.unit or label.unit)
     with np.errstate(divide="ignore", invalid="ignore"):
         factor = np.abs(conversion(label.unit, unit, frequency)) ** 2
@@ -242,10 +244,10 @@ def _compared(
     for at, stated in sheet.noise_density:
         band = (at / THIRD, at * THIRD)
         values = tuple(_root(value) for value in mean(*band))
-        rows.append(_compare(Quantity.NOISE_DENSITY, band, f"({unit})/√Hz", stated, values))
+        rows.append(_compare(SheetQuantity.NOISE_DENSITY, band, f"({unit})/√Hz", stated, values))
     for low, high, stated in sheet.integrated_noise:
         values = tuple(_root(value * (high - low)) for value in mean(low, high))
-        rows.append(_compare(Quantity.INTEGRATED_NOISE, (low, high), unit, stated, values))
+        rows.append(_compare(SheetQuantity.INTEGRATED_NOISE, (low, high), unit, stated, values))
     for low, high, stated in sheet.dynamic_range:
         rms = [_root(value * (high - low)) for value in mean(low, high)]
         sine = (sheet.full_scale or math.nan) / math.sqrt(2)
@@ -254,7 +256,7 @@ def _compared(
             for v in (rms[0], rms[2], rms[1])
         )
         rows.append(
-            _compare(Quantity.DYNAMIC_RANGE, (low, high), "dB", stated, (middle, worst, best))
+            _compare(SheetQuantity.DYNAMIC_RANGE, (low, high), "dB", stated, (middle, worst, best))
         )
     return rows
 
@@ -264,24 +266,24 @@ def _root(power: float) -> float:
 
 
 def _compare(
-    quantity: Quantity,
+    quantity: SheetQuantity,
     band: tuple[float, float],
     unit: str,
     stated: float,
     values: tuple[float, ...],
-) -> Comparison:
+) -> SheetComparison:
     measured, low, high = values
-    if quantity is Quantity.DYNAMIC_RANGE:
+    if quantity is SheetQuantity.DYNAMIC_RANGE:
         falls_short, meets = high < stated, low >= stated
     else:
         falls_short, meets = low > stated, high <= stated
     outcome = (
-        Outcome.UNKNOWN
+        SheetOutcome.UNKNOWN
         if math.isnan(measured)
-        else Outcome.FALLS_SHORT
+        else SheetOutcome.FALLS_SHORT
         if falls_short
-        else Outcome.MEETS
+        else SheetOutcome.MEETS
         if meets
-        else Outcome.NOT_DECIDED
+        else SheetOutcome.NOT_DECIDED
     )
-    return Comparison(quantity, *band, unit, stated, measured, low, high, outcome)
+    return SheetComparison(quantity, *band, unit, stated, measured, low, high, outcome)

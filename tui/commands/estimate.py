@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from daq.results.decision.verdict import TestVerdict
-    from daq.results.noise_parameters import ChannelNoise
+    from daq.results.noise_parameters import ChannelParameters
     from daq.results.result import Result
     from daq.results.sources import Source
 
@@ -229,7 +229,7 @@ def show_result(
     json: str | None,
     csv: str | None,
     diagnostics: bool = False,
-    parameters: Sequence[ChannelNoise] | None = None,
+    parameters: Sequence[ChannelParameters] | None = None,
 ) -> None:
     """Print the table, and write JSON and CSV if requested."""
     from daq.results.noise_parameters import quantisation_shares
@@ -277,7 +277,7 @@ def show_result(
             write_metadata(Path(csv), provenance(result))
 
 
-def _show_parameters(screen: Console, found: Sequence[ChannelNoise], unit: str) -> None:
+def _show_parameters(screen: Console, found: Sequence[ChannelParameters], unit: str) -> None:
     """Print the noise parameters as tables."""
     from tui.output.noise_parameters import allan_table, notes, sheet_table, term_table
     from tui.page.terminal import terminal_table

@@ -21,7 +21,7 @@ from daq.devices.registry import present_ports
 from daq.errors import BenchFileError, HuddleError, RecordingError
 from daq.host_clock import SystemClock
 from daq.preflight.device_check import DiscoveredDevice, discover, network_ports
-from daq.preflight.findings import Outcome
+from daq.preflight.findings import CheckOutcome
 from daq.preflight.preview import SensorPreview, preview
 from daq.recording.control import ask
 from daq.recording.reader import Recording
@@ -239,7 +239,9 @@ class BenchControls(_Controls):
         with self.ports:  # a preview has released them
             rows = examined_bench(self.bench, duration=plan.end.duration).rows
         return [
-            sentence(row.finding) for row in rows if row.finding and row.outcome is Outcome.FAILED
+            sentence(row.finding)
+            for row in rows
+            if row.finding and row.outcome is CheckOutcome.FAILED
         ]
 
     def start(self, plan: TestPlan) -> Path:

@@ -7,15 +7,19 @@ from typing import Any
 
 from rich.text import Text
 
-from daq.preflight.findings import Check, CheckRow, Finding, Outcome, Problem
+from daq.preflight.findings import Check, CheckFinding, CheckOutcome, CheckRow, Problem
 from daq.results.vocabulary import CAUSES
 from estimator.wording import listed
 
-MARKS: Mapping[Outcome, str] = {Outcome.PASSED: "✓", Outcome.FAILED: "✗", Outcome.NOT_CHECKED: "?"}
-STYLES: Mapping[Outcome, str] = {
-    Outcome.PASSED: "green",
-    Outcome.FAILED: "bold #ff6b6b",
-    Outcome.NOT_CHECKED: "yellow",
+MARKS: Mapping[CheckOutcome, str] = {
+    CheckOutcome.PASSED: "✓",
+    CheckOutcome.FAILED: "✗",
+    CheckOutcome.NOT_CHECKED: "?",
+}
+STYLES: Mapping[CheckOutcome, str] = {
+    CheckOutcome.PASSED: "green",
+    CheckOutcome.FAILED: "bold #ff6b6b",
+    CheckOutcome.NOT_CHECKED: "yellow",
 }
 PASSED: Mapping[Check, str] = {
     Check.PORTS: "every sensor answers and sends samples",
@@ -88,7 +92,7 @@ MERGED = frozenset(
 """Problems of several sensors that are one line."""
 
 
-def sentence(finding: Finding, sensors: Sequence[str] = ()) -> str:
+def sentence(finding: CheckFinding, sensors: Sequence[str] = ()) -> str:
     """Return a finding with what to do; `sensors` are all of which it is true."""
     name = f"{finding.sensor}.{finding.channel}" if finding.channel else finding.sensor
     if finding.problem is Problem.SENSITIVITY:
@@ -112,7 +116,7 @@ def sentence(finding: Finding, sensors: Sequence[str] = ()) -> str:
 def lines(rows: Iterable[CheckRow], *, failures_only: bool = False) -> list[Text]:
     """Return the list, a line a row; what cannot be checked of several sensors is one line."""
     sensors: dict[tuple[Check, Problem], list[str]] = {}
-    chosen = [row for row in rows if not failures_only or row.outcome is Outcome.FAILED]
+    chosen = [row for row in rows if not failures_only or row.outcome is CheckOutcome.FAILED]
     for row in chosen:
         if row.finding is not None and row.finding.problem in MERGED:
             sensors.setdefault((row.check, row.finding.problem), []).append(row.finding.sensor)

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     )
     from daq.results.calibration import Calibration
     from daq.results.decision.verdict import TestVerdict
-    from daq.results.noise_parameters import ChannelNoise
+    from daq.results.noise_parameters import ChannelParameters
     from daq.results.result import Result
     from estimator.checks.stability import Stability
 
@@ -71,7 +71,7 @@ def result_document(snapshot: Snapshot, method: str) -> dict[str, Any]:
 
 
 def document(
-    result: Result, noise_parameters: Sequence[ChannelNoise] | None = None
+    result: Result, noise_parameters: Sequence[ChannelParameters] | None = None
 ) -> dict[str, Any]:
     """Return the JSON of a result: of its one method, or of all of them under ``results``.
 
@@ -79,7 +79,7 @@ def document(
     ----------
     result : Result
         A finished estimate.
-    noise_parameters : sequence of ChannelNoise or None
+    noise_parameters : sequence of ChannelParameters or None
         Of every channel, where they were asked for.
     """
     snapshot, sources = result.snapshot, result.sources

@@ -9,10 +9,10 @@ import numpy as np
 
 from daq.results.noise_parameters import (
     QUANTISATION_SHARE,
-    ChannelNoise,
-    Comparison,
-    Outcome,
-    Quantity,
+    ChannelParameters,
+    SheetComparison,
+    SheetOutcome,
+    SheetQuantity,
 )
 from estimator.noise_parameters.fit import Term
 from estimator.wording import percent, span
@@ -36,21 +36,21 @@ COLUMNS = {
     Term.F_SQUARED: "f²",
 }
 OUTCOMES = {
-    Outcome.MEETS: "meets it",
-    Outcome.FALLS_SHORT: "falls short",
-    Outcome.NOT_DECIDED: "not decided",
-    Outcome.UNKNOWN: "no estimate",
+    SheetOutcome.MEETS: "meets it",
+    SheetOutcome.FALLS_SHORT: "falls short",
+    SheetOutcome.NOT_DECIDED: "not decided",
+    SheetOutcome.UNKNOWN: "no estimate",
 }
 QUANTITIES = {
-    Quantity.NOISE_DENSITY: "noise density",
-    Quantity.INTEGRATED_NOISE: "integrated noise",
-    Quantity.DYNAMIC_RANGE: "dynamic range",
+    SheetQuantity.NOISE_DENSITY: "noise density",
+    SheetQuantity.INTEGRATED_NOISE: "integrated noise",
+    SheetQuantity.DYNAMIC_RANGE: "dynamic range",
 }
 MAX_TIMES = 5
 """Averaging times in the table of Allan deviations: what a terminal is wide."""
 
 
-def term_table(found: Sequence[ChannelNoise]) -> Table:
+def term_table(found: Sequence[ChannelParameters]) -> Table:
     """Return each term's PSD at 1 Hz in dB, with its standard error."""
     header = ("channel", *COLUMNS.values(), "quantisation")
     rows = []
@@ -70,7 +70,7 @@ def _term(value: float, error: float) -> str:
     return f"< {level(max(value, 0.0) + SIGNIFICANT * error)}"
 
 
-def allan_table(found: Sequence[ChannelNoise]) -> Table:
+def allan_table(found: Sequence[ChannelParameters]) -> Table:
     """Return the Allan deviation and its 95 % interval, by averaging time."""
     known = [each for each in found if each.allan is not None and len(each.allan.tau)]
     if not known or known[0].allan is None:
@@ -96,7 +96,7 @@ def _allan(found: AllanDeviation, at: int) -> str:
     return f"{scientific(value)} ±{percent((high - low) / 2 / value)}"
 
 
-def sheet_table(found: Sequence[ChannelNoise]) -> Table:
+def sheet_table(found: Sequence[ChannelParameters]) -> Table:
     """Return every value of a data sheet beside the measured one."""
     header = ("channel", "quantity", "at", "data sheet", "measured", "95 % interval", "")
     rows = [
@@ -115,8 +115,8 @@ def sheet_table(found: Sequence[ChannelNoise]) -> Table:
     return Table.of(header, rows, right=header[2:6])
 
 
-def _where(one: Comparison) -> str:
-    if one.quantity is Quantity.NOISE_DENSITY:
+def _where(one: SheetComparison) -> str:
+    if one.quantity is SheetQuantity.NOISE_DENSITY:
         return f"{math.sqrt(one.low_hz * one.high_hz):.3g} Hz"
     return span(one.low_hz, one.high_hz)
 
@@ -125,7 +125,7 @@ def _number(value: float) -> str:
     return "–" if math.isnan(value) else f"{value:.4g}"
 
 
-def notes(found: Sequence[ChannelNoise]) -> list[str]:
+def notes(found: Sequence[ChannelParameters]) -> list[str]:
     """Return what must be said beside the tables."""
     lines = [
         f"{each.label.name}: no noise parameters: {each.refused}"
@@ -166,7 +166,7 @@ def quantisation_notes(
     return [line]
 
 
-def noise_parameters_document(found: Sequence[ChannelNoise]) -> list[dict[str, Any]]:
+def noise_parameters_document(found: Sequence[ChannelParameters]) -> list[dict[str, Any]]:
     """Return the noise parameters of every channel as JSON values."""
     return [
         {

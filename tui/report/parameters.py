@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from daq.results.noise_parameters import ChannelNoise, noise_parameters, quantisation_shares
+from daq.results.noise_parameters import ChannelParameters, noise_parameters, quantisation_shares
 from tui.output.noise_parameters import (
     allan_table,
     notes,
@@ -35,7 +35,7 @@ class _AllanPanel:
     """Draws the Allan deviation of one sensor's channels."""
 
     name: str
-    channels: tuple[ChannelNoise, ...]
+    channels: tuple[ChannelParameters, ...]
     unit: str
     scale: tuple[float, float]
 
@@ -108,7 +108,7 @@ def parameters_section(result: Result) -> Section | None:
     return Section("Noise parameters", tuple(parts))
 
 
-def _plots(found: tuple[ChannelNoise, ...], snapshot: Snapshot) -> list[Plot]:
+def _plots(found: tuple[ChannelParameters, ...], snapshot: Snapshot) -> list[Plot]:
     """Return the Allan deviation of every sensor, up to three side by side."""
     known = [each.allan for each in found if each.allan is not None]
     values = np.concatenate([each.deviation for each in known] or [np.empty(0)])

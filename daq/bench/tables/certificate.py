@@ -10,7 +10,7 @@ from typing import Annotated, TypeAlias
 
 from pydantic import AfterValidator, Field
 
-from daq.bench.tables.fields import Table
+from daq.bench.tables.fields import BenchTable
 
 Day: TypeAlias = dt.date
 _PREFIX = re.compile(r"[A-Za-z0-9][A-Za-z0-9.]{0,15}", re.ASCII)
@@ -41,7 +41,7 @@ def _country(value: str) -> str:
     return value
 
 
-class Laboratory(Table):
+class Laboratory(BenchTable):
     """``[laboratory]``: who issues the certificate."""
 
     name: str = ""
@@ -54,7 +54,7 @@ class Laboratory(Table):
     """Text of the accreditation, such as its body and number; empty without one."""
 
 
-class Customer(Table):
+class Customer(BenchTable):
     """``[customer]``: for whom the test is done."""
 
     name: str = ""
@@ -64,7 +64,7 @@ class Customer(Table):
     """Number of the order."""
 
 
-class CertificateTable(Table):
+class CertificateTable(BenchTable):
     """``[certificate]``: how certificates are numbered, and what they state."""
 
     prefix: Annotated[str, AfterValidator(_prefix)] = "HT"

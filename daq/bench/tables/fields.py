@@ -15,7 +15,7 @@ Name = Annotated[str, AfterValidator(check_name)]
 Duration = Annotated[float, BeforeValidator(parse_duration)]
 
 
-class Table(BaseModel):
+class BenchTable(BaseModel):
     """A table of the bench file: unknown keys are faults."""
 
     # Built when one is read: what only reads recordings without a bench needs none.

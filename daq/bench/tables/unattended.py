@@ -13,7 +13,7 @@ from cronsim import CronSim, CronSimError
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from daq.bench.end_condition import EndCondition
-from daq.bench.tables.fields import Duration, Name, PositiveNumber, Table
+from daq.bench.tables.fields import BenchTable, Duration, Name, PositiveNumber
 
 _BYTES = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "tb": 10**12}
 _SIZE = re.compile(r"(\d+(?:\.\d*)?)\s*([a-z]*)", re.ASCII)
@@ -69,7 +69,7 @@ Size = Annotated[int, BeforeValidator(parse_size)]
 Command = Annotated[tuple[str, ...], Field(min_length=1, description="a program and its arguments")]
 
 
-class ScheduledRun(Table):
+class ScheduledRun(BenchTable):
     """One ``[[schedule]]`` table: when runs are due, and how long they record."""
 
     name: Name = "runs"
@@ -141,7 +141,7 @@ def _in_words(days: str) -> str:
     return named.replace("/", "÷")[:_LONGEST_NAME]
 
 
-class Schedule(Table):
+class Schedule(BenchTable):
     """When ``huddle serve`` starts a run: ``[[schedule]]`` tables, or cron lines in one table."""
 
     cron: tuple[CronLine, ...] = ()
@@ -190,7 +190,7 @@ class Schedule(Table):
         return next((zone for zone in zones if zone != "UTC"), "UTC")
 
 
-class Storage(Table):
+class Storage(BenchTable):
     """What ``huddle serve`` keeps; without limits, every run for ever."""
 
     keep_for: Duration | None = None
@@ -203,7 +203,7 @@ class Storage(Table):
     """Bytes of free space below which no run starts and a running one is closed."""
 
 
-class Hooks(Table):
+class Hooks(BenchTable):
     """Commands of ``huddle serve``, given a JSON document on standard input."""
 
     on_finished: Command | None = None
@@ -222,7 +222,7 @@ class Hooks(Table):
     """Seconds between attempts, doubled after each."""
 
 
-class Metrics(Table):
+class Metrics(BenchTable):
     """Prometheus metrics of ``huddle serve``."""
 
     port: Annotated[int, Field(strict=True, ge=0, le=65535)]
@@ -245,7 +245,7 @@ Secret = Annotated[str, AfterValidator(_secret)]
 """Hash of a password or of a token, or the variable of the environment that holds a token."""
 
 
-class Web(Table):
+class Web(BenchTable):
     """The pages of the bench in a browser: ``huddle web``, and beside ``huddle serve``."""
 
     port: Annotated[int, Field(strict=True, ge=0, le=65535)] = 8040
@@ -297,14 +297,14 @@ class Web(Table):
             )
 
 
-class Signing(Table):
+class Signing(BenchTable):
     """How recordings are signed when they are closed."""
 
     key: Annotated[str, Field(min_length=1)]
     """Absolute path of a private key; ``${NAME}`` is a variable of the environment."""
 
 
-class History(Table):
+class History(BenchTable):
     """What ``huddle serve`` keeps of each run for ``huddle history``."""
 
     bands: tuple[tuple[PositiveNumber, PositiveNumber], ...] = ()

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.bench.tables.certificate import Rule
-from daq.results.decision.limits import Bands, Columns
+from daq.results.decision.limits import Bands, ColumnLevels
 from estimator.decision.comparison import joint_quantile
 from estimator.decision.verdict import Obstacle
 
@@ -98,7 +98,7 @@ def conformity(bench: Bench | None, estimate: Estimate) -> list[Conformity]:
         columns, low, high = None, np.empty(0), np.empty(0)
         if spectrum is not None and each.n_bands:
             levels = spectrum.levels(each.edges)
-            columns, (low, high) = Columns.of(levels, quantile), distribution(levels)
+            columns, (low, high) = ColumnLevels.of(levels, quantile), distribution(levels)
         for column in each.columns:
             compared = each.comparison(bench, snapshot, columns, column)
             judged, label = compared.judged(), snapshot.channels[column]

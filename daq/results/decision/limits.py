@@ -59,7 +59,7 @@ def judge(bench: Bench | None, estimate: Estimate) -> TestVerdict | None:
     bands = [Bands.of(bench, limit, snapshot) for limit in bench.limits]
     quantile = joint_quantile(sum(each.n_bands * len(each.columns) for each in bands))
     spectrum = None if estimate.noise is None else estimate.spectrum(method)
-    known: dict[bytes, Columns] = {}  # limits often share their bands
+    known: dict[bytes, ColumnLevels] = {}  # limits often share their bands
     found: list[Comparison] = []
     judged: list[Judged] = []
     doubted = _doubted(snapshot)
@@ -67,7 +67,7 @@ def judge(bench: Bench | None, estimate: Estimate) -> TestVerdict | None:
     for each in bands:
         columns = known.get(each.edges.tobytes())
         if columns is None and spectrum is not None and each.n_bands:
-            columns = Columns.of(spectrum.levels(each.edges), quantile)
+            columns = ColumnLevels.of(spectrum.levels(each.edges), quantile)
             known[each.edges.tobytes()] = columns
         for column in each.columns:
             found.append(
@@ -159,7 +159,7 @@ def _unit_in_file(bench: Bench, label: ChannelLabel) -> str | None:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Columns:
+class ColumnLevels:
     """Levels of all channels in the bands of a limit, as a verdict needs them.
 
     Each pair has lower and upper ends, shape (n_bands, n_channels): by what is random (the scatter
@@ -175,7 +175,7 @@ class Columns:
     reach: FloatArray
 
     @classmethod
-    def of(cls, found: Levels, quantile: float) -> Columns:
+    def of(cls, found: Levels, quantile: float) -> ColumnLevels:
         """Return the columns at a quantile."""
         reach = quantile * found.deviation
         return cls(
@@ -221,7 +221,7 @@ class Bands:
         return max(len(self.edges) - 1, 0)
 
     def comparison(
-        self, bench: Bench, snapshot: Snapshot, columns: Columns | None, column: int
+        self, bench: Bench, snapshot: Snapshot, columns: ColumnLevels | None, column: int
     ) -> Comparison:
         """Return the noise of a channel beside the mask."""
         frequency, label = snapshot.frequency, snapshot.channels[column]

@@ -22,7 +22,7 @@ from benchmarks.studies.shipped import (
     evaluated,
     response_files,
 )
-from daq.bench.response import Fir, Gain, Measured, Response, response_from_json
+from daq.bench.response import Fir, GainStage, Measured, Response, response_from_json
 from daq.errors import ImportFormatError
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
@@ -83,7 +83,7 @@ def test_a_filter_has_the_transform_of_its_coefficients(symmetry: Any) -> None: 
 
 def test_nothing_is_known_beyond_a_list() -> None:
     stage = Measured(2.0, (1.0, 2.0, 3.0, 4.0, 5.0), (1.0,) * 5, (0.5,) * 5)
-    values = Response((stage, Gain(10.0)), 2.0).at(np.array([0.5, 1.0, 3.3, 5.0, 6.0]))
+    values = Response((stage, GainStage(10.0)), 2.0).at(np.array([0.5, 1.0, 3.3, 5.0, 6.0]))
     np.testing.assert_allclose(values[1:4], np.exp(0.5j))
     assert np.isnan(values[[0, 4]]).all()
 

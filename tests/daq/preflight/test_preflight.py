@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from daq.bench.model import DataSheet
 from daq.devices.interface import DeviceInformation
-from daq.preflight.findings import Check, CheckRow, Finding, Outcome, Problem
+from daq.preflight.findings import Check, CheckFinding, CheckOutcome, CheckRow, Problem
 from daq.preflight.preflight import check_list, is_complete
 from daq.preflight.preview import SensorPreview, arrivals
 from daq.protocols.block import Block, HostTime
@@ -50,13 +50,13 @@ def previews(
     ]
 
 
-def findings(sensors: list[SensorPreview]) -> list[Finding]:
+def findings(sensors: list[SensorPreview]) -> list[CheckFinding]:
     return [row.finding for row in check_list(BENCH, sensors) if row.finding is not None]
 
 
 def failures(sensors: list[SensorPreview]) -> list[tuple[Problem, str, str]]:
     rows = check_list(BENCH, sensors)
-    found = [row.finding for row in rows if row.outcome is Outcome.FAILED]
+    found = [row.finding for row in rows if row.outcome is CheckOutcome.FAILED]
     return [(each.problem, each.sensor, each.channel) for each in found if each is not None]
 
 
@@ -94,9 +94,9 @@ def test_enough_samples_are_awaited() -> None:
     assert is_complete(previews())
     assert not is_complete(previews(2.0))
     rows = check_list(BENCH, previews(2.0))
-    unknown = {row.check for row in rows if row.outcome is Outcome.NOT_CHECKED}
+    unknown = {row.check for row in rows if row.outcome is CheckOutcome.NOT_CHECKED}
     assert unknown >= {Check.CHANNELS, Check.HUM, Check.SENSITIVITIES, Check.POLARITY, Check.MOTION}
-    assert all(row.outcome is not Outcome.FAILED for row in rows)
+    assert all(row.outcome is not CheckOutcome.FAILED for row in rows)
 
 
 def test_each_fault_is_found_where_it_is() -> None:
@@ -120,8 +120,8 @@ def test_each_fault_is_found_where_it_is() -> None:
     ]
     # Two sensors without a third say nothing of each other: one line, whatever is moot.
     rows = check_list(BENCH, sensors)
-    (left_out,) = (row.finding for row in rows if row.outcome is Outcome.NOT_CHECKED)
-    assert left_out == Finding(Problem.LEFT_OUT, "C", text="motion, sensitivities, polarity")
+    (left_out,) = (row.finding for row in rows if row.outcome is CheckOutcome.NOT_CHECKED)
+    assert left_out == CheckFinding(Problem.LEFT_OUT, "C", text="motion, sensitivities, polarity")
     assert {row.check for row in rows} == set(Check) - {
         *(Check.MOTION, Check.SENSITIVITIES, Check.POLARITY),
     }
@@ -187,8 +187,8 @@ def test_nothing_passes_where_nothing_is_sent() -> None:
         for each in previews()
     ]
     rows = check_list(BENCH, silent)
-    assert {row.check for row in rows if row.outcome is Outcome.PASSED} == {Check.DISK}
-    assert [row.outcome for row in rows].count(Outcome.FAILED) == 3
+    assert {row.check for row in rows if row.outcome is CheckOutcome.PASSED} == {Check.DISK}
+    assert [row.outcome for row in rows].count(CheckOutcome.FAILED) == 3
 
 
 def test_levels_near_full_scale_and_unknown_ones() -> None:

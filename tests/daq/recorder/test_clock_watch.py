@@ -9,10 +9,10 @@ import pytest
 
 from daq.host_clock import SystemClock
 from daq.protocols.block import Event, EventKind
-from daq.recorder.clock_trust import ClockState, ClockWatch, clock_state
+from daq.recorder.clock_trust import ClockWatch, KernelClock, clock_state
 
 UTC_NS = 1_790_000_000_000_000_000
-GOOD = ClockState(synchronised=True, offset=-0.0003, error=0.002, max_error=0.04)
+GOOD = KernelClock(synchronised=True, offset=-0.0003, error=0.002, max_error=0.04)
 
 
 class Computer:
@@ -20,7 +20,7 @@ class Computer:
 
     def __init__(self, *, speed: float = 1.0) -> None:
         self.monotonic_ns, self.utc_ns = 5_000_000_000, UTC_NS
-        self.state: ClockState | None = GOOD
+        self.state: KernelClock | None = GOOD
         clock = SystemClock(
             speed,
             monotonic_ns=lambda: self.monotonic_ns,
@@ -45,7 +45,7 @@ def test_the_state_is_reported_at_the_start_and_every_hour() -> None:
         "synchronised: offset -0.300 ms, estimated error 2.000 ms, at most 40 ms (adjtimex)"
     )
     assert [computer.after(900) for _ in range(3)] == [None] * 3
-    computer.state = ClockState(synchronised=False, offset=0.0, error=0.0, max_error=16.0)
+    computer.state = KernelClock(synchronised=False, offset=0.0, error=0.0, max_error=16.0)
     later = computer.after(900)
     assert later is not None
     assert later.text == "unverified: not synchronised (adjtimex)"

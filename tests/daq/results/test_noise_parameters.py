@@ -21,8 +21,8 @@ from daq.protocols.block import HostTime
 from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
 from daq.results.noise_parameters import (
-    Outcome,
-    Quantity,
+    SheetOutcome,
+    SheetQuantity,
     noise_parameters,
     quantisation_shares,
 )
@@ -85,9 +85,11 @@ def test_without_a_result_or_with_few_frequencies_it_is_said_why() -> None:
 
 @pytest.mark.parametrize(
     ("factor", "outcome"),
-    [(2.0, Outcome.MEETS), (0.5, Outcome.FALLS_SHORT), (1.0, Outcome.NOT_DECIDED)],
+    [(2.0, SheetOutcome.MEETS), (0.5, SheetOutcome.FALLS_SHORT), (1.0, SheetOutcome.NOT_DECIDED)],
 )
-def test_values_of_a_data_sheet_are_judged_by_the_interval(factor: float, outcome: Outcome) -> None:
+def test_values_of_a_data_sheet_are_judged_by_the_interval(
+    factor: float, outcome: SheetOutcome
+) -> None:
     snapshot = made_snapshot()
     psd = 1e-12 / 0.97  # of A.X, as 100 averages leave it
     density, rms = math.sqrt(psd), math.sqrt(8 * psd)
@@ -99,10 +101,10 @@ def test_values_of_a_data_sheet_are_judged_by_the_interval(factor: float, outcom
     assert one.measured == pytest.approx(density, rel=1e-6)
     assert one.low < one.measured < one.high
     assert noise.measured == pytest.approx(rms, rel=1e-6)
-    assert dynamic.quantity is Quantity.DYNAMIC_RANGE
+    assert dynamic.quantity is SheetQuantity.DYNAMIC_RANGE
     assert dynamic.measured == pytest.approx(20 * math.log10(10 / math.sqrt(2) / rms), rel=1e-6)
     assert dynamic.low < dynamic.measured < dynamic.high
-    assert beyond.outcome is Outcome.UNKNOWN  # 500 Hz
+    assert beyond.outcome is SheetOutcome.UNKNOWN  # 500 Hz
     assert (
         noise_parameters(Result(snapshot, SETTINGS), sheet)[3].comparisons == ()
     )  # sensor B has none
@@ -193,5 +195,5 @@ def test_an_uncertain_sensitivity_is_in_terms_allan_deviation_and_data_sheet() -
     reach = np.log(after.allan.high / after.allan.deviation)
     scatter = np.log(before.allan.high / before.allan.deviation)
     np.testing.assert_allclose(reach, np.hypot(scatter, 1.96 * own), rtol=1e-3)
-    assert before.comparisons[0].outcome is Outcome.MEETS
-    assert after.comparisons[0].outcome is Outcome.NOT_DECIDED
+    assert before.comparisons[0].outcome is SheetOutcome.MEETS
+    assert after.comparisons[0].outcome is SheetOutcome.NOT_DECIDED

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from daq.bench.durations import format_duration
 from daq.errors import HuddleError
-from daq.preflight.findings import Check, Outcome
+from daq.preflight.findings import Check, CheckOutcome
 from daq.preflight.preflight import check_list, is_complete
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.wording import listed
@@ -313,8 +313,8 @@ def checks(bench: Bench, sensors: Sequence[SensorPreview]) -> list[Text]:
     Rows that passed are not shown, and what is not checked is named in the last line.
     """
     rows = check_list(bench, sensors)
-    failing = [row.finding for row in rows if row.outcome is Outcome.FAILED and row.finding]
-    unknown = {row.check for row in rows if row.outcome is Outcome.NOT_CHECKED}
+    failing = [row.finding for row in rows if row.outcome is CheckOutcome.FAILED and row.finding]
+    unknown = {row.check for row in rows if row.outcome is CheckOutcome.NOT_CHECKED}
     lines = [Text(f"✗ {sentence(each)}", BAD) for each in failing]
     if not is_complete(sensors):
         return [*lines, Text("checking …", MUTED)]
